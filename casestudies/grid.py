@@ -1,0 +1,86 @@
+"""A rectangle cut into cells: which cell a point lies in, and where a cell's centre is."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Grid:
+    """A grid over x in [x_low, x_high] and y in [y_low, y_high], in the map's units.
+
+    Cells are counted from the lower left corner, row-major with y first, as the lines of the machine
+    are: line = row * width + column (row along y, column along x).
+    """
+
+    x_low: float
+    x_high: float
+    y_low: float
+    y_high: float
+    width: int
+    height: int
+
+    def __post_init__(self) -> None:
+        if self.width < 1 or self.height < 1 or self.x_low >= self.x_high or self.y_low >= self.y_high:
+            raise ValueError(f"a grid needs at least one cell and a positive area, not {self}")
+
+    @property
+    def cells(self) -> int:
+        """How many cells there are."""
+        return self.width * self.height
+
+    @property
+    def cell_width(self) -> float:
+        """A cell's extent along x, in the map's units."""
+        return (self.x_high - self.x_low) / self.width
+
+    @property
+    def cell_height(self) -> float:
+        """A cell's extent along y, in the map's units."""
+        return (self.y_high - self.y_low) / self.height
+
+    def cell(self, x: float, y: float) -> tuple[int, int]:
+        """The (column, row) of the cell around a point; points outside belong to the nearest border cell."""
+        column = math.floor((x - self.x_low) / self.cell_width)
+        row = math.floor((y - self.y_low) / self.cell_height)
+        return min(max(column, 0), self.width - 1), min(max(row, 0), self.height - 1)
+
+    def line(self, x: float, y: float) -> int:
+        """The machine's line of the cell around a point."""
+        column, row = self.cell(x, y)
+        return row * self.width + column
+
+    def centre(self, line: int) -> tuple[float, float]:
+        """The centre (x, y) of a line's cell, in the map's units.
+
+        Raises:
+            IndexError: there is no such line.
+        """
+        if not 0 <= line < self.cells:
+            raise IndexError(f"line {line} of a grid of {self.cells} cells")
+        row, column = divmod(line, self.width)
+        return self.x_low + (column + 0.5) * self.cell_width, self.y_low + (row + 0.5) * self.cell_height
+
+    def mean(self, posterior: Sequence[float]) -> tuple[float, float]:
+        """The mean position (x, y) of a posterior over the cells' centres, in the map's units.
+
+        Args:
+            posterior: float[cells], row-major, not negative; it need not sum to 1.
+
+        Raises:
+            ValueError: another length, or nothing in it.
+        """
+        if len(posterior) != self.cells:
+            raise ValueError(f"a posterior of {len(posterior)} values for a grid of {self.cells} cells")
+        total = math.fsum(posterior)
+        if not total > 0:
+            raise ValueError("a posterior without any mass has no mean")
+        by_row = [
+            math.fsum(posterior[row * self.width : (row + 1) * self.width]) for row in range(self.height)
+        ]
+        by_column = [math.fsum(posterior[column :: self.width]) for column in range(self.width)]
+        column_mean = math.fsum(mass * (i + 0.5) for i, mass in enumerate(by_column)) / total
+        row_mean = math.fsum(mass * (i + 0.5) for i, mass in enumerate(by_row)) / total
+        return self.x_low + column_mean * self.cell_width, self.y_low + row_mean * self.cell_height
