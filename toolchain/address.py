@@ -1,0 +1,100 @@
+"""How a reading becomes an address of its column: the one rule, in plain Python.
+
+`address = floor((value - offset) / step + 0.5)`, then modulo `period` where there is one, then the range
+check. The subscriber applies it to every frame, the tests to every table.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from toolchain.errors import NotANumberError, ReadingMissingError, ValueOutOfRangeError
+
+if TYPE_CHECKING:
+    from toolchain.deployment import Variable
+
+_SHOWN = 60
+
+
+def to_address(variable: Variable, value: object) -> int | None:
+    """Return the address of one reading in its variable's column.
+
+    Args:
+        variable: Offset, step, period, number of served addresses, and what to do with a reading out of
+            range or missing.
+        value: What stood in the message. `None` stands for null and for a field that was absent; NaN and an
+            empty array are missing too. Booleans are 0 and 1. Strings are never numbers.
+
+    Returns:
+        The address, 0 to `variable.values - 1`, or `None` for a missing reading.
+
+    Raises:
+        ReadingMissingError: The reading is missing and `on_missing` is `error`.
+        NotANumberError: The reading is a string, an object or a non-empty array.
+        ValueOutOfRangeError: The address is not served and `on_range` is `error`, or the reading is
+            infinite where a period leaves no end to clamp it to.
+    """
+    if value is None:
+        return _missing(variable, "is absent or null")
+    if not isinstance(value, int | float):  # bool is an int: False is 0, True is 1
+        if isinstance(value, list | tuple) and not value:
+            return _missing(variable, "is an empty array")
+        message = f"variable {variable.name}: {_shown(value)} is {_kind(value)}, not a number"
+        raise NotANumberError(message)
+    if value != value:  # noqa: PLR0124 (NaN; math.isnan fails on integers beyond a double)
+        return _missing(variable, "is NaN")
+
+    try:
+        position = math.floor((value - variable.offset) / variable.step + 0.5)
+    except OverflowError:  # infinite, or an integer beyond a double
+        upwards = (value > 0) == (variable.step > 0)
+        return _unserved(variable, value, None if variable.period else upwards)
+    if variable.period is not None:
+        position %= variable.period
+    if 0 <= position < variable.values:
+        return position
+    return _unserved(variable, value, position >= variable.values)
+
+
+def _missing(variable: Variable, what: str) -> int | None:
+    if variable.on_missing == "error":
+        message = f"variable {variable.name} {what}, and this deployment needs it (on_missing = error)"
+        raise ReadingMissingError(message)
+    return None
+
+
+def _unserved(variable: Variable, value: float, beyond_top: bool | None) -> int | None:
+    """Apply `on_range`; `beyond_top` says at which end, None that there is no end (a period)."""
+    if variable.on_range == "missing":
+        return _missing(variable, f"is {_shown(value)}, out of range")
+    if variable.on_range == "clamp" and beyond_top is not None:
+        return variable.values - 1 if beyond_top else 0
+    last = variable.offset + (variable.values - 1) * variable.step
+    low, high = sorted((variable.offset, last))
+    around = f", around a period of {variable.period} steps" if variable.period else ""
+    message = (
+        f"variable {variable.name}: {_shown(value)} is out of range, expected {low:g} to {high:g} "
+        f"in steps of {abs(variable.step):g}{around}"
+    )
+    raise ValueOutOfRangeError(message)
+
+
+def _shown(value: object) -> str:
+    try:
+        text = repr(value)
+    except ValueError:  # an integer of more digits than Python prints
+        return "an integer of thousands of digits"
+    return text if len(text) <= _SHOWN else text[:_SHOWN] + "..."
+
+
+def _kind(value: object) -> str:
+    match value:
+        case str():
+            return "a string"
+        case list() | tuple():
+            return f"an array of {len(value)}"
+        case dict():
+            return "an object"
+        case _:
+            return f"of type {type(value).__name__}"

@@ -1,0 +1,415 @@
+"""The deployment: all that follows from the model, in one file that the services read (thesis 3.3, 3.4).
+
+`deployment.toml` lies in a folder of its own with the boards' images. Its hash covers everything that follows
+from the model and nothing that says where things run (URIs and endpoints), so pointing it at another robot
+leaves it valid, and editing what the tables were made from does not.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import re
+from collections import Counter
+from pathlib import Path, PurePosixPath
+from typing import Annotated, Any, Final, Literal, Self, TypeVar
+
+import tomli_w
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
+
+from toolchain.errors import DamagedDeploymentError, DeploymentError, DeploymentVersionError
+from toolchain.toml_file import parse_toml, read_text, validate
+
+FORMAT: Final = 1
+FILE_NAME: Final = "deployment.toml"
+
+_HEADER = """\
+# Written by `toolchain build`. URIs and endpoints may be changed here; the rest belongs to the boards' images
+# and is guarded by the hash: change the model and build again.
+"""
+
+_TYPE = re.compile(r"[A-Za-z]\w*/(?:msg/)?[A-Za-z]\w*")
+_TOPIC = re.compile(r"/?[A-Za-z]\w*(?:/\w+)*")
+_INTERFACE = re.compile(r"([1-9]\d{0,4})x([1-9]\d{0,5})")
+
+
+def _websocket_uri(uri: str) -> str:
+    if not re.fullmatch(r"wss?://[^\s/?#]+\S*", uri):
+        message = f"{uri!r} is no WebSocket URI; expected one like 'ws://robot:9090'"
+        raise ValueError(message)
+    return uri
+
+
+def _topic(topic: str) -> str:
+    if not _TOPIC.fullmatch(topic):
+        message = f"{topic!r} is no topic name; expected one like '/boat/sensors'"
+        raise ValueError(message)
+    return topic
+
+
+def _message_type(name: str) -> str:
+    if not _TYPE.fullmatch(name):
+        message = (
+            f"{name!r} is no message type; expected one like 'std_msgs/Float64' or 'std_msgs/msg/Float64'"
+        )
+        raise ValueError(message)
+    return name
+
+
+def _not_zero(step: float) -> float:
+    if step == 0:
+        message = "a step of 0 would give every value the same address"
+        raise ValueError(message)
+    return step
+
+
+def _sha256(text: str) -> str:
+    if not re.fullmatch(r"[0-9a-f]{64}", text):
+        message = f"{text!r} is no SHA-256 hash; expected 64 hexadecimal digits"
+        raise ValueError(message)
+    return text
+
+
+WebSocketUri = Annotated[str, AfterValidator(_websocket_uri)]
+Topic = Annotated[str, AfterValidator(_topic)]
+MessageType = Annotated[str, AfterValidator(_message_type)]
+Name = Annotated[str, Field(min_length=1, max_length=200)]
+Sha256 = Annotated[str, AfterValidator(_sha256)]
+Step = Annotated[float, AfterValidator(_not_zero)]
+
+Item = TypeVar("Item")
+# TOML has arrays, we keep tuples; the items stay strict.
+Sequence = Annotated[tuple[Item, ...], Field(strict=False)]
+
+
+class _Section(BaseModel):
+    """Strict and frozen: 8 is an integer and "8" isn't, and a key nobody knows is a mistake."""
+
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", strict=True, allow_inf_nan=False, validate_by_name=True
+    )
+
+
+class Source(_Section):
+    """`[[source]]`: a topic on a rosbridge server from which readings come."""
+
+    uri: WebSocketUri
+    topic: Topic
+    type: MessageType
+
+
+class Variable(_Section):
+    """`[[variable]]`: a known variable, one column of the machine, and how its readings become addresses."""
+
+    name: Name
+    source: int = Field(default=0, ge=0)
+    path: str = ""
+    kind: Literal["sensor"] = "sensor"
+    bits: int = Field(ge=1, le=24)
+    offset: float = 0.0
+    step: Step = 1.0
+    period: int | None = Field(default=None, ge=1)
+    values: int = Field(ge=1)
+    on_range: Literal["error", "clamp", "missing"] = "error"
+    on_missing: Literal["error", "missing"] = "error"
+
+    @model_validator(mode="after")
+    def _addresses_fit(self) -> Self:
+        if self.values > 2**self.bits - 1:
+            message = (
+                f"{self.name} serves {self.values} values, but {self.bits} bits hold {2**self.bits - 1} "
+                "beside the address of a missing reading"
+            )
+            raise ValueError(message)
+        return self
+
+
+class Dimension(_Section):
+    """`[[searched]]`: one searched variable, a dimension of the grid of lines; the first is the slowest."""
+
+    label: Name
+    size: int = Field(ge=1)
+    offset: float = 0.0
+    step: Step = 1.0
+
+    def value(self, index: float) -> float:
+        """Return the variable's value at an index: a cell's centre where the index is whole."""
+        return self.offset + index * self.step
+
+
+class MachineSection(_Section):
+    """`[machine]`: the BM1's parameters, the registers it is reached through, and when it stops."""
+
+    type: Literal["BM1"] = "BM1"
+    lines: int = Field(ge=1)
+    interface: str = "20x1200"
+    prob_bits: int = Field(default=8, ge=1, le=16)
+    prior_bits: int = Field(default=0, ge=0, le=16)
+    prior_mode: Literal["table", "written"] = "table"
+    counter_bits: int = Field(default=8, ge=1, le=32)
+    rng: Literal["lfsr8", "lfsr16", "lfsr24", "lfsr32", "table", "ideal"] = "lfsr32"
+    rng_banks: int = Field(default=16, ge=1)
+    rng_reset: Literal["bank", "free"] = "bank"
+    shared: bool = True
+    steps_per_clock: int = Field(default=8, ge=1)
+    target_count: int = Field(default=255, ge=1)
+    max_cycles: int = Field(default=2**17, ge=1)
+    stop: Literal["slices", "own"] = "slices"
+
+    @field_validator("interface")
+    @classmethod
+    def _inputs_by_results(cls, text: str) -> str:
+        parse_interface(text)
+        return text
+
+    @model_validator(mode="after")
+    def _target_fits(self) -> Self:
+        if self.target_count > 2**self.counter_bits - 1:
+            message = (
+                f"target_count = {self.target_count} does not fit counters of {self.counter_bits} bits; "
+                f"expected 1 to {2**self.counter_bits - 1}"
+            )
+            raise ValueError(message)
+        return self
+
+    @property
+    def interface_sensors(self) -> int:
+        """Inputs that the boards' registers have room for."""
+        return parse_interface(self.interface)[0]
+
+    @property
+    def interface_results(self) -> int:
+        """Results that the boards' registers have room for."""
+        return parse_interface(self.interface)[1]
+
+
+class Board(_Section):
+    """`[[board]]`: one board of the mini-cluster, its image and its lines of the machine."""
+
+    image: str
+    image_hash: Sha256
+    line_offset: int = Field(ge=0)
+    lines: int = Field(ge=1)
+    endpoint: str = ""
+
+    @field_validator("image")
+    @classmethod
+    def _inside(cls, image: str) -> str:
+        path = PurePosixPath(image)
+        if path.is_absolute() or ".." in path.parts or not path.name:
+            message = f"{image!r} must be a path inside the deployment's folder"
+            raise ValueError(message)
+        return image
+
+
+class Output(_Section):
+    """`[[output]]`: a topic on which posteriors go out; an empty URI is that of the first source."""
+
+    topic: Topic = "/BMresults"
+    type: Literal["std_msgs/Float64MultiArray"] = "std_msgs/Float64MultiArray"
+    uri: str = ""
+
+    @field_validator("uri")
+    @classmethod
+    def _uri_or_nothing(cls, uri: str) -> str:
+        return _websocket_uri(uri) if uri else uri
+
+
+class DeploymentFile(_Section):
+    """What `deployment.toml` says, checked as a whole."""
+
+    format: Literal[1] = FORMAT
+    name: Name
+    hash: str = ""
+    queue: Literal["latest", "all"] = "latest"
+    tolerance_s: float = Field(default=0.05, ge=0)
+    sources: Sequence[Source] = Field(validation_alias="source", min_length=1)
+    variables: Sequence[Variable] = Field(default=(), validation_alias="variable")
+    searched: Sequence[Dimension] = Field(min_length=1)
+    machine: MachineSection
+    boards: Sequence[Board] = Field(validation_alias="board", min_length=1)
+    outputs: Sequence[Output] = Field(default=(Output(),), validation_alias="output")
+
+    @model_validator(mode="after")
+    def _parts_agree(self) -> Self:
+        _names_differ("variable", [variable.name for variable in self.variables])
+        _names_differ("searched", [dimension.label for dimension in self.searched])
+        _names_differ("output", [output.topic for output in self.outputs])
+        for variable in self.variables:
+            if variable.source >= len(self.sources):
+                message = (
+                    f"variable {variable.name} reads source {variable.source}, but the last one is "
+                    f"{len(self.sources) - 1}"
+                )
+                raise ValueError(message)
+        cells = math.prod(dimension.size for dimension in self.searched)
+        if cells != self.machine.lines:
+            message = (
+                f"the searched variables have {cells} cells, but the machine has {self.machine.lines} lines"
+            )
+            raise ValueError(message)
+        offset = 0
+        for index, board in enumerate(self.boards):
+            if board.line_offset != offset:
+                message = f"board {index} starts at line {board.line_offset}, expected {offset}"
+                raise ValueError(message)
+            offset += board.lines
+        if offset != self.machine.lines:
+            message = f"the boards have {offset} lines together, but the machine has {self.machine.lines}"
+            raise ValueError(message)
+        return self
+
+
+class Deployment(DeploymentFile):
+    """A deployment in its folder, ready for the services."""
+
+    directory: Path = Field(default=Path(), exclude=True)
+
+    @property
+    def path(self) -> Path:
+        """Where its `deployment.toml` is."""
+        return self.directory / FILE_NAME
+
+    def image_path(self, board: int) -> Path:
+        """Return where a board's image is."""
+        return self.directory / self.boards[board].image
+
+    def output_uri(self, output: Output) -> str:
+        """Return the rosbridge server on which an output is published."""
+        return output.uri or self.sources[0].uri
+
+
+def parse_interface(text: str) -> tuple[int, int]:
+    """Return inputs and results of an interface such as `20x1200` (thesis 3.2).
+
+    Raises:
+        ValueError: Not two numbers from 1 with an `x` between.
+    """
+    match = _INTERFACE.fullmatch(text)
+    if not match:
+        message = f"{text!r} is no interface; expected inputs x results, such as '20x1200'"
+        raise ValueError(message)
+    return int(match[1]), int(match[2])
+
+
+def deployment_hash(deployment: DeploymentFile) -> str:
+    """Return the SHA-256 (hexadecimal) of all that follows from the model: all but URIs and endpoints."""
+    content = deployment.model_dump(
+        mode="json",
+        exclude={
+            "hash": True,
+            "sources": {"__all__": {"uri"}},
+            "boards": {"__all__": {"endpoint"}},
+            "outputs": {"__all__": {"uri"}},
+        },
+    )
+    return hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+
+def load_deployment(directory: Path, *, images: bool = True) -> Deployment:
+    """Read and check a deployment.
+
+    Args:
+        directory: The folder that `toolchain build` wrote.
+        images: Whether to read the boards' images too and compare their hashes; a process that drives no
+            boards may leave it out, and starts without NumPy.
+
+    Raises:
+        DeploymentError: Not there, not TOML, a wrong key or value (file, line, nearest right name).
+        DeploymentVersionError: Another format.
+        DamagedDeploymentError: `deployment.toml` or an image is not what was built; says which file and
+            which hash.
+    """
+    directory = Path(directory)
+    path = directory / FILE_NAME
+    if not path.is_file():
+        message = f"{directory} holds no deployment: {path} is not there; make one with 'toolchain build'"
+        raise DeploymentError(message)
+    text = read_text(path, DeploymentError)
+    tables = parse_toml(text, path, DeploymentError)
+    version = tables.get("format")
+    if version != FORMAT or isinstance(version, bool):
+        found = "has no key 'format'" if version is None else f"is of format {version!r}"
+        message = (
+            f"{path} {found}, and this version reads format {FORMAT}: build it again with 'toolchain build'"
+        )
+        raise DeploymentVersionError(message)
+    file = validate(DeploymentFile, tables, text, path, DeploymentError)
+    computed = deployment_hash(file)
+    if computed != file.hash:
+        message = (
+            f"{path} is not as it was built: its hash is {computed[:16]}, "
+            f"it says {file.hash[:16] or 'nothing'}; only URIs and endpoints may be edited: build it again "
+            "with 'toolchain build'"
+        )
+        raise DamagedDeploymentError(message)
+    deployment = Deployment(**dict(file), directory=directory)
+    if images:
+        _check_images(deployment)
+    return deployment
+
+
+def write_deployment(directory: Path, deployment: DeploymentFile) -> Deployment:
+    """Write `deployment.toml` with its hash, whole or not at all, and return what was written.
+
+    Raises:
+        DeploymentError: The folder can't be written.
+    """
+    directory = Path(directory)
+    fields = dict(deployment) | {"hash": deployment_hash(deployment), "directory": directory}
+    written = Deployment(**fields)
+    partial = directory / (FILE_NAME + ".part")
+    try:
+        partial.write_text(deployment_text(written), encoding="utf-8")
+        partial.replace(written.path)
+    except OSError as reason:
+        message = f"{written.path} can't be written: {reason.strerror or reason}"
+        raise DeploymentError(message) from None
+    return written
+
+
+def deployment_text(deployment: DeploymentFile) -> str:
+    """Return the text of `deployment.toml`: the same deployment gives the same bytes."""
+    content: dict[str, Any] = deployment.model_dump(mode="json", exclude_none=True)
+    aliases = {name: field.validation_alias for name, field in type(deployment).model_fields.items()}
+    plain = {key: value for key, value in content.items() if not isinstance(value, list | dict)}
+    parts = [_HEADER + tomli_w.dumps(plain)]
+    for key, value in content.items():
+        heading = str(aliases[key] or key)
+        if isinstance(value, dict):
+            parts.append(f"[{heading}]\n" + tomli_w.dumps(value))
+        elif isinstance(value, list):
+            parts.extend(f"[[{heading}]]\n" + tomli_w.dumps(item) for item in value)
+    return "\n".join(parts)
+
+
+def _check_images(deployment: Deployment) -> None:
+    # Here, not above: a subscriber loads a deployment without NumPy.
+    from pcie_shim.errors import PcieShimError
+    from pcie_shim.programming_file import read_image
+
+    for index, board in enumerate(deployment.boards):
+        path = deployment.image_path(index)
+        if not path.is_file():
+            message = (
+                f"{path}, the image of board {index}, is not there: build it again with 'toolchain build'"
+            )
+            raise DamagedDeploymentError(message)
+        try:
+            image = read_image(path)
+        except PcieShimError as reason:
+            raise DamagedDeploymentError(str(reason)) from reason
+        if image.image_hash != board.image_hash:
+            message = (
+                f"{path} is another board's or another build's image: its hash is {image.image_hash[:16]}, "
+                f"{deployment.path} says {board.image_hash[:16]}"
+            )
+            raise DamagedDeploymentError(message)
+
+
+def _names_differ(kind: str, names: list[str]) -> None:
+    twice = [name for name, count in Counter(names).items() if count > 1]
+    if twice:
+        message = f"[[{kind}]] has {twice[0]!r} twice; every name must be its own"
+        raise ValueError(message)
