@@ -1,7 +1,5 @@
 """A rectangle cut into cells: which cell a point lies in, and where a cell's centre is."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ The boat localisation problem of thesis 2.1.2.1 with the numbers of its publishe
 Bayesian Programming, ch. 7). Distances are in map units, bearings in degrees.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Final
 
