@@ -1,0 +1,27 @@
+"""What the case studies' processes refuse, each as one sentence for the user."""
+
+from typing import ClassVar
+
+
+class CaseStudyError(Exception):
+    """Root of the case studies' errors; `str()` is one sentence that says what to do."""
+
+    exit_code: ClassVar[int] = 2
+
+
+class DataFileError(CaseStudyError):
+    """A file of recorded data that is not there, or is another kind of file."""
+
+
+class OutputError(CaseStudyError):
+    """Pictures or numbers that cannot be written: no matplotlib, or a folder that refuses."""
+
+
+class BadResultError(CaseStudyError):
+    """A message on a result topic that is no result of the machine."""
+
+
+class NoResultError(CaseStudyError):
+    """No result came in time."""
+
+    exit_code: ClassVar[int] = 3
