@@ -1,0 +1,166 @@
+"""What the hub knows: its clients, and the topics and services that they have between them.
+
+The graph keeps its parts consistent with each other; what clients may do is the broker's to decide.
+Topics and services are found by their absolute name. A client that leaves the leading slash out means
+the same topic, and gets its messages under the name that it used.
+"""
+
+from dataclasses import dataclass, field
+
+from bridge.hub.outbox import Lane, Outbox
+from bridge.names import same_type
+
+#: What tells one operation of a client from another: rosbridge's optional ``id``.
+OperationId = str | int | None
+
+
+@dataclass(eq=False, slots=True)
+class Client:
+    """One connection.
+
+    Attributes:
+        number: 1, 2, ... in the order of connecting.
+        address: where from, for the log and ``service_host``.
+        outbox: what waits for it.
+        advertisements: what it publishes, by the topic's absolute name.
+        subscriptions: what it hears, by the topic's absolute name.
+        open_advertisements: advertise operations that it has open, over all topics.
+        open_subscriptions: subscribe operations that it has open, over all topics.
+        services: absolute names of those it offers.
+        asked: keys of the calls whose answers it waits for.
+        asked_of: keys of the calls that it has yet to answer.
+        refused: operations that it sent in vain.
+        doomed: why it is to be disconnected, empty while it may stay.
+        has_output: whether it is on the broker's list of those to be served.
+    """
+
+    number: int
+    address: str
+    outbox: Outbox
+    advertisements: dict[str, "Advertisement"] = field(default_factory=dict)
+    subscriptions: dict[str, "Subscription"] = field(default_factory=dict)
+    open_advertisements: int = 0
+    open_subscriptions: int = 0
+    services: set[str] = field(default_factory=set)
+    asked: set[str] = field(default_factory=set)
+    asked_of: set[str] = field(default_factory=set)
+    refused: int = 0
+    doomed: str = ""
+    has_output: bool = False
+
+    @property
+    def node(self) -> str:
+        """What it would be called as a ROS node."""
+        return f"/client_{self.number}"
+
+
+@dataclass(eq=False, slots=True)
+class Advertisement:
+    """That a client publishes on a topic: one, however many advertise operations it sent."""
+
+    client: Client
+    topic: "Topic"
+    latching: bool = False
+    ids: set[OperationId] = field(default_factory=set)
+
+
+@dataclass(frozen=True, slots=True)
+class Wish:
+    """What one subscribe operation asked for: seconds between messages, messages that may wait (or 0)."""
+
+    throttle: float
+    queue_length: int
+
+
+@dataclass(eq=False, slots=True)
+class Subscription:
+    """That a client hears a topic: one, however many subscribe operations it sent.
+
+    Attributes:
+        client: who hears.
+        topic: what.
+        prefix: the beginning of each of its messages on the wire, with the topic's name as the client has it.
+        lane: its messages' way to the client.
+        typed: whether it named the type, and so keeps the topic to it.
+        wishes: by operation; the least of each counts, as on the reference server.
+    """
+
+    client: Client
+    topic: "Topic"
+    prefix: bytes
+    lane: Lane = field(default_factory=Lane)
+    typed: bool = False
+    wishes: dict[OperationId, Wish] = field(default_factory=dict)
+
+
+@dataclass(eq=False, slots=True)
+class Topic:
+    """A topic that somebody publishes or hears.
+
+    Attributes:
+        name: absolute.
+        type: as the first who named it wrote it; empty while nobody has.
+        advertisements: who publishes.
+        subscriptions: who hears.
+        latched: the last message (its JSON) while somebody latches, else None.
+    """
+
+    name: str
+    type: str = ""
+    advertisements: dict[Client, Advertisement] = field(default_factory=dict)
+    subscriptions: dict[Client, Subscription] = field(default_factory=dict)
+    latched: bytes | None = None
+
+    @property
+    def latching(self) -> bool:
+        """Whether one of its publishers latches."""
+        return any(advertisement.latching for advertisement in self.advertisements.values())
+
+
+@dataclass(frozen=True, slots=True)
+class Service:
+    """A service that a client offers."""
+
+    name: str
+    type: str
+    client: Client
+
+
+class Graph:
+    """Clients by number, topics and services by absolute name.
+
+    Attributes:
+        latched_bytes: all latched messages together.
+    """
+
+    def __init__(self) -> None:
+        self.clients: dict[int, Client] = {}
+        self.topics: dict[str, Topic] = {}
+        self.services: dict[str, Service] = {}
+        self.latched_bytes = 0
+
+    def topics_of_type(self, type_name: str) -> list[Topic]:
+        """All topics of a type, in either form of its name."""
+        return [topic for topic in self.topics.values() if topic.type and same_type(topic.type, type_name)]
+
+    def services_of_type(self, type_name: str) -> list[Service]:
+        """All services of a type, in either form of its name."""
+        return [service for service in self.services.values() if same_type(service.type, type_name)]
+
+    def client_of_node(self, node: str) -> Client | None:
+        """The client that a node's name means."""
+        return next((client for client in self.clients.values() if client.node == node), None)
+
+    def latch(self, topic: Topic, message: bytes | None) -> None:
+        """Keep a topic's last message (None: none) in place of the one before."""
+        self.latched_bytes += len(message or b"") - len(topic.latched or b"")
+        topic.latched = message
+
+    def tidy(self, topic: Topic) -> None:
+        """After somebody left a topic: forget what nobody latches, a type nobody named, what nobody uses."""
+        if not topic.latching:
+            self.latch(topic, None)
+        if not topic.advertisements and not any(heard.typed for heard in topic.subscriptions.values()):
+            topic.type = ""
+        if not topic.advertisements and not topic.subscriptions:
+            self.topics.pop(topic.name, None)

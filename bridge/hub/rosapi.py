@@ -1,0 +1,219 @@
+"""The services of ROS's ``rosapi`` node, answered from what the hub knows.
+
+Clients ask these for diagnosis (which topics, of which type, who publishes) and for parameters. Names,
+fields and types are rosapi's of ROS 1 (http://wiki.ros.org/rosapi); ``get_ros_version``, which only ROS 2
+has, says 1. Times carry the fields of both (``secs``, ``nsecs`` and ``sec``, ``nanosec``).
+
+Parameters are a flat dictionary of the hub's own: a name is a string, its value is JSON.
+The hub knows no message definitions: ``message_details`` and its kin do not exist here.
+"""
+
+from collections.abc import Callable
+from typing import Any, Final
+
+import orjson
+
+from bridge.hub.graph import Graph
+from bridge.hub.limits import HubLimits
+from bridge.json_codec import depth
+from bridge.names import MAX_NAME, absolute, same_type
+
+#: The node that offers these services, and the beginning of their names, which no client can take.
+NODE: Final = "/rosapi"
+PREFIX: Final = NODE + "/"
+
+Values = dict[str, Any]
+Answer = Callable[..., Values]
+
+
+class RosapiError(Exception):
+    """Raised when a call of rosapi fails; its text is the answer's ``values``."""
+
+
+class Rosapi:
+    """The services of one hub."""
+
+    def __init__(self, graph: Graph, limits: HubLimits, wall_clock: Callable[[], int]) -> None:
+        """Answer about ``graph``; ``wall_clock`` gives nanoseconds since 1970."""
+        self._graph = graph
+        self._limits = limits
+        self._wall_clock = wall_clock
+        self._parameters: dict[str, bytes] = {}
+        self._parameter_bytes = 0
+        # Short name -> type, arguments (all strings) in their order, what answers.
+        self._services: dict[str, tuple[str, tuple[str, ...], Answer]] = {
+            "action_servers": ("GetActionServers", (), self._action_servers),
+            "delete_param": ("DeleteParam", ("name",), self._delete_param),
+            "get_param": ("GetParam", ("name", "default"), self._get_param),
+            "get_param_names": ("GetParamNames", (), self._get_param_names),
+            "get_ros_version": ("GetROSVersion", (), self._get_ros_version),
+            "get_time": ("GetTime", (), self._get_time),
+            "has_param": ("HasParam", ("name",), self._has_param),
+            "node_details": ("NodeDetails", ("node",), self._node_details),
+            "nodes": ("Nodes", (), self._nodes),
+            "publishers": ("Publishers", ("topic",), self._publishers),
+            "service_host": ("ServiceHost", ("service",), self._service_host),
+            "service_node": ("ServiceNode", ("service",), self._service_node),
+            "service_providers": ("ServiceProviders", ("service",), self._service_providers),
+            "service_type": ("ServiceType", ("service",), self._service_type),
+            "services": ("Services", (), self._all_services),
+            "services_for_type": ("ServicesForType", ("type",), self._services_for_type),
+            "set_param": ("SetParam", ("name", "value"), self._set_param),
+            "subscribers": ("Subscribers", ("topic",), self._subscribers),
+            "topic_type": ("TopicType", ("topic",), self._topic_type),
+            "topics": ("Topics", (), self._topics),
+            "topics_for_type": ("TopicsForType", ("type",), self._topics_for_type),
+        }
+
+    def offers(self, service: str) -> bool:
+        """Whether a service (its absolute name) is one of these."""
+        return service.startswith(PREFIX) and service.removeprefix(PREFIX) in self._services
+
+    def call(self, service: str, args: object) -> Values:
+        """Answer one call.
+
+        Args:
+            service: an absolute name that `offers` knows.
+            args: what the client sent: an object, or a list in the order of the service's fields. A field
+                left out is the empty string, as in any ROS request.
+
+        Returns:
+            The answer's ``values``.
+
+        Raises:
+            RosapiError: the arguments are wrong, or a limit is reached.
+        """
+        _type, names, answer = self._services[service.removeprefix(PREFIX)]
+        if isinstance(args, list):
+            args = dict(zip(names, args, strict=False))
+        if not isinstance(args, dict):
+            raise RosapiError(
+                f"{service}: args must be an object with the fields {', '.join(names) or '(none)'}"
+            )
+        given = [args.get(name, "") for name in names]
+        for name, value in zip(names, given, strict=True):
+            if not isinstance(value, str):
+                raise RosapiError(f"{service}: field {name} must be a string")
+        return answer(*given)
+
+    # --- topics
+
+    def _topics(self) -> Values:
+        topics = self._graph.topics.values()
+        return {"topics": [topic.name for topic in topics], "types": [topic.type for topic in topics]}
+
+    def _topics_for_type(self, type_name: str) -> Values:
+        return {"topics": [topic.name for topic in self._graph.topics_of_type(type_name)]}
+
+    def _topic_type(self, name: str) -> Values:
+        topic = self._graph.topics.get(absolute(name))
+        return {"type": topic.type if topic else ""}
+
+    def _publishers(self, name: str) -> Values:
+        topic = self._graph.topics.get(absolute(name))
+        return {"publishers": [client.node for client in topic.advertisements] if topic else []}
+
+    def _subscribers(self, name: str) -> Values:
+        topic = self._graph.topics.get(absolute(name))
+        return {"subscribers": [client.node for client in topic.subscriptions] if topic else []}
+
+    # --- services
+
+    def _own_types(self) -> dict[str, str]:
+        return {PREFIX + name: f"rosapi/{entry[0]}" for name, entry in self._services.items()}
+
+    def _all_services(self) -> Values:
+        return {"services": [*self._own_types(), *self._graph.services]}
+
+    def _service_type(self, name: str) -> Values:
+        name = absolute(name)
+        service = self._graph.services.get(name)
+        return {"type": service.type if service else self._own_types().get(name, "")}
+
+    def _services_for_type(self, type_name: str) -> Values:
+        own = [name for name, its_type in self._own_types().items() if same_type(its_type, type_name)]
+        return {"services": own + [service.name for service in self._graph.services_of_type(type_name)]}
+
+    def _service_node(self, name: str) -> Values:
+        service = self._graph.services.get(absolute(name))
+        if service:
+            return {"node": service.client.node}
+        return {"node": NODE if self.offers(absolute(name)) else ""}
+
+    def _service_host(self, name: str) -> Values:
+        service = self._graph.services.get(absolute(name))
+        if service:
+            return {"host": service.client.address}
+        return {"host": "localhost" if self.offers(absolute(name)) else ""}
+
+    def _service_providers(self, type_name: str) -> Values:
+        nodes = [service.client.node for service in self._graph.services_of_type(type_name)]
+        if any(same_type(its_type, type_name) for its_type in self._own_types().values()):
+            nodes.insert(0, NODE)
+        return {"providers": list(dict.fromkeys(nodes))}
+
+    def _action_servers(self) -> Values:
+        return {"action_servers": []}
+
+    # --- nodes, time, version
+
+    def _nodes(self) -> Values:
+        return {"nodes": [NODE, *(client.node for client in self._graph.clients.values())]}
+
+    def _node_details(self, node: str) -> Values:
+        node = absolute(node)
+        if node == NODE:
+            return {"subscribing": [], "publishing": [], "services": list(self._own_types())}
+        client = self._graph.client_of_node(node)
+        if client is None:
+            return {"subscribing": [], "publishing": [], "services": []}
+        return {
+            "subscribing": list(client.subscriptions),
+            "publishing": list(client.advertisements),
+            "services": sorted(client.services),
+        }
+
+    def _get_time(self) -> Values:
+        seconds, nanoseconds = divmod(self._wall_clock(), 10**9)
+        return {"time": {"secs": seconds, "nsecs": nanoseconds, "sec": seconds, "nanosec": nanoseconds}}
+
+    def _get_ros_version(self) -> Values:
+        return {"version": 1, "distro": "hub"}
+
+    # --- parameters
+
+    def _get_param(self, name: str, default: str) -> Values:
+        value = self._parameters.get(absolute(name))
+        return {"value": value.decode() if value is not None else default or "null"}
+
+    def _has_param(self, name: str) -> Values:
+        return {"exists": absolute(name) in self._parameters}
+
+    def _get_param_names(self) -> Values:
+        return {"names": list(self._parameters)}
+
+    def _set_param(self, name: str, value: str) -> Values:
+        if not name or len(name) > MAX_NAME:
+            raise RosapiError(f"the name of a parameter has 1 to {MAX_NAME} characters")
+        try:
+            parsed = orjson.loads(value)
+        except orjson.JSONDecodeError:
+            raise RosapiError(f"the value of parameter {name} must be JSON text") from None
+        if depth(parsed, self._limits.depth) > self._limits.depth:
+            raise RosapiError(
+                f"the value of parameter {name} is nested deeper than {self._limits.depth} levels"
+            )
+        data = orjson.dumps(parsed)
+        key = absolute(name)
+        size = self._parameter_bytes + len(data) - len(self._parameters.get(key, b""))
+        if size > self._limits.parameter_bytes:
+            raise RosapiError(f"all parameters together may have {self._limits.parameter_bytes} bytes")
+        if key not in self._parameters and len(self._parameters) >= self._limits.parameters:
+            raise RosapiError(f"there are {self._limits.parameters} parameters already")
+        self._parameters[key] = data
+        self._parameter_bytes = size
+        return {}
+
+    def _delete_param(self, name: str) -> Values:
+        self._parameter_bytes -= len(self._parameters.pop(absolute(name), b""))
+        return {}
