@@ -1,0 +1,185 @@
+"""JSON on the wire: one object in, one out, within limits of size and depth; nothing non-finite leaves.
+
+Inbound:
+
+* One object per WebSocket message. A key that comes twice has its last value, as with the servers' parsers.
+* Bare ``NaN``, ``Infinity`` and ``-Infinity``, which some servers leak although JSON has none, and numbers
+  beyond float64 (``1e999``) are read as None: to a reader they are what the reference server's ``null`` is.
+  Only a message that strict JSON refuses pays for this second look.
+* Integers beyond 64 bits become floats.
+
+Outbound: floats that are NaN or infinite either leave as ``null`` (what the reference server does), or are
+refused with their place named (what a publisher wants: servers drop ``null`` in a float field silently).
+NumPy arrays and scalars are written without lists in between when NumPy is loaded; it is never imported here.
+"""
+
+import json
+import math
+from collections.abc import Mapping
+from typing import Any, Final, Literal
+
+import orjson
+
+from bridge.errors import DecodeError, EncodeError
+
+#: Bytes of one message at most, both ways, unless a caller says otherwise.
+MAX_SIZE: Final = 1 << 20
+#: Objects and arrays within each other at most, both ways. The deepest standard ROS message has about ten.
+MAX_DEPTH: Final = 64
+
+_OPTIONS: Final = orjson.OPT_SERIALIZE_NUMPY
+_SHOWN: Final = 60
+
+
+def excerpt(data: bytes | str) -> str:
+    """The beginning of what arrived, fit for a line of a log."""
+    return repr(data[:_SHOWN]) + ("..." if len(data) > _SHOWN else "")
+
+
+def decode(data: bytes | str, *, max_size: int = MAX_SIZE, max_depth: int = MAX_DEPTH) -> dict[str, Any]:
+    """Read one message.
+
+    Args:
+        data: a whole WebSocket message, text as UTF-8 or already decoded.
+        max_size: bytes (characters of a str) at most.
+        max_depth: objects and arrays within each other at most, the outermost included.
+
+    Returns:
+        The object. Its numbers are finite.
+
+    Raises:
+        DecodeError: too large, too deep, no JSON, or JSON but no object.
+    """
+    if len(data) > max_size:
+        raise DecodeError(f"a message of {len(data)} bytes arrived, at most {max_size} are taken")
+    try:
+        message = orjson.loads(data)
+    except orjson.JSONDecodeError as error:
+        message = _decode_leniently(data, error)
+    if type(message) is not dict:
+        raise DecodeError(f"a message that is no JSON object arrived: {excerpt(data)}")
+    # No message can be deeper than its opening brackets are many: small messages need no walk.
+    if _brackets(data) > max_depth and depth(message, max_depth) > max_depth:
+        raise DecodeError(f"a message nested deeper than {max_depth} levels arrived: {excerpt(data)}")
+    return message
+
+
+def _brackets(data: bytes | str) -> int:
+    if isinstance(data, str):
+        return data.count("{") + data.count("[")
+    return data.count(b"{") + data.count(b"[")
+
+
+def _decode_leniently(data: bytes | str, error: orjson.JSONDecodeError) -> Any:
+    """Read what only breaks JSON by non-finite numbers, as None; refuse everything else."""
+    if "infinity when parsed" not in error.msg:
+        text = data if isinstance(data, str) else data.decode("utf-8", "replace")
+        if "NaN" not in text and "Infinity" not in text:
+            raise DecodeError(f"a message that is no JSON arrived ({error.msg}): {excerpt(data)}") from None
+    try:
+        message = json.loads(
+            data,
+            parse_constant=lambda _constant: None,
+            parse_float=_finite_or_none,
+            parse_int=_int_of_64_bits,
+        )
+        orjson.dumps(
+            message
+        )  # refuses what strict reading would not have given: half characters, great depth
+    except (ValueError, TypeError, RecursionError):  # ValueError: also bad UTF-8, an integer of 5000 digits
+        raise DecodeError(f"a message that is no JSON arrived ({error.msg}): {excerpt(data)}") from None
+    return message
+
+
+def _int_of_64_bits(text: str) -> int | float | None:
+    value = int(text)
+    return value if -(1 << 63) <= value < 1 << 64 else _finite_or_none(text)
+
+
+def _finite_or_none(text: str) -> float | None:
+    value = float(text)
+    return value if math.isfinite(value) else None
+
+
+def depth(value: Any, limit: int) -> int:
+    """How many objects and arrays are within each other in ``value``; counting ends at ``limit`` + 1."""
+    level, inner = 0, [value]
+    while inner := [item for item in inner if isinstance(item, dict | list | tuple)]:
+        level += 1
+        if level > limit:
+            break
+        inner = [
+            item
+            for container in inner
+            for item in (container.values() if isinstance(container, dict) else container)
+        ]
+    return level
+
+
+def encode(
+    message: Mapping[str, Any],
+    *,
+    nonfinite: Literal["null", "refuse"] = "null",
+    max_size: int = MAX_SIZE,
+    max_depth: int = MAX_DEPTH,
+) -> bytes:
+    """Write one message.
+
+    Args:
+        message: what to send; values may be NumPy arrays (C-contiguous or not) and NumPy scalars.
+        nonfinite: what happens to NaN and infinities.
+        max_size: bytes at most.
+        max_depth: objects and arrays within each other at most.
+
+    Returns:
+        UTF-8 JSON without whitespace.
+
+    Raises:
+        EncodeError: a type that JSON has not got, an integer beyond 64 bits, a key that is no string, a NaN
+            or infinity with ``nonfinite="refuse"`` (its place is named), too deep or too large.
+    """
+    try:
+        data = orjson.dumps(message, _not_json, _OPTIONS)
+    except TypeError as error:  # orjson.JSONEncodeError is a TypeError; default's own errors are its cause
+        raise EncodeError(f"the message cannot be written as JSON: {error.__cause__ or error}") from None
+    if len(data) > max_size:
+        raise EncodeError(f"the message has {len(data)} bytes as JSON, at most {max_size} are sent")
+    if nonfinite == "refuse" and b"null" in data:
+        place = find_nonfinite(message)
+        if place is not None:
+            raise EncodeError(
+                f"{place} is NaN or infinite, which JSON has not got and rosbridge servers drop without a "
+                "word: leave it out, or send None where the receiver takes null"
+            )
+    if data.count(b"{") + data.count(b"[") > max_depth and depth(orjson.loads(data), max_depth) > max_depth:
+        raise EncodeError(f"the message is nested deeper than {max_depth} levels")
+    return data
+
+
+def _not_json(value: object) -> Any:
+    """What orjson does not know: NumPy arrays that are not contiguous, and mappings that are no dicts."""
+    if isinstance(value, Mapping):
+        return dict(value)
+    to_list = getattr(value, "tolist", None)
+    if to_list is not None:
+        return to_list()
+    raise EncodeError(f"{type(value).__name__} is no type of JSON")
+
+
+def find_nonfinite(message: Any) -> str | None:
+    """The place of the first NaN or infinity (``scan.ranges[3]``), None if there is none."""
+    inner: list[tuple[str, Any]] = [("", message)]
+    while inner:
+        place, value = inner.pop()
+        if isinstance(value, float):
+            if not math.isfinite(value):
+                return place or "the value"
+        elif isinstance(value, Mapping):
+            inner.extend(
+                (f"{place}.{key}" if place else str(key), value[key]) for key in reversed(list(value))
+            )
+        elif isinstance(value, list | tuple):
+            inner.extend((f"{place}[{index}]", value[index]) for index in reversed(range(len(value))))
+        elif (to_list := getattr(value, "tolist", None)) is not None:
+            inner.append((place, to_list()))
+    return None

@@ -1,0 +1,527 @@
+"""The rosbridge client as a state machine: objects in, events and bytes out, no socket and no clock anywhere.
+
+What a client wants (advertisements, subscriptions, served services) is kept here, so that
+`ClientCore.restore` can say it all again to a server that has forgotten it. Bytes to send gather in an outbox
+that the shell empties with `ClientCore.data_to_send`; while there is no connection nothing gathers, what is
+wanted is only remembered.
+
+Several advertisements, or several subscriptions, of one topic share one on the wire: there are servers that
+deliver a first message twice, or not at all, to a client that subscribes twice.
+
+Source: the rosbridge protocol, version 2 (https://github.com/RobotWebTools/rosbridge_suite), and what its
+servers really do (``docs/bridge.md``).
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from itertools import count
+from typing import Any, Final, Literal
+
+from bridge.errors import BridgeError, DecodeError, OptionError, SlowPeerError, TypeConflictError
+from bridge.json_codec import MAX_DEPTH, MAX_SIZE, decode, encode, excerpt
+from bridge.names import Kind, absolute, check_name, ros1_type, ros2_type, same_type, split_type
+from bridge.stamps import ros_version_of_message
+
+RosVersion = Literal[1, 2]
+
+#: Calls that may wait for their answers at once.
+MAX_CALLS: Final = 1000
+#: Requests to services of this client that may wait for their answers at once; more are refused.
+MAX_REQUESTS: Final = 64
+
+
+@dataclass(frozen=True, slots=True)
+class MessageReceived:
+    """A message of a subscribed topic: for which of this client's subscriptions."""
+
+    topic: str
+    msg: dict[str, Any]
+    subscriptions: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class CallAnswered:
+    """A service answered: its values, or the text with which it refused."""
+
+    call: str
+    ok: bool
+    values: Any
+
+
+@dataclass(frozen=True, slots=True)
+class ServiceRequested:
+    """Someone calls a service of this client; `ClientCore.answer` takes the ticket back."""
+
+    service: str
+    args: dict[str, Any]
+    ticket: int
+
+
+@dataclass(frozen=True, slots=True)
+class StatusReceived:
+    """The server says something about an operation (few servers do)."""
+
+    level: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Unusable:
+    """Something arrived that no client can use: one sentence says what."""
+
+    reason: str
+
+
+Event = MessageReceived | CallAnswered | ServiceRequested | StatusReceived | Unusable
+
+
+@dataclass(slots=True)
+class _Advertised:
+    """One topic as advertised on the wire, for one or more advertisements of this client."""
+
+    topic: str
+    type: str
+    latch: bool
+    queue_size: int
+    wire_id: str
+    holders: set[int] = field(default_factory=set)
+    latched: bytes | None = None  # the last message, said again after a reconnection
+
+
+@dataclass(slots=True)
+class _Wanted:
+    """What one subscription asked for; ``due`` is when its throttle lets the next message through."""
+
+    throttle_rate: int
+    queue_length: int
+    due: float = 0.0
+
+
+@dataclass(slots=True)
+class _Subscribed:
+    """One topic as subscribed on the wire, for one or more subscriptions of this client."""
+
+    topic: str
+    type: str | None
+    wire_id: str
+    wanted: dict[int, _Wanted] = field(default_factory=dict)
+    throttle_rate: int = 0
+    queue_length: int = 0
+    everyone: tuple[int, ...] = ()
+    someone_is_slower: bool = False
+    heard: bool = False
+
+    def settle(self) -> bool:
+        """Find what to ask of the server for all: fastest rate, longest queue. True if that changed."""
+        before = (self.throttle_rate, self.queue_length)
+        self.throttle_rate = min(w.throttle_rate for w in self.wanted.values())
+        self.queue_length = max(w.queue_length for w in self.wanted.values())
+        self.everyone = tuple(self.wanted)
+        self.someone_is_slower = any(w.throttle_rate > self.throttle_rate for w in self.wanted.values())
+        return before != (self.throttle_rate, self.queue_length)
+
+    def receivers(self, now: float) -> tuple[int, ...]:
+        """The subscriptions that a message arriving ``now`` is for."""
+        if not self.someone_is_slower:
+            return self.everyone
+        through = []
+        for number, wanted in self.wanted.items():
+            if wanted.throttle_rate > self.throttle_rate:
+                if now < wanted.due:
+                    continue
+                wanted.due = now + wanted.throttle_rate / 1000
+            through.append(number)
+        return tuple(through)
+
+
+class ClientCore:
+    """All that a rosbridge client has to remember, and what its messages mean.
+
+    Numbers that name an advertisement, a subscription or a ticket are never used twice.
+
+    Attributes:
+        ros_version: which ROS the server speaks for, None while nobody knows. Decides the form of type names
+            on the wire: if unknown, they leave in the form of ROS 1, which ROS 2 servers take too.
+        seen_version: what the header stamps of received messages say about it.
+        connected: between `restore` and `lost`.
+    """
+
+    def __init__(
+        self,
+        *,
+        ros_version: RosVersion | None = None,
+        max_size: int = MAX_SIZE,
+        max_depth: int = MAX_DEPTH,
+    ) -> None:
+        """Begin with no connection and nothing wanted."""
+        self.ros_version: RosVersion | None = ros_version
+        self.seen_version: RosVersion | None = None
+        self.connected = False
+        self._max_size = max_size
+        self._max_depth = max_depth
+        self._outbox: list[bytes] = []
+        self._numbers = count(1)
+        self._advertised: dict[str, _Advertised] = {}
+        self._advertisements: dict[int, _Advertised] = {}
+        self._subscribed: dict[str, _Subscribed] = {}
+        self._subscriptions: dict[int, _Subscribed] = {}
+        self._services: dict[str, str] = {}
+        self._calls: set[str] = set()
+        self._requests: dict[int, tuple[str, Any]] = {}
+
+    # The connection
+
+    def restore(self) -> None:
+        """Take up a new connection: everything wanted goes into the outbox, advertisements first."""
+        self.connected = True
+        self._outbox.clear()
+        for advertised in self._advertised.values():
+            self._send_advertise(advertised)
+            if advertised.latched is not None:
+                self._outbox.append(advertised.latched)
+        for service, type_name in self._services.items():
+            self._send_advertise_service(service, type_name)
+        for subscribed in self._subscribed.values():
+            subscribed.heard = False
+            self._send_subscribe(subscribed)
+
+    def lost(self) -> None:
+        """Take note that the connection is gone: its calls and requests will not be answered."""
+        self.connected = False
+        self._outbox.clear()
+        self._calls.clear()
+        self._requests.clear()
+
+    def data_to_send(self) -> list[bytes]:
+        """Empty the outbox: whole messages, in order."""
+        data, self._outbox = self._outbox, []
+        return data
+
+    def _send(self, **operation: Any) -> None:
+        if self.connected:
+            self._outbox.append(encode(operation, max_size=self._max_size, max_depth=self._max_depth))
+
+    def _wire_type(self, name: str, kind: Kind = "msg") -> str:
+        return ros2_type(name, kind) if self.ros_version == 2 else ros1_type(name)
+
+    # Publishing
+
+    def advertise(self, topic: str, type_name: str, *, latch: bool = False, queue_size: int = 100) -> int:
+        """Want to publish on a topic.
+
+        Args:
+            topic: its name.
+            type_name: in the form of ROS 1 or of ROS 2.
+            latch: the server keeps the last message for those who subscribe later.
+            queue_size: messages that the server holds for ROS's transport.
+
+        Returns:
+            The advertisement's number, for `publish` and `unadvertise`.
+
+        Raises:
+            NameFormError: of topic or type.
+            TypeConflictError: this client advertises the topic already, as something else.
+        """
+        check_name(topic)
+        split_type(type_name)
+        number = next(self._numbers)
+        key = absolute(topic)
+        advertised = self._advertised.get(key)
+        if advertised is None:
+            advertised = _Advertised(topic, type_name, latch, queue_size, f"advertise:{topic}:{number}")
+            self._advertised[key] = advertised
+            self._send_advertise(advertised)
+        elif not same_type(advertised.type, type_name) or advertised.latch != latch:
+            raise TypeConflictError(
+                f"topic {topic} is already advertised as {advertised.type}, latch={advertised.latch}; "
+                f"it cannot be advertised as {type_name}, latch={latch} too"
+            )
+        advertised.holders.add(number)
+        self._advertisements[number] = advertised
+        return number
+
+    def _send_advertise(self, advertised: _Advertised) -> None:
+        self._send(
+            op="advertise",
+            id=advertised.wire_id,
+            topic=advertised.topic,
+            type=self._wire_type(advertised.type),
+            latch=advertised.latch,
+            queue_size=advertised.queue_size,
+        )
+
+    def publish(self, advertisement: int, msg: Mapping[str, Any]) -> bytes:
+        """Write one message of an advertised topic; the bytes are for the wire at once, not for the outbox.
+
+        Raises:
+            EncodeError: the message cannot leave as JSON; a NaN or an infinity is named with its place.
+        """
+        advertised = self._advertisements[advertisement]
+        data = encode(
+            {"op": "publish", "topic": advertised.topic, "msg": msg},
+            nonfinite="refuse",
+            max_size=self._max_size,
+            max_depth=self._max_depth,
+        )
+        if advertised.latch:
+            advertised.latched = data
+        return data
+
+    def unadvertise(self, advertisement: int) -> None:
+        """Stop wanting to publish; the last advertisement of a topic takes it off the wire."""
+        advertised = self._advertisements.pop(advertisement)
+        advertised.holders.discard(advertisement)
+        if not advertised.holders:
+            del self._advertised[absolute(advertised.topic)]
+            self._send(op="unadvertise", id=advertised.wire_id, topic=advertised.topic)
+
+    # Subscribing
+
+    def subscribe(
+        self, topic: str, type_name: str | None = None, *, throttle_rate: int = 0, queue_length: int = 0
+    ) -> int:
+        """Want the messages of a topic.
+
+        The server is asked for the fastest rate and the longest queue that any subscription of this client
+        wants of the topic; who wants fewer messages is served at its own rate from those.
+
+        Args:
+            topic: its name.
+            type_name: in the form of ROS 1 or of ROS 2; None leaves it to the server (see `ask_again`).
+            throttle_rate: milliseconds between two messages at least.
+            queue_length: messages that the server keeps while the throttle holds them back; 0 drops them.
+
+        Returns:
+            The subscription's number.
+
+        Raises:
+            NameFormError: of topic or type.
+            TypeConflictError: this client subscribes to the topic already, as another type.
+            OptionError: a rate or length that is no whole number from 0 up (servers drop a subscription with a
+                float here without a word).
+        """
+        check_name(topic)
+        if type_name is not None:
+            split_type(type_name)
+        for name, value in (("throttle_rate", throttle_rate), ("queue_length", queue_length)):
+            if type(value) is not int or value < 0:
+                raise OptionError(f"{name} of topic {topic} must be a whole number from 0 up, not {value!r}")
+        number = next(self._numbers)
+        key = absolute(topic)
+        subscribed = self._subscribed.get(key)
+        new = subscribed is None
+        if subscribed is None:
+            subscribed = _Subscribed(topic, type_name, f"subscribe:{topic}:{number}")
+            self._subscribed[key] = subscribed
+        elif type_name is not None:
+            if subscribed.type is None:
+                subscribed.type = type_name
+                new = True
+            elif not same_type(subscribed.type, type_name):
+                raise TypeConflictError(
+                    f"topic {topic} is already subscribed to as {subscribed.type}, not as {type_name}"
+                )
+        subscribed.wanted[number] = _Wanted(throttle_rate, queue_length)
+        self._subscriptions[number] = subscribed
+        if subscribed.settle() or new:
+            self._send_subscribe(subscribed)
+        return number
+
+    def _send_subscribe(self, subscribed: _Subscribed) -> None:
+        operation: dict[str, Any] = {"op": "subscribe", "id": subscribed.wire_id, "topic": subscribed.topic}
+        if subscribed.type is not None:
+            operation["type"] = self._wire_type(subscribed.type)
+        self._send(**operation, throttle_rate=subscribed.throttle_rate, queue_length=subscribed.queue_length)
+
+    def unsubscribe(self, subscription: int) -> None:
+        """Stop wanting messages; the last subscription of a topic takes it off the wire."""
+        subscribed = self._subscriptions.pop(subscription)
+        del subscribed.wanted[subscription]
+        if subscribed.wanted:
+            if subscribed.settle():
+                self._send_subscribe(subscribed)
+        else:
+            del self._subscribed[absolute(subscribed.topic)]
+            self._send(op="unsubscribe", id=subscribed.wire_id, topic=subscribed.topic)
+
+    def ask_again(self) -> bool:
+        """Ask again for topics of unknown type that have brought nothing yet.
+
+        A server that does not know the topic yet forgets such a subscription, most without a word.
+
+        Returns:
+            Whether there are such topics, so that it is worth asking once more later.
+        """
+        waiting = [s for s in self._subscribed.values() if s.type is None and not s.heard]
+        for subscribed in waiting:
+            self._send_subscribe(subscribed)
+        return bool(waiting)
+
+    # Calling services
+
+    def call(self, service: str, args: Mapping[str, Any]) -> str:
+        """Call a service.
+
+        Returns:
+            The call's identity, which its `CallAnswered` bears.
+
+        Raises:
+            NameFormError: of the service.
+            EncodeError: the arguments cannot leave as JSON.
+            SlowPeerError: `MAX_CALLS` calls wait already.
+        """
+        check_name(service)
+        if len(self._calls) >= MAX_CALLS:
+            raise SlowPeerError(
+                f"{MAX_CALLS} service calls wait for answers already, {service} is not called"
+            )
+        call = f"call_service:{service}:{next(self._numbers)}"
+        data = encode(
+            {"op": "call_service", "id": call, "service": service, "args": args},
+            nonfinite="refuse",
+            max_size=self._max_size,
+            max_depth=self._max_depth,
+        )
+        self._calls.add(call)
+        if self.connected:
+            self._outbox.append(data)
+        return call
+
+    def forget_call(self, call: str) -> None:
+        """Wait no longer for an answer; one that comes all the same is passed over."""
+        self._calls.discard(call)
+
+    # Serving services
+
+    def advertise_service(self, service: str, type_name: str) -> None:
+        """Want to serve a service.
+
+        Raises:
+            NameFormError: of service or type.
+            TypeConflictError: this client serves it already.
+        """
+        check_name(service)
+        split_type(type_name)
+        key = absolute(service)
+        if key in self._services:
+            raise TypeConflictError(f"service {service} is already served by this client")
+        self._services[key] = type_name
+        self._send_advertise_service(key, type_name)
+
+    def _send_advertise_service(self, service: str, type_name: str) -> None:
+        self._send(op="advertise_service", service=service, type=self._wire_type(type_name, "srv"))
+
+    def unadvertise_service(self, service: str) -> None:
+        """Stop serving a service."""
+        key = absolute(service)
+        del self._services[key]
+        self._send(op="unadvertise_service", service=key)
+
+    def answer(self, ticket: int, values: Mapping[str, Any] | str, *, ok: bool = True) -> None:
+        """Answer a request; one whose connection is gone needs no answer any more.
+
+        Args:
+            ticket: the request's.
+            values: the answer's fields, or with ``ok=False`` the reason as text.
+            ok: whether the service did it.
+
+        Raises:
+            EncodeError: the values cannot leave as JSON; the request still waits for an answer.
+        """
+        request = self._requests.get(ticket)
+        if request is None:
+            return
+        service, wire_id = request
+        operation = {"op": "service_response", "service": service, "values": values, "result": ok}
+        if wire_id is not None:
+            operation["id"] = wire_id
+        data = encode(operation, nonfinite="refuse", max_size=self._max_size, max_depth=self._max_depth)
+        del self._requests[ticket]
+        self._outbox.append(data)
+
+    # Receiving
+
+    def receive(self, data: bytes | str, now: float) -> Event | None:
+        """Take one WebSocket message.
+
+        Args:
+            data: the message, whatever it may be.
+            now: seconds of any clock that never goes back, for throttled subscriptions.
+
+        Returns:
+            What it means; None for what was answered here, or comes too late to mean anything (a topic or a
+            call given up).
+        """
+        try:
+            operation = decode(data, max_size=self._max_size, max_depth=self._max_depth)
+        except DecodeError as error:
+            return Unusable(str(error))
+        op = operation.get("op")
+        if op == "publish":
+            return self._receive_publish(operation, now, data)
+        if op == "service_response":
+            return self._receive_answer(operation, data)
+        if op == "call_service":
+            return self._receive_request(operation, data)
+        if op == "status":
+            return StatusReceived(_text(operation.get("level")) or "error", _text(operation.get("msg")))
+        if not isinstance(op, str):
+            return Unusable(f"a message without an op arrived: {excerpt(data)}")
+        return Unusable(f"a message with an op that was not asked for arrived: {excerpt(data)}")
+
+    def _receive_publish(self, operation: dict[str, Any], now: float, data: bytes | str) -> Event | None:
+        topic = operation.get("topic")
+        msg = operation.get("msg")
+        if type(topic) is not str or type(msg) is not dict:
+            return Unusable(f"a publish without a topic or a message object arrived: {excerpt(data)}")
+        subscribed = self._subscribed.get(topic) or self._subscribed.get(absolute(topic))
+        if subscribed is None:
+            return None
+        subscribed.heard = True
+        if self.seen_version is None:
+            self.seen_version = ros_version_of_message(msg)
+        receivers = subscribed.receivers(now)
+        return MessageReceived(topic, msg, receivers) if receivers else None
+
+    def _receive_answer(self, operation: dict[str, Any], data: bytes | str) -> Event | None:
+        call = operation.get("id")
+        if not isinstance(call, str):
+            return Unusable(f"a service_response without the id of a call arrived: {excerpt(data)}")
+        if call not in self._calls:
+            return None
+        self._calls.discard(call)
+        values = operation.get("values")
+        # Some servers leave `result` out when all went well.
+        if operation.get("result", True) is False:
+            return CallAnswered(call, ok=False, values=_text(values))
+        return CallAnswered(call, ok=True, values={} if values is None else values)
+
+    def _receive_request(self, operation: dict[str, Any], data: bytes | str) -> Event | None:
+        service = operation.get("service")
+        args = operation.get("args")
+        wire_id = operation.get("id")
+        if not isinstance(service, str) or not isinstance(wire_id, str | int | None):
+            return Unusable(f"a call_service without a service or with an odd id arrived: {excerpt(data)}")
+        ticket = next(self._numbers)
+        self._requests[ticket] = (service, wire_id)
+        if absolute(service) not in self._services:
+            self.answer(ticket, f"service {excerpt(service)} is not served here", ok=False)
+        elif len(self._requests) > MAX_REQUESTS:
+            self.answer(ticket, f"{MAX_REQUESTS} requests wait here already", ok=False)
+        elif not isinstance(args, dict | None):
+            self.answer(ticket, "args must be an object", ok=False)
+        else:
+            return ServiceRequested(absolute(service), args or {}, ticket)
+        return None
+
+
+def _text(value: Any) -> str:
+    """What a server says, as text: it is meant to be a string, and some send an object."""
+    if isinstance(value, str):
+        return value
+    if value is None:
+        return ""
+    try:
+        return encode({"": value})[4:-1].decode()
+    except BridgeError:
+        return repr(value)
