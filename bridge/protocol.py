@@ -297,8 +297,8 @@ class ClientCore:
         Raises:
             NameFormError: of topic or type.
             TypeConflictError: this client subscribes to the topic already, as another type.
-            OptionError: a rate or length that is no whole number from 0 up (servers drop a subscription with a
-                float here without a word).
+            OptionError: a rate or length that is no whole number from 0 up (servers drop a subscription
+                with a float here without a word).
         """
         check_name(topic)
         if type_name is not None:

@@ -1,0 +1,216 @@
+"""Finding a variable in a ROS message: by its bare name wherever that is, or by a path.
+
+The rules of ``deployment.toml``'s variables: a name with ``.`` or ``[`` is a path (``pose.position.x``,
+``ranges[3]``). A bare name is searched in the whole message, depth first, not inside arrays; it may be there
+only once, and the place found first is kept, so that later messages cost no search.
+"""
+
+import re
+from typing import Any, Final
+
+from bridge.errors import FieldAmbiguousError, FieldMissingError, PathError
+
+#: A place in a message: keys of objects and indices of arrays, from outside to inside.
+Place = tuple[str | int, ...]
+
+#: Fields that an error lists at most.
+MAX_LISTED: Final = 24
+
+_STEP = re.compile(r"([A-Za-z_][A-Za-z0-9_]*)|\[([0-9]{1,9})\]")
+
+
+class Field:
+    """One variable's place in the messages of one topic.
+
+    Attributes:
+        name: the bare name or path, as configured.
+        place: where it is; of a bare name None until a message had it.
+    """
+
+    __slots__ = ("_is_path", "name", "place")
+
+    def __init__(self, name: str) -> None:
+        """Read a bare name or a path.
+
+        Raises:
+            PathError: it is neither.
+        """
+        self.name = name
+        self._is_path = "." in name or "[" in name
+        self.place: Place | None = parse_path(name) if self._is_path else None
+        if not self._is_path and _STEP.fullmatch(name) is None:
+            raise PathError(
+                f"{name!r} is no name of a field: letters, digits and _ (example: D1), or a path "
+                "(examples: pose.position.x, ranges[3])"
+            )
+
+    def locate(self, message: dict[str, Any]) -> Place:
+        """Find the place in a message, and keep it.
+
+        Raises:
+            FieldMissingError: the message has not got it; the sentence lists what it has.
+            FieldAmbiguousError: a bare name is there more than once; the sentence lists the places.
+        """
+        present, _value = self.value(message)
+        if not present or self.place is None:
+            raise self.missing(message)
+        return self.place
+
+    def value(self, message: dict[str, Any]) -> tuple[bool, Any]:
+        """Look the variable up.
+
+        Returns:
+            Whether the message has it, and its value as it is (None for JSON's null, and if it is not there).
+
+        Raises:
+            FieldAmbiguousError: a bare name, not found before, is there more than once.
+        """
+        place = self.place
+        if place is None:
+            places = find_places(message, self.name)
+            if not places:
+                return False, None
+            if len(places) > 1:
+                shown = ", ".join(map(format_place, places[:MAX_LISTED]))
+                raise FieldAmbiguousError(
+                    f"the message has {len(places)} fields named {self.name!r} ({shown}): "
+                    "give the path of the one that is meant"
+                )
+            self.place = place = places[0]
+        value: Any = message
+        for step in place:
+            if isinstance(step, str):
+                if not isinstance(value, dict) or step not in value:
+                    return False, None
+            elif not isinstance(value, list) or step >= len(value):
+                return False, None
+            value = value[step]
+        return True, value
+
+    def missing(self, message: dict[str, Any]) -> FieldMissingError:
+        """The error that says that a message has not got the variable, and what it has instead."""
+        if self.place is None:
+            listed = _list_fields(message)
+            return FieldMissingError(f"the message has no field {self.name!r}; it has {listed}")
+        value: Any = message
+        for depth, step in enumerate(self.place):
+            before = format_place(self.place[:depth])
+            where = f" in {before!r}" if before else ""
+            if isinstance(step, int):
+                if not isinstance(value, list):
+                    reason = f"{before!r} is {_kind(value)}, not an array"
+                elif step >= len(value):
+                    reason = f"{before!r} has {len(value)} elements, the index {step} is none of theirs"
+                else:
+                    value = value[step]
+                    continue
+            elif not isinstance(value, dict):
+                reason = f"{before!r} is {_kind(value)}, not an object"
+            elif step not in value:
+                reason = f"it has no {step!r}{where}; there it has {_list_fields(value)}"
+            else:
+                value = value[step]
+                continue
+            return FieldMissingError(f"the message has no field {self.name!r}: {reason}")
+        return FieldMissingError(f"the field {self.name!r} is there")
+
+
+def find_field(message: dict[str, Any], name: str) -> Any:
+    """Look a variable up once.
+
+    Args:
+        message: a ROS message.
+        name: bare name or path.
+
+    Returns:
+        The value as it is.
+
+    Raises:
+        PathError: the name is no name and no path.
+        FieldMissingError: it is not there.
+        FieldAmbiguousError: a bare name is there more than once.
+    """
+    field = Field(name)
+    present, value = field.value(message)
+    if not present:
+        raise field.missing(message)
+    return value
+
+
+def parse_path(path: str) -> Place:
+    """Read a path: names joined by dots, whole numbers from 0 in brackets.
+
+    Raises:
+        PathError: it is not well-formed; the sentence says where.
+    """
+    steps: list[str | int] = []
+    at = 0
+    while at < len(path):
+        start = at
+        if steps and path[at] == ".":
+            at += 1
+        step = _STEP.match(path, at)
+        # A dot stands before every name but the first, and before nothing else.
+        if step is None or (step[1] is not None) != (at > start or not steps):
+            raise PathError(
+                f"the path {path!r} breaks at character {at + 1}: it must be names joined by dots with "
+                "indices in brackets (examples: pose.position.x, ranges[3])"
+            )
+        steps.append(step[1] if step[1] is not None else int(step[2]))
+        at = step.end()
+    if not steps:
+        raise PathError("the path of a variable is empty (examples: D1, pose.position.x, ranges[3])")
+    return tuple(steps)
+
+
+def format_place(place: Place) -> str:
+    """Write a place as the path that names it."""
+    text = ""
+    for step in place:
+        text += f"[{step}]" if isinstance(step, int) else f".{step}" if text else step
+    return text
+
+
+def find_places(message: dict[str, Any], name: str) -> list[Place]:
+    """All places of a bare name, depth first in the message's order, not inside arrays."""
+    places: list[Place] = []
+    inner: list[tuple[Place, dict[str, Any]]] = [((), message)]
+    while inner:
+        place, value = inner.pop()
+        if place and place[-1] == name:
+            places.append(place)
+        inner.extend(
+            ((*place, key), part if isinstance(part, dict) else {})
+            for key, part in reversed(value.items())
+            if key == name or isinstance(part, dict)
+        )
+    return places
+
+
+def _list_fields(message: dict[str, Any]) -> str:
+    """The paths of all that a message holds, arrays with their lengths."""
+    listed: list[str] = []
+    inner: list[tuple[Place, Any]] = [((key,), value) for key, value in reversed(message.items())]
+    while inner:
+        place, value = inner.pop()
+        if len(listed) == MAX_LISTED:
+            return ", ".join(listed) + " and more"
+        if isinstance(value, dict) and value:
+            inner.extend(((*place, key), part) for key, part in reversed(value.items()))
+        elif isinstance(value, list):
+            listed.append(f"{format_place(place)} ({_kind(value)})")
+        else:
+            listed.append(format_place(place))
+    return ", ".join(listed) or "no fields at all"
+
+
+def _kind(value: Any) -> str:
+    if value is None:
+        return "null"
+    if isinstance(value, dict):
+        return "an object"
+    if isinstance(value, list):
+        return f"an array of {len(value)}"
+    if isinstance(value, bool):
+        return "a boolean"
+    return "a string" if isinstance(value, str) else "a number"
