@@ -1,0 +1,369 @@
+"""Programming files: what the toolchain makes of a model and the loader puts on a board (thesis 3.4).
+
+A file is a fixed header, a manifest (JSON, for people too: ``head -c 4000 board0.bm``) and the
+machine's tables, one section each, in the manifest's order. The header carries the manifest's
+SHA-256 and the manifest that of every section, so that a damaged file is found and the damaged part
+named. The same image and build date always give the same bytes.
+
+``image_hash`` identifies what a board computes: parameters, tables, partition, interface, model and
+register map; not when or with which version of the tools it was built.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import struct
+import time
+from dataclasses import dataclass
+from functools import cached_property
+from importlib.metadata import version
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from machines.bm1 import BM1Machine
+from machines.errors import MachineError
+from machines.parameters import BM1Parameters  # noqa: TC001 - pydantic reads the annotation at run time
+from pcie_shim import register_map
+from pcie_shim.errors import DamagedImageError, ImageError, ImageMismatchError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+MAGIC: Final = b"BMIMAGE\x01"
+"""First bytes of a programming file; the last of them is the format's version."""
+
+MAX_IMAGE_BYTES: Final = 1 << 30
+"""Larger programming files are refused, by whoever reads or receives them."""
+
+_HEADER: Final = struct.Struct("<8sII32s")  # magic, length of the manifest, zero, SHA-256 of the manifest
+
+
+@dataclass(frozen=True)
+class Partition:
+    """Which lines of the model a board holds.
+
+    Attributes:
+        index: This part's number, from 0.
+        count: Number of parts (boards).
+        line_offset: First line of this part in the whole model.
+        total_lines: Lines of the whole model.
+    """
+
+    index: int
+    count: int
+    line_offset: int
+    total_lines: int
+
+
+@dataclass(frozen=True, eq=False)
+class Image:
+    """What one board is programmed with.
+
+    Attributes:
+        machine: The board's lines of the machine.
+        partition: Which part of the model they are.
+        interface_sensors: Sensor words of the interface (thesis 3.2: 20).
+        interface_results: Result words of the interface (thesis 3.2: 1200).
+        model_hash: SHA-256 (hex) that names the model; the same for all boards of a deployment.
+        build_date: When it was built, ISO 8601 (see :func:`build_date`).
+        tool_version: Version of the toolchain that built it.
+
+    Raises:
+        ImageError: The machine is larger than the interface, or the interface than the register map, or
+            the partition does not hold these lines.
+    """
+
+    machine: BM1Machine
+    partition: Partition
+    interface_sensors: int
+    interface_results: int
+    model_hash: str
+    build_date: str
+    tool_version: str
+
+    def __post_init__(self) -> None:
+        """Refuse what no board can hold."""
+        lines, sensors = self.machine.parameters.lines, self.machine.parameters.sensors
+        part, words = self.partition, (register_map.SENSORS_WORDS, register_map.RESULTS_WORDS)
+        if not (0 < self.interface_sensors <= words[0] and 0 < self.interface_results <= words[1]):
+            raise ImageError(
+                f"The interface {self.interface_sensors}x{self.interface_results} does not fit the register "
+                f"map, which has room for 1x1 to {words[0]}x{words[1]}."
+            )
+        if sensors > self.interface_sensors or lines > self.interface_results:
+            raise ImageError(
+                f"The machine has {sensors} sensors and {lines} lines; the interface "
+                f"{self.interface_sensors}x{self.interface_results} is smaller: use --interface "
+                f"{max(sensors, self.interface_sensors)}x{max(lines, self.interface_results)}, "
+                "or more partitions."
+            )
+        if not (0 <= part.index < part.count < 1 << 16 and 0 <= part.line_offset <= part.total_lines - lines):
+            raise ImageError(
+                f"Part {part.index} of {part.count} cannot hold {lines} lines from line {part.line_offset} "
+                f"on: the model has {part.total_lines}."
+            )
+
+    @property
+    def map_hash(self) -> str:
+        """SHA-256 (hex) of the register map that the image is made for: this software's."""
+        return register_map.MAP_SHA256
+
+    @cached_property
+    def image_hash(self) -> str:
+        """SHA-256 (hex) that identifies what the board computes, whenever it was built."""
+        return _manifest(self, _sections(self.machine)).image_hash
+
+
+class _Checked(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class _PartitionEntry(_Checked):
+    index: int
+    count: int
+    line_offset: int
+    total_lines: int
+
+
+class _Interface(_Checked):
+    sensors: int
+    results: int
+
+
+class _Section(_Checked):
+    name: str
+    dtype: str
+    shape: tuple[int, ...]
+    sha256: str
+
+
+class _Identity(_Checked):
+    """What the image hash is made of."""
+
+    machine: str
+    parameters: BM1Parameters
+    partition: _PartitionEntry
+    interface: _Interface
+    model_hash: str
+    map_hash: str
+    sections: tuple[_Section, ...]
+
+    @property
+    def hash(self) -> str:
+        return hashlib.sha256(_canonical(self.model_dump(mode="json"))).hexdigest()
+
+
+class _Manifest(_Checked):
+    emulated: bool
+    tool_version: str
+    build_date: str
+    image_hash: str
+    identity: _Identity
+
+
+def build_date() -> str:
+    """Now, or the time that ``SOURCE_DATE_EPOCH`` gives (for builds that repeat to the byte); ISO 8601, UTC.
+
+    Raises:
+        ImageError: ``SOURCE_DATE_EPOCH`` is no time.
+    """
+    epoch = os.environ.get("SOURCE_DATE_EPOCH")
+    try:
+        return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(None if epoch is None else int(epoch)))
+    except (ValueError, OverflowError, OSError):
+        raise ImageError(
+            f"SOURCE_DATE_EPOCH is {epoch!r}; it must be a number of seconds since 1970."
+        ) from None
+
+
+def tool_version() -> str:
+    """The installed version of this software, for :attr:`Image.tool_version`."""
+    return version("rosbayes")
+
+
+def image_bytes(image: Image) -> bytes:
+    """The bytes of the image's programming file: always the same for the same image."""
+    sections = _sections(image.machine)
+    manifest = _canonical(_manifest(image, sections).model_dump(mode="json"))
+    header = _HEADER.pack(MAGIC, len(manifest), 0, hashlib.sha256(manifest).digest())
+    return b"".join([header, manifest, *(array.tobytes() for _, array in sections)])
+
+
+def write_image(path: Path, image: Image) -> None:
+    """Write the image's programming file; a reader never sees half of it.
+
+    Raises:
+        ImageError: The file cannot be written.
+    """
+    part = path.with_name(path.name + ".part")
+    try:
+        part.write_bytes(image_bytes(image))
+        part.replace(path)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise ImageError(f"{path} cannot be written: {error.strerror}.") from error
+
+
+def read_image(path: Path) -> Image:
+    """The image in a programming file, all its hashes checked.
+
+    Raises:
+        ImageError: The file cannot be read.
+        DamagedImageError: Its bytes are not those that were written; the sentence names the hash.
+        ImageMismatchError: It is for another register map or format.
+    """
+    try:
+        with path.open("rb") as file:
+            # one byte more than allowed, so that a file that is too large is told from one that is not
+            content = file.read(MAX_IMAGE_BYTES + 1)
+    except OSError as error:
+        raise ImageError(f"{path} cannot be read: {error.strerror}.") from error
+    return image_from_bytes(content, str(path))
+
+
+def image_from_bytes(content: bytes, name: str = "the image") -> Image:
+    """The image in the bytes of a programming file, all its hashes checked.
+
+    Args:
+        content: The file's bytes.
+        name: What errors call it: a path, a board.
+
+    Raises:
+        DamagedImageError: The bytes are not those that were written; the sentence names the hash.
+        ImageMismatchError: It is for another register map or format.
+    """
+    manifest, data_start = _read_manifest(content, name)
+    if manifest.identity.map_hash != register_map.MAP_SHA256:
+        raise ImageMismatchError(
+            f"{name} was built for register map {manifest.identity.map_hash}, this software has "
+            f"{register_map.MAP_SHA256}: build the deployment again."
+        )
+    sections = _read_sections(content, name, manifest, data_start)
+    if manifest.identity.hash != manifest.image_hash:
+        raise DamagedImageError(
+            f"{name} is damaged: the image hash is {manifest.identity.hash}, its manifest says "
+            f"{manifest.image_hash}; build the deployment again."
+        )
+    part, interface = manifest.identity.partition, manifest.identity.interface
+    columns = [array for section, array in sections if section.startswith("column ")]
+    by_name = dict(sections)
+    try:
+        machine = BM1Machine(
+            manifest.identity.parameters, by_name["prior"], tuple(columns), by_name.get("rng")
+        )
+        return Image(
+            machine=machine,
+            partition=Partition(part.index, part.count, part.line_offset, part.total_lines),
+            interface_sensors=interface.sensors,
+            interface_results=interface.results,
+            model_hash=manifest.identity.model_hash,
+            build_date=manifest.build_date,
+            tool_version=manifest.tool_version,
+        )
+    except KeyError:
+        raise ImageMismatchError(f"{name} has no prior: it is no image of a BM1.") from None
+    except MachineError as error:
+        raise ImageMismatchError(f"{name} holds a machine that cannot be built: {error}") from error
+
+
+def _read_manifest(content: bytes, name: str) -> tuple[_Manifest, int]:
+    """The manifest, and where the sections start."""
+    if len(content) > MAX_IMAGE_BYTES:
+        raise ImageMismatchError(f"{name} is larger than {MAX_IMAGE_BYTES} bytes: it is no programming file.")
+    if len(content) < _HEADER.size or content[:7] != MAGIC[:7]:
+        raise DamagedImageError(
+            f"{name} is no programming file: it does not start with {MAGIC[:7].decode()}."
+        )
+    magic, length, _, digest = _HEADER.unpack_from(content)
+    if magic != MAGIC:
+        raise ImageMismatchError(
+            f"{name} has format {magic[7]}, this software reads format {MAGIC[7]}: "
+            "build the deployment again."
+        )
+    start = _HEADER.size + length
+    text = content[_HEADER.size : start]
+    _check_hash(name, "its manifest", text, digest.hex(), "its header")
+    try:
+        return _Manifest.model_validate_json(text), start
+    except (ValidationError, MachineError) as error:
+        first = error.errors()[0]["msg"] if isinstance(error, ValidationError) else str(error)
+        raise ImageMismatchError(f"{name} has a manifest that this software cannot read: {first}") from error
+
+
+def _read_sections(
+    content: bytes, name: str, manifest: _Manifest, start: int
+) -> list[tuple[str, npt.NDArray[Any]]]:
+    sections: list[tuple[str, npt.NDArray[Any]]] = []
+    for section in manifest.identity.sections:
+        if section.dtype not in {"<u2", "<u4"} or any(size < 0 for size in section.shape):
+            raise ImageMismatchError(
+                f"{name} has a section '{section.name}' of an unknown kind: {section.dtype}."
+            )
+        dtype = np.dtype(section.dtype)
+        end = start + dtype.itemsize * int(np.prod(section.shape, dtype=object))
+        data = content[start:end]
+        _check_hash(name, f"section '{section.name}'", data, section.sha256, "its manifest")
+        sections.append((section.name, np.frombuffer(data, dtype).reshape(section.shape)))
+        start = end
+    if start != len(content):
+        raise DamagedImageError(f"{name} is damaged: {len(content) - start} bytes follow its last section.")
+    return sections
+
+
+def _check_hash(name: str, what: str, data: bytes, expected: str, source: str) -> None:
+    found = hashlib.sha256(data).hexdigest()
+    if found != expected:
+        raise DamagedImageError(
+            f"{name} is damaged: the sha256 of {what} is {found}, {source} says {expected}; "
+            "build the deployment again."
+        )
+
+
+def _manifest(image: Image, sections: list[tuple[str, npt.NDArray[Any]]]) -> _Manifest:
+    part = image.partition
+    identity = _Identity(
+        machine="BM1",
+        parameters=image.machine.parameters,
+        partition=_PartitionEntry(
+            index=part.index, count=part.count, line_offset=part.line_offset, total_lines=part.total_lines
+        ),
+        interface=_Interface(sensors=image.interface_sensors, results=image.interface_results),
+        model_hash=image.model_hash,
+        map_hash=image.map_hash,
+        sections=tuple(
+            _Section(
+                name=name,
+                dtype=array.dtype.str,
+                shape=array.shape,
+                sha256=hashlib.sha256(array.tobytes()).hexdigest(),
+            )
+            for name, array in sections
+        ),
+    )
+    return _Manifest(
+        emulated=True,
+        tool_version=image.tool_version,
+        build_date=image.build_date,
+        image_hash=identity.hash,
+        identity=identity,
+    )
+
+
+def _sections(machine: BM1Machine) -> list[tuple[str, npt.NDArray[Any]]]:
+    """The machine's tables in the file's order and types (one per MIF of the thesis's hardware project)."""
+    sections: list[tuple[str, npt.NDArray[Any]]] = [("prior", machine.prior.astype("<u2", copy=False))]
+    for column, table in enumerate(machine.tables, start=1):
+        sections.append((f"column {column}", table.astype("<u2", copy=False)))
+    if machine.rng_table is not None:
+        sections.append(("rng", machine.rng_table.astype("<u4", copy=False)))
+    return sections
+
+
+def _canonical(value: object) -> bytes:
+    """JSON that is the same for the same value, and can be read by people."""
+    return json.dumps(value, indent=1, sort_keys=True, ensure_ascii=False).encode() + b"\n"

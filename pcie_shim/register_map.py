@@ -1,0 +1,288 @@
+"""The boards' register map as constants: offsets in bytes, masks, shifts, encodings.
+
+Generated from hdl/bm_registers.rdl by scripts/registers: change that file, not this one. What
+each register means is in docs/registers.md.
+"""
+
+from enum import IntEnum
+from typing import Final, NamedTuple
+
+MAP_SHA256: Final = "674673b05953112b318f8efe2eb02652f1e7c40a9017b2cb2ee89f4c6a5d202b"
+BAR_SIZE: Final = 0x10000
+
+
+class MachineKind(IntEnum):
+    """Values of CAP_MACHINE.KIND.
+
+    Attributes:
+        NONE: blank: no image has been loaded.
+        BM1: exact inference with approximate computations (thesis 2.1.2).
+    """
+
+    NONE = 0
+    BM1 = 1
+
+
+class RngKind(IntEnum):
+    """Values of CAP_MACHINE.RNG.
+
+    Attributes:
+        NONE: blank: no image has been loaded.
+        LFSR8: 8-bit Fibonacci LFSR.
+        LFSR16: 16-bit Fibonacci LFSR.
+        LFSR24: 24-bit Fibonacci LFSR.
+        LFSR32: 32-bit Fibonacci LFSR.
+        TABLE: a table that all columns play in a ring.
+        IDEAL: a hash of seed, column and cycle; emulated boards only.
+    """
+
+    NONE = 0
+    LFSR8 = 1
+    LFSR16 = 2
+    LFSR24 = 3
+    LFSR32 = 4
+    TABLE = 5
+    IDEAL = 6
+
+
+class BoardState(IntEnum):
+    """Values of STATUS.STATE.
+
+    Attributes:
+        BLANK: no image: only identity and control can be used.
+        IDLE: reset, nothing has run.
+        RUNNING: the machine runs; writes are refused, except CONTROL.RESET.
+        DONE: the machine has stopped; STOP_REASON says why.
+    """
+
+    BLANK = 0
+    IDLE = 1
+    RUNNING = 2
+    DONE = 3
+
+
+class StopReason(IntEnum):
+    """Values of STATUS.STOP_REASON.
+
+    Attributes:
+        NONE: nothing has run since the reset.
+        OVERFLOW: a counter reached TARGET_COUNT.
+        MAX_CYCLES: MAX_CYCLES cycles have run.
+        SLICE: RUN_UNTIL was reached; RESUME goes on.
+        IMPOSSIBLE: no line can count for these readings; nothing was run.
+    """
+
+    NONE = 0
+    OVERFLOW = 1
+    MAX_CYCLES = 2
+    SLICE = 3
+    IMPOSSIBLE = 4
+
+
+class ErrorCode(IntEnum):
+    """Values of STATUS.ERROR.
+
+    Attributes:
+        NONE: nothing was refused since the reset.
+        OUTSIDE: the address is not in the map, or not implemented by this image.
+        MISALIGNED: the address is no multiple of 4.
+        TOO_LONG: the access runs past the end of its block.
+        READ_ONLY: the register cannot be written.
+        BUSY: the machine runs; only CONTROL.RESET may be written.
+        BLANK: no image has been loaded.
+        DOORBELL: the number is not DONE + 1, or there is nothing to resume.
+        BAD_VALUE: a value is impossible for the machine: address, target, bank, cycles.
+        STALE: the board was programmed after this handle was opened.
+        HELD: another host holds the board, or another loader programs it.
+        BAD_FRAME: the frame is broken: operation, length, CRC or sequence number; the link is closed.
+        BAD_IMAGE: the image is damaged, or made for another map or board.
+        FAILED: the machine itself failed.
+    """
+
+    NONE = 0
+    OUTSIDE = 1
+    MISALIGNED = 2
+    TOO_LONG = 3
+    READ_ONLY = 4
+    BUSY = 5
+    BLANK = 6
+    DOORBELL = 7
+    BAD_VALUE = 8
+    STALE = 9
+    HELD = 10
+    BAD_FRAME = 11
+    BAD_IMAGE = 12
+    FAILED = 13
+
+
+class Block(NamedTuple):
+    """A register, an array of registers or a memory: 32-bit words from ``address`` on."""
+
+    name: str
+    address: int
+    words: int
+    writable: bool
+
+
+ID: Final = 0x0000
+ID_VALUE: Final = 0x31304d42
+
+MAP_VERSION: Final = 0x0004
+MAP_VERSION_VALUE: Final = 0x10000
+MAP_VERSION_MINOR_SHIFT: Final = 0
+MAP_VERSION_MINOR_MASK: Final = 0xffff
+MAP_VERSION_MAJOR_SHIFT: Final = 16
+MAP_VERSION_MAJOR_MASK: Final = 0xffff0000
+
+LIVENESS: Final = 0x0008
+
+PROGRAMMED: Final = 0x000c
+
+MAP_HASH: Final = 0x0020
+MAP_HASH_WORDS: Final = 8
+
+IMAGE_HASH: Final = 0x0040
+IMAGE_HASH_WORDS: Final = 8
+
+CAP_MACHINE: Final = 0x0080
+CAP_MACHINE_KIND_SHIFT: Final = 0
+CAP_MACHINE_KIND_MASK: Final = 0xff
+CAP_MACHINE_RNG_SHIFT: Final = 8
+CAP_MACHINE_RNG_MASK: Final = 0xff00
+CAP_MACHINE_SHARED_SHIFT: Final = 16
+CAP_MACHINE_SHARED_MASK: Final = 0x10000
+CAP_MACHINE_FREE_SHIFT: Final = 17
+CAP_MACHINE_FREE_MASK: Final = 0x20000
+CAP_MACHINE_PRIOR_WRITTEN_SHIFT: Final = 18
+CAP_MACHINE_PRIOR_WRITTEN_MASK: Final = 0x40000
+
+CAP_LINES: Final = 0x0084
+
+CAP_TOTAL_LINES: Final = 0x0088
+
+CAP_LINE_OFFSET: Final = 0x008c
+
+CAP_PARTITION: Final = 0x0090
+CAP_PARTITION_INDEX_SHIFT: Final = 0
+CAP_PARTITION_INDEX_MASK: Final = 0xffff
+CAP_PARTITION_COUNT_SHIFT: Final = 16
+CAP_PARTITION_COUNT_MASK: Final = 0xffff0000
+
+CAP_SENSORS: Final = 0x0094
+
+CAP_WIDTHS: Final = 0x0098
+CAP_WIDTHS_PROB_BITS_SHIFT: Final = 0
+CAP_WIDTHS_PROB_BITS_MASK: Final = 0xff
+CAP_WIDTHS_COUNTER_BITS_SHIFT: Final = 8
+CAP_WIDTHS_COUNTER_BITS_MASK: Final = 0xff00
+CAP_WIDTHS_PRIOR_BITS_SHIFT: Final = 16
+CAP_WIDTHS_PRIOR_BITS_MASK: Final = 0xff0000
+
+CAP_BANKS: Final = 0x009c
+
+CAP_REPLICAS: Final = 0x00a0
+
+CAP_INTERFACE: Final = 0x00a4
+CAP_INTERFACE_SENSORS_SHIFT: Final = 0
+CAP_INTERFACE_SENSORS_MASK: Final = 0xffff
+CAP_INTERFACE_RESULTS_SHIFT: Final = 16
+CAP_INTERFACE_RESULTS_MASK: Final = 0xffff0000
+
+CAP_SPEED: Final = 0x00a8
+
+CAP_STEPS: Final = 0x00ac
+
+CAP_SENSOR_BITS: Final = 0x00c0
+CAP_SENSOR_BITS_WORDS: Final = 16
+CAP_SENSOR_BITS_FIRST_SHIFT: Final = 0
+CAP_SENSOR_BITS_FIRST_MASK: Final = 0xff
+CAP_SENSOR_BITS_SECOND_SHIFT: Final = 8
+CAP_SENSOR_BITS_SECOND_MASK: Final = 0xff00
+CAP_SENSOR_BITS_THIRD_SHIFT: Final = 16
+CAP_SENSOR_BITS_THIRD_MASK: Final = 0xff0000
+CAP_SENSOR_BITS_FOURTH_SHIFT: Final = 24
+CAP_SENSOR_BITS_FOURTH_MASK: Final = 0xff000000
+
+CONTROL: Final = 0x0100
+CONTROL_RESET_SHIFT: Final = 0
+CONTROL_RESET_MASK: Final = 0x1
+CONTROL_INTERRUPT_ENABLE_SHIFT: Final = 1
+CONTROL_INTERRUPT_ENABLE_MASK: Final = 0x2
+
+TARGET_COUNT: Final = 0x0104
+
+MAX_CYCLES: Final = 0x0108
+MAX_CYCLES_WORDS: Final = 2
+
+BANK: Final = 0x0110
+
+PRIOR_SELECT: Final = 0x0114
+
+RUN_UNTIL: Final = 0x0118
+RUN_UNTIL_WORDS: Final = 2
+
+START: Final = 0x0120
+
+RESUME: Final = 0x0124
+
+DONE: Final = 0x0140
+
+STATUS: Final = 0x0144
+STATUS_STATE_SHIFT: Final = 0
+STATUS_STATE_MASK: Final = 0xf
+STATUS_STOP_REASON_SHIFT: Final = 4
+STATUS_STOP_REASON_MASK: Final = 0xf0
+STATUS_ERROR_SHIFT: Final = 8
+STATUS_ERROR_MASK: Final = 0xff00
+
+CYCLES: Final = 0x0148
+CYCLES_WORDS: Final = 2
+
+COMPUTE_NS: Final = 0x0150
+COMPUTE_NS_WORDS: Final = 2
+
+SENSORS: Final = 0x0200
+SENSORS_WORDS: Final = 64
+
+RESULTS: Final = 0x4000
+RESULTS_WORDS: Final = 4096
+
+PRIOR_CODES: Final = 0x8000
+PRIOR_CODES_WORDS: Final = 4096
+
+BLOCKS: Final = (
+    Block("ID", ID, 1, writable=False),
+    Block("MAP_VERSION", MAP_VERSION, 1, writable=False),
+    Block("LIVENESS", LIVENESS, 1, writable=True),
+    Block("PROGRAMMED", PROGRAMMED, 1, writable=False),
+    Block("MAP_HASH", MAP_HASH, 8, writable=False),
+    Block("IMAGE_HASH", IMAGE_HASH, 8, writable=False),
+    Block("CAP_MACHINE", CAP_MACHINE, 1, writable=False),
+    Block("CAP_LINES", CAP_LINES, 1, writable=False),
+    Block("CAP_TOTAL_LINES", CAP_TOTAL_LINES, 1, writable=False),
+    Block("CAP_LINE_OFFSET", CAP_LINE_OFFSET, 1, writable=False),
+    Block("CAP_PARTITION", CAP_PARTITION, 1, writable=False),
+    Block("CAP_SENSORS", CAP_SENSORS, 1, writable=False),
+    Block("CAP_WIDTHS", CAP_WIDTHS, 1, writable=False),
+    Block("CAP_BANKS", CAP_BANKS, 1, writable=False),
+    Block("CAP_REPLICAS", CAP_REPLICAS, 1, writable=False),
+    Block("CAP_INTERFACE", CAP_INTERFACE, 1, writable=False),
+    Block("CAP_SPEED", CAP_SPEED, 1, writable=False),
+    Block("CAP_STEPS", CAP_STEPS, 1, writable=False),
+    Block("CAP_SENSOR_BITS", CAP_SENSOR_BITS, 16, writable=False),
+    Block("CONTROL", CONTROL, 1, writable=True),
+    Block("TARGET_COUNT", TARGET_COUNT, 1, writable=True),
+    Block("MAX_CYCLES", MAX_CYCLES, 2, writable=True),
+    Block("BANK", BANK, 1, writable=True),
+    Block("PRIOR_SELECT", PRIOR_SELECT, 1, writable=True),
+    Block("RUN_UNTIL", RUN_UNTIL, 2, writable=True),
+    Block("START", START, 1, writable=True),
+    Block("RESUME", RESUME, 1, writable=True),
+    Block("DONE", DONE, 1, writable=False),
+    Block("STATUS", STATUS, 1, writable=False),
+    Block("CYCLES", CYCLES, 2, writable=False),
+    Block("COMPUTE_NS", COMPUTE_NS, 2, writable=False),
+    Block("SENSORS", SENSORS, 64, writable=True),
+    Block("RESULTS", RESULTS, 4096, writable=False),
+    Block("PRIOR_CODES", PRIOR_CODES, 4096, writable=True),
+)
