@@ -288,7 +288,7 @@ class Broker:
                 latch=_flag(operation, "latch"),
             )
         topic = advertisement.topic
-        data = _json(message)
+        data = orjson.dumps(message)
         # Rewriting can lengthen (1e15 becomes 1000000000000000.0), beyond what subscribers take.
         if len(topic.name) + len(data) + _AROUND > self.limits.message_bytes:
             raise _RefusedError(f"the message for {name} has more than {self.limits.message_bytes} bytes")
@@ -384,7 +384,6 @@ class Broker:
 
     def _call_service(self, client: Client, operation: _Operation, now: float) -> None:
         name, call_id = _text(operation, "service"), _operation_id(operation)
-        _json([name, call_id])  # refused now if it could not be answered
         try:
             self._start_call(client, name, call_id, operation, now)
         except _RefusedError as error:
@@ -417,7 +416,7 @@ class Broker:
             "service": key,
             "args": {} if args is None else args,
         }
-        payload = _json(request)
+        payload = orjson.dumps(request)
         if len(payload) > self.limits.message_bytes:
             raise _RefusedError(f"the request for {name} has more than {self.limits.message_bytes} bytes")
         self._calls[request_id] = _Call(client, call_id, name, server, now + timeout)
@@ -441,8 +440,7 @@ class Broker:
             self._answer_failure(call, f"{call.service} answered with values that are no JSON object")
         else:
             # The wire has a string here; what a server says beyond that is told as JSON.
-            reason = values if isinstance(values, str) else f"{call.service} refused: {_excerpt(values)}"
-            self._answer_failure(call, reason)
+            self._answer_failure(call, values if isinstance(values, str) else orjson.dumps(values).decode())
 
     def _take_call(self, key: str) -> _Call:
         call = self._calls.pop(key)
@@ -457,7 +455,7 @@ class Broker:
         answer["result"] = result
         if call_id is not None:
             answer["id"] = call_id
-        payload = _json(answer)
+        payload = orjson.dumps(answer)
         if len(payload) > self.limits.message_bytes:
             raise _RefusedError(f"the answer of {service} has more than {self.limits.message_bytes} bytes")
         self._send(client, payload)
@@ -476,21 +474,6 @@ def _prefix(name: str) -> bytes:
 
 #: Bytes around a topic's name and a message's JSON.
 _AROUND: Final = len(_prefix("")) + 1
-
-
-def _json(value: object) -> bytes:
-    """Write JSON. Refused is what only broken input has: lone surrogates, integers beyond 64 bits."""
-    try:
-        return orjson.dumps(value)
-    except TypeError as error:
-        raise _RefusedError(f"it cannot be written as JSON: {error}") from None
-
-
-def _excerpt(value: object) -> str:
-    try:
-        return _json(value).decode()[:1000]
-    except _RefusedError as error:
-        return str(error)
 
 
 def _text(operation: _Operation, field: str) -> str:

@@ -195,6 +195,7 @@ class Outbox:
             while lane.held and self.size + size > self._max_bytes:
                 self._take_held(lane)
                 lane.lost += 1
+        self._find_deadline()
         return self.size + size <= self._max_bytes
 
     def _find_deadline(self) -> None:

@@ -1,0 +1,148 @@
+"""A hub without sockets for tests, its clients, and all that must be true of it at any moment."""
+
+import json
+from dataclasses import dataclass, field
+from math import inf
+from typing import Any
+
+from bridge.hub.broker import Broker
+from bridge.hub.graph import Client
+from bridge.hub.limits import HubLimits
+
+WALL_CLOCK = 1_700_000_000_123_456_789
+
+
+def _no_constant(name: str) -> Any:
+    raise AssertionError(f"{name} went onto the wire")
+
+
+@dataclass(eq=False)
+class Guest:
+    """A client of a hub without sockets."""
+
+    room: "Room"
+    client: Client
+    arrived: list[dict[str, Any]] = field(default_factory=list)
+
+    def send(self, **operation: Any) -> None:
+        self.send_raw(json.dumps(operation).encode())
+
+    def send_raw(self, data: bytes) -> None:
+        self.room.broker.receive(self.client, data, self.room.now)
+
+    def advertise(self, topic: str, type_name: str = "a/B", **more: Any) -> None:
+        self.send(op="advertise", topic=topic, type=type_name, **more)
+
+    def publish(self, topic: str, msg: Any = None, **more: Any) -> None:
+        self.send(op="publish", topic=topic, msg={} if msg is None else msg, **more)
+
+    def subscribe(self, topic: str, **more: Any) -> None:
+        self.send(op="subscribe", topic=topic, **more)
+
+    def read(self) -> list[dict[str, Any]]:
+        """All that waits for it, as a socket that takes everything would have it."""
+        operations = []
+        while (payload := self.client.outbox.pop()) is not None:
+            assert len(payload) <= self.room.broker.limits.message_bytes
+            operations.append(json.loads(payload, parse_constant=_no_constant))
+        return operations
+
+    def heard(self, topic: str | None = None) -> list[Any]:
+        """The messages among it, of one topic or all; anything else is an error."""
+        operations = self.read()
+        assert all(set(operation) == {"op", "topic", "msg"} for operation in operations), operations
+        assert {operation["op"] for operation in operations} <= {"publish"}
+        return [operation["msg"] for operation in operations if topic in {None, operation["topic"]}]
+
+    def ask(self, service: str, args: Any = None, **more: Any) -> dict[str, Any]:
+        """Call a service that is answered at once, and take the answer."""
+        self.send(op="call_service", service=service, args={} if args is None else args, **more)
+        (answer,) = self.read()
+        assert answer["op"] == "service_response"
+        return answer
+
+    def rosapi(self, service: str, /, **args: Any) -> Any:
+        answer = self.ask(f"/rosapi/{service}", args)
+        assert answer["result"] is True, answer
+        return answer["values"]
+
+    def leave(self) -> None:
+        self.room.broker.disconnect(self.client)
+
+
+class Room:
+    """A broker, its guests and the time."""
+
+    def __init__(self, **limits: Any) -> None:
+        self.broker = Broker(HubLimits(**limits), wall_clock=lambda: WALL_CLOCK)
+        self.now = 1000.0
+
+    def enter(self, address: str = "127.0.0.1") -> Guest:
+        return Guest(self, self.broker.connect(address))
+
+    def pass_time(self, seconds: float) -> None:
+        """Let time pass, waking the broker whenever it asked for it."""
+        end = self.now + seconds
+        while self.broker.deadline <= end:
+            self.now = max(self.now, self.broker.deadline)
+            self.broker.wake(self.now)
+            assert self.broker.deadline > self.now, "a wake that leaves work undone would spin"
+        self.now = end
+
+    def check(self) -> None:
+        """What must hold whatever the clients did."""
+        broker, graph, limits = self.broker, self.broker.graph, self.broker.limits
+        clients = set(graph.clients.values())
+        assert len(graph.topics) <= limits.topics
+        for name, topic in graph.topics.items():
+            assert topic.name == name
+            assert name.startswith("/")
+            assert topic.advertisements or topic.subscriptions, "a topic of nobody"
+            assert set(topic.advertisements) | set(topic.subscriptions) <= clients
+            assert topic.latched is None or topic.latching
+            assert topic.type or not topic.advertisements, "published without a type"
+            for client, advertisement in topic.advertisements.items():
+                assert client.advertisements[name] is advertisement
+                assert advertisement.ids
+            for client, subscription in topic.subscriptions.items():
+                assert client.subscriptions[name] is subscription
+                assert subscription.wishes
+        assert graph.latched_bytes == sum(len(topic.latched or b"") for topic in graph.topics.values())
+        assert graph.latched_bytes <= limits.latched_bytes
+        for name, service in graph.services.items():
+            assert service.name == name
+            assert name in service.client.services
+        calls = broker._calls
+        for client in clients:
+            assert all(graph.topics[name].advertisements[client] for name in client.advertisements)
+            assert all(graph.topics[name].subscriptions[client] for name in client.subscriptions)
+            assert client.open_advertisements == sum(len(a.ids) for a in client.advertisements.values())
+            assert client.open_advertisements <= limits.advertisements_per_client
+            assert client.open_subscriptions == sum(len(s.wishes) for s in client.subscriptions.values())
+            assert client.open_subscriptions <= limits.subscriptions_per_client
+            assert all(graph.services[name].client is client for name in client.services)
+            assert len(client.services) <= limits.services_per_client
+            assert client.asked == {key for key, call in calls.items() if call.caller is client}
+            assert client.asked_of == {key for key, call in calls.items() if call.server is client}
+            assert max(len(client.asked), len(client.asked_of)) <= limits.calls_per_client
+            self._check_outbox(client)
+        assert all(call.caller in clients and call.server in clients for call in calls.values())
+        deadlines = [call.deadline for call in calls.values()]
+        deadlines += [client.outbox.deadline for client in clients]
+        assert broker.deadline <= min(deadlines, default=inf), "it would be woken too late"
+
+    def _check_outbox(self, client: Client) -> None:
+        outbox = client.outbox
+        entries = [entry for entry in outbox._entries if entry.payload is not None]
+        lanes = {subscription.lane for subscription in client.subscriptions.values()}
+        assert {entry.lane for entry in entries} - {None} <= lanes, "a message of a subscription that is over"
+        assert len(outbox) == len(entries)
+        held = sum(len(payload) for lane in lanes for payload in lane.held)
+        assert outbox.size == sum(len(entry.payload or b"") for entry in entries) + held
+        assert outbox.size <= self.broker.limits.client_bytes
+        assert outbox.deadline == min((lane.next_time for lane in lanes if lane.held), default=inf)
+        for lane in lanes:
+            assert list(lane.queued) == [entry for entry in entries if entry.lane is lane]
+            assert len(lane.queued) <= max(lane.queue_length, 1)
+            assert len(lane.held) <= lane.queue_length
+            assert lane.queue_length <= self.broker.limits.longest_queue

@@ -1,0 +1,24 @@
+import dataclasses
+
+import pytest
+
+from bridge.hub.errors import HubError
+from bridge.hub.limits import HubLimits
+
+
+def test_every_limit_must_be_positive() -> None:
+    for field in dataclasses.fields(HubLimits):
+        with pytest.raises(HubError, match=field.name):
+            HubLimits(**{field.name: 0})
+
+
+def test_limits_that_contradict_each_other_are_refused() -> None:
+    with pytest.raises(HubError, match="client_bytes"):
+        HubLimits(message_bytes=1000, client_bytes=999)
+    with pytest.raises(HubError, match="depth"):
+        HubLimits(depth=251)
+    assert HubError.exit_code == 2
+
+
+def test_the_default_message_is_a_mebibyte() -> None:
+    assert HubLimits().message_bytes == 1 << 20

@@ -1,0 +1,277 @@
+"""The outbox against a model of it: two plain lists, and every rule in its plainest form."""
+
+from dataclasses import dataclass, field
+from math import inf
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bridge.hub.outbox import Lane, Outbox
+
+
+def _drain(outbox: Outbox) -> list[bytes]:
+    payloads = []
+    while (payload := outbox.pop()) is not None:
+        payloads.append(payload)
+    return payloads
+
+
+def _lane(throttle: float = 0.0, queue_length: int = 3) -> Lane:
+    lane = Lane()
+    lane.throttle, lane.queue_length = throttle, queue_length
+    return lane
+
+
+def test_order_is_kept_between_topics_and_answers() -> None:
+    outbox, one, other = Outbox(1000), _lane(), _lane()
+    outbox.offer(one, b"1", 0)
+    outbox.put(b"2")
+    outbox.offer(other, b"3", 0)
+    outbox.offer(one, b"4", 0)
+    assert _drain(outbox) == [b"1", b"2", b"3", b"4"]
+    assert (outbox.size, len(outbox)) == (0, 0)
+
+
+def test_a_full_lane_drops_its_own_oldest_and_counts_it() -> None:
+    outbox, quick, quiet = Outbox(1000), _lane(queue_length=2), _lane()
+    outbox.offer(quiet, b"quiet", 0)
+    for index in range(5):
+        outbox.offer(quick, b"%d" % index, 0)
+    assert _drain(outbox) == [b"quiet", b"3", b"4"]
+    assert (quick.lost, quiet.lost) == (3, 0)
+
+
+def test_bytes_are_bounded_over_all_lanes_and_answers_are_never_dropped() -> None:
+    outbox, one, other = Outbox(10), _lane(), _lane()
+    outbox.offer(one, b"1111", 0)
+    outbox.put(b"22")
+    outbox.offer(other, b"3333", 0)
+    outbox.offer(other, b"4444", 0)
+    assert _drain(outbox) == [b"22", b"3333", b"4444"]
+    assert one.lost == 1
+    assert not outbox.overflowed
+
+
+def test_answers_beyond_the_bound_overflow() -> None:
+    outbox, lane = Outbox(10), _lane()
+    outbox.offer(lane, b"333", 0)
+    outbox.put(b"55555")
+    outbox.put(b"55555")
+    assert not outbox.overflowed
+    outbox.put(b"1")
+    assert outbox.overflowed
+    outbox.offer(lane, b"1", 0)
+    assert lane.lost == 2
+    assert _drain(outbox) == [b"55555", b"55555"]
+
+
+def test_a_throttle_without_a_queue_drops_what_comes_too_early() -> None:
+    outbox, lane = Outbox(1000), _lane(throttle=1.0, queue_length=0)
+    sent = []
+    for index in range(25):
+        outbox.offer(lane, b"%d" % index, index / 10)
+        sent += _drain(outbox)
+    assert sent == [b"0", b"10", b"20"]
+    assert outbox.deadline == inf
+
+
+def test_a_throttle_with_a_queue_spreads_what_comes_too_early() -> None:
+    outbox, lane = Outbox(1000), _lane(throttle=1.0, queue_length=2)
+    for index in range(5):
+        outbox.offer(lane, b"%d" % index, 100)
+    assert _drain(outbox) == [b"0"]
+    assert lane.lost == 2
+    assert outbox.deadline == 101
+    outbox.release(100.5)
+    assert _drain(outbox) == []
+    outbox.release(101)
+    assert _drain(outbox) == [b"3"]
+    assert outbox.deadline == 102
+    outbox.release(110)
+    assert _drain(outbox) == [b"4"]
+    assert outbox.deadline == inf
+    outbox.offer(lane, b"5", 110.5)
+    assert outbox.deadline == 111
+
+
+def test_what_is_held_counts_towards_the_bytes_and_makes_room() -> None:
+    outbox, held, queued = Outbox(10), _lane(throttle=1.0, queue_length=9), _lane(queue_length=9)
+    for _ in range(5):
+        outbox.offer(held, b"333", 0)
+    assert (outbox.size, held.lost) == (9, 2)  # one queued and two held
+    outbox.offer(queued, b"8888 8888", 0)
+    assert outbox.size == 9
+    assert held.lost == 5
+    assert outbox.deadline == inf
+
+
+def test_lifting_a_throttle_queues_what_it_held() -> None:
+    outbox, lane = Outbox(1000), _lane(throttle=1.0, queue_length=5)
+    for index in range(4):
+        outbox.offer(lane, b"%d" % index, 0)
+    outbox.adjust(lane, 0.0, 5)
+    assert outbox.deadline == inf
+    assert _drain(outbox) == [b"0", b"1", b"2", b"3"]
+
+
+def test_shortening_a_queue_drops_the_oldest_held() -> None:
+    outbox, lane = Outbox(1000), _lane(throttle=1.0, queue_length=5)
+    for index in range(4):
+        outbox.offer(lane, b"%d" % index, 0)
+    assert _drain(outbox) == [b"0"]
+    outbox.adjust(lane, 0.5, 1)
+    assert lane.lost == 2
+    assert outbox.deadline == 0.5
+    outbox.release(0.5)
+    assert _drain(outbox) == [b"3"]
+
+
+def test_a_throttled_message_replaces_the_one_that_the_socket_has_not_taken() -> None:
+    outbox, lane = Outbox(1000), _lane(throttle=1.0, queue_length=0)
+    outbox.offer(lane, b"old", 0)
+    outbox.offer(lane, b"new", 1)
+    assert _drain(outbox) == [b"new"]
+    assert lane.lost == 1
+
+
+def test_forgetting_a_lane_leaves_nothing_of_it() -> None:
+    outbox, gone, stays = Outbox(1000), _lane(throttle=1.0, queue_length=5), _lane()
+    for index in range(3):
+        outbox.offer(gone, b"%d" % index, 0)
+        outbox.offer(stays, b"s", 0)
+    outbox.forget(gone)
+    assert outbox.deadline == inf
+    assert outbox.size == 3
+    assert _drain(outbox) == [b"s", b"s", b"s"]
+
+
+def test_dropping_does_not_make_the_queue_longer() -> None:
+    outbox, lane = Outbox(10_000), _lane(queue_length=1)
+    outbox.put(b"first")
+    for _ in range(10_000):
+        outbox.offer(lane, b"x", 0)
+    assert len(outbox._entries) < 200
+    assert _drain(outbox) == [b"first", b"x"]
+
+
+@dataclass
+class _ModelLane:
+    throttle: float
+    queue_length: int
+    next_time: float = -inf
+    held: list[bytes] = field(default_factory=list)
+    lost: int = 0
+
+
+class _Model:
+    """The outbox's rules over plain lists. A waiting item is (payload, lane or None)."""
+
+    def __init__(self, max_bytes: int) -> None:
+        self.max_bytes = max_bytes
+        self.waiting: list[tuple[bytes, _ModelLane | None]] = []
+        self.lanes: list[_ModelLane] = []
+        self.overflowed = False
+
+    @property
+    def size(self) -> int:
+        held = sum(len(payload) for lane in self.lanes for payload in lane.held)
+        return held + sum(len(payload) for payload, _lane in self.waiting)
+
+    def put(self, payload: bytes) -> None:
+        if self._make_room(len(payload)):
+            self.waiting.append((payload, None))
+        else:
+            self.overflowed = True
+
+    def offer(self, lane: _ModelLane, payload: bytes, now: float) -> None:
+        if not lane.throttle:
+            self._queue(lane, payload)
+        elif now >= lane.next_time and not lane.held:
+            lane.next_time = now + lane.throttle
+            self._queue(lane, payload)
+        elif lane.queue_length:
+            if len(lane.held) == lane.queue_length:
+                del lane.held[0]
+                lane.lost += 1
+            if self._make_room(len(payload)):
+                lane.held.append(payload)
+            else:
+                lane.lost += 1
+
+    def release(self, now: float) -> None:
+        for lane in self.lanes:
+            if lane.held and lane.next_time <= now:
+                lane.next_time = now + lane.throttle
+                self._queue(lane, lane.held.pop(0))
+
+    def _queue(self, lane: _ModelLane, payload: bytes) -> None:
+        own = [index for index, (_payload, its_lane) in enumerate(self.waiting) if its_lane is lane]
+        if len(own) >= max(lane.queue_length, 1):
+            del self.waiting[own[0]]
+            lane.lost += 1
+        if self._make_room(len(payload)):
+            self.waiting.append((payload, lane))
+        else:
+            lane.lost += 1
+
+    def _make_room(self, size: int) -> bool:
+        while self.size + size > self.max_bytes:
+            index = next((i for i, (_payload, lane) in enumerate(self.waiting) if lane is not None), None)
+            if index is not None:
+                lane = self.waiting.pop(index)[1]
+            else:
+                lane = next((lane for lane in self.lanes if lane.held), None)
+                if lane is None:
+                    return False
+                del lane.held[0]
+            assert lane is not None
+            lane.lost += 1
+        return True
+
+
+_LANES = st.lists(st.tuples(st.sampled_from([0.0, 0.0, 1.0, 2.5]), st.integers(0, 4)), min_size=1, max_size=3)
+_STEPS = st.lists(
+    st.one_of(
+        st.tuples(st.just("offer"), st.integers(0, 2), st.integers(1, 12)),
+        st.tuples(st.just("offer"), st.integers(0, 2), st.integers(1, 12)),
+        st.tuples(st.just("put"), st.just(0), st.integers(1, 12)),
+        st.tuples(st.just("pop"), st.just(0), st.just(0)),
+        st.tuples(st.just("wait"), st.just(0), st.integers(0, 3)),
+    ),
+    max_size=120,
+)
+
+
+@given(_LANES, _STEPS, st.integers(12, 60))
+@settings(max_examples=300, deadline=None)
+def test_the_outbox_is_its_model(
+    shapes: list[tuple[float, int]], steps: list[tuple[str, int, int]], max_bytes: int
+) -> None:
+    outbox, model, now = Outbox(max_bytes), _Model(max_bytes), 0.0
+    # Room for held messages is made in no stated order of lanes: one throttled lane keeps the model exact.
+    throttles = [throttle for throttle, _length in shapes]
+    first = next((index for index, throttle in enumerate(throttles) if throttle), None)
+    lanes = []
+    for index, (throttle, length) in enumerate(shapes):
+        used = throttle if index == first else 0.0
+        lanes.append(_lane(used, length if used else max(length, 1)))
+        model.lanes.append(_ModelLane(used, length if used else max(length, 1)))
+    for number, (step, which, amount) in enumerate(steps):
+        payload = b"%d " % number + b"x" * amount
+        if step == "offer":
+            outbox.offer(lanes[which % len(lanes)], payload, now)
+            model.offer(model.lanes[which % len(lanes)], payload, now)
+        elif step == "put":
+            outbox.put(payload)
+            model.put(payload)
+        elif step == "pop":
+            assert outbox.pop() == (model.waiting.pop(0)[0] if model.waiting else None)
+        else:
+            now += amount / 2
+            outbox.release(now)
+            model.release(now)
+        assert outbox.size == model.size
+        assert outbox.overflowed == model.overflowed
+        assert [lane.lost for lane in lanes] == [lane.lost for lane in model.lanes]
+        assert outbox.deadline == min((lane.next_time for lane in model.lanes if lane.held), default=inf)
+    assert _drain(outbox) == [payload for payload, _lane in model.waiting]
