@@ -9,8 +9,17 @@ from collections import deque
 from dataclasses import dataclass
 from typing import Annotated, Any, Final
 
-from pydantic import AliasChoices, BaseModel, ConfigDict, Field, FiniteFloat, NonNegativeInt, ValidationError
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    FiniteFloat,
+    NonNegativeInt,
+    ValidationError,
+)
 
+from bridge.stamps import stamp_ns
 from casestudies.errors import BadResultError
 
 RESULTS_TOPIC: Final = "/BMresults"
@@ -19,7 +28,6 @@ FRAME_TOPIC: Final = "/bm/frame"
 FRAME_TYPE: Final = "diagnostic_msgs/DiagnosticArray"
 TRUTH_TYPE: Final = "geometry_msgs/PoseStamped"
 
-_SECOND_NS = 1_000_000_000
 _TRUTHS_KEPT = 4096
 
 
@@ -121,17 +129,8 @@ class _Part(BaseModel):
     model_config = ConfigDict(extra="ignore", frozen=True)
 
 
-class _Stamp(_Part):
-    seconds: int = Field(validation_alias=AliasChoices("sec", "secs"))
-    nanoseconds: NonNegativeInt = Field(validation_alias=AliasChoices("nanosec", "nsecs"))
-
-    @property
-    def ns(self) -> int:
-        return self.seconds * _SECOND_NS + self.nanoseconds
-
-
 class _Header(_Part):
-    stamp: _Stamp
+    stamp: Annotated[int, BeforeValidator(stamp_ns)]
 
 
 class _KeyValue(_Part):
@@ -216,7 +215,7 @@ def read_frame_report(message: dict[str, Any], heard_ns: int) -> FrameReport:
     except ValidationError as error:
         raise BadResultError(_complaint(FRAME_TOPIC, FRAME_TYPE, error)) from None
     return FrameReport(
-        stamp_ns=array.header.stamp.ns,
+        stamp_ns=array.header.stamp,
         heard_ns=heard_ns,
         outcome=first.message,
         published=values.published,
@@ -275,7 +274,7 @@ def read_truth(message: dict[str, Any], topic: str) -> Truth:
         pose = _PoseStamped.model_validate(message)
     except ValidationError as error:
         raise BadResultError(_complaint(topic, TRUTH_TYPE, error)) from None
-    return Truth(stamp_ns=pose.header.stamp.ns, x=pose.pose.position.x, y=pose.pose.position.y)
+    return Truth(stamp_ns=pose.header.stamp, x=pose.pose.position.x, y=pose.pose.position.y)
 
 
 class Pairing:

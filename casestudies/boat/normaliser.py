@@ -1,0 +1,99 @@
+"""Makes the boat's raw readings fit the machine's columns: whole numbers in range (thesis chapter 4)."""
+
+import math
+from typing import Annotated
+
+import typer
+
+from casestudies.boat.geometry import LONGEST_DISTANCE, SENSOR_NAMES
+from casestudies.boat.messages import (
+    ARRAY_TYPE,
+    RAW_MSG,
+    RAW_TOPIC,
+    RAW_TYPE,
+    SENSORS_MSG,
+    SENSORS_TOPIC,
+    SENSORS_TYPE,
+    BadReadingError,
+    is_distance,
+    read_raw,
+    readings_message,
+)
+from casestudies.running import command, run, say
+
+
+def normalise_distance(raw: float) -> int:
+    """A distance in map units as a whole number 0..100, halves up; the ends hold the tails."""
+    return min(max(math.floor(raw + 0.5), 0), LONGEST_DISTANCE)
+
+
+def normalise_bearing(raw: float) -> int:
+    """A bearing in radians as whole degrees 0..359, halves up."""
+    return math.floor(math.degrees(raw) + 0.5) % 360
+
+
+def normalise(raw: tuple[float, ...]) -> tuple[int, ...]:
+    """Raw readings in the order of `SENSOR_NAMES` as the machine's."""
+    return tuple(
+        normalise_distance(value) if is_distance(name) else normalise_bearing(value)
+        for name, value in zip(SENSOR_NAMES, raw, strict=True)
+    )
+
+
+async def serve(uri: str, *, raw_topic: str, sensors_topic: str, array: bool) -> None:
+    """Normalise what arrives until cancelled.
+
+    A message without six finite numbers is dropped, and each cause is said once.
+
+    Raises:
+        BridgeError: no rosbridge server answers at the URI.
+    """
+    from bridge.client import connect
+
+    from casestudies.boat.lossy import LossyPublication
+
+    said: set[str] = set()
+    async with connect(uri) as ros:
+        sensors = LossyPublication(await ros.advertise(sensors_topic, ARRAY_TYPE if array else SENSORS_TYPE))
+        raw = ros.subscribe(raw_topic, ARRAY_TYPE if array else RAW_TYPE)
+        async for message in raw:
+            try:
+                values, head = read_raw(message.msg, array=array)
+            except BadReadingError as error:
+                if str(error) not in said:
+                    say(f"warning: a message on {raw_topic} is dropped: {error}")
+                    said.add(str(error))
+                continue
+            await sensors.publish(readings_message(normalise(values), head, array=array))
+
+
+app = typer.Typer(rich_markup_mode="rich")
+
+
+@app.command(epilog="Example:  boat-normaliser --uri ws://127.0.0.1:9090")
+def boat_normaliser(
+    uri: Annotated[str, typer.Option(envvar="BM_URI", help="The rosbridge server.")] = "ws://127.0.0.1:9090",
+    raw_topic: Annotated[str, typer.Option(help="Where the raw readings come from.")] = RAW_TOPIC,
+    sensors_topic: Annotated[str, typer.Option(help="Where the whole numbers go.")] = SENSORS_TOPIC,
+    array: Annotated[
+        bool, typer.Option("--array", help="std_msgs/Float64MultiArray in and out instead of boat_msgs.")
+    ] = False,
+    print_msg: Annotated[
+        bool, typer.Option("--print-msg", help="Print boat_msgs' two .msg files and end.")
+    ] = False,
+) -> None:
+    """Turn the boat's raw readings into whole numbers in range: distances 0..100, bearings 0..359 degrees."""
+    if print_msg:
+        print(f"{RAW_MSG}\n{SENSORS_MSG}", end="")
+        return
+    say(f"boat-normaliser: {raw_topic} to {sensors_topic}, {uri}")
+    run(lambda: serve(uri, raw_topic=raw_topic, sensors_topic=sensors_topic, array=array))
+
+
+def main() -> None:
+    """The command `boat-normaliser`."""
+    command(app)
+
+
+if __name__ == "__main__":
+    main()

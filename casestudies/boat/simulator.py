@@ -1,0 +1,161 @@
+"""Stands for Gazebo: a boat that sails from waypoint to waypoint and publishes what its sensors measure."""
+
+import asyncio
+import math
+import random
+import time
+from typing import Annotated
+
+import typer
+
+from casestudies.boat.geometry import (
+    BEACONS,
+    BEARING_SIGMA,
+    MAP_HIGH,
+    MAP_LOW,
+    bearing,
+    distance,
+    distance_sigma,
+)
+from casestudies.boat.messages import (
+    ARRAY_TYPE,
+    MAP_FRAME,
+    RAW_TOPIC,
+    RAW_TYPE,
+    TRUE_POSE_TOPIC,
+    TRUE_POSE_TYPE,
+    readings_message,
+    true_pose,
+)
+from casestudies.running import command, run, say
+
+_SHORE = 2.0  # waypoints keep this far from the map's edge
+_SEEDS = 1_000_000
+
+
+class Boat:
+    """A boat that starts in the middle of the map and is driven along random waypoints (thesis 4.1).
+
+    Two boats with one seed sail the same way and measure the same, step by step.
+    """
+
+    def __init__(self, seed: int, speed: float) -> None:
+        """Put the boat into the middle of the map.
+
+        Args:
+            seed: of the waypoints and of the noise.
+            speed: in map units a second.
+        """
+        self._random = random.Random(seed)
+        self._speed = speed
+        self.x = (MAP_LOW + MAP_HIGH) / 2
+        self.y = (MAP_LOW + MAP_HIGH) / 2
+        self._waypoint = self._next_waypoint()
+
+    def sail(self, seconds: float) -> None:
+        """Go on towards the waypoint, and from there to the next one, for that long."""
+        left = self._speed * seconds
+        while left > 0:
+            to_go = math.dist((self.x, self.y), self._waypoint)
+            if to_go > left:
+                self.x += (self._waypoint[0] - self.x) * left / to_go
+                self.y += (self._waypoint[1] - self.y) * left / to_go
+                return
+            left -= to_go
+            self.x, self.y = self._waypoint
+            self._waypoint = self._next_waypoint()
+
+    def measure(self) -> tuple[float, ...]:
+        """Noisy readings D1, D2, D3 (map units) and B1, B2, B3 (radians), with the model's noise.
+
+        A distance may come out negative or off the scale, a bearing outside one turn: making them fit is the
+        normaliser's work.
+        """
+        ranges = [distance(self.x, self.y, beacon) for beacon in BEACONS]
+        distances = [self._random.gauss(true, distance_sigma(true)) for true in ranges]
+        bearings = [
+            math.radians(self._random.gauss(bearing(self.x, self.y, beacon), BEARING_SIGMA))
+            for beacon in BEACONS
+        ]
+        return (*distances, *bearings)
+
+    def _next_waypoint(self) -> tuple[float, float]:
+        low, high = MAP_LOW + _SHORE, MAP_HIGH - _SHORE
+        return self._random.uniform(low, high), self._random.uniform(low, high)
+
+
+async def simulate(
+    uri: str,
+    *,
+    boat: Boat,
+    rate: float,
+    topic: str = RAW_TOPIC,
+    array: bool = False,
+    count: int | None = None,
+) -> None:
+    """Sail and publish until `count` readings are out (None: for ever).
+
+    Each step publishes the true pose first and then the readings, with the same stamp. While the server is
+    away the boat sails on unheard.
+
+    Args:
+        uri: the rosbridge server's.
+        boat: which boat.
+        rate: steps a second.
+        topic: of the raw readings.
+        array: publish std_msgs/Float64MultiArray instead of `boat_msgs/Raw`.
+        count: how many readings; None for no end.
+
+    Raises:
+        BridgeError: no rosbridge server answers at the URI.
+    """
+    from bridge.client import connect
+
+    from bridge.stamps import header
+    from casestudies.boat.lossy import LossyPublication
+
+    async with connect(uri) as ros:
+        ros_version = await ros.detect_ros_version()
+        poses = LossyPublication(await ros.advertise(TRUE_POSE_TOPIC, TRUE_POSE_TYPE))
+        readings = LossyPublication(await ros.advertise(topic, ARRAY_TYPE if array else RAW_TYPE))
+        begin = time.monotonic()
+        step = 0
+        while count is None or step < count:
+            head = header(time.time_ns(), MAP_FRAME, ros_version)
+            await poses.publish(true_pose(boat.x, boat.y, head))
+            await readings.publish(readings_message(boat.measure(), head, array=array))
+            step += 1
+            boat.sail(1 / rate)
+            await asyncio.sleep(begin + step / rate - time.monotonic())
+
+
+app = typer.Typer(rich_markup_mode="rich")
+
+
+@app.command(epilog="Example:  boat-simulator --uri ws://127.0.0.1:9090 --seed 7 --rate 10")
+def boat_simulator(
+    uri: Annotated[str, typer.Option(envvar="BM_URI", help="The rosbridge server.")] = "ws://127.0.0.1:9090",
+    seed: Annotated[
+        int | None, typer.Option(min=0, help="Of route and noise; by default one is chosen and printed.")
+    ] = None,
+    rate: Annotated[float, typer.Option(min=0.01, max=10_000, help="Readings a second.")] = 10.0,
+    topic: Annotated[str, typer.Option(help="Where the raw readings go.")] = RAW_TOPIC,
+    speed: Annotated[float, typer.Option(min=0.0, help="Of the boat, in map units a second.")] = 40.0,
+    count: Annotated[int | None, typer.Option(min=1, help="End after so many readings.")] = None,
+    array: Annotated[
+        bool, typer.Option("--array", help="Publish std_msgs/Float64MultiArray instead of boat_msgs/Raw.")
+    ] = False,
+) -> None:
+    """Sail a boat about its map: publish noisy ranges and bearings, and the true pose on /boat/true_pose."""
+    chosen = random.SystemRandom().randrange(_SEEDS) if seed is None else seed
+    say(f"boat-simulator: seed {chosen}, {rate:g} readings a second on {topic}, {uri}")
+    run(lambda: simulate(uri, boat=Boat(chosen, speed), rate=rate, topic=topic, array=array, count=count))
+
+
+def main() -> None:
+    """The command `boat-simulator`."""
+    command(app)
+
+
+if __name__ == "__main__":
+    main()
