@@ -1,0 +1,61 @@
+"""Probabilities to codes and back: the values that a cell of `prob_bits` bits can make."""
+
+import numpy as np
+import numpy.typing as npt
+
+from machines.errors import ParameterError
+from machines.parameters import PROB_BITS_MAX
+
+
+def encode_probability(p: npt.ArrayLike, prob_bits: int) -> npt.NDArray[np.uint16]:
+    """The code of the nearest probability that a cell can make; ties go up.
+
+    A cell of W bits makes k / 2**W for 0 <= k <= 2**W - 2, and 1 with the all-ones code.
+
+    Args:
+        p: Probabilities from 0 to 1, of any shape.
+        prob_bits: Bits of a code (W), 1 to 16.
+
+    Returns:
+        uint16 codes, of the same shape.
+
+    Raises:
+        ParameterError: A probability is not from 0 to 1 (or is NaN), or there are no codes of so many bits.
+    """
+    _check_bits(prob_bits)
+    probabilities = np.asarray(p, dtype=np.float64)
+    if not ((probabilities >= 0) & (probabilities <= 1)).all():
+        raise ParameterError("A probability that is to be encoded is not a number from 0 to 1.")
+    ones = (1 << prob_bits) - 1
+    scaled = probabilities * (1 << prob_bits)  # exact: a power of two
+    below = np.floor(scaled)
+    # `floor(x + 0.5)` would send the float just below one half up; the remainder is exact.
+    nearest = np.minimum(below + (scaled - below >= 0.5), ones - 1)
+    # The step from (2**W - 2) / 2**W to 1 is twice as wide: its middle is (2**W - 1) / 2**W.
+    return np.where(scaled >= ones, ones, nearest).astype(np.uint16)
+
+
+def decode_code(codes: npt.ArrayLike, prob_bits: int) -> npt.NDArray[np.float64]:
+    """The probability that a cell with this code makes: code / 2**W, and 1 for the all-ones code.
+
+    Args:
+        codes: Codes of any shape.
+        prob_bits: Bits of a code (W), 1 to 16.
+
+    Returns:
+        float64 probabilities, of the same shape.
+
+    Raises:
+        ParameterError: A code has more bits, or there are no codes of so many bits.
+    """
+    _check_bits(prob_bits)
+    array = np.asarray(codes)
+    ones = (1 << prob_bits) - 1
+    if array.dtype.kind not in "ui" or not ((array >= 0) & (array <= ones)).all():
+        raise ParameterError(f"A code that is to be decoded is no integer from 0 to {ones}.")
+    return np.where(array == ones, 1.0, array / (1 << prob_bits))
+
+
+def _check_bits(prob_bits: int) -> None:
+    if not 1 <= prob_bits <= PROB_BITS_MAX:
+        raise ParameterError(f"prob_bits is {prob_bits}; it must be from 1 to {PROB_BITS_MAX}.")

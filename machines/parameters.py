@@ -1,0 +1,172 @@
+"""What a BM1 is built with: sizes, widths and random number generators (thesis 2.1.2)."""
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Final
+
+from machines.errors import ParameterError
+
+PROB_BITS_MAX: Final = 16
+"""Widest code, in bits: tables hold uint16."""
+
+ADDRESS_BITS_MAX: Final = 16
+"""Widest address of a sensor or prior table, in bits: 65,536 rows of one code per line."""
+
+COUNTER_BITS_MAX: Final = 32
+"""Widest counter, in bits: a result register holds 32."""
+
+
+class RngKind(StrEnum):
+    """How a column makes its random numbers. `machines.rng` says how each one works."""
+
+    LFSR8 = "lfsr8"
+    LFSR16 = "lfsr16"
+    LFSR24 = "lfsr24"
+    LFSR32 = "lfsr32"
+    TABLE = "table"
+    IDEAL = "ideal"
+
+    @property
+    def lfsr_bits(self) -> int | None:
+        """Width of the LFSR's state in bits; None where the kind is no LFSR."""
+        return _LFSR_BITS.get(self)
+
+
+_LFSR_BITS: Final = {RngKind.LFSR8: 8, RngKind.LFSR16: 16, RngKind.LFSR24: 24, RngKind.LFSR32: 32}
+
+
+class RngReset(StrEnum):
+    """Where a new frame's random numbers start: at the bank that it names, or where they are (`free`)."""
+
+    BANK = "bank"
+    FREE = "free"
+
+
+class PriorMode(StrEnum):
+    """Where the prior's codes come from: a table with an address, or one code a line that the host writes."""
+
+    TABLE = "table"
+    WRITTEN = "written"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BM1Parameters:
+    """Parameters of a BM1: a matrix of `lines` lines and `sensors` + 1 columns, column 0 being the prior.
+
+    Attributes:
+        lines: Lines of the matrix, one per value of the searched variable (M in the thesis).
+        sensor_bits: Address bits of each sensor column's table, columns 1..N. The top address of each
+            column stands for a missing reading, so a column of b bits serves 2**b - 1 values.
+        prob_bits: Bits of a code (W), 1 to 16.
+        prior_bits: Address bits of the prior's table; 0 is a table of a single row.
+        prior_mode: `table`, or `written`: the host writes the codes with the start, and the table's single
+            row stands until it does.
+        counter_bits: Bits of a line's counter, 1 to 32.
+        rng: Kind of random number generator. An LFSR must be wider than a code, or its low bits would
+            never all be 0 and code 1 would be dead.
+        shared: One generator per column, shared by all its lines; else one per cell.
+        steps_per_clock: Steps of a generator between two cycles. 0 asks for the default, which takes its
+            place here: for an LFSR the smallest power of two that is not below `prob_bits`, so that every
+            cycle sees fresh bits; 1 for `table` and `ideal`, whose every step is fresh.
+        rng_banks: Sets of seeds that a start can choose from.
+        rng_reset: Whether a start restarts the generators.
+        ideal_seed: Seed of the `ideal` generator, 64 bits.
+
+    Raises:
+        ParameterError: No such machine can be built.
+    """
+
+    lines: int
+    sensor_bits: tuple[int, ...]
+    prob_bits: int = 8
+    prior_bits: int = 0
+    prior_mode: PriorMode = PriorMode.TABLE
+    counter_bits: int = 8
+    rng: RngKind = RngKind.LFSR32
+    shared: bool = True
+    steps_per_clock: int = 0
+    rng_banks: int = 16
+    rng_reset: RngReset = RngReset.BANK
+    ideal_seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Refuse what can't be built, and put the default in the place of `steps_per_clock = 0`."""
+        # A plain string from a file is as good as the member it names; everything after this line sees
+        # members.
+        for name, kind in (("prior_mode", PriorMode), ("rng", RngKind), ("rng_reset", RngReset)):
+            given = getattr(self, name)
+            try:
+                object.__setattr__(self, name, kind(given))
+            except ValueError:
+                allowed = ", ".join(kind)
+                raise ParameterError(f"{name} is {given!r}; it must be one of {allowed}.") from None
+        object.__setattr__(self, "sensor_bits", tuple(self.sensor_bits))
+        _check("lines", self.lines, 1, 2**32 - 1)
+        for column, bits in enumerate(self.sensor_bits, start=1):
+            _check(f"sensor_bits of column {column}", bits, 1, ADDRESS_BITS_MAX)
+        _check("prob_bits", self.prob_bits, 1, PROB_BITS_MAX)
+        _check("prior_bits", self.prior_bits, 0, ADDRESS_BITS_MAX)
+        _check("counter_bits", self.counter_bits, 1, COUNTER_BITS_MAX)
+        _check("steps_per_clock", self.steps_per_clock, 0, 2**32 - 1)
+        _check("rng_banks", self.rng_banks, 1, 2**32 - 1)
+        _check("ideal_seed", self.ideal_seed, 0, 2**64 - 1)
+        if self.prior_mode is PriorMode.WRITTEN and self.prior_bits != 0:
+            raise ParameterError(
+                f"prior_bits is {self.prior_bits} with prior_mode = written; "
+                "a written prior has no address, so it must be 0."
+            )
+        width = self.rng.lfsr_bits
+        if width is not None and width <= self.prob_bits:
+            raise ParameterError(
+                f"{self.rng} is too narrow for prob_bits = {self.prob_bits}: "
+                "the generator must have more bits than a code; "
+                f"use at most {width - 1} bits or a wider generator."
+            )
+        if self.steps_per_clock == 0:
+            steps = 1 if width is None else 1 << (self.prob_bits - 1).bit_length()
+            object.__setattr__(self, "steps_per_clock", steps)
+
+    @property
+    def sensors(self) -> int:
+        """Number of sensor columns (N)."""
+        return len(self.sensor_bits)
+
+    @property
+    def columns(self) -> int:
+        """Number of columns that make bits: the prior and the sensors (N + 1)."""
+        return len(self.sensor_bits) + 1
+
+    @property
+    def prior_addresses(self) -> int:
+        """Number of rows of the prior's table."""
+        return 1 << self.prior_bits
+
+    @property
+    def ones_code(self) -> int:
+        """The all-ones code, which is always 1."""
+        return (1 << self.prob_bits) - 1
+
+    @property
+    def target_count_max(self) -> int:
+        """Highest target count that a counter can reach."""
+        return (1 << self.counter_bits) - 1
+
+    def missing_address(self, column: int) -> int:
+        """Address that stands for a missing reading in sensor column `column` (1..N): the top one.
+
+        Raises:
+            ParameterError: There is no such sensor column.
+        """
+        if not 1 <= column <= self.sensors:
+            raise ParameterError(
+                f"There is no sensor column {column}: this machine's are 1 to {self.sensors}."
+            )
+        return (1 << self.sensor_bits[column - 1]) - 1
+
+
+def _check(name: str, value: object, lowest: int, highest: int) -> None:
+    """Refuse a value that is no integer from `lowest` to `highest`; `name` says whose it is."""
+    if not isinstance(value, int) or isinstance(value, bool):
+        raise ParameterError(f"{name} is {value!r}; it must be an integer.")
+    if not lowest <= value <= highest:
+        raise ParameterError(f"{name} is {value}; it must be from {lowest} to {highest}.")
