@@ -1,0 +1,173 @@
+"""Emulated boards as processes: one alone, or a mini-cluster forked from one that has loaded the kernels."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+from typing import Annotated, NoReturn
+
+import typer
+
+from pcie_shim.board import Misbehaviour, serve_board
+from pcie_shim.endpoint import Endpoint
+from services import options
+from services.command_line import ends_well, make_app, raise_on_signals
+from services.errors import BoardFailedError, SettingsError, StoppedError, exit_code_of
+from services.logs import say
+from services.serving import endpoint_from
+from services.settings import endpoint_in
+from services.supervision import (
+    PARENT_VARIABLE,
+    RESTARTS,
+    RESTARTS_WITHIN,
+    end_with_parent,
+    leave_private_directory,
+)
+
+
+class BoardProcesses:
+    """Boards 0 to n-1, each a process forked from this one."""
+
+    def __init__(self, directory: Path, count: int, restarts: int) -> None:
+        self._endpoints = [endpoint_in(directory, f"board{at}") for at in range(count)]
+        self._restarts = restarts
+        self._started: dict[int, int] = {}
+        self._ends: list[float] = []
+
+    def run(self) -> NoReturn:
+        """Keep the boards running until a signal raises here.
+
+        Raises:
+            BoardFailedError: a board ended and may not be restarted any more.
+        """
+        from machines.kernel import warm_up
+
+        # the children share these pages: four imports of numba would take 1.6 s
+        warm_up()
+        try:
+            for at in range(len(self._endpoints)):
+                self._fork(at)
+            while True:
+                pid, status = os.wait()
+                at = self._started.pop(pid, -1)
+                if at >= 0:
+                    self._ended(at, os.waitstatus_to_exitcode(status))
+        finally:
+            self._end_all()
+            leave_private_directory()
+
+    def _fork(self, at: int) -> None:
+        parent = os.getpid()
+        pid = os.fork()
+        if pid:
+            self._started[pid] = at
+            return
+        code = 1
+        try:
+            os.environ[PARENT_VARIABLE] = str(parent)
+            end_with_parent()
+            serve_board(self._endpoints[at], index=at)
+            code = 0
+        except StoppedError as stopped:
+            code = stopped.exit_code
+        except BaseException as error:  # the fork must never run on in its parent's code
+            code = exit_code_of(error)
+            say(f"error: board {at}: {error}")
+        finally:
+            with contextlib.suppress(Exception):
+                sys.stderr.flush()
+            os._exit(code)
+
+    def _ended(self, at: int, code: int) -> None:
+        how = f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
+        now = time.monotonic()
+        self._ends = [each for each in self._ends if now - each <= RESTARTS_WITHIN] + [now]
+        if len(self._ends) > self._restarts:
+            often = (
+                f", {len(self._ends)} ends of boards within {RESTARTS_WITHIN:.0f} s" if self._restarts else ""
+            )
+            msg = f"board {at} {how}{often}"
+            raise BoardFailedError(msg)
+        say(f"board {at} {how}; restarting it")
+        self._fork(at)
+
+    def _end_all(self) -> None:
+        for pid in self._started:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGTERM)
+        deadline = time.monotonic() + 2
+        while self._started and time.monotonic() < deadline:
+            with contextlib.suppress(ChildProcessError):
+                pid, _ = os.waitpid(-1, os.WNOHANG)
+                self._started.pop(pid, None)
+                if not pid:
+                    time.sleep(0.005)
+                continue
+            break
+        for pid in self._started:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+        for at in range(len(self._endpoints)):
+            self._forget(self._endpoints[at])
+
+    def _forget(self, endpoint: Endpoint) -> None:
+        # a board that was killed could not take its sockets away
+        if endpoint.path is not None:
+            path = Path(endpoint.path)
+            for each in (path, path.with_suffix(".program.sock")):
+                with contextlib.suppress(OSError):
+                    each.unlink()
+
+
+app = make_app(
+    "Emulate boards of the mini-cluster. They start blank; pcie-app or the loader programs them.\n\n"
+    "`board --listen unix:/tmp/b/board0.sock` is one board; `board --boards 4 --directory /tmp/b` is four, "
+    "each a process of its own."
+)
+
+
+@app.command()
+@ends_well
+def board(
+    listen: options.Listen = None,
+    index: Annotated[int, typer.Option(min=0, help="The board's number, for its messages.")] = 0,
+    boards: Annotated[int | None, typer.Option(min=1, max=64, help="Start this many boards.")] = None,
+    directory: Annotated[
+        Path | None, typer.Option(help="Where their sockets go: board0.sock, board1.sock, ...")
+    ] = None,
+    restarts: Annotated[
+        int, typer.Option(min=0, help="Restarts of boards within 60 s before it gives up.")
+    ] = RESTARTS,
+    misbehave: Annotated[
+        str, typer.Option(help="For tests: one of the misbehaviours listed in docs/boards.md.")
+    ] = "",
+) -> int:
+    """Emulate boards of the mini-cluster."""
+    end_with_parent()
+    raise_on_signals()
+    if (listen is None) == (boards is None):
+        msg = "give either --listen ENDPOINT for one board, or --boards N --directory DIR for several"
+        raise SettingsError(msg)
+    if boards is not None:
+        if directory is None or not directory.is_dir():
+            msg = f"--directory {directory or ''} is no folder; name one for the boards' sockets"
+            raise SettingsError(msg)
+        BoardProcesses(directory, boards, restarts).run()
+    try:
+        wrong = Misbehaviour.parse(misbehave) if misbehave else None
+    except ValueError as error:
+        raise SettingsError(str(error)) from error
+    from machines.kernel import warm_up
+
+    warm_up()
+    serve_board(endpoint_from(listen or "", "--listen"), index=index, misbehave=wrong)
+    return 0
+
+
+def main() -> None:
+    """Entry point of the command `board`."""
+    app()

@@ -1,0 +1,121 @@
+"""How every command starts and ends: signals, one sentence for an error, the exit code."""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import os
+import signal
+import sys
+import traceback
+from collections.abc import Callable, Coroutine
+from typing import Any, NoReturn, ParamSpec
+
+import typer
+import uvloop
+
+from services.errors import ExitCode, StoppedError, exit_code_of
+from services.logs import say
+
+Parameters = ParamSpec("Parameters")
+
+_SIGNALS = {
+    signal.SIGINT: (ExitCode.INTERRUPTED, "interrupted (Ctrl-C)"),
+    signal.SIGTERM: (ExitCode.TERMINATED, "asked to end (SIGTERM)"),
+    signal.SIGHUP: (ExitCode.HANGUP, "the terminal was closed (SIGHUP)"),
+}
+
+
+def make_app(help_text: str) -> typer.Typer:
+    """A command's typer application, without tracebacks of typer's own."""
+    return typer.Typer(
+        help=help_text,
+        add_completion=True,
+        pretty_exceptions_enable=False,
+        rich_markup_mode="markdown",
+        context_settings={"help_option_names": ["-h", "--help"]},
+    )
+
+
+def ends_well(command: Callable[Parameters, int | None]) -> Callable[Parameters, None]:
+    """Wrap a command so that errors become one sentence and an exit code.
+
+    Only an exception that is none of ours (a bug) shows a traceback; it exits 1.
+    """
+
+    @functools.wraps(command)
+    def run(*args: Parameters.args, **kwargs: Parameters.kwargs) -> None:
+        try:
+            code = command(*args, **kwargs) or ExitCode.DONE
+        except KeyboardInterrupt:
+            code = ExitCode.INTERRUPTED
+            say("interrupted (Ctrl-C)")
+        except BrokenPipeError:
+            # whoever read our output has what it wanted (as `| head` does)
+            code = ExitCode.DONE
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        except Exception as error:
+            code = exit_code_of(error)
+            if code == ExitCode.BUG:
+                say(traceback.format_exc().rstrip())
+                say("error: this is a bug in rosbayes; please report it with the lines above")
+            elif isinstance(error, StoppedError):
+                say(str(error))
+            else:
+                say(f"error: {error}")
+        raise typer.Exit(int(code))
+
+    return run
+
+
+def run_async(main: Coroutine[Any, Any, int | None]) -> int:
+    """Run a service's coroutine on uvloop until it ends or a signal asks it to.
+
+    A signal cancels the coroutine, which then has its `finally` clauses to clean up.
+
+    Returns:
+        The coroutine's exit code.
+
+    Raises:
+        StoppedError: a signal ended it.
+    """
+
+    async def guarded() -> int:
+        task = asyncio.ensure_future(main)
+        stopped: list[signal.Signals] = []
+
+        def stop(number: signal.Signals) -> None:
+            if not stopped:
+                stopped.append(number)
+                task.cancel()
+
+        loop = asyncio.get_running_loop()
+        for number in _SIGNALS:
+            loop.add_signal_handler(number, stop, number)
+        try:
+            code = await task
+        except asyncio.CancelledError:
+            if not stopped:
+                raise
+        else:
+            if not stopped:
+                return int(code or 0)
+        raise StoppedError(*_SIGNALS[stopped[0]])
+
+    with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
+        return runner.run(guarded())
+
+
+def raise_on_signals() -> None:
+    """For a process with one blocking thread: a signal raises StoppedError where the thread stands.
+
+    A second signal while the first is being handled is ignored: cleaning up is bounded anyway.
+    """
+
+    def stop(number: int, _frame: object) -> NoReturn:
+        for each in _SIGNALS:
+            signal.signal(each, signal.SIG_IGN)
+        raise StoppedError(*_SIGNALS[signal.Signals(number)])
+
+    for number in _SIGNALS:
+        signal.signal(number, stop)

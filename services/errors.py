@@ -1,0 +1,106 @@
+"""What can go wrong in a service, and the exit code that each failure ends with."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+
+class ExitCode(IntEnum):
+    """Exit codes of every command (see docs/commands.md)."""
+
+    DONE = 0
+    BUG = 1
+    USAGE = 2
+    ROSBRIDGE = 3
+    VARIABLE = 4
+    BOARD = 5
+    CHILD = 6
+    HANGUP = 129
+    INTERRUPTED = 130
+    TERMINATED = 143
+
+
+class ServiceError(Exception):
+    """Root of the services' errors; its text is one sentence for the user.
+
+    Attributes:
+        exit_code: what the command exits with when this error ends it.
+    """
+
+    exit_code: int = ExitCode.USAGE
+
+
+class SettingsError(ServiceError):
+    """A flag, an environment variable or a value in the configuration is wrong."""
+
+
+class InputLineError(ServiceError):
+    """A line on standard input is not what the command reads."""
+
+
+class LocalSocketError(ServiceError):
+    """A local socket can't be made, or what came over it is no message of ours."""
+
+    exit_code = ExitCode.CHILD
+
+
+class OtherPeerError(ServiceError):
+    """The process at the other end of a local socket is not the one that belongs there."""
+
+
+class NoDataError(ServiceError):
+    """A topic stayed silent longer than it may."""
+
+    exit_code = ExitCode.ROSBRIDGE
+
+
+class RosbridgeLostError(ServiceError):
+    """The rosbridge server went away in a run that does not wait for it."""
+
+    exit_code = ExitCode.ROSBRIDGE
+
+
+class VariableError(ServiceError):
+    """A variable is missing in a message, or its value can't be used."""
+
+    exit_code = ExitCode.VARIABLE
+
+
+class BoardFailedError(ServiceError):
+    """A board failed, or failed too often."""
+
+    exit_code = ExitCode.BOARD
+
+
+class ChildDiedError(ServiceError):
+    """A process that the master started ended when it should not have, or too often."""
+
+    exit_code = ExitCode.CHILD
+
+
+class OverflowedQueueError(ServiceError):
+    """With `queue = all`, frames came in faster than they could be computed."""
+
+    exit_code = ExitCode.CHILD
+
+
+class StoppedError(ServiceError):
+    """A signal asked the process to end; not a failure, but no success either."""
+
+    def __init__(self, exit_code: int, sentence: str) -> None:
+        super().__init__(sentence)
+        self.exit_code = exit_code
+
+
+class ReportedError(ServiceError):
+    """A failure that another process put into words; it keeps that process's exit code."""
+
+    def __init__(self, exit_code: int, sentence: str) -> None:
+        super().__init__(sentence)
+        self.exit_code = exit_code
+
+
+def exit_code_of(error: BaseException) -> int:
+    """The exit code of any package's error; a bug (1) for an exception that is none of ours."""
+    code = getattr(error, "exit_code", ExitCode.BUG)
+    return int(code) if isinstance(code, int) else int(ExitCode.BUG)

@@ -1,0 +1,183 @@
+"""Frames: when readings from one or several topics are complete, and what waits while a frame is computed.
+
+No socket and no clock here: messages go in, complete sets of addresses come out.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
+
+from bridge.errors import BridgeError
+from bridge.fields import Field
+from bridge.stamps import header_stamp_ns
+from services.errors import OverflowedQueueError, VariableError
+from toolchain.address import to_address
+from toolchain.deployment import Deployment, Variable
+from toolchain.errors import ReadingError
+
+QUEUE_ALL_DEPTH = 256
+"""Frames that wait with `queue = all` before the run says which part is too slow."""
+
+UNPAIRED_DEPTH = 64
+"""Messages kept per topic while those of the other topics are awaited."""
+
+Item = TypeVar("Item")
+
+
+@dataclass(frozen=True, slots=True)
+class CompleteReading:
+    """One address per sensor column (None: missing), with the newest stamp or receipt of its messages."""
+
+    addresses: list[int | None]
+    stamp_ns: int
+    received_ns: int
+    received_tick: int
+
+
+@dataclass(frozen=True, slots=True)
+class _Message:
+    stamp_ns: int
+    received_ns: int
+    received_tick: int
+    addresses: tuple[int | None, ...]
+
+
+class _SourceReader:
+    """Takes the variables of one topic out of its messages."""
+
+    def __init__(self, variables: Sequence[Variable], topic: str) -> None:
+        self._fields = [(variable, Field(variable.path or variable.name)) for variable in variables]
+        self._topic = topic
+        self.optional = all(variable.on_missing == "missing" for variable in variables)
+
+    def read(self, message: dict[str, Any]) -> tuple[int | None, ...]:
+        addresses: list[int | None] = []
+        for variable, field in self._fields:
+            try:
+                present, value = field.value(message)
+                if not present and variable.on_missing == "error":
+                    raise field.missing(message)  # noqa: TRY301 - told like the other two, with the topic's name
+                addresses.append(to_address(variable, value))
+            except (BridgeError, ReadingError) as error:
+                sentence = f"{self._topic}: {error}"
+                raise VariableError(sentence) from error
+        return tuple(addresses)
+
+
+class FrameAssembler:
+    """Turns the messages of a deployment's topics into complete readings.
+
+    With one topic every message makes a frame. With several, messages are paired by stamp: a frame is
+    complete when each topic that may not be missing has a fresh message within the deployment's tolerance of
+    the newest arrival; a message that finds no partner is counted in `unpaired`.
+    """
+
+    def __init__(self, deployment: Deployment) -> None:
+        count = len(deployment.sources)
+        self._columns: list[list[int]] = [
+            [at for at, variable in enumerate(deployment.variables) if variable.source == source]
+            for source in range(count)
+        ]
+        self._readers = [
+            _SourceReader([deployment.variables[at] for at in columns], deployment.sources[source].topic)
+            for source, columns in enumerate(self._columns)
+        ]
+        everything_optional = all(reader.optional for reader in self._readers)
+        self._needed = [
+            bool(columns) and (not reader.optional or (everything_optional and count == 1))
+            for columns, reader in zip(self._columns, self._readers, strict=True)
+        ]
+        self._width = len(deployment.variables)
+        self._tolerance_ns = int(deployment.tolerance_s * 1e9)
+        self._fresh: list[deque[_Message]] = [deque() for _ in range(count)]
+        self.unpaired = 0
+
+    def take(
+        self, source: int, message: dict[str, Any], received_ns: int, received_tick: int
+    ) -> CompleteReading | None:
+        """One message of one source; the frame that it completes, if any.
+
+        Args:
+            source: index of the message's source in the deployment.
+            message: the ROS message as it came.
+            received_ns: Unix time of its receipt.
+            received_tick: monotonic time of its receipt, ns.
+
+        Raises:
+            VariableError: a variable is missing or unusable; the sentence names topic and variable.
+        """
+        stamp = header_stamp_ns(message)
+        taken = _Message(
+            received_ns if stamp is None else stamp,
+            received_ns,
+            received_tick,
+            self._readers[source].read(message),
+        )
+        if len(self._fresh) == 1:
+            return CompleteReading(list(taken.addresses), taken.stamp_ns, received_ns, received_tick)
+        queue = self._fresh[source]
+        if len(queue) == UNPAIRED_DEPTH:
+            queue.popleft()
+            self.unpaired += 1
+        queue.append(taken)
+        return self._pair(source, taken)
+
+    def _pair(self, newest: int, arrived: _Message) -> CompleteReading | None:
+        chosen: dict[int, _Message] = {newest: arrived}
+        for source, queue in enumerate(self._fresh):
+            if source == newest:
+                continue
+            near = min(queue, key=lambda each: abs(each.stamp_ns - arrived.stamp_ns), default=None)
+            if near is not None and abs(near.stamp_ns - arrived.stamp_ns) <= self._tolerance_ns:
+                chosen[source] = near
+            elif self._needed[source]:
+                return None
+        addresses: list[int | None] = [None] * self._width
+        for source, message in chosen.items():
+            for column, address in zip(self._columns[source], message.addresses, strict=True):
+                addresses[column] = address
+            queue = self._fresh[source]
+            while queue:
+                if queue.popleft() is message:
+                    break
+                self.unpaired += 1
+        latest = max(chosen.values(), key=lambda each: each.stamp_ns)
+        last = max(chosen.values(), key=lambda each: each.received_tick)
+        return CompleteReading(addresses, latest.stamp_ns, last.received_ns, last.received_tick)
+
+
+class WaitingFrames(Generic[Item]):
+    """What waits while the boards compute: the newest frame, or all in order up to a bound."""
+
+    def __init__(self, queue: str) -> None:
+        self._keep_all = queue == "all"
+        self._waiting: deque[Item] = deque()
+        self.passed_over = 0
+
+    def put(self, frame: Item) -> None:
+        """Add a frame.
+
+        Raises:
+            OverflowedQueueError: with `queue = all`, 256 frames wait already.
+        """
+        if self._keep_all:
+            if len(self._waiting) >= QUEUE_ALL_DEPTH:
+                msg = (
+                    f"{QUEUE_ALL_DEPTH} frames wait for the boards and more come in: the boards (pcie-app) are the slow part; "
+                    "publish more slowly, lower the target count, or use queue = latest"
+                )
+                raise OverflowedQueueError(msg)
+        elif self._waiting:
+            self._waiting.clear()
+            self.passed_over += 1
+        self._waiting.append(frame)
+
+    def get(self) -> Item | None:
+        """The next frame to compute, or None."""
+        return self._waiting.popleft() if self._waiting else None
+
+    def __len__(self) -> int:
+        return len(self._waiting)

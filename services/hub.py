@@ -1,0 +1,50 @@
+"""The hub as a command: the embedded rosbridge server, where no robot runs one."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Annotated
+
+import typer
+
+from bridge.hub.server import serve_hub
+from services.command_line import ends_well, make_app, run_async
+from services.errors import SettingsError
+from services.logs import say
+from services.supervision import end_with_parent
+
+app = make_app(
+    "Serve rosbridge without ROS: topics, services between clients, and rosapi.\n\n`hub --port 9090`\n\n"
+    "It knows no passwords: on another address than this machine's own, whoever reaches it may publish."
+)
+
+
+@app.command()
+@ends_well
+def hub(
+    host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port; 0 takes any free one.")] = 9090,
+    insecure: Annotated[
+        bool, typer.Option("--insecure", help="Say that another address than loopback is meant.")
+    ] = False,
+) -> int:
+    """Serve rosbridge without ROS."""
+    end_with_parent()
+    if host not in {"127.0.0.1", "::1", "localhost"} and not insecure:
+        msg = f"--host {host} lets everybody on that network publish to your robot, and the hub knows no passwords; add --insecure if that is meant"
+        raise SettingsError(msg)
+
+    def ready(at: int) -> None:
+        shown = f"[{host}]" if ":" in host else host
+        say(f"hub: listening on ws://{shown}:{at}")
+
+    async def serve() -> int:
+        await serve_hub(host, port, on_ready=ready, stop=asyncio.Event())
+        return 0
+
+    return run_async(serve())
+
+
+def main() -> None:
+    """Entry point of the command `hub`."""
+    app()

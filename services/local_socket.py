@@ -1,0 +1,282 @@
+"""Local sockets between services: length-prefixed MessagePack records, and the greeting.
+
+A frame is four bytes of length (little-endian) and that many bytes of MessagePack. The core knows no
+socket; an asyncio shell and a blocking one stand around it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import socket
+import struct
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Self
+
+import msgspec
+
+from pcie_shim.endpoint import Endpoint
+from services.errors import LocalSocketError, OtherPeerError
+from services.records import AnyRecord, Hello, Record
+from services.version import VERSION
+
+MAX_RECORD = 4 * 1024 * 1024
+"""Bytes of the largest record: 64 boards of 4096 counts fit with room to spare."""
+
+_LENGTH = struct.Struct("<I")
+_encoder = msgspec.msgpack.Encoder()
+_decoder: msgspec.msgpack.Decoder[AnyRecord] = msgspec.msgpack.Decoder(AnyRecord)
+
+
+def encode_record(record: Record) -> bytes:
+    """The bytes of one framed record.
+
+    Raises:
+        LocalSocketError: the record is larger than MAX_RECORD.
+    """
+    body = _encoder.encode(record)
+    if len(body) > MAX_RECORD:
+        msg = f"a {type(record).__name__} record has {len(body)} bytes, more than the {MAX_RECORD} that a local socket takes"
+        raise LocalSocketError(msg)
+    return _LENGTH.pack(len(body)) + body
+
+
+class RecordSplitter:
+    """Bytes in, records out. Keeps what is incomplete until the rest has come."""
+
+    def __init__(self, peer: str) -> None:
+        self._peer = peer
+        self._pending = bytearray()
+
+    def feed(self, data: bytes) -> list[AnyRecord]:
+        """The records that `data` completes, in order.
+
+        Raises:
+            LocalSocketError: a length beyond MAX_RECORD, or bytes that are no record.
+        """
+        pending = self._pending
+        pending += data
+        records: list[AnyRecord] = []
+        at = 0
+        while len(pending) - at >= _LENGTH.size:
+            (length,) = _LENGTH.unpack_from(pending, at)
+            if length > MAX_RECORD:
+                msg = f"{self._peer} announced a record of {length} bytes; {MAX_RECORD} is the limit, so it is no service of rosbayes"
+                raise LocalSocketError(msg)
+            end = at + _LENGTH.size + length
+            if len(pending) < end:
+                break
+            try:
+                records.append(_decoder.decode(memoryview(pending)[at + _LENGTH.size : end]))
+            except (msgspec.MsgspecError, RecursionError) as error:
+                msg = f"{self._peer} sent bytes that are no record of rosbayes ({error})"
+                raise LocalSocketError(msg) from error
+            at = end
+        del pending[:at]
+        return records
+
+
+def own_hello(role: str, deployment_hash: str) -> Hello:
+    """The greeting of this process."""
+    return Hello(role=role, version=VERSION, deployment_hash=deployment_hash)
+
+
+def check_hello(record: AnyRecord, expected_role: str, deployment_hash: str, where: str) -> None:
+    """Refuse a peer that is someone else, of another version, or serves another model.
+
+    Raises:
+        OtherPeerError: says what was expected and what was found.
+    """
+    if not isinstance(record, Hello):
+        msg = f"{where}: the peer did not greet (a {type(record).__name__} came first); is it a {expected_role}?"
+        raise OtherPeerError(msg)
+    if record.role != expected_role:
+        msg = f"{where}: expected a {expected_role} there, found a {record.role}; check the endpoints"
+        raise OtherPeerError(msg)
+    if record.version != VERSION:
+        msg = f"{where}: the {record.role} is rosbayes {record.version}, this is {VERSION}; run the same version on both sides"
+        raise OtherPeerError(msg)
+    if record.deployment_hash != deployment_hash:
+        msg = (
+            f"{where}: the {record.role} runs deployment {record.deployment_hash[:12] or '(none)'}, "
+            f"this process runs {deployment_hash[:12] or '(none)'}; give both the same deployment"
+        )
+        raise OtherPeerError(msg)
+
+
+def bind(endpoint: Endpoint) -> socket.socket:
+    """A listening socket; a unix one is private (0600) and replaces a dead one of the same name.
+
+    Raises:
+        LocalSocketError: the address is taken or can't be bound.
+    """
+    try:
+        if endpoint.path is None:
+            listener = socket.create_server((endpoint.host, endpoint.port), reuse_port=False)
+        else:
+            path = Path(endpoint.path)
+            _remove_dead_socket(path)
+            listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+            mask = os.umask(0o177)
+            try:
+                listener.bind(str(path))
+            finally:
+                os.umask(mask)
+            listener.listen(8)
+    except OSError as error:
+        msg = f"can't listen on {endpoint}: {error.strerror or error}; is another process using it?"
+        raise LocalSocketError(msg) from error
+    return listener
+
+
+def _remove_dead_socket(path: Path) -> None:
+    if not path.is_socket():
+        return
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+        probe.settimeout(1)
+        try:
+            probe.connect(str(path))
+        except OSError:
+            path.unlink(missing_ok=True)
+
+
+def unlink(endpoint: Endpoint) -> None:
+    """Take a unix endpoint's file away; nothing for TCP."""
+    if endpoint.path is not None:
+        with contextlib.suppress(OSError):
+            Path(endpoint.path).unlink()
+
+
+class RecordProtocol(asyncio.Protocol):
+    """One local connection under asyncio: records go to a callback, without a task in between."""
+
+    def __init__(
+        self,
+        where: str,
+        on_record: Callable[[RecordProtocol, AnyRecord], None],
+        on_open: Callable[[RecordProtocol], None],
+        on_close: Callable[[RecordProtocol, Exception | None], None],
+    ) -> None:
+        self.where = where
+        self._splitter = RecordSplitter(where)
+        self._on_record = on_record
+        self._on_open = on_open
+        self._on_close = on_close
+        self._transport: asyncio.Transport | None = None
+        self._failure: Exception | None = None
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """asyncio's: the socket is open."""
+        assert isinstance(transport, asyncio.Transport)  # noqa: S101 - tells mypy what a stream socket gives
+        self._transport = transport
+        sock = transport.get_extra_info("socket")
+        if sock is not None and sock.family != socket.AF_UNIX:
+            sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._on_open(self)
+
+    def data_received(self, data: bytes) -> None:
+        """asyncio's: bytes came."""
+        try:
+            for record in self._splitter.feed(data):
+                self._on_record(self, record)
+        except (LocalSocketError, OtherPeerError) as error:
+            self._failure = error
+            self.close()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """asyncio's: the socket is closed."""
+        self._transport = None
+        self._on_close(self, self._failure or exc)
+
+    @property
+    def backlog(self) -> int:
+        """Bytes written that the peer has not taken yet."""
+        return 0 if self._transport is None else self._transport.get_write_buffer_size()
+
+    def send(self, record: Record) -> bool:
+        """Write a record; False if the connection is gone."""
+        if self._transport is None or self._transport.is_closing():
+            return False
+        self._transport.write(encode_record(record))
+        return True
+
+    def close(self) -> None:
+        """Close after what was written has gone out."""
+        if self._transport is not None:
+            self._transport.close()
+
+
+async def open_connection(endpoint: Endpoint, make: Callable[[], RecordProtocol]) -> RecordProtocol:
+    """Connect once; raises OSError like the socket would."""
+    loop = asyncio.get_running_loop()
+    if endpoint.path is None:
+        _, protocol = await loop.create_connection(make, endpoint.host, endpoint.port)
+    else:
+        _, protocol = await loop.create_unix_connection(make, endpoint.path)
+    return protocol
+
+
+class BlockingRecordSocket:
+    """The same connection for a process with one blocking thread."""
+
+    def __init__(self, sock: socket.socket, where: str, *, send_timeout: float = 10.0) -> None:
+        self._sock = sock
+        self._where = where
+        self._splitter = RecordSplitter(where)
+        self._send_timeout = send_timeout
+        if sock.family != socket.AF_UNIX:
+            sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        sock.setblocking(False)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def fileno(self) -> int:
+        """For selectors."""
+        return self._sock.fileno()
+
+    def receive(self) -> list[AnyRecord] | None:
+        """What has come so far, possibly nothing; None when the peer has closed.
+
+        Raises:
+            LocalSocketError: what came is no record.
+        """
+        try:
+            data = self._sock.recv(1 << 18)
+        except (BlockingIOError, InterruptedError):
+            return []
+        except OSError:
+            return None
+        return self._splitter.feed(data) if data else None
+
+    def send(self, record: Record) -> bool:
+        """Write a record whole; False if the peer is gone or has not read for `send_timeout` seconds."""
+        left = memoryview(encode_record(record))
+        deadline = time.monotonic() + self._send_timeout
+        while left:
+            try:
+                left = left[self._sock.send(left) :]
+            except BlockingIOError:
+                if time.monotonic() > deadline:
+                    return False
+                self._sock.setblocking(True)
+                self._sock.settimeout(max(0.001, deadline - time.monotonic()))
+                try:
+                    left = left[self._sock.send(left) :]
+                except OSError:
+                    return False
+                finally:
+                    self._sock.setblocking(False)
+            except OSError:
+                return False
+        return True
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._sock.close()

@@ -1,0 +1,63 @@
+"""Logs: one line format for every process, on standard error."""
+
+from __future__ import annotations
+
+import os
+import sys
+from typing import Any, TextIO
+
+import structlog
+from structlog.typing import FilteringBoundLogger
+
+
+class _SurvivingStream:
+    """Standard error that may go away: a closed terminal must not end a robot's run by an exception."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        try:
+            return self._stream.write(text)
+        except (OSError, ValueError):
+            return len(text)
+
+    def flush(self) -> None:
+        try:
+            self._stream.flush()
+        except (OSError, ValueError):
+            return
+
+
+def say(text: str) -> None:
+    """A plain line for the user on standard error, even where that has been closed."""
+    stream = _SurvivingStream(sys.stderr)
+    stream.write(text + "\n")
+    stream.flush()
+
+
+def get_logger(role: str) -> FilteringBoundLogger:
+    """The logger of a process; every line says which process, and the frame where there is one.
+
+    Args:
+        role: the process's name, for example "subscriber".
+    """
+    colours = sys.stderr.isatty() and "NO_COLOR" not in os.environ
+    structlog.configure_once(
+        processors=[
+            structlog.processors.add_log_level,
+            structlog.processors.TimeStamper(fmt="%H:%M:%S.%f", utc=False),
+            _short_time,
+            structlog.dev.ConsoleRenderer(colors=colours, pad_event_to=0, pad_level=False),
+        ],
+        wrapper_class=structlog.make_filtering_bound_logger(20),
+        logger_factory=structlog.PrintLoggerFactory(file=_SurvivingStream(sys.stderr)),  # type: ignore[arg-type]  # only write and flush are used
+        cache_logger_on_first_use=True,
+    )
+    logger: FilteringBoundLogger = structlog.get_logger().bind(process=role)
+    return logger
+
+
+def _short_time(_: Any, __: str, event: structlog.typing.EventDict) -> structlog.typing.EventDict:
+    event["timestamp"] = str(event["timestamp"])[:12]
+    return event

@@ -1,0 +1,609 @@
+"""The master: moves readings, frames and results between the processes (thesis 3.3, figure 3.4)."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import shutil
+import sys
+import time
+from collections import Counter, deque
+from pathlib import Path
+from typing import Annotated
+
+import orjson
+import typer
+
+from pcie_shim.endpoint import Endpoint
+from services import options
+from services.command_line import ends_well, make_app, run_async
+from services.errors import (
+    BoardFailedError,
+    ChildDiedError,
+    ExitCode,
+    ReportedError,
+    RosbridgeLostError,
+    ServiceError,
+    SettingsError,
+    VariableError,
+)
+from services.frames import WaitingFrames
+from services.local_socket import RecordProtocol, check_hello, open_connection, own_hello
+from services.logs import get_logger, say
+from services.records import (
+    AnyRecord,
+    Begin,
+    Frame,
+    FrameFailed,
+    FrameResult,
+    Notice,
+    Publish,
+    Published,
+    Reading,
+    Ready,
+    Trouble,
+    Unusable,
+)
+from services.serving import deployment_for, endpoint_from
+from services.settings import Settings, endpoint_in, load_settings
+from services.supervision import (
+    RESTARTS,
+    RESTARTS_WITHIN,
+    Child,
+    end_all,
+    end_with_parent,
+    make_private_directory,
+    own_command,
+)
+from toolchain.deployment import Deployment
+
+ROLE = "master"
+RESULTS_UNDER_WAY = 8
+"""Results that the publisher may have unanswered; then frames wait, and `queue` says which."""
+
+_CONNECT_EVERY = 0.01
+_RECONNECT_PATIENCE = 60.0
+_PROGRESS_EVERY = 1.0
+
+
+class Peer:
+    """One service that the master talks to: its endpoint, its process if it is the master's own, its connection."""
+
+    def __init__(self, role: str, endpoint: Endpoint, child: Child | None) -> None:
+        self.role = role
+        self.endpoint = endpoint
+        self.child = child
+        self.protocol: RecordProtocol | None = None
+        self.greeted = False
+        self.ready = False
+        self.closed = asyncio.Event()
+        self.reason: Exception | None = None
+
+
+class Master:
+    """One run: once or in a loop, over a deployment."""
+
+    def __init__(
+        self, settings: Settings, deployment: Deployment, *, once: bool, count: int | None, json: bool
+    ) -> None:
+        self._settings = settings
+        self._deployment = deployment
+        self._once = once
+        self._count = 1 if once else count
+        self._json = json
+        self._log = get_logger(ROLE)
+        self._waiting: WaitingFrames[tuple[Reading, int]] = WaitingFrames(settings.queue or deployment.queue)
+        self._computing: tuple[Frame, Reading, int, int] | None = None
+        self._under_way = 0
+        self._number = 0
+        self._published = 0
+        self._losses: Counter[str] = Counter()
+        self._told: set[str] = set()
+        self._failures: deque[float] = deque(maxlen=RESTARTS + 1)
+        self._end: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self._began = False
+        self._directory: Path | None = None
+        self._boards: Child | None = None
+        self._peers: dict[str, Peer] = {}
+        self._started = time.monotonic()
+        self._shown = (0.0, 0)
+
+    async def run(self) -> int:
+        """Start what is not running, move frames until the run is over, and end what was started.
+
+        Raises:
+            ServiceError: what ended the run, with its exit code.
+        """
+        tasks: list[asyncio.Task[None]] = []
+        try:
+            self._prepare()
+            if self._boards is not None:
+                self._boards.start()
+                tasks.append(asyncio.ensure_future(self._keep_boards(self._boards)))
+            for peer in self._peers.values():
+                if peer.child is not None:
+                    peer.child.start()
+            tasks.extend(asyncio.ensure_future(self._keep(peer)) for peer in self._peers.values())
+            if sys.stderr.isatty() and not self._once:
+                tasks.append(asyncio.ensure_future(self._show_progress()))
+            await self._end
+        finally:
+            for task in tasks:
+                task.cancel()
+            await self._finish()
+        return ExitCode.DONE
+
+    # --- starting and ending -------------------------------------------------------------------
+
+    def _prepare(self) -> None:
+        settings, deployment = self._settings, self._deployment
+        given = {
+            "subscriber": settings.subscriber,
+            "publisher": settings.publisher,
+            "pcie-app": settings.pcie_app,
+        }
+        if not all(given.values()):
+            self._directory = make_private_directory()
+        directory = self._directory
+        common = ["--deployment", str(settings.deployment)]
+        rosbridge = [*(["--uri", settings.uri] if settings.uri else [])]
+        rosbridge += [
+            "--ros-version",
+            settings.ros_version,
+            "--connect-timeout",
+            str(settings.connect_timeout),
+        ]
+        boards = list(settings.boards)
+        if not given["pcie-app"] and directory is not None:
+            endpoints = [board.endpoint for board in deployment.boards]
+            if not boards and not all(endpoints):
+                boards = [str(endpoint_in(directory, f"board{at}")) for at in range(len(endpoints))]
+                command = [*own_command("board"), "--boards", str(len(boards)), "--directory", str(directory)]
+                command += ["--restarts", "0" if self._once else str(RESTARTS)]
+                self._boards = Child("boards", command, directory=directory)
+        arguments = {
+            "subscriber": [
+                *common,
+                *rosbridge,
+                "--first-data-timeout",
+                str(settings.first_data_timeout),
+                *(["--queue", settings.queue] if settings.queue else []),
+            ],
+            "publisher": [*common, *rosbridge, "--seen-timeout", str(settings.seen_timeout)],
+            "pcie-app": [
+                *common,
+                *(["--boards", ",".join(boards)] if boards else []),
+                *(["--stop", settings.stop] if settings.stop else []),
+                "--peer-timeout",
+                str(settings.peer_timeout),
+                "--board-timeout",
+                str(settings.board_timeout),
+            ],
+        }
+        for role, text in given.items():
+            child = None
+            if text:
+                endpoint = endpoint_from(text, f"--{role}")
+            else:
+                assert directory is not None  # noqa: S101 - made above for whoever has no endpoint
+                endpoint = endpoint_in(directory, role)
+                command = [*own_command(role), "--listen", str(endpoint), *arguments[role]]
+                child = Child(role, command, directory=directory)
+            self._peers[role] = Peer(role, endpoint, child)
+
+    async def _finish(self) -> None:
+        children = [peer.child for peer in self._peers.values() if peer.child is not None]
+        if self._boards is not None:
+            children.append(self._boards)
+        for peer in self._peers.values():
+            if peer.protocol is not None:
+                peer.protocol.close()
+        killed = await end_all(children, self._settings.stop_timeout)
+        if killed:
+            say(
+                f"{' and '.join(killed)} did not end within {self._settings.stop_timeout:g} s and had to be killed"
+            )
+        if self._directory is not None:
+            shutil.rmtree(self._directory, ignore_errors=True)
+        if not self._once:
+            say(self._summary())
+
+    def _summary(self) -> str:
+        elapsed = time.monotonic() - self._started
+        text = f"{self._published} results published in {elapsed:.1f} s"
+        self._losses["passed over"] += self._waiting.passed_over
+        self._waiting.passed_over = 0
+        losses = ", ".join(f"{count} {reason}" for reason, count in self._losses.items() if count)
+        return f"{text}; not published: {losses}" if losses else text
+
+    def _fail(self, error: Exception) -> None:
+        if not self._end.done():
+            self._end.set_exception(error)
+
+    def _done(self) -> None:
+        if not self._end.done():
+            self._end.set_result(None)
+
+    # --- processes -----------------------------------------------------------------------------
+
+    async def _keep_boards(self, boards: Child) -> None:
+        while True:
+            await self._until_exit(boards)
+            failure = boards.failure()
+            if boards.exit_code() == ExitCode.BOARD:
+                self._fail(failure)
+                return
+            if self._once or not boards.may_restart():
+                self._fail(BoardFailedError(f"the boards' process ended: {failure}"))
+                return
+            self._log.warning("the boards' process ended; restarting it", why=str(failure))
+            boards.start()
+
+    async def _until_exit(self, child: Child) -> None:
+        while child.exit_code() is None:
+            child.relay()
+            await asyncio.sleep(0.05)
+        child.relay()
+
+    async def _keep(self, peer: Peer) -> None:
+        try:
+            first = True
+            while True:
+                await self._connect(peer, self._settings.peer_timeout if first else _RECONNECT_PATIENCE)
+                first = False
+                closing = asyncio.ensure_future(peer.closed.wait())
+                while not closing.done():
+                    if peer.child is not None:
+                        peer.child.relay()
+                    await asyncio.wait([closing], timeout=0.05)
+                peer.protocol, peer.ready = None, False
+                self._lost(peer)
+                await self._again(peer)
+        except ServiceError as error:
+            self._fail(error)
+
+    async def _connect(self, peer: Peer, patience: float) -> None:
+        deadline = time.monotonic() + patience
+
+        def make() -> RecordProtocol:
+            return RecordProtocol(
+                f"{peer.role} at {peer.endpoint}",
+                lambda protocol, record: self._take(peer, protocol, record),
+                lambda protocol: self._opened(peer, protocol),
+                lambda protocol, why: self._closed(peer, protocol, why),
+            )
+
+        peer.greeted = False
+        peer.reason = None
+        peer.closed.clear()
+        while True:
+            child = peer.child
+            if child is not None:
+                child.relay()
+                if child.exit_code() is not None:
+                    raise child.failure()
+            try:
+                await open_connection(peer.endpoint, make)
+            except OSError as error:
+                if time.monotonic() > deadline:
+                    msg = f"no {peer.role} answers at {peer.endpoint} within {patience:g} s ({error.strerror or error}); is it running?"
+                    raise ChildDiedError(msg) from error
+                await asyncio.sleep(_CONNECT_EVERY)
+            else:
+                return
+
+    def _lost(self, peer: Peer) -> None:
+        if peer.role == "pcie-app" and self._computing is not None:
+            self._losses["lost with pcie-app"] += 1
+            self._computing = None
+        if peer.role == "publisher" and self._under_way:
+            self._losses["lost with the publisher"] += self._under_way
+            self._under_way = 0
+
+    async def _again(self, peer: Peer) -> None:
+        """After a lost connection: bring the process back, or say why the run is over."""
+        if isinstance(peer.reason, ServiceError):
+            raise peer.reason
+        child = peer.child
+        if child is None:
+            if self._once:
+                msg = f"{peer.role} at {peer.endpoint} closed the connection"
+                raise ChildDiedError(msg)
+            self._log.warning(f"{peer.role} at {peer.endpoint} is gone; waiting for it")
+            return
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(self._until_exit(child), self._settings.stop_timeout)
+        if child.exit_code() is None:
+            child.kill()
+        failure = child.failure()
+        if self._once or getattr(failure, "exit_code", ExitCode.CHILD) != ExitCode.CHILD:
+            raise failure
+        if not child.may_restart():
+            msg = f"{failure}; it was restarted {RESTARTS} times within {RESTARTS_WITHIN:.0f} s before"
+            raise ChildDiedError(msg)
+        self._log.warning(f"{failure}; restarting it")
+        child.start()
+
+    # --- records -------------------------------------------------------------------------------
+
+    def _opened(self, peer: Peer, protocol: RecordProtocol) -> None:
+        peer.protocol = protocol
+        protocol.send(own_hello(ROLE, self._deployment.hash))
+
+    def _closed(self, peer: Peer, protocol: RecordProtocol, why: Exception | None) -> None:
+        if peer.protocol in (protocol, None):
+            peer.reason = why
+            peer.closed.set()
+
+    def _take(self, peer: Peer, protocol: RecordProtocol, record: AnyRecord) -> None:
+        if isinstance(record, Trouble):
+            self._fail(ReportedError(record.exit_code, f"{peer.role}: {record.sentence}"))
+            return
+        if not peer.greeted:
+            check_hello(record, peer.role, self._deployment.hash, f"{peer.role} at {peer.endpoint}")
+            peer.greeted = True
+            return
+        match record:
+            case Ready():
+                self._ready(peer, record)
+            case Notice():
+                self._noticed(record)
+            case Reading():
+                self._read(record)
+            case Unusable():
+                self._unusable(record)
+            case FrameResult():
+                self._computed(record)
+            case FrameFailed():
+                self._frame_failed(record)
+            case Published():
+                self._was_published(record)
+            case _:
+                self._log.warning(
+                    f"{protocol.where} sent a {type(record).__name__}, which is not its to send"
+                )
+
+    def _ready(self, peer: Peer, record: Ready) -> None:
+        peer.ready = True
+        self._log.info(f"{peer.role}: {record.sentence}")
+        subscriber = self._peers["subscriber"]
+        # the publisher advertises before the subscriber subscribes: no result without a topic
+        if not self._began and all(each.ready for each in self._peers.values()):
+            self._began = True
+            for each in self._peers.values():
+                if each.role != "pcie-app" and each.protocol is not None:
+                    each.protocol.send(Begin(self._once))
+        elif self._began and peer.protocol is not None and peer.role != "pcie-app":
+            peer.protocol.send(Begin(self._once))
+        if peer is not subscriber:
+            self._next()
+
+    def _noticed(self, record: Notice) -> None:
+        if record.level == "warning":
+            self._log.warning(record.sentence)
+        else:
+            self._log.info(record.sentence)
+
+    def _read(self, reading: Reading) -> None:
+        if self._once and self._number:
+            return
+        self._losses["passed over"] += reading.passed_over
+        try:
+            self._waiting.put((reading, time.monotonic_ns()))
+        except ServiceError as error:
+            self._fail(error)
+            return
+        self._next()
+
+    def _unusable(self, record: Unusable) -> None:
+        if self._once:
+            self._fail(VariableError(record.sentence))
+            return
+        self._losses["with an unusable variable"] += 1
+        if record.cause not in self._told:
+            self._told.add(record.cause)
+            self._log.warning(f"{record.sentence}; such messages are skipped and counted")
+
+    def _next(self) -> None:
+        app = self._peers["pcie-app"]
+        if self._computing is not None or not app.ready or app.protocol is None:
+            return
+        if self._under_way >= RESULTS_UNDER_WAY or not self._peers["publisher"].ready:
+            return
+        waiting = self._waiting.get()
+        if waiting is None:
+            return
+        reading, arrived = waiting
+        self._number += 1
+        frame = Frame(self._number, reading.addresses, self._number % self._deployment.machine.rng_banks)
+        self._computing = (frame, reading, arrived, time.monotonic_ns())
+        app.protocol.send(frame)
+
+    def _computed(self, result: FrameResult) -> None:
+        computing = self._computing
+        if computing is None or computing[0].number != result.number:
+            return
+        _, reading, arrived, sent = computing
+        self._computing = None
+        publisher = self._peers["publisher"].protocol
+        record = Publish(
+            result=result,
+            stamp_ns=reading.stamp_ns,
+            received_ns=reading.received_ns,
+            received_tick=reading.received_tick,
+            reading_sent_tick=reading.sent_tick,
+            waited_ns=sent - arrived,
+        )
+        if publisher is not None and publisher.send(record):
+            self._under_way += 1
+        else:
+            self._losses["lost with the publisher"] += 1
+        self._next()
+
+    def _frame_failed(self, record: FrameFailed) -> None:
+        if self._computing is not None and self._computing[0].number == record.number:
+            self._computing = None
+        if self._once:
+            self._fail(ReportedError(record.exit_code, record.sentence))
+            return
+        self._losses["failed on a board"] += 1
+        if "is not back yet" not in record.sentence:
+            now = time.monotonic()
+            self._failures.append(now)
+            recent = [each for each in self._failures if now - each <= RESTARTS_WITHIN]
+            if len(recent) > RESTARTS:
+                msg = (
+                    f"{record.sentence}; {len(recent)} frames failed on boards within {RESTARTS_WITHIN:.0f} s"
+                )
+                self._fail(BoardFailedError(msg))
+                return
+            self._log.warning(record.sentence, frame=record.number)
+        self._next()
+
+    def _was_published(self, record: Published) -> None:
+        self._under_way = max(0, self._under_way - 1)
+        if record.outcome == "published":
+            self._published += 1
+            self._print(record)
+            if record.seen is False:
+                say(
+                    f"the result was published, but not seen on the wire within {self._settings.seen_timeout:g} s"
+                )
+        elif self._once:
+            if record.outcome == "no posterior":
+                msg = f"frame {record.number} has no posterior: its readings are impossible for every line of the model; nothing was published"
+                self._fail(VariableError(msg))
+            else:
+                self._fail(RosbridgeLostError("rosbridge went away before the result could be published"))
+            return
+        else:
+            self._losses[record.outcome] += 1
+        if self._count is not None and self._published >= self._count:
+            self._done()
+        else:
+            self._next()
+
+    # --- what the user sees --------------------------------------------------------------------
+
+    def _print(self, record: Published) -> None:
+        cell = self._cell(record.best_line)
+        milliseconds = record.total_ns / 1e6
+        if self._json:
+            line = orjson.dumps(
+                {
+                    "frame": record.number,
+                    "best": cell,
+                    "probability": record.best_probability,
+                    "cycles": record.cycles,
+                    "ms": round(milliseconds, 3),
+                    "seen": record.seen,
+                }
+            )
+            sys.stdout.buffer.write(line + b"\n")
+            sys.stdout.buffer.flush()
+        elif self._once:
+            where = ", ".join(f"{label} = {value:g}" for label, value in cell.items())
+            print(
+                f"frame {record.number}: most probable {where} (p = {record.best_probability:.3g}), "
+                f"{record.cycles} cycles, {milliseconds:.2f} ms",
+                flush=True,
+            )
+
+    def _cell(self, line: int) -> dict[str, float]:
+        cell: dict[str, float] = {}
+        for dimension in reversed(self._deployment.searched):
+            line, index = divmod(line, dimension.size)
+            cell[dimension.label] = dimension.value(index)
+        return dict(reversed(cell.items()))
+
+    async def _show_progress(self) -> None:
+        while True:
+            await asyncio.sleep(_PROGRESS_EVERY)
+            at, count = self._shown
+            now = time.monotonic()
+            if at and self._published != count:
+                rate = (self._published - count) / (now - at)
+                of = f" of {self._count}" if self._count else ""
+                self._log.info(f"{self._published}{of} results, {rate:.0f} a second")
+            self._shown = (now, self._published)
+
+
+async def run_master(
+    settings: Settings, deployment: Deployment, *, once: bool, count: int | None, json: bool
+) -> int:
+    """Run a master until its end (see `Master.run`)."""
+    return await Master(settings, deployment, once=once, count=count, json=json).run()
+
+
+app = make_app(
+    "Move readings to the boards and posteriors back to the robot.\n\n"
+    "`master --once -d build/boat --uri ws://robot:9090` computes one frame; `master --loop` goes on until Ctrl-C.\n\n"
+    "It starts what is not running (subscriber, publisher, pcie-app, emulated boards) and ends it again. "
+    "Exit codes: 0 done, 2 usage or deployment, 3 rosbridge, 4 a variable, 5 a board, 6 a process, 130, 143."
+)
+
+
+@app.command()
+@ends_well
+def master(
+    once: Annotated[bool, typer.Option("--once", help="Compute the first complete frame, then end.")] = False,
+    loop: Annotated[bool, typer.Option("--loop", help="Go on until Ctrl-C, or --count.")] = False,
+    count: options.Count = None,
+    deployment: options.Deployment = None,
+    uri: options.Uri = None,
+    connect: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder with subscriber.sock, publisher.sock and pcie-app.sock of services that already run."
+        ),
+    ] = None,
+    boards: options.Boards = None,
+    queue: options.Queue = None,
+    stop: options.Stop = None,
+    ros_version: options.RosVersion = None,
+    connect_timeout: options.ConnectTimeout = None,
+    first_data_timeout: options.FirstDataTimeout = None,
+    peer_timeout: options.PeerTimeout = None,
+    board_timeout: options.BoardTimeout = None,
+    stop_timeout: options.StopTimeout = None,
+    json: Annotated[bool, typer.Option("--json", help="Print one JSON object per result.")] = False,
+    print_config: Annotated[
+        bool, typer.Option("--print-config", help="Print all settings as they are in force, and end.")
+    ] = False,
+) -> int:
+    """Move readings to the boards and posteriors back to the robot."""
+    end_with_parent()
+    connected = {}
+    if connect is not None:
+        for name in ("subscriber", "publisher", "pcie-app"):
+            connected[name.replace("-", "_")] = str(endpoint_in(connect, name))
+    settings = load_settings(
+        deployment=deployment,
+        uri=uri,
+        boards=boards,
+        queue=queue,
+        stop=stop,
+        ros_version=ros_version,
+        connect_timeout=connect_timeout,
+        first_data_timeout=first_data_timeout,
+        peer_timeout=peer_timeout,
+        board_timeout=board_timeout,
+        stop_timeout=stop_timeout,
+        **connected,
+    )
+    if print_config:
+        print(orjson.dumps(settings.model_dump(mode="json"), option=orjson.OPT_INDENT_2).decode())
+        return ExitCode.DONE
+    if once == loop:
+        msg = "choose one of --once and --loop"
+        raise SettingsError(msg)
+    if once and count is not None:
+        msg = "--count belongs to --loop; --once computes one frame"
+        raise SettingsError(msg)
+    loaded = deployment_for(settings)
+    return run_async(run_master(settings, loaded, once=once, count=count, json=json))
+
+
+def main() -> None:
+    """Entry point of the command `master`."""
+    app()

@@ -1,0 +1,62 @@
+"""The flags that several commands share, each with one meaning."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+Deployment = Annotated[
+    Path | None,
+    typer.Option("--deployment", "-d", help="Folder that `toolchain build` wrote.", metavar="DIR"),
+]
+Uri = Annotated[
+    str | None,
+    typer.Option("--uri", help="rosbridge server, instead of the deployment's.", metavar="ws://HOST:PORT"),
+]
+Listen = Annotated[
+    str | None,
+    typer.Option(
+        "--listen",
+        help="Serve a master at this endpoint instead of standard input and output.",
+        metavar="unix:PATH|tcp://HOST:PORT",
+    ),
+]
+RosVersion = Annotated[
+    str | None, typer.Option("--ros-version", help="How stamps and types are written: auto, 1 or 2.")
+]
+Queue = Annotated[
+    str | None,
+    typer.Option(
+        "--queue", help="What waits while a frame is computed: latest, or all (in order, 256 deep)."
+    ),
+]
+Stop = Annotated[
+    str | None, typer.Option("--stop", help="When boards stop: slices (together) or own (each by itself).")
+]
+Boards = Annotated[
+    str | None,
+    typer.Option(
+        "--boards",
+        help="Boards that already run, comma-separated, in the order of the partitions.",
+        metavar="ENDPOINT,...",
+    ),
+]
+ConnectTimeout = Annotated[
+    float | None, typer.Option("--connect-timeout", help="Seconds to reach the rosbridge server (10).")
+]
+FirstDataTimeout = Annotated[
+    float | None, typer.Option("--first-data-timeout", help="Seconds until the first reading (30).")
+]
+PeerTimeout = Annotated[
+    float | None, typer.Option("--peer-timeout", help="Seconds to reach a local process or a board (10).")
+]
+BoardTimeout = Annotated[
+    float | None,
+    typer.Option("--board-timeout", help="Seconds a board may take beyond max_cycles at its speed (5)."),
+]
+StopTimeout = Annotated[
+    float | None, typer.Option("--stop-timeout", help="Seconds a process has to end (5).")
+]
+Count = Annotated[int | None, typer.Option("--count", "-n", min=1, help="End after this many.")]

@@ -1,0 +1,351 @@
+"""The PCIe application: the only process that drives boards (thesis 3.2, figure 3.3).
+
+One blocking thread serves the master and all boards: a frame comes in, its readings and the start are
+posted to every board, the counts are collected, and the result goes back.
+"""
+
+from __future__ import annotations
+
+import selectors
+import sys
+import time
+from collections.abc import Sequence
+
+import orjson
+
+from machines.bm1 import StopReason
+from pcie_shim.driver import FrameInput, FrameOutput, MiniCluster
+from pcie_shim.endpoint import Endpoint
+from pcie_shim.errors import BoardError, PcieShimError
+from pcie_shim.programming_file import Image, read_image
+from services import options
+from services.command_line import ends_well, make_app, raise_on_signals
+from services.errors import (
+    ExitCode,
+    InputLineError,
+    LocalSocketError,
+    OtherPeerError,
+    SettingsError,
+    exit_code_of,
+)
+from services.local_socket import BlockingRecordSocket, bind, check_hello, own_hello, unlink
+from services.logs import get_logger, say
+from services.records import BoardOutcome, Frame, FrameFailed, FrameResult, Notice, Ready, Record, Trouble
+from services.results import REASON_WORDS, counts_of
+from services.serving import deployment_for, endpoint_from
+from services.settings import Settings, load_settings
+from services.supervision import end_with_parent, leave_private_directory
+from toolchain.deployment import Deployment
+
+ROLE = "pcie-app"
+_TICK = 0.2
+"""Seconds between looks at boards that are gone."""
+
+
+class Boards:
+    """A deployment's boards, opened and programmed; a board that restarts is opened and programmed again."""
+
+    def __init__(self, settings: Settings, deployment: Deployment, endpoints: Sequence[Endpoint]) -> None:
+        self._settings = settings
+        self._machine = deployment.machine
+        self._images: list[Image] = [
+            read_image(deployment.image_path(at)) for at in range(len(deployment.boards))
+        ]
+        self._endpoints = list(endpoints)
+        self._cluster: MiniCluster | None = None
+        self.gone: dict[int, str] = {}
+
+    def open(self) -> str:
+        """Open all boards, programming blank ones; gives a sentence.
+
+        Raises:
+            PcieShimError: a board is not there, holds another image, or does not behave.
+        """
+        self._cluster = MiniCluster.open(
+            self._endpoints,
+            self._images,
+            timeout=self._settings.peer_timeout,
+            board_timeout=self._settings.board_timeout,
+        )
+        return f"{len(self._endpoints)} boards programmed and open"
+
+    def run(self, frame: Frame) -> FrameOutput:
+        """Compute one frame.
+
+        Raises:
+            BoardError: a board failed; it is then in `gone` until `mend` has it back.
+        """
+        if self._cluster is None or self.gone:
+            board, why = next(iter(self.gone.items()))
+            msg = f"board {board} is not back yet ({why})"
+            raise BoardError(msg, board=board)
+        machine = self._machine
+        try:
+            return self._cluster.run(
+                FrameInput(
+                    addresses=tuple(frame.addresses),
+                    target_count=machine.target_count,
+                    max_cycles=machine.max_cycles,
+                    bank=frame.bank,
+                    stop=self._settings.stop or machine.stop,
+                )
+            )
+        except BoardError as error:
+            self.gone[error.board] = str(error)
+            raise
+
+    def look(self) -> list[tuple[int, str]]:
+        """Boards that went away since the last look, with the reason."""
+        if self._cluster is None:
+            return []
+        found = []
+        for board in range(len(self._endpoints)):
+            if board not in self.gone and not self._cluster.alive(board):
+                self.gone[board] = f"board {board} at {self._endpoints[board]} closed its link"
+                found.append((board, self.gone[board]))
+        return found
+
+    def mend(self) -> list[int]:
+        """Try once to open the boards that are gone; the numbers of those that are back.
+
+        Raises:
+            PcieShimError: a board is back with another image; waiting would not help.
+        """
+        back = []
+        for board in list(self.gone):
+            if self._cluster is not None and self._cluster.reopen(board, timeout=_TICK):
+                del self.gone[board]
+                back.append(board)
+        return back
+
+    def close(self) -> None:
+        """Let go of all boards."""
+        if self._cluster is not None:
+            self._cluster.close()
+
+
+def result_record(number: int, output: FrameOutput) -> FrameResult:
+    """The boards' outcome as a record."""
+    return FrameResult(
+        number=number,
+        boards=[
+            BoardOutcome(board.counts.astype("<u4", copy=False).tobytes(), board.cycles, int(board.reason))
+            for board in output.boards
+        ],
+        register_writes_ns=output.register_writes_ns,
+        compute_ns=output.compute_ns,
+        reads_ns=output.reads_ns,
+        boards_compute_ns=output.boards_compute_ns,
+    )
+
+
+class PcieApp:
+    """Serves one master at a time over a local socket."""
+
+    def __init__(self, boards: Boards, deployment_hash: str, endpoint: Endpoint) -> None:
+        self._boards = boards
+        self._hash = deployment_hash
+        self._endpoint = endpoint
+        self._where = f"{ROLE} at {endpoint}"
+        self._master: BlockingRecordSocket | None = None
+        self._greeted = False
+        self._ready: Ready | None = None
+        self._selector = selectors.DefaultSelector()
+        self._log = get_logger(ROLE)
+
+    def serve(self) -> int:
+        """Serve until a signal raises in this thread.
+
+        Raises:
+            PcieShimError: the boards can't be opened, or one came back as another.
+        """
+        listener = bind(self._endpoint)
+        listener.setblocking(False)
+        self._selector.register(listener, selectors.EVENT_READ)
+        try:
+            try:
+                self._ready = Ready(self._boards.open())
+                while True:
+                    for key, _ in self._selector.select(_TICK):
+                        if key.fileobj is listener:
+                            self._accept(listener.accept()[0])
+                        else:
+                            self._receive()
+                    self._look_at_boards()
+            except PcieShimError as error:
+                self._report(listener, Trouble(exit_code_of(error), str(error)))
+                raise
+        finally:
+            self._boards.close()
+            if self._master is not None:
+                self._master.close()
+            listener.close()
+            unlink(self._endpoint)
+            leave_private_directory()
+
+    def _accept(self, sock: object) -> None:
+        connection = BlockingRecordSocket(sock, self._where)  # type: ignore[arg-type]  # what accept() gives
+        if self._master is not None:
+            connection.send(Trouble(ExitCode.USAGE, f"the {self._where} serves another master already"))
+            connection.close()
+            return
+        self._master = connection
+        self._greeted = False
+        self._selector.register(connection, selectors.EVENT_READ)
+        connection.send(own_hello(ROLE, self._hash))
+
+    def _drop(self) -> None:
+        if self._master is not None:
+            self._selector.unregister(self._master)
+            self._master.close()
+            self._master = None
+
+    def _send(self, record: Record) -> None:
+        if self._master is not None and self._greeted and not self._master.send(record):
+            self._drop()
+
+    def _report(self, listener: object, trouble: Trouble) -> None:
+        # a master that started with us may need a moment to connect
+        deadline = time.monotonic() + 2
+        while not self._greeted and time.monotonic() < deadline:
+            for key, _ in self._selector.select(0.05):
+                if key.fileobj is listener:
+                    self._accept(listener.accept()[0])  # type: ignore[attr-defined]  # it is the listening socket
+                else:
+                    self._receive()
+        self._send(trouble)
+
+    def _receive(self) -> None:
+        master = self._master
+        if master is None:
+            return
+        try:
+            records = master.receive()
+            if records is None:
+                self._drop()
+                return
+            for record in records:
+                if not self._greeted:
+                    check_hello(record, "master", self._hash, self._where)
+                    self._greeted = True
+                    if self._ready is not None:
+                        self._send(self._ready)
+                elif isinstance(record, Frame):
+                    self._compute(record)
+        except (LocalSocketError, OtherPeerError) as error:
+            master.send(Trouble(error.exit_code, str(error)))
+            self._drop()
+
+    def _compute(self, frame: Frame) -> None:
+        try:
+            output = self._boards.run(frame)
+        except BoardError as error:
+            self._log.warning(str(error), frame=frame.number)
+            self._send(FrameFailed(frame.number, error.board, exit_code_of(error), str(error)))
+        else:
+            self._send(result_record(frame.number, output))
+
+    def _look_at_boards(self) -> None:
+        for _board, why in self._boards.look():
+            self._send(Notice("warning", f"{why}; waiting for it"))
+        for board in self._boards.mend():
+            self._send(Notice("info", f"board {board} is back, programmed"))
+
+
+def compute_lines(boards: Boards, banks: int) -> int:
+    """Alone: compute the readings that come on standard input, one JSON object a line.
+
+    Raises:
+        InputLineError: a line is no reading.
+        BoardError: a board failed.
+    """
+    say(boards.open())
+    try:
+        for number, line in enumerate(sys.stdin.buffer, 1):
+            try:
+                addresses = orjson.loads(line)["addresses"]
+                frame = Frame(
+                    number, [None if each is None else int(each) for each in addresses], number % banks
+                )
+            except (ValueError, TypeError, KeyError) as error:
+                msg = (
+                    f'line {number} of standard input is no reading; expected {{"addresses": [12, null, 7]}}'
+                )
+                raise InputLineError(msg) from error
+            result = result_record(number, boards.run(frame))
+            printed = {
+                "number": number,
+                "boards": [
+                    {
+                        "counts": counts.tolist(),
+                        "cycles": board.cycles,
+                        "reason": board.reason,
+                        "why": REASON_WORDS[StopReason(board.reason)],
+                    }
+                    for board, counts in zip(result.boards, counts_of(result), strict=True)
+                ],
+            }
+            sys.stdout.buffer.write(orjson.dumps(printed) + b"\n")
+            sys.stdout.buffer.flush()
+    finally:
+        boards.close()
+    return 0
+
+
+def board_endpoints(settings: Settings, deployment: Deployment) -> list[Endpoint]:
+    """Where the boards are: the settings' list, else the deployment's own endpoints.
+
+    Raises:
+        SettingsError: a board has no endpoint, or there are too few or too many.
+    """
+    texts = settings.boards or tuple(board.endpoint for board in deployment.boards)
+    if len(texts) != len(deployment.boards):
+        msg = f"--boards names {len(texts)} boards, the deployment has {len(deployment.boards)} partitions; name one each"
+        raise SettingsError(msg)
+    if not all(texts):
+        msg = "the deployment names no endpoints of boards; give --boards ENDPOINT,... (start some with: board --boards 4 --directory DIR)"
+        raise SettingsError(msg)
+    return [endpoint_from(text, "--boards") for text in texts]
+
+
+app = make_app(
+    "Drive the boards of a mini-cluster.\n\n"
+    "Alone it reads readings from standard input (what `subscriber --deployment` prints) and prints counts:\n\n"
+    "`echo '{\"addresses\": [71, 50, 50, 45, 18, 72]}' | pcie-app -d build/boat --boards unix:/tmp/b/board0.sock,...`\n\n"
+    "With `--listen ENDPOINT` it serves a master."
+)
+
+
+@app.command()
+@ends_well
+def pcie_app(
+    deployment: options.Deployment = None,
+    boards: options.Boards = None,
+    listen: options.Listen = None,
+    stop: options.Stop = None,
+    peer_timeout: options.PeerTimeout = None,
+    board_timeout: options.BoardTimeout = None,
+) -> int:
+    """Drive the boards of a mini-cluster."""
+    end_with_parent()
+    raise_on_signals()
+    settings = load_settings(
+        deployment=deployment,
+        boards=boards,
+        stop=stop,
+        peer_timeout=peer_timeout,
+        board_timeout=board_timeout,
+    )
+    loaded = deployment_for(settings, images=True)
+    opened = Boards(settings, loaded, board_endpoints(settings, loaded))
+    if listen is not None:
+        return PcieApp(opened, loaded.hash, endpoint_from(listen, "--listen")).serve()
+    if sys.stdin.isatty():
+        msg = "pcie-app reads readings from standard input, which is a terminal: pipe them in, or use --listen (pcie-app --help)"
+        raise SettingsError(msg)
+    return compute_lines(opened, loaded.machine.rng_banks)
+
+
+def main() -> None:
+    """Entry point of the command `pcie-app`."""
+    app()

@@ -1,0 +1,303 @@
+"""The publisher: results become posteriors on /BMresults (thesis 3.1, Publisher.jar)."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import sys
+import time
+from collections.abc import AsyncIterator
+from typing import Annotated, Any
+
+import orjson
+import typer
+
+from bridge.client import ConnectionState, Publication, Ros, Subscription, connect
+from bridge.errors import BridgeError, NoMessageError
+from services import options
+from services.command_line import ends_well, make_app, run_async
+from services.errors import InputLineError, SettingsError, exit_code_of
+from services.logs import get_logger, say
+from services.records import AnyRecord, Begin, BoardOutcome, FrameResult, Publish, Published, Ready, Trouble
+from services.results import (
+    FRAME_TOPIC,
+    FRAME_TYPE,
+    Times,
+    frame_message,
+    posterior_layout,
+    posterior_of,
+    times_of,
+)
+from services.serving import MasterLink, deployment_for, endpoint_from
+from services.settings import Settings, load_settings
+from services.supervision import end_with_parent
+from toolchain.deployment import Deployment
+
+ROLE = "publisher"
+RESULTS_DEPTH = 64
+"""Results that may wait for the rosbridge server; the master keeps fewer than that under way."""
+
+
+class ResultTopics:
+    """The deployment's output topics on their servers, advertised."""
+
+    def __init__(self, settings: Settings, deployment: Deployment) -> None:
+        self._settings = settings
+        self._deployment = deployment
+        self._layout = posterior_layout(deployment)
+        self._outputs: list[tuple[Ros, Publication]] = []
+        self._frames: Publication | None = None
+        self._watched: Subscription | None = None
+        self._ros_version = 2
+        self._previous_out_ns = 0
+
+    @contextlib.asynccontextmanager
+    async def opened(self, on_state: Any = None) -> AsyncIterator[str]:
+        """Connect and advertise; gives a sentence that says where.
+
+        Raises:
+            BridgeError: a server is not reachable, or is none.
+        """
+        settings, deployment = self._settings, self._deployment
+        async with contextlib.AsyncExitStack() as stack:
+            by_uri: dict[str, Ros] = {}
+            for output in deployment.outputs:
+                uri = settings.uri or deployment.output_uri(output)
+                if uri not in by_uri:
+                    by_uri[uri] = await stack.enter_async_context(
+                        connect(
+                            uri,
+                            connect_timeout=settings.connect_timeout,
+                            ros_version=settings.ros_version,
+                            on_state=on_state,
+                        )
+                    )
+                self._outputs.append((by_uri[uri], await by_uri[uri].advertise(output.topic, output.type)))
+            first = self._outputs[0][0]
+            self._frames = await first.advertise(FRAME_TOPIC, FRAME_TYPE)
+            if settings.ros_version == "auto":
+                self._ros_version = await first.detect_ros_version() or 2
+            else:
+                self._ros_version = int(settings.ros_version)
+            topics = ", ".join(output.topic for output in deployment.outputs)
+            yield f"publishing on {topics} at {', '.join(by_uri)}"
+
+    def watch(self) -> None:
+        """Subscribe to the first output, so that a result can be seen on the wire."""
+        if self._watched is None:
+            output = self._deployment.outputs[0]
+            self._watched = self._outputs[0][0].subscribe(output.topic, output.type, queue_size=RESULTS_DEPTH)
+
+    async def _seen(self, data: list[float], timeout: float) -> bool:
+        if self._watched is None:
+            return False
+        deadline = time.monotonic() + timeout
+        while (left := deadline - time.monotonic()) > 0:
+            try:
+                message = await self._watched.next(timeout=left)
+            except NoMessageError:
+                return False
+            if message.msg.get("data") == data:
+                return True
+        return False
+
+    async def publish(self, publish: Publish, *, look: bool) -> Published:
+        """Publish a frame's data and then its posterior, where it has one.
+
+        Args:
+            publish: the result and its frame's times.
+            look: wait until the result was seen on the wire, or the settings' time is over.
+        """
+        started = time.monotonic_ns()
+        times = times_of(publish, started, self._previous_out_ns)
+        posterior = posterior_of(publish.result)
+        best = int(posterior.argmax()) if posterior is not None else -1
+        outcome = "published" if posterior is not None else "no posterior"
+        seen: bool | None = None
+        if all(ros.state is not ConnectionState.CONNECTED for ros, _ in self._outputs):
+            outcome = "rosbridge away"
+        else:
+            try:
+                await self._send(publish, times, posterior)
+                self._previous_out_ns = time.monotonic_ns() - started
+                if look and posterior is not None:
+                    seen = await self._seen(posterior.tolist(), self._settings.seen_timeout)
+            except BridgeError as error:
+                get_logger(ROLE).warning(str(error), frame=publish.result.number)
+                outcome = "rosbridge away"
+        return Published(
+            number=publish.result.number,
+            outcome=outcome,
+            seen=seen,
+            best_line=best,
+            best_probability=float(posterior[best]) if posterior is not None else 0.0,
+            cycles=max((board.cycles for board in publish.result.boards), default=0),
+            total_ns=time.monotonic_ns() - publish.received_tick,
+        )
+
+    async def _send(self, publish: Publish, times: Times, posterior: Any) -> None:
+        if self._frames is not None:
+            await self._frames.publish(
+                frame_message(
+                    self._deployment,
+                    publish,
+                    times,
+                    published=posterior is not None,
+                    sent_ns=time.time_ns(),
+                    ros_version=self._ros_version,
+                )
+            )
+        if posterior is not None:
+            await self.publish_array(posterior)
+
+    async def publish_array(self, values: Any) -> None:
+        """Publish probabilities (float64, one per line) on every output."""
+        for _, publication in self._outputs:
+            await publication.publish({"layout": self._layout, "data": values})
+
+
+class Publisher:
+    """Serves a master: publishes each result that it sends."""
+
+    def __init__(self, settings: Settings, deployment: Deployment, listen: str) -> None:
+        self._topics = ResultTopics(settings, deployment)
+        self._waiting: asyncio.Queue[Publish] = asyncio.Queue(RESULTS_DEPTH)
+        self._begun = asyncio.Event()
+        self._once = False
+        self._link = MasterLink(endpoint_from(listen, "--listen"), ROLE, deployment.hash, self._take)
+
+    def _take(self, record: AnyRecord) -> None:
+        if isinstance(record, Begin):
+            self._once = record.once
+            if self._once:
+                self._topics.watch()
+            self._begun.set()
+        elif isinstance(record, Publish):
+            try:
+                self._waiting.put_nowait(record)
+            except asyncio.QueueFull:
+                self._link.send(Published(record.result.number, "rosbridge away", None, -1, 0.0, 0, 0))
+
+    def _state_changed(self, state: ConnectionState) -> None:
+        if state is ConnectionState.RECONNECTING:
+            self._link.notice("warning", "rosbridge is gone; results are lost until it is back")
+
+    async def run(self) -> int:
+        """Serve until a signal; raises what ends it."""
+        async with self._link:
+            try:
+                async with self._topics.opened(self._state_changed) as where:
+                    self._link.keep(Ready(where))
+                    while True:
+                        publish = await self._waiting.get()
+                        self._link.send(await self._topics.publish(publish, look=self._once))
+            except BridgeError as error:
+                for _ in range(100):
+                    if self._link.send(Trouble(exit_code_of(error), str(error))):
+                        break
+                    await asyncio.sleep(0.02)
+                raise
+
+
+async def _lines() -> AsyncIterator[bytes]:
+    """Lines of standard input, without blocking the loop.
+
+    A pipe or a terminal; regular files are read at once.
+    """
+    loop = asyncio.get_running_loop()
+    reader = asyncio.StreamReader(limit=1 << 24)
+    try:
+        await loop.connect_read_pipe(lambda: asyncio.StreamReaderProtocol(reader), sys.stdin)
+    except (ValueError, OSError):
+        for line in sys.stdin.buffer:
+            yield line
+        return
+    while line := await reader.readline():
+        yield line
+
+
+def result_from_line(line: bytes, number: int, lines: int) -> FrameResult | list[float]:
+    """What one line of standard input says: `pcie-app`'s result, or an array of probabilities.
+
+    Raises:
+        InputLineError: neither; says which line.
+    """
+    try:
+        value = orjson.loads(line)
+        if isinstance(value, list) and len(value) == lines:
+            return [float(each) for each in value]
+        boards = [
+            BoardOutcome(
+                b"".join(int(count).to_bytes(4, "little") for count in board["counts"]),
+                int(board["cycles"]),
+                int(board["reason"]),
+            )
+            for board in value["boards"]
+        ]
+        if sum(len(board.counts) for board in boards) == 4 * lines:
+            return FrameResult(int(value["number"]), boards, 0, 0, 0, 0)
+    except (ValueError, TypeError, KeyError, OverflowError):
+        pass
+    msg = f"line {number} of standard input is neither a result of pcie-app nor an array of {lines} probabilities"
+    raise InputLineError(msg)
+
+
+async def publish_lines(settings: Settings, deployment: Deployment) -> int:
+    """Alone: publish what comes on standard input, one result a line, until it ends."""
+    topics = ResultTopics(settings, deployment)
+    async with topics.opened() as where:
+        say(where)
+        number = 0
+        async for line in _lines():
+            number += 1
+            result = result_from_line(line, number, deployment.machine.lines)
+            if isinstance(result, FrameResult):
+                now, tick = time.time_ns(), time.monotonic_ns()
+                await topics.publish(Publish(result, now, now, tick, tick, 0), look=False)
+            else:
+                await topics.publish_array(result)
+    say(f"{number} published")
+    return 0
+
+
+app = make_app(
+    "Publish posteriors over rosbridge.\n\n"
+    "Alone it reads results from standard input, one JSON value a line (what `pcie-app` prints, or arrays of probabilities):\n\n"
+    "`subscriber -d build/boat | pcie-app -d build/boat --boards ... | publisher -d build/boat --uri ws://robot:9090`\n\n"
+    "With `--listen ENDPOINT` it serves a master."
+)
+
+
+@app.command()
+@ends_well
+def publisher(
+    deployment: options.Deployment = None,
+    uri: options.Uri = None,
+    listen: options.Listen = None,
+    ros_version: options.RosVersion = None,
+    connect_timeout: options.ConnectTimeout = None,
+    seen_timeout: Annotated[
+        float | None, typer.Option(help="Seconds until a result is seen on the wire (2).")
+    ] = None,
+) -> int:
+    """Publish posteriors over rosbridge."""
+    end_with_parent()
+    settings = load_settings(
+        deployment=deployment,
+        uri=uri,
+        ros_version=ros_version,
+        connect_timeout=connect_timeout,
+        seen_timeout=seen_timeout,
+    )
+    loaded = deployment_for(settings)
+    if listen is not None:
+        return run_async(Publisher(settings, loaded, listen).run())
+    if sys.stdin.isatty():
+        msg = "the publisher reads results from standard input, which is a terminal: pipe them in, or use --listen (publisher --help)"
+        raise SettingsError(msg)
+    return run_async(publish_lines(settings, loaded))
+
+
+def main() -> None:
+    """Entry point of the command `publisher`."""
+    app()

@@ -1,0 +1,149 @@
+"""What the services tell each other: the records that cross the local sockets.
+
+Every record is a MessagePack array whose first element is its tag. Times called `*_ns` are Unix
+time; those called `*_tick` are the machine's monotonic clock, comparable between its processes.
+"""
+
+from __future__ import annotations
+
+import msgspec
+
+
+class Record(msgspec.Struct, array_like=True, frozen=True):
+    """Root of all records."""
+
+
+class Hello(Record, tag="hello"):
+    """First record in each direction: who speaks, which version, for which model."""
+
+    role: str
+    version: str
+    deployment_hash: str
+
+
+class Begin(Record, tag="begin"):
+    """Master to a service: go ahead. `once`: this run ends after its first frame."""
+
+    once: bool
+
+
+class Ready(Record, tag="ready"):
+    """A service to the master: it has what it needs (a connection, an advertised topic, programmed boards)."""
+
+    sentence: str
+
+
+class Notice(Record, tag="notice"):
+    """A service to the master: something that the user should read, but that ends nothing."""
+
+    level: str
+    sentence: str
+
+
+class Trouble(Record, tag="trouble"):
+    """A service to the master: it can't go on, and why."""
+
+    exit_code: int
+    sentence: str
+
+
+class Reading(Record, tag="reading"):
+    """Subscriber to master: one complete set of addresses, in the order of the machine's columns.
+
+    `addresses` holds None for a missing reading; `passed_over` counts the readings that the
+    subscriber lost since the last one it sent.
+    """
+
+    stamp_ns: int
+    received_ns: int
+    received_tick: int
+    sent_tick: int
+    addresses: list[int | None]
+    passed_over: int
+
+
+class Unusable(Record, tag="unusable"):
+    """Subscriber to master: a message that makes no frame. Equal causes have equal `cause`."""
+
+    cause: str
+    sentence: str
+
+
+class Frame(Record, tag="frame"):
+    """Master to pcie-app: compute this. `number` rises from 1 per master."""
+
+    number: int
+    addresses: list[int | None]
+    bank: int
+
+
+class BoardOutcome(Record, tag="board"):
+    """What one board returned: counts as little-endian uint32, one per line of its partition."""
+
+    counts: bytes
+    cycles: int
+    reason: int
+
+
+class FrameResult(Record, tag="result"):
+    """pcie-app to master: the boards' counts and where the time went."""
+
+    number: int
+    boards: list[BoardOutcome]
+    register_writes_ns: int
+    compute_ns: int
+    reads_ns: int
+    boards_compute_ns: int
+
+
+class FrameFailed(Record, tag="failed"):
+    """pcie-app to master: a frame that the boards did not finish."""
+
+    number: int
+    board: int
+    exit_code: int
+    sentence: str
+
+
+class Publish(Record, tag="publish"):
+    """Master to publisher: a result with the frame's own data."""
+
+    result: FrameResult
+    stamp_ns: int
+    received_ns: int
+    received_tick: int
+    reading_sent_tick: int
+    waited_ns: int
+
+
+class Published(Record, tag="published"):
+    """Publisher to master: what became of a result.
+
+    `outcome` is "published", "no posterior" or "rosbridge away"; `seen` says whether it was seen on
+    the wire (None where nobody looked). `best_line` has `best_probability`; `total_ns` is the time
+    from the reading's receipt to the result's sending.
+    """
+
+    number: int
+    outcome: str
+    seen: bool | None
+    best_line: int
+    best_probability: float
+    cycles: int
+    total_ns: int
+
+
+AnyRecord = (
+    Hello
+    | Begin
+    | Ready
+    | Notice
+    | Trouble
+    | Reading
+    | Unusable
+    | Frame
+    | FrameResult
+    | FrameFailed
+    | Publish
+    | Published
+)

@@ -1,0 +1,135 @@
+"""A service's side of a local socket: it listens, and serves one master at a time."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from types import TracebackType
+from typing import Self
+
+from pcie_shim.endpoint import Endpoint, parse_endpoint
+from pcie_shim.errors import PcieShimError
+from services.errors import OtherPeerError, SettingsError
+from services.local_socket import RecordProtocol, bind, check_hello, own_hello, unlink
+from services.records import AnyRecord, Hello, Notice, Record, Trouble
+from services.settings import Settings
+from services.supervision import leave_private_directory
+from toolchain.deployment import Deployment, load_deployment
+
+
+class MasterLink:
+    """Listens for a master, greets it, and passes its records on.
+
+    A second master is told that there is one already and is turned away; when a master goes, the next may come.
+    """
+
+    def __init__(
+        self, endpoint: Endpoint, role: str, deployment_hash: str, on_record: Callable[[AnyRecord], None]
+    ) -> None:
+        self._endpoint = endpoint
+        self._role = role
+        self._hash = deployment_hash
+        self._on_record = on_record
+        self._master: RecordProtocol | None = None
+        self._greeted = False
+        self._server: asyncio.Server | None = None
+        self._last: dict[type[Record], Record] = {}
+
+    async def __aenter__(self) -> Self:
+        """Start listening."""
+        loop = asyncio.get_running_loop()
+        listener = bind(self._endpoint)
+
+        def make() -> RecordProtocol:
+            return RecordProtocol(f"{self._role} at {self._endpoint}", self._take, self._open, self._closed)
+
+        if self._endpoint.path is None:
+            self._server = await loop.create_server(make, sock=listener)
+        else:
+            self._server = await loop.create_unix_server(make, sock=listener)
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Stop listening; take the socket's file away."""
+        if self._server is not None:
+            self._server.close()
+        if self._master is not None:
+            self._master.close()
+            await asyncio.sleep(0)
+        unlink(self._endpoint)
+        leave_private_directory()
+
+    def _open(self, protocol: RecordProtocol) -> None:
+        if self._master is not None:
+            protocol.send(Trouble(2, f"the {self._role} at {self._endpoint} serves another master already"))
+            protocol.close()
+            return
+        self._master = protocol
+        self._greeted = False
+        protocol.send(own_hello(self._role, self._hash))
+
+    def _take(self, protocol: RecordProtocol, record: AnyRecord) -> None:
+        if protocol is not self._master:
+            return
+        if not self._greeted:
+            try:
+                check_hello(record, "master", self._hash, f"{self._role} at {self._endpoint}")
+            except OtherPeerError as error:
+                protocol.send(Trouble(error.exit_code, str(error)))
+                raise
+            self._greeted = True
+            for each in self._last.values():
+                protocol.send(each)
+            return
+        if not isinstance(record, Hello):
+            self._on_record(record)
+
+    def _closed(self, protocol: RecordProtocol, _: Exception | None) -> None:
+        if protocol is self._master:
+            self._master = None
+
+    @property
+    def backlog(self) -> int:
+        """Bytes that the master has not taken yet."""
+        return 0 if self._master is None else self._master.backlog
+
+    def send(self, record: Record) -> bool:
+        """Send to the master; False where there is none."""
+        return self._master is not None and self._greeted and self._master.send(record)
+
+    def keep(self, record: Record) -> None:
+        """Send now, and again to every later master: what is true from now on (readiness)."""
+        self._last[type(record)] = record
+        self.send(record)
+
+    def notice(self, level: str, sentence: str) -> None:
+        """Tell the master something that ends nothing."""
+        self.send(Notice(level, sentence))
+
+
+def endpoint_from(text: str, flag: str) -> Endpoint:
+    """An endpoint that a user gave.
+
+    Raises:
+        SettingsError: it is none.
+    """
+    try:
+        return parse_endpoint(text)
+    except PcieShimError as error:
+        msg = f"{flag}: {error}"
+        raise SettingsError(msg) from error
+
+
+def deployment_for(settings: Settings, *, images: bool = False) -> Deployment:
+    """The deployment that the settings name.
+
+    Raises:
+        SettingsError: none is named.
+        ToolchainError: it is damaged, of another version, or not there.
+    """
+    if settings.deployment is None:
+        msg = "no deployment was given: use --deployment DIR (or BM_DEPLOYMENT), with a folder that `toolchain build` wrote"
+        raise SettingsError(msg)
+    return load_deployment(settings.deployment, images=images)

@@ -1,0 +1,117 @@
+"""Settings of all services: flag over `BM_*` variable over deployment over default, in one class."""
+
+from __future__ import annotations
+
+import difflib
+import os
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, ValidationError, field_validator
+from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
+
+from pcie_shim.endpoint import Endpoint, parse_endpoint
+from pcie_shim.errors import PcieShimError
+from services.errors import SettingsError
+
+Seconds = Annotated[float, Field(gt=0, le=86_400)]
+ENV_PREFIX = "BM_"
+
+
+class Settings(BaseSettings):
+    """What a user can set. A field of None or "" leaves the deployment's own value, or the default behaviour."""
+
+    model_config = SettingsConfigDict(env_prefix=ENV_PREFIX, extra="forbid", frozen=True)
+
+    deployment: Path | None = Field(default=None, description="folder that `toolchain build` wrote")
+    uri: str | None = Field(default=None, description="rosbridge server, instead of the deployment's")
+    ros_version: Literal["auto", "1", "2"] = Field(
+        default="auto", description="how time stamps and types are written"
+    )
+    queue: Literal["latest", "all"] | None = Field(
+        default=None, description="what waits while a frame is computed"
+    )
+    stop: Literal["slices", "own"] | None = Field(default=None, description="when the boards stop")
+    boards: Annotated[tuple[str, ...], NoDecode] = Field(
+        default=(), description="endpoints of boards that already run, comma-separated"
+    )
+    subscriber: str = Field(default="", description="endpoint of a subscriber that already runs")
+    publisher: str = Field(default="", description="endpoint of a publisher that already runs")
+    pcie_app: str = Field(default="", description="endpoint of a pcie-app that already runs")
+    connect_timeout: Seconds = Field(default=10, description="seconds to reach the rosbridge server")
+    first_data_timeout: Seconds = Field(default=30, description="seconds until the first reading")
+    peer_timeout: Seconds = Field(default=10, description="seconds to reach a local process or a board")
+    board_timeout: Seconds = Field(
+        default=5, description="seconds a board may take beyond max_cycles at its speed"
+    )
+    stop_timeout: Seconds = Field(default=5, description="seconds a process has to end")
+    seen_timeout: Seconds = Field(default=2, description="seconds until a result is seen on the wire")
+
+    @field_validator("boards", mode="before")
+    @classmethod
+    def _split(cls, value: object) -> object:
+        if isinstance(value, str):
+            return tuple(part.strip() for part in value.split(",") if part.strip())
+        return value
+
+    @field_validator("uri")
+    @classmethod
+    def _uri(cls, value: str | None) -> str | None:
+        if value is not None and not value.startswith(("ws://", "wss://")):
+            msg = "a rosbridge URI starts with ws:// or wss://, for example ws://192.168.1.10:9090"
+            raise ValueError(msg)
+        return value
+
+    @field_validator("boards", "subscriber", "publisher", "pcie_app")
+    @classmethod
+    def _endpoints(cls, value: str | tuple[str, ...]) -> str | tuple[str, ...]:
+        for text in (value,) if isinstance(value, str) else value:
+            if text:
+                try:
+                    parse_endpoint(text)
+                except PcieShimError as error:
+                    raise ValueError(str(error)) from error
+        return value
+
+
+def load_settings(**flags: Any) -> Settings:
+    """Settings from flags (those that are not None) over the environment over the defaults.
+
+    Raises:
+        SettingsError: an unknown `BM_*` variable, or a value that can't be used; says which, and what was expected.
+    """
+    known = {ENV_PREFIX + name.upper() for name in Settings.model_fields}
+    for name in sorted(os.environ):
+        if name.upper().startswith(ENV_PREFIX) and name.upper() not in known:
+            near = difflib.get_close_matches(name.upper(), known, 1, 0.5)
+            hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(sorted(known))}"
+            msg = f"environment variable {name} is no setting of rosbayes; {hint} (unset it, or rename it)"
+            raise SettingsError(msg)
+    given = {name: value for name, value in flags.items() if value is not None and value != ()}
+    try:
+        return Settings(**given)
+    except ValidationError as error:
+        first = error.errors()[0]
+        name = str(first["loc"][0]) if first["loc"] else "?"
+        where = (
+            f"--{name.replace('_', '-')}"
+            if name in given
+            else f"environment variable {ENV_PREFIX}{name.upper()}"
+        )
+        reason = str(first["msg"]).removeprefix("Value error, ")
+        msg = f"{where}: {reason} (got {first.get('input')!r})"
+        raise SettingsError(msg) from error
+
+
+def endpoint_in(directory: Path, name: str) -> Endpoint:
+    """The endpoint of a named local socket in a directory.
+
+    Raises:
+        SettingsError: the path is too long for a unix socket.
+    """
+    path = directory / f"{name}.sock"
+    # sun_path holds 108 bytes with its terminating zero; the programming port's name is 8 longer
+    if len(os.fsencode(path)) > 99:
+        msg = f"{path} is too long for a local socket (99 bytes at most); choose a shorter directory"
+        raise SettingsError(msg)
+    return parse_endpoint(f"unix:{path}")

@@ -1,0 +1,311 @@
+"""The subscriber: takes the variables out of a topic's messages (thesis 3.1, Subscriber.jar)."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import sys
+import time
+from collections import Counter
+from typing import Annotated, Any
+
+import orjson
+import typer
+
+from bridge.client import ConnectionState, Message, Ros, connect
+from bridge.errors import BridgeError, NoMessageError
+from bridge.fields import Field
+from services import options
+from services.command_line import ends_well, make_app, run_async
+from services.errors import NoDataError, RosbridgeLostError, SettingsError, VariableError, exit_code_of
+from services.frames import CompleteReading, FrameAssembler
+from services.local_socket import MAX_RECORD
+from services.logs import get_logger, say
+from services.records import AnyRecord, Begin, Reading, Ready, Trouble, Unusable
+from services.serving import MasterLink, deployment_for, endpoint_from
+from services.settings import Settings, load_settings
+from services.supervision import end_with_parent
+from toolchain.deployment import Deployment, Source
+
+ROLE = "subscriber"
+_RECEIVED_QUEUE = 64
+_BACKLOG_LIMIT = min(1 << 18, MAX_RECORD)
+"""Bytes that may wait for the master; beyond, readings are passed over (queue = latest) and counted."""
+
+
+async def why_silent(ros: Ros, source: Source, waited: float) -> str:
+    """One sentence about a topic that stayed silent, with what the server says of it where it has rosapi."""
+    sentence = f"no message came on {source.topic} ({source.type}) from {source.uri} within {waited:g} s"
+    try:
+        known = (await ros.call("/rosapi/topic_type", {"topic": source.topic}, timeout=2)).get("type", "")
+    except BridgeError:
+        return f"{sentence}; is its publisher running?"
+    if not known:
+        return f"{sentence}; the server knows no such topic: start its publisher, or check the name"
+    return f"{sentence}; the server knows it as {known}: is its publisher running, and is that the type?"
+
+
+class Subscriber:
+    """Serves a master: readings of a deployment's topics, as addresses of the machine's columns."""
+
+    def __init__(self, settings: Settings, deployment: Deployment, listen: str) -> None:
+        self._settings = settings
+        self._deployment = deployment
+        self._assembler = FrameAssembler(deployment)
+        self._queue_all = (settings.queue or deployment.queue) == "all"
+        self._begun = asyncio.Event()
+        self._once = False
+        self._passed_over = 0
+        self._causes: Counter[str] = Counter()
+        self._link = MasterLink(endpoint_from(listen, "--listen"), ROLE, deployment.hash, self._take)
+        self._log = get_logger(ROLE)
+        self._lost: asyncio.Future[None] | None = None
+
+    def _take(self, record: AnyRecord) -> None:
+        if isinstance(record, Begin):
+            self._once = record.once
+            self._begun.set()
+
+    def _state_changed(self, uri: str, state: ConnectionState) -> None:
+        if state is ConnectionState.RECONNECTING:
+            self._link.notice("warning", f"rosbridge at {uri} is gone; waiting for it")
+            if self._once and self._lost is not None and not self._lost.done():
+                self._lost.set_exception(
+                    RosbridgeLostError(f"rosbridge at {uri} went away before a reading came")
+                )
+        elif state is ConnectionState.CONNECTED and self._begun.is_set():
+            self._link.notice("info", f"rosbridge at {uri} is connected again")
+
+    async def run(self) -> int:
+        """Serve until a signal; raises what ends it."""
+        settings = self._settings
+        sources = self._deployment.sources
+        self._lost = asyncio.get_running_loop().create_future()
+        async with self._link, contextlib.AsyncExitStack() as stack:
+            try:
+                by_uri: dict[str, Ros] = {}
+                for uri in {settings.uri or source.uri: None for source in sources}:
+                    by_uri[uri] = await stack.enter_async_context(
+                        connect(
+                            uri,
+                            connect_timeout=settings.connect_timeout,
+                            ros_version=settings.ros_version,
+                            on_state=lambda state, uri=uri: self._state_changed(uri, state),
+                        )
+                    )
+                self._link.keep(Ready(f"connected to {', '.join(by_uri)}"))
+                await self._begun.wait()
+                async with asyncio.TaskGroup() as group:
+                    lost = group.create_task(self._watch_loss())
+                    tasks = [
+                        group.create_task(self._follow(by_uri[settings.uri or source.uri], at, source))
+                        for at, source in enumerate(sources)
+                    ]
+                    await asyncio.wait(tasks)
+                    lost.cancel()
+            except BaseExceptionGroup as group_error:
+                error: BaseException = group_error
+                while isinstance(error, BaseExceptionGroup):
+                    error = error.exceptions[0]
+                await self._fail(error)
+                raise error from None
+            except (BridgeError, NoDataError) as error:
+                await self._fail(error)
+                raise
+        return 0
+
+    async def _watch_loss(self) -> None:
+        if self._lost is not None:
+            await self._lost
+
+    async def _fail(self, error: BaseException) -> None:
+        code = exit_code_of(error)
+        if code != 1 and isinstance(error, Exception):
+            # a master that started with us may need a moment to connect
+            for _ in range(100):
+                if self._link.send(Trouble(code, str(error))):
+                    break
+                await asyncio.sleep(0.02)
+
+    async def _follow(self, ros: Ros, at: int, source: Source) -> None:
+        subscription = ros.subscribe(
+            source.topic, source.type, queue_length=0 if self._queue_all else 1, queue_size=_RECEIVED_QUEUE
+        )
+        timeout = self._settings.first_data_timeout
+        first = True
+        lost_before = 0
+        while True:
+            try:
+                message = await subscription.next(timeout=timeout)
+            except NoMessageError as error:
+                source = source.model_copy(update={"uri": self._settings.uri or source.uri})
+                sentence = await why_silent(ros, source, timeout)
+                if first and ros.state is ConnectionState.CONNECTED:
+                    raise NoDataError(sentence) from error
+                self._link.notice("warning", sentence)
+                continue
+            first = False
+            self._passed_over += subscription.lost - lost_before
+            lost_before = subscription.lost
+            self._forward(at, message)
+
+    def _forward(self, at: int, message: Message) -> None:
+        try:
+            reading = self._assembler.take(
+                at, message.msg, message.received_ns, message.received_monotonic_ns
+            )
+        except VariableError as error:
+            cause = f"{type(error.__cause__).__name__} {at}"
+            self._causes[cause] += 1
+            self._link.send(Unusable(cause, str(error)))
+            return
+        if reading is None:
+            return
+        if self._link.backlog > _BACKLOG_LIMIT and not self._queue_all:
+            self._passed_over += 1
+            return
+        if self._link.send(_reading_record(reading, self._passed_over)):
+            self._passed_over = 0
+
+
+def _reading_record(reading: CompleteReading, passed_over: int) -> Reading:
+    return Reading(
+        stamp_ns=reading.stamp_ns,
+        received_ns=reading.received_ns,
+        received_tick=reading.received_tick,
+        sent_tick=time.monotonic_ns(),
+        addresses=reading.addresses,
+        passed_over=passed_over,
+    )
+
+
+async def print_readings(settings: Settings, source: Source, names: list[str], count: int | None) -> int:
+    """Alone, without a deployment: print the named variables of each message, one JSON object a line.
+
+    Raises:
+        NoDataError: no message in time.
+        BridgeError: a variable is not there, or the server is not.
+    """
+    fields = [Field(name) for name in names]
+    async with connect(
+        source.uri, connect_timeout=settings.connect_timeout, ros_version=settings.ros_version
+    ) as ros:
+        subscription = ros.subscribe(source.topic, source.type, queue_size=_RECEIVED_QUEUE)
+        printed = 0
+        timeout: float = settings.first_data_timeout
+        while count is None or printed < count:
+            try:
+                message = await subscription.next(timeout=timeout)
+            except NoMessageError as error:
+                raise NoDataError(await why_silent(ros, source, timeout)) from error
+            values: dict[str, Any] = {}
+            for field in fields:
+                present, value = field.value(message.msg)
+                if not present:
+                    raise field.missing(message.msg)
+                values[field.name] = value
+            _print(values or message.msg)
+            printed += 1
+    return 0
+
+
+async def print_addresses(settings: Settings, deployment: Deployment, count: int | None) -> int:
+    """Alone, with a deployment: print each complete reading as `pcie-app` reads it, one JSON object a line.
+
+    Raises:
+        NoDataError: no message in time.
+        VariableError: a variable is missing or unusable.
+    """
+    if len({settings.uri or source.uri for source in deployment.sources}) > 1:
+        msg = "alone, the subscriber reads from one rosbridge server; this deployment names several: use --listen with a master"
+        raise SettingsError(msg)
+    assembler = FrameAssembler(deployment)
+    uri = settings.uri or deployment.sources[0].uri
+    printed = 0
+    async with connect(
+        uri, connect_timeout=settings.connect_timeout, ros_version=settings.ros_version
+    ) as ros:
+        queue: asyncio.Queue[tuple[int, Message]] = asyncio.Queue(_RECEIVED_QUEUE)
+
+        async def follow(at: int, source: Source) -> None:
+            subscription = ros.subscribe(source.topic, source.type, queue_size=_RECEIVED_QUEUE)
+            async for message in subscription:
+                await queue.put((at, message))
+
+        followers = [
+            asyncio.ensure_future(follow(at, source)) for at, source in enumerate(deployment.sources)
+        ]
+        try:
+            while count is None or printed < count:
+                try:
+                    at, message = await asyncio.wait_for(queue.get(), settings.first_data_timeout)
+                except TimeoutError as error:
+                    source = deployment.sources[0].model_copy(update={"uri": uri})
+                    raise NoDataError(await why_silent(ros, source, settings.first_data_timeout)) from error
+                reading = assembler.take(at, message.msg, message.received_ns, message.received_monotonic_ns)
+                if reading is not None:
+                    _print({"stamp_ns": reading.stamp_ns, "addresses": reading.addresses})
+                    printed += 1
+        finally:
+            for follower in followers:
+                follower.cancel()
+    return 0
+
+
+def _print(value: Any) -> None:
+    sys.stdout.buffer.write(orjson.dumps(value) + b"\n")
+    sys.stdout.buffer.flush()
+
+
+app = make_app(
+    "Take variables out of a ROS topic over rosbridge.\n\n"
+    "Alone it prints them, one JSON object a line:\n\n"
+    "`subscriber --uri ws://robot:9090 --topic /boat/sensors --type boat_msgs/Sensors --variables D1,B1`\n\n"
+    "With `--deployment DIR` it prints addresses as `pcie-app` reads them; "
+    "with `--listen ENDPOINT` too, it serves a master."
+)
+
+
+@app.command()
+@ends_well
+def subscriber(
+    deployment: options.Deployment = None,
+    uri: options.Uri = None,
+    topic: Annotated[str | None, typer.Option(help="Topic to subscribe to (without a deployment).")] = None,
+    type_: Annotated[str | None, typer.Option("--type", help="Its message type.")] = None,
+    variables: Annotated[
+        str, typer.Option(help="Names or paths, comma-separated; none prints whole messages.")
+    ] = "",
+    count: options.Count = None,
+    listen: options.Listen = None,
+    queue: options.Queue = None,
+    ros_version: options.RosVersion = None,
+    connect_timeout: options.ConnectTimeout = None,
+    first_data_timeout: options.FirstDataTimeout = None,
+) -> int:
+    """Take variables out of a ROS topic over rosbridge."""
+    end_with_parent()
+    settings = load_settings(
+        deployment=deployment,
+        uri=uri,
+        queue=queue,
+        ros_version=ros_version,
+        connect_timeout=connect_timeout,
+        first_data_timeout=first_data_timeout,
+    )
+    if listen is not None:
+        return run_async(Subscriber(settings, deployment_for(settings), listen).run())
+    if settings.deployment is not None:
+        return run_async(print_addresses(settings, deployment_for(settings), count))
+    if settings.uri is None or topic is None or type_ is None:
+        msg = "give --uri, --topic and --type, or --deployment DIR (subscriber --help shows examples)"
+        raise SettingsError(msg)
+    say(f"listening on {topic} at {settings.uri}")
+    names = [name.strip() for name in variables.split(",") if name.strip()]
+    source = Source(uri=settings.uri, topic=topic, type=type_)
+    return run_async(print_readings(settings, source, names, count))
+
+
+def main() -> None:
+    """Entry point of the command `subscriber`."""
+    app()

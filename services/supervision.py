@@ -1,0 +1,215 @@
+"""Processes of a run: started together, watched, and ended together, however the run ends."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import ctypes
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import deque
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+from services.errors import ExitCode, ReportedError, ServiceError
+from services.logs import say
+
+PARENT_VARIABLE = "ROSBAYES_PARENT"
+"""Names the process whose end ends this one; set by `Child`."""
+
+DIRECTORY_VARIABLE = "ROSBAYES_DIRECTORY"
+"""The run's private directory, which whoever ends last takes away."""
+
+RESTARTS = 3
+RESTARTS_WITHIN = 60.0
+"""A process may be restarted three times in 60 s; then its master gives up."""
+
+_PR_SET_PDEATHSIG = 1
+_TAIL_LINES = 20
+
+
+def make_private_directory() -> Path:
+    """A directory for this run's sockets that only this user can enter (0700)."""
+    runtime = os.environ.get("XDG_RUNTIME_DIR", "")
+    usable = runtime and len(runtime) < 40 and os.access(runtime, os.W_OK | os.X_OK)
+    try:
+        return Path(tempfile.mkdtemp(prefix="rosbayes-", dir=runtime if usable else None))
+    except OSError as error:
+        msg = f"can't make a private directory for the local sockets: {error.strerror or error}; set TMPDIR to a writable folder"
+        raise ServiceError(msg) from error
+
+
+def end_with_parent() -> None:
+    """In a child: have the kernel send SIGTERM when the parent ends, even by SIGKILL.
+
+    Does nothing in a process that nobody supervises.
+    """
+    parent = os.environ.get(PARENT_VARIABLE)
+    if parent is None or not parent.isdigit():
+        return
+    ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
+    # the parent may have ended before the kernel was told
+    if os.getppid() != int(parent):
+        raise SystemExit(ExitCode.TERMINATED)
+
+
+def leave_private_directory() -> None:
+    """In a child that ends: take the run's directory away if it is empty and the parent did not."""
+    directory = os.environ.get(DIRECTORY_VARIABLE)
+    if directory:
+        with contextlib.suppress(OSError):
+            Path(directory).rmdir()
+
+
+def own_command(name: str) -> list[str]:
+    """How to start one of our commands in this same environment."""
+    beside = Path(sys.executable).with_name(name)
+    return [str(beside)] if beside.exists() else [shutil.which(name) or name]
+
+
+class Child:
+    """A process that belongs to this one. Its errors (lines `error: ...`) are kept, other lines are passed on."""
+
+    def __init__(self, name: str, command: list[str], *, directory: Path | None = None) -> None:
+        self.name = name
+        self._command = command
+        self._directory = directory
+        self._errors: deque[str] = deque(maxlen=_TAIL_LINES)
+        self._process: subprocess.Popen[bytes] | None = None
+        self._restarts: deque[float] = deque(maxlen=RESTARTS + 1)
+        self._pending = b""
+
+    def start(self) -> None:
+        """Start it, in a session of its own so that a terminal's Ctrl-C reaches the parent alone.
+
+        Raises:
+            ServiceError: the command is not installed.
+        """
+        environment = dict(os.environ) | {PARENT_VARIABLE: str(os.getpid()), "PYTHONUNBUFFERED": "1"}
+        if self._directory is not None:
+            environment[DIRECTORY_VARIABLE] = str(self._directory)
+        self._errors.clear()
+        self._pending = b""
+        try:
+            self._process = subprocess.Popen(
+                self._command,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.PIPE,
+                env=environment,
+                start_new_session=True,
+            )
+        except OSError as error:
+            msg = f"can't start {self.name} ({self._command[0]}): {error.strerror or error}; install rosbayes into this environment"
+            raise ServiceError(msg) from error
+        assert self._process.stderr is not None  # noqa: S101 - a pipe was asked for
+        os.set_blocking(self._process.stderr.fileno(), False)
+
+    @property
+    def pid(self) -> int:
+        """Its process number; 0 before it was started."""
+        return self._process.pid if self._process else 0
+
+    def relay(self) -> None:
+        """Pass on what it wrote; keep the sentences of its errors for `failure`."""
+        if self._process is None or self._process.stderr is None:
+            return
+        while True:
+            try:
+                data = os.read(self._process.stderr.fileno(), 65536)
+            except (BlockingIOError, ValueError, OSError):
+                break
+            if not data:
+                break
+            self._pending += data
+        *lines, self._pending = self._pending.split(b"\n")
+        if self._process.poll() is not None and self._pending:
+            lines, self._pending = [*lines, self._pending], b""
+        for line in lines:
+            text = line.decode("utf-8", "replace").rstrip()
+            if text.startswith("error: "):
+                self._errors.append(text.removeprefix("error: "))
+            elif text:
+                say(text)
+
+    def fileno(self) -> int | None:
+        """Its standard error, for an event loop; None before the start."""
+        if self._process is None or self._process.stderr is None or self._process.stderr.closed:
+            return None
+        return self._process.stderr.fileno()
+
+    def exit_code(self) -> int | None:
+        """Its exit code, negative for a signal; None while it runs."""
+        return None if self._process is None else self._process.poll()
+
+    def failure(self) -> ServiceError:
+        """Its end, as an error: its own sentence and exit code where it left them."""
+        self.relay()
+        code = self.exit_code()
+        if self._errors:
+            return ReportedError(code if code and code > 0 else ExitCode.CHILD, self._errors[-1])
+        if code is not None and code < 0:
+            how = f"was killed by {signal.Signals(-code).name}"
+        else:
+            how = f"ended by itself with exit code {code}"
+        return ReportedError(ExitCode.CHILD, f"{self.name} {how}")
+
+    def may_restart(self) -> bool:
+        """Count a restart; False when there were too many within the last minute."""
+        now = time.monotonic()
+        self._restarts.append(now)
+        return sum(1 for at in self._restarts if now - at <= RESTARTS_WITHIN) <= RESTARTS
+
+    def terminate(self) -> None:
+        """Ask it to end."""
+        if self._process is not None and self._process.poll() is None:
+            with contextlib.suppress(ProcessLookupError):
+                self._process.terminate()
+
+    def kill(self) -> None:
+        """End it at once."""
+        if self._process is not None and self._process.poll() is None:
+            with contextlib.suppress(ProcessLookupError):
+                self._process.kill()
+            self._process.wait(5)
+
+    def close(self) -> None:
+        """Let go of its standard error after its end."""
+        self.relay()
+        if self._process is not None and self._process.stderr is not None:
+            self._process.stderr.close()
+
+
+async def watch(child: Child, on_exit: Callable[[Child], None]) -> None:
+    """Relay a child's lines as they come, and call `on_exit` once when it has ended."""
+    while True:
+        child.relay()
+        if child.exit_code() is not None:
+            child.relay()
+            on_exit(child)
+            return
+        await asyncio.sleep(0.05)
+
+
+async def end_all(children: Iterable[Child], stop_timeout: float) -> list[str]:
+    """End children within `stop_timeout` seconds, the stubborn ones by SIGKILL.
+
+    Returns:
+        The names of those that had to be killed.
+    """
+    children = list(children)
+    for child in children:
+        child.terminate()
+    deadline = time.monotonic() + stop_timeout
+    while any(child.pid and child.exit_code() is None for child in children) and time.monotonic() < deadline:
+        await asyncio.sleep(0.01)
+    killed = [child.name for child in children if child.pid and child.exit_code() is None]
+    for child in children:
+        child.kill()
+        child.close()
+    return killed
