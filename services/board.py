@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Annotated, NoReturn
 
 import typer
-
 from pcie_shim.board import Misbehaviour, serve_board
+
 from pcie_shim.endpoint import Endpoint
 from services import options
 from services.command_line import ends_well, make_app, raise_on_signals
@@ -25,6 +25,7 @@ from services.supervision import (
     RESTARTS,
     RESTARTS_WITHIN,
     end_with_parent,
+    how_it_ended,
     leave_private_directory,
 )
 
@@ -83,16 +84,15 @@ class BoardProcesses:
             os._exit(code)
 
     def _ended(self, at: int, code: int) -> None:
-        how = f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
         now = time.monotonic()
         self._ends = [each for each in self._ends if now - each <= RESTARTS_WITHIN] + [now]
         if len(self._ends) > self._restarts:
             often = (
                 f", {len(self._ends)} ends of boards within {RESTARTS_WITHIN:.0f} s" if self._restarts else ""
             )
-            msg = f"board {at} {how}{often}"
+            msg = f"board {at} {how_it_ended(code)}{often}"
             raise BoardFailedError(msg)
-        say(f"board {at} {how}; restarting it")
+        say(f"board {at} {how_it_ended(code)}; restarting it")
         self._fork(at)
 
     def _end_all(self) -> None:

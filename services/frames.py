@@ -59,7 +59,7 @@ class _SourceReader:
             try:
                 present, value = field.value(message)
                 if not present and variable.on_missing == "error":
-                    raise field.missing(message)  # noqa: TRY301 - told like the other two, with the topic's name
+                    raise field.missing(message)
                 addresses.append(to_address(variable, value))
             except (BridgeError, ReadingError) as error:
                 sentence = f"{self._topic}: {error}"

@@ -228,7 +228,7 @@ class Master:
 
     async def _keep_boards(self, boards: Child) -> None:
         while True:
-            await self._until_exit(boards)
+            await boards.ended()
             failure = boards.failure()
             if boards.exit_code() == ExitCode.BOARD:
                 self._fail(failure)
@@ -238,12 +238,6 @@ class Master:
                 return
             self._log.warning("the boards' process ended; restarting it", why=str(failure))
             boards.start()
-
-    async def _until_exit(self, child: Child) -> None:
-        while child.exit_code() is None:
-            child.relay()
-            await asyncio.sleep(0.05)
-        child.relay()
 
     async def _keep(self, peer: Peer) -> None:
         try:
@@ -312,7 +306,7 @@ class Master:
             self._log.warning(f"{peer.role} at {peer.endpoint} is gone; waiting for it")
             return
         with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(self._until_exit(child), self._settings.stop_timeout)
+            await asyncio.wait_for(child.ended(), self._settings.stop_timeout)
         if child.exit_code() is None:
             child.kill()
         failure = child.failure()

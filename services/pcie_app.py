@@ -12,9 +12,9 @@ import time
 from collections.abc import Sequence
 
 import orjson
+from pcie_shim.driver import FrameInput, FrameOutput, MiniCluster
 
 from machines.bm1 import StopReason
-from pcie_shim.driver import FrameInput, FrameOutput, MiniCluster
 from pcie_shim.endpoint import Endpoint
 from pcie_shim.errors import BoardError, PcieShimError
 from pcie_shim.programming_file import Image, read_image

@@ -11,8 +11,8 @@ from typing import Annotated, Any
 
 import orjson
 import typer
-
 from bridge.client import ConnectionState, Publication, Ros, Subscription, connect
+
 from bridge.errors import BridgeError, NoMessageError
 from services import options
 from services.command_line import ends_well, make_app, run_async

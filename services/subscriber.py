@@ -11,8 +11,8 @@ from typing import Annotated, Any
 
 import orjson
 import typer
-
 from bridge.client import ConnectionState, Message, Ros, connect
+
 from bridge.errors import BridgeError, NoMessageError
 from bridge.fields import Field
 from services import options

@@ -13,7 +13,7 @@ import sys
 import tempfile
 import time
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 
 from services.errors import ExitCode, ReportedError, ServiceError
@@ -70,6 +70,13 @@ def own_command(name: str) -> list[str]:
     """How to start one of our commands in this same environment."""
     beside = Path(sys.executable).with_name(name)
     return [str(beside)] if beside.exists() else [shutil.which(name) or name]
+
+
+def how_it_ended(code: int | None) -> str:
+    """A process's exit code in words: the signal that killed it, or the code itself."""
+    if code is not None and code < 0:
+        return f"was killed by {signal.Signals(-code).name}"
+    return f"ended by itself with exit code {code}"
 
 
 class Child:
@@ -137,15 +144,16 @@ class Child:
             elif text:
                 say(text)
 
-    def fileno(self) -> int | None:
-        """Its standard error, for an event loop; None before the start."""
-        if self._process is None or self._process.stderr is None or self._process.stderr.closed:
-            return None
-        return self._process.stderr.fileno()
-
     def exit_code(self) -> int | None:
         """Its exit code, negative for a signal; None while it runs."""
         return None if self._process is None else self._process.poll()
+
+    async def ended(self) -> None:
+        """Pass its lines on as they come, until it has ended."""
+        while self.exit_code() is None:
+            self.relay()
+            await asyncio.sleep(0.05)
+        self.relay()
 
     def failure(self) -> ServiceError:
         """Its end, as an error: its own sentence and exit code where it left them."""
@@ -153,11 +161,7 @@ class Child:
         code = self.exit_code()
         if self._errors:
             return ReportedError(code if code and code > 0 else ExitCode.CHILD, self._errors[-1])
-        if code is not None and code < 0:
-            how = f"was killed by {signal.Signals(-code).name}"
-        else:
-            how = f"ended by itself with exit code {code}"
-        return ReportedError(ExitCode.CHILD, f"{self.name} {how}")
+        return ReportedError(ExitCode.CHILD, f"{self.name} {how_it_ended(code)}")
 
     def may_restart(self) -> bool:
         """Count a restart; False when there were too many within the last minute."""
@@ -183,17 +187,6 @@ class Child:
         self.relay()
         if self._process is not None and self._process.stderr is not None:
             self._process.stderr.close()
-
-
-async def watch(child: Child, on_exit: Callable[[Child], None]) -> None:
-    """Relay a child's lines as they come, and call `on_exit` once when it has ended."""
-    while True:
-        child.relay()
-        if child.exit_code() is not None:
-            child.relay()
-            on_exit(child)
-            return
-        await asyncio.sleep(0.05)
 
 
 async def end_all(children: Iterable[Child], stop_timeout: float) -> list[str]:
