@@ -140,7 +140,7 @@ def boat_simulator(
     ] = None,
     rate: Annotated[float, typer.Option(min=0.01, max=10_000, help="Readings a second.")] = 10.0,
     topic: Annotated[str, typer.Option(help="Where the raw readings go.")] = RAW_TOPIC,
-    speed: Annotated[float, typer.Option(min=0.0, help="Of the boat, in map units a second.")] = 40.0,
+    speed: Annotated[float, typer.Option(min=0.0, help="Of the boat, in map units a second.")] = 60.0,
     count: Annotated[int | None, typer.Option(min=1, help="End after so many readings.")] = None,
     array: Annotated[
         bool, typer.Option("--array", help="Publish std_msgs/Float64MultiArray instead of boat_msgs/Raw.")

@@ -1,0 +1,269 @@
+"""The pictures: posteriors beside the truth (thesis figure 4.4), and shares of time (figure 4.5)."""
+
+import math
+from collections.abc import Iterable, Sequence
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, Final
+
+from casestudies.boat.geometry import BEACONS, map_grid
+from casestudies.boat.shares import Part, StageShare
+from casestudies.errors import OutputError
+from casestudies.grid import Grid
+from casestudies.results import Instance, Posterior, Truth
+
+POSITIONS_SHOWN: Final = 4
+"""As many as the thesis shows."""
+
+_PART_COLOURS: Final = {
+    Part.ROSBRIDGE: "#4477aa",
+    Part.HOST: "#bbbbbb",
+    Part.REGISTERS: "#ccbb44",
+    Part.COMPUTING: "#ee6677",
+}
+_TRUTH_COLOUR: Final = "#ff4d4d"
+_DPI: Final = 130
+
+
+def check_pictures_possible() -> None:
+    """Find out before a long run that its pictures cannot be drawn.
+
+    Raises:
+        OutputError: matplotlib is not installed.
+    """
+    if find_spec("matplotlib") is None:
+        raise OutputError(
+            "the pictures need matplotlib, which is not installed: run pip install 'rosbayes[pictures]', "
+            "or leave out --out"
+        )
+
+
+def far_apart(instances: Iterable[Instance], count: int = POSITIONS_SHOWN) -> tuple[Instance, ...]:
+    """Results whose true positions lie far from each other, in the order of time.
+
+    The first one is kept, and then, again and again, the one that is furthest from all that are kept. Results
+    without a truth are shown only if there is none with one.
+    """
+    results = [instance for instance in instances if instance.posterior is not None]
+    candidates = [instance for instance in results if instance.truth is not None] or results
+    kept: list[int] = []
+    while len(kept) < min(count, len(candidates)):
+        free = [i for i in range(len(candidates)) if i not in kept]
+        kept.append(max(free, key=lambda i: min((_apart(candidates, i, j) for j in kept), default=0.0)))
+    return tuple(candidates[i] for i in sorted(kept))
+
+
+def draw_positions(path: Path, instances: Sequence[Instance], *, route: Sequence[Truth] = ()) -> None:
+    """Write figure 4.4: for each instance the true position on the map, and beside it the posterior.
+
+    Args:
+        path: of the PNG.
+        instances: at least one, each with a posterior of two dimensions, y and x.
+        route: all true positions in the order of time, drawn faintly.
+
+    Raises:
+        OutputError: no matplotlib, a posterior that is no picture, or a file that cannot be written.
+    """
+    figure_class = _figure_class()
+    across = 2 if len(instances) > 1 else 1
+    down = math.ceil(len(instances) / across)
+    figure = figure_class(figsize=(5.6 * across + 0.9, 2.95 * down + 0.75), layout="constrained")
+    axes = figure.subplots(down, 2 * across, squeeze=False)
+    scale = max(max(_posterior_of(instance).values) for instance in instances)
+    image = None
+    for number, instance in enumerate(instances):
+        row, pair = divmod(number, across)
+        grid = posterior_grid(_posterior_of(instance))
+        _draw_map(axes[row, 2 * pair], grid, instance, route, number)
+        image = _draw_posterior(axes[row, 2 * pair + 1], grid, instance, scale, number)
+    for blank in axes.flat[2 * len(instances) :]:
+        blank.set_axis_off()
+    if image is not None:
+        figure.colorbar(image, ax=list(axes.flat), label="probability of a cell", shrink=0.8, pad=0.01)
+    handles, labels = axes[0, 1].get_legend_handles_labels()
+    figure.legend(
+        handles, labels, loc="outside lower center", ncols=len(labels), frameon=False, handletextpad=0.4
+    )
+    figure.suptitle("Where the boat is (a), and what the Bayesian machine says from its readings (b)")
+    _save(figure, path)
+
+
+def draw_shares(path: Path, shares: Sequence[StageShare], *, frames: int) -> None:
+    """Write figure 4.5: the mean time of each stage and its share of a frame.
+
+    Args:
+        path: of the PNG.
+        shares: the stages in the order of a frame's way.
+        frames: how many frames the means are of.
+
+    Raises:
+        OutputError: no matplotlib, or a file that cannot be written.
+    """
+    figure = _figure_class()(figsize=(8.4, 1.5 + 0.42 * max(len(shares), 1)), layout="constrained")
+    axes = figure.subplots()
+    names = [stage.name for stage in shares]
+    times = [stage.mean_us / 1000 for stage in shares]
+    bars = axes.barh(names, times, color=[_PART_COLOURS[stage.part] for stage in shares], height=0.72)
+    axes.bar_label(
+        bars,
+        [f"{time:.3f} ms   {100 * stage.share:.1f} %" for time, stage in zip(times, shares, strict=True)],
+        padding=4,
+    )
+    axes.invert_yaxis()
+    axes.set_xlim(0, 1.32 * max(times, default=1.0))
+    axes.set_xlabel("mean time a frame, in ms")
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.tick_params(axis="y", length=0)
+    parts = [part for part in Part if any(stage.part is part for stage in shares)]
+    figure.legend(
+        [axes.barh([0], [0], color=_PART_COLOURS[part]) for part in parts],
+        [
+            f"{part}: {100 * sum(stage.share for stage in shares if stage.part is part):.1f} %"
+            for part in parts
+        ],
+        loc="outside lower center",
+        ncols=2,
+        frameon=False,
+    )
+    axes.set_title(f"Where a frame's time goes: {sum(times):.2f} ms, mean of {frames} frames")
+    _save(figure, path)
+
+
+def posterior_grid(posterior: Posterior) -> Grid:
+    """The map cut as finely as the posterior is.
+
+    Raises:
+        OutputError: the posterior has not two dimensions.
+    """
+    if len(posterior.sizes) != 2:
+        raise OutputError(
+            f"the boat's posterior has two dimensions, y and x, but what arrived has "
+            f"{' x '.join(map(str, posterior.sizes))} values: is this the boat's deployment?"
+        )
+    height, width = posterior.sizes
+    return map_grid(width, height)
+
+
+def _draw_map(axes: Any, grid: Grid, instance: Instance, route: Sequence[Truth], number: int) -> None:
+    _map_axes(axes, grid, f"({_letter(number)}a) true position")
+    axes.set_facecolor("#eaf2f8")
+    _draw_beacons(axes)
+    axes.plot([t.x for t in route], [t.y for t in route], color="#9fb8cc", linewidth=0.8, zorder=1)
+    truth = instance.truth
+    if truth is None:
+        axes.text(0.5, 0.5, "not known", transform=axes.transAxes, ha="center", va="center", color="0.4")
+        return
+    for x, y in BEACONS:
+        axes.plot([x, truth.x], [y, truth.y], color="0.45", linewidth=0.7, linestyle=(0, (4, 3)), zorder=2)
+    axes.scatter([truth.x], [truth.y], marker="o", s=64, color=_TRUTH_COLOUR, edgecolors="black", zorder=4)
+    axes.annotate(
+        f"({truth.x:.1f}, {truth.y:.1f})",
+        (truth.x, truth.y),
+        xytext=(0, 9 if truth.y < 30 else -17),
+        textcoords="offset points",
+        ha="center",
+        fontsize=8,
+        zorder=3.5,
+        bbox={"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": "none", "alpha": 0.8},
+    )
+
+
+def _draw_posterior(axes: Any, grid: Grid, instance: Instance, scale: float, number: int) -> Any:
+    from matplotlib.patheffects import withStroke
+
+    posterior = _posterior_of(instance)
+    height, width = posterior.sizes
+    title = f"({_letter(number)}b) posterior"
+    if instance.report is not None and instance.report.number is not None:
+        title += f", frame {instance.report.number}"
+    _map_axes(axes, grid, title)
+    rows = [posterior.values[row * width : (row + 1) * width] for row in range(height)]
+    image = axes.imshow(
+        rows,
+        origin="lower",
+        extent=(grid.x_low, grid.x_high, grid.y_low, grid.y_high),
+        cmap="viridis",
+        vmin=0.0,
+        vmax=scale,
+        interpolation="nearest",
+    )
+    if instance.truth is not None:
+        axes.scatter(
+            [instance.truth.x],
+            [instance.truth.y],
+            marker="o",
+            s=90,
+            facecolors="none",
+            edgecolors=_TRUTH_COLOUR,
+            linewidths=1.8,
+            zorder=4,
+            label="true position",
+        )
+    mean_x, mean_y = grid.mean(posterior.values)
+    outline = [withStroke(linewidth=3.2, foreground="black")]
+    axes.plot(
+        [mean_x],
+        [mean_y],
+        marker="+",
+        markersize=10,
+        markeredgewidth=1.5,
+        color="white",
+        linestyle="none",
+        path_effects=outline,
+        zorder=4,
+        label="posterior's mean",
+    )
+    _draw_beacons(axes)
+    return image
+
+
+def _map_axes(axes: Any, grid: Grid, title: str) -> None:
+    axes.set_xlim(grid.x_low, grid.x_high)
+    axes.set_ylim(grid.y_low, grid.y_high)
+    axes.set_aspect("equal")
+    axes.set_title(title, fontsize=10)
+    axes.set_xlabel("x (map units)", fontsize=8)
+    axes.set_ylabel("y (map units)", fontsize=8)
+    axes.set_xticks([grid.x_low, (grid.x_low + grid.x_high) / 2, grid.x_high])
+    axes.set_yticks([grid.y_low, (grid.y_low + grid.y_high) / 2, grid.y_high])
+    axes.tick_params(labelsize=8)
+
+
+def _draw_beacons(axes: Any) -> None:
+    xs, ys = zip(*BEACONS, strict=True)
+    axes.scatter(
+        xs, ys, marker="^", s=46, color="#ffd24d", edgecolors="black", zorder=5, clip_on=False, label="beacon"
+    )
+
+
+def _letter(number: int) -> str:
+    return str(number + 1)
+
+
+def _posterior_of(instance: Instance) -> Posterior:
+    if instance.posterior is None:
+        raise OutputError("a frame without a posterior cannot be drawn")
+    return instance.posterior
+
+
+def _apart(instances: Sequence[Instance], one: int, other: int) -> float:
+    a, b = instances[one].truth, instances[other].truth
+    if a is None or b is None:
+        return float(abs(one - other))
+    return math.dist((a.x, a.y), (b.x, b.y))
+
+
+def _figure_class() -> Any:
+    """Matplotlib's Figure, without pyplot: it needs no display and keeps no state."""
+    check_pictures_possible()
+    from matplotlib.figure import Figure
+
+    return Figure
+
+
+def _save(figure: Any, path: Path) -> None:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(path, dpi=_DPI)
+    except OSError as error:
+        raise OutputError(f"{path} cannot be written: {error.strerror or error}") from None

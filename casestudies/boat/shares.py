@@ -1,0 +1,65 @@
+"""Where a frame's time goes: the mean of each stage and its share, as in the thesis's figure 4.5."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from enum import StrEnum
+from statistics import fmean
+from typing import Final
+
+from casestudies.results import Instance
+
+
+class Part(StrEnum):
+    """The parts of the system that the thesis measured, and the host's own sockets, which it did not."""
+
+    ROSBRIDGE = "rosbridge"
+    HOST = "between the host's processes"
+    REGISTERS = "registers of the boards"
+    COMPUTING = "computing on the boards"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StageShare:
+    """One stage of a frame's way: its mean over the frames that know it, and its share of all stages."""
+
+    name: str
+    part: Part
+    mean_us: float
+    share: float
+
+
+def _reported(field: str) -> Callable[[Instance], float | None]:
+    def time_of(instance: Instance) -> float | None:
+        time: float | None = getattr(instance.report.stages, field) if instance.report else None
+        return time
+
+    return time_of
+
+
+_STAGES: Final[tuple[tuple[str, Part, Callable[[Instance], float | None]], ...]] = (
+    ("rosbridge in", Part.ROSBRIDGE, _reported("rosbridge_in")),
+    ("local hops", Part.HOST, _reported("local_hops")),
+    ("register writes", Part.REGISTERS, _reported("register_writes")),
+    ("compute", Part.COMPUTING, _reported("compute")),
+    ("register reads", Part.REGISTERS, _reported("reads")),
+    ("rosbridge out", Part.ROSBRIDGE, lambda instance: instance.rosbridge_out_us),
+)
+
+
+def stage_shares(instances: Iterable[Instance]) -> tuple[StageShare, ...]:
+    """The stages in the order of a frame's way; those that no published frame knows are left out.
+
+    `rosbridge out` is measured here, from the sending of a result to its arrival; the others are what
+    `/bm/frame` says.
+    """
+    published = [instance for instance in instances if instance.posterior is not None]
+    means: list[tuple[str, Part, float]] = []
+    for name, part, time_of in _STAGES:
+        known = [time for time in map(time_of, published) if time is not None]
+        if known:
+            means.append((name, part, fmean(known)))
+    total = sum(mean for _, _, mean in means)
+    return tuple(
+        StageShare(name=name, part=part, mean_us=mean, share=mean / total if total else 0.0)
+        for name, part, mean in means
+    )
