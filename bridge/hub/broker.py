@@ -139,7 +139,7 @@ class Broker:
             self._take_call(key)
         for key in list(client.asked_of):
             call = self._take_call(key)
-            self._answer_failure(call, f"{call.service} went away during the call")
+            self._fail_call(call, f"{call.service} went away during the call")
         self._throttled.discard(client)
 
     def receive(self, client: Client, data: bytes, now: float) -> None:
@@ -168,7 +168,7 @@ class Broker:
         if now >= self._calls_deadline:
             for key in [key for key, call in self._calls.items() if call.deadline <= now]:
                 call = self._take_call(key)
-                self._answer_failure(call, f"{call.service} did not answer in time")
+                self._fail_call(call, f"{call.service} did not answer in time")
             self._calls_deadline = min((call.deadline for call in self._calls.values()), default=inf)
 
     def take_ready(self) -> list[Client]:
@@ -199,7 +199,7 @@ class Broker:
 
     def _note_refusal(self, client: Client, why: str) -> None:
         client.refused += 1
-        if str(client.refused).strip("0") == "1":  # the 1st, 10th, 100th ...: a flood fills no log
+        if _is_round(client.refused):
             log.warning("%s of %s: refused (no. %d): %s", client.node, client.address, client.refused, why)
 
     # --- topics
@@ -370,7 +370,9 @@ class Broker:
             raise _RefusedError(f"{name} would be one service more than {len(client.services)}")
         before = self.graph.services.get(key)
         if before is not None and before.client is not client:
-            log.warning("%s is now offered by %s, no longer by %s", key, client.node, before.client.node)
+            client.takeovers += 1
+            if _is_round(client.takeovers):
+                log.warning("%s is now offered by %s, no longer by %s", key, client.node, before.client.node)
             before.client.services.discard(key)
         self.graph.services[key] = Service(key, type_name, client)
         client.services.add(key)
@@ -387,7 +389,7 @@ class Broker:
         try:
             self._start_call(client, name, call_id, operation, now)
         except _RefusedError as error:
-            self._answer(client, call_id, name, str(error), result=False)
+            self._answer_failure(client, call_id, name, str(error))
 
     def _start_call(
         self, client: Client, name: str, call_id: OperationId, operation: _Operation, now: float
@@ -398,7 +400,7 @@ class Broker:
                 values = self._rosapi.call(key, {} if args is None else args)
             except RosapiError as error:
                 raise _RefusedError(str(error)) from None
-            self._answer(client, call_id, name, values, result=True)
+            self._answer(client, call_id, name, values)
             return
         service = self.graph.services.get(key)
         if service is None:
@@ -433,14 +435,14 @@ class Broker:
         values, result = operation.get("values", {}), operation.get("result", True)
         if result is True and isinstance(values, dict):
             try:
-                self._answer(call.caller, call.call_id, call.service, values, result=True)
+                self._answer(call.caller, call.call_id, call.service, values)
             except _RefusedError as error:
-                self._answer_failure(call, str(error))
+                self._fail_call(call, str(error))
         elif result is True:
-            self._answer_failure(call, f"{call.service} answered with values that are no JSON object")
+            self._fail_call(call, f"{call.service} answered with values that are no JSON object")
         else:
             # The wire has a string here; what a server says beyond that is told as JSON.
-            self._answer_failure(call, values if isinstance(values, str) else orjson.dumps(values).decode())
+            self._fail_call(call, values if isinstance(values, str) else orjson.dumps(values).decode())
 
     def _take_call(self, key: str) -> _Call:
         call = self._calls.pop(key)
@@ -448,23 +450,26 @@ class Broker:
         call.server.asked_of.discard(key)
         return call
 
-    def _answer(
-        self, client: Client, call_id: OperationId, service: str, values: object, *, result: bool
-    ) -> None:
-        answer: dict[str, object] = {"op": "service_response", "service": service, "values": values}
-        answer["result"] = result
-        if call_id is not None:
-            answer["id"] = call_id
-        payload = orjson.dumps(answer)
+    def _answer(self, client: Client, call_id: OperationId, service: str, values: dict[str, Any]) -> None:
+        payload = _service_response(call_id, service, values, result=True)
         if len(payload) > self.limits.message_bytes:
             raise _RefusedError(f"the answer of {service} has more than {self.limits.message_bytes} bytes")
         self._send(client, payload)
 
-    def _answer_failure(self, call: _Call, reason: str) -> None:
-        try:
-            self._answer(call.caller, call.call_id, call.service, reason, result=False)
-        except _RefusedError as error:
-            self._answer(call.caller, call.call_id, call.service, str(error), result=False)
+    def _answer_failure(self, client: Client, call_id: OperationId, service: str, reason: str) -> None:
+        # An eighth, as a character can take six bytes; a failure must always get through.
+        reason = reason[: self.limits.message_bytes // 8]
+        self._send(client, _service_response(call_id, service, reason, result=False))
+
+    def _fail_call(self, call: _Call, reason: str) -> None:
+        self._answer_failure(call.caller, call.call_id, call.service, reason)
+
+
+def _service_response(call_id: OperationId, service: str, values: object, *, result: bool) -> bytes:
+    answer = {"op": "service_response", "service": service, "values": values, "result": result}
+    if call_id is not None:
+        answer["id"] = call_id
+    return orjson.dumps(answer)
 
 
 def _prefix(name: str) -> bytes:
@@ -474,6 +479,11 @@ def _prefix(name: str) -> bytes:
 
 #: Bytes around a topic's name and a message's JSON.
 _AROUND: Final = len(_prefix("")) + 1
+
+
+def _is_round(count: int) -> bool:
+    """Whether to log it: the 1st, 10th, 100th and so on, so that a flood fills no log."""
+    return str(count).strip("0") == "1"
 
 
 def _text(operation: _Operation, field: str) -> str:

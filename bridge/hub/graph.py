@@ -30,6 +30,7 @@ class Client:
         asked: keys of the calls whose answers it waits for.
         asked_of: keys of the calls that it has yet to answer.
         refused: operations that it sent in vain.
+        takeovers: services that it took over from other clients.
         doomed: why it is to be disconnected, empty while it may stay.
         has_output: whether it is on the broker's list of those to be served.
     """
@@ -45,6 +46,7 @@ class Client:
     asked: set[str] = field(default_factory=set)
     asked_of: set[str] = field(default_factory=set)
     refused: int = 0
+    takeovers: int = 0
     doomed: str = ""
     has_output: bool = False
 

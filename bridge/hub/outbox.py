@@ -127,6 +127,7 @@ class Outbox:
         while len(lane.held) > queue_length:
             self._take_held(lane)
             lane.lost += 1
+        self._shorten(lane, max(queue_length, 1))
         self._find_deadline()
 
     def forget(self, lane: Lane) -> None:
@@ -138,9 +139,7 @@ class Outbox:
         self._find_deadline()
 
     def _queue(self, lane: Lane, payload: bytes) -> None:
-        while len(lane.queued) >= max(lane.queue_length, 1):  # 0 with a throttle: one under way
-            self._drop_queued(lane)
-            lane.lost += 1
+        self._shorten(lane, max(lane.queue_length, 1) - 1)  # 0 with a throttle: one under way
         if not self._make_room(len(payload)):
             lane.lost += 1
             return
@@ -160,6 +159,11 @@ class Outbox:
         self.size += len(payload)
         self._holding.add(lane)
         self.deadline = min(self.deadline, lane.next_time)
+
+    def _shorten(self, lane: Lane, length: int) -> None:
+        while len(lane.queued) > length:
+            self._drop_queued(lane)
+            lane.lost += 1
 
     def _drop_queued(self, lane: Lane) -> None:
         """Leave a gap where the lane's oldest queued message was."""

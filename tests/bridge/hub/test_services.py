@@ -291,6 +291,22 @@ def test_an_answer_that_is_too_large_fails_the_call() -> None:
     assert (answer["id"], answer["result"]) == ("i" * 100, False)
 
 
+def test_a_reason_that_is_too_large_is_cut() -> None:
+    room = Room(message_bytes=800)
+    server, caller = room.enter(), room.enter()
+    _serve(server)
+    caller.send(op="call_service", service="/add", id="i" * 100)
+    server.send(op="service_response", id=_request(server)["id"], values="x" * 700, result=False)
+    (answer,) = caller.read()
+    assert (answer["values"], answer["result"]) == ("x" * 100, False)
+
+
+def test_a_name_of_nearly_the_limit_is_answered() -> None:
+    caller = Room(message_bytes=1000).enter()
+    answer = caller.ask("/" + "x" * 700)
+    assert answer["result"] is False
+
+
 def test_a_request_that_is_too_large_fails_the_call() -> None:
     room = Room(message_bytes=500)
     server, caller = room.enter(), room.enter()

@@ -1,0 +1,187 @@
+"""Long random lives of a small hub: mostly sensible clients, now and then not, in every order.
+
+Everything that must always hold is checked after each step; every call is answered exactly once.
+"""
+
+import json
+import random
+from collections import Counter
+from typing import Any
+
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from tests.bridge.hub.room import Guest, Room
+
+_NAMES = ["/t", "t", "/u", "/u", "/v", "v", "/w", "", "a b"]
+_TYPES = ["a/B", "a/msg/B", "a/B", "a/B", "a/C", "nonsense"]
+_IDS: list[Any] = [None, None, "one", "two", 3, 1.5]
+_SERVICES = ["/s", "s", "/r", "/q", "/nowhere", "/rosapi/set_param", "/rosapi/topics", "/rosapi/nodes"]
+_WILD: list[Any] = [None, True, -1, 1e300, 10**400, float("nan"), "", "x" * 2000, [], {}, [{"a": [1]}]]
+
+
+def _message(rng: random.Random) -> Any:
+    if rng.random() < 0.05:
+        return rng.choice(_WILD)
+    return {"data": "x" * rng.choice([0, 1, 10, 100, 1000, 3300])}
+
+
+def _operation(rng: random.Random) -> dict[str, Any]:
+    """What a client could send; one in twenty has a field that makes no sense."""
+    name, service = rng.choice(_NAMES), rng.choice(_SERVICES)
+    kind = rng.choice(
+        ["publish"] * 6
+        + ["subscribe"] * 3
+        + ["call_service"] * 4
+        + ["advertise", "advertise", "unadvertise", "unsubscribe", "advertise_service", "advertise_service"]
+        + ["unadvertise_service", "service_response", "fly"]
+    )
+    fields: dict[str, Any] = {"op": kind}
+    if "service" in kind:
+        fields |= {"service": service}
+    else:
+        fields |= {"topic": name}
+    if kind in {"advertise", "advertise_service"} or (kind != "call_service" and rng.random() < 0.3):
+        fields["type"] = rng.choice(_TYPES)
+    if kind == "publish":
+        fields["msg"] = _message(rng)
+    elif kind in {"subscribe", "advertise", "unsubscribe", "unadvertise"}:
+        fields["id"] = rng.choice(_IDS)
+    if kind in {"advertise", "publish"}:
+        fields["latch"] = rng.random() < 0.4
+    if kind == "subscribe":
+        fields["throttle_rate"] = rng.choice([0, 0, 50, 1000, 0.0])
+        fields["queue_length"] = rng.choice([0, 1, 3, 100])
+    if kind == "call_service":
+        fields["args"] = rng.choice(
+            [{}, {"name": name, "value": rng.choice(["1", "[2]", "x"])}, {"a": "y" * 3000}]
+        )
+        fields["timeout"] = rng.choice([0, 0, 0.5, 1])
+    if rng.random() < 0.05:
+        fields[rng.choice(list(fields)[1:])] = rng.choice(_WILD)
+    return fields
+
+
+class _Visitor:
+    """A client that remembers what it was asked, and counts its own calls and their answers."""
+
+    def __init__(self, room: Room) -> None:
+        self.guest: Guest = room.enter()
+        self.requests: list[str] = []
+        self.calls: set[int] = set()
+        self.answered: set[int] = set()
+
+    def send(self, operation: dict[str, Any], call_number: int) -> None:
+        service = operation.get("service")
+        if operation["op"] == "call_service" and isinstance(service, str) and service:
+            operation["id"] = call_number
+            if len(json.dumps(operation)) <= self.guest.room.broker.limits.message_bytes:
+                self.calls.add(call_number)
+        self.guest.send(**operation)
+
+    def read(self, happened: Counter[str]) -> None:
+        for operation in self.guest.read():
+            happened[operation["op"]] += 1
+            if operation["op"] == "call_service":
+                self.requests.append(operation["id"])
+            elif operation["op"] == "service_response":
+                assert operation["result"] is True or isinstance(operation["values"], str)
+                happened["failure"] += not operation["result"]
+                assert operation["id"] in self.calls - self.answered, "answered twice, or never asked"
+                self.answered.add(operation["id"])
+            else:
+                assert set(operation) == {"op", "topic", "msg"}
+
+    def answer(self, rng: random.Random) -> None:
+        self.guest.send(
+            op="service_response",
+            id=self.requests.pop(rng.randrange(len(self.requests))),
+            values=rng.choice([{}, {"a": 1}, "no", {"a": "x" * 3400}, None]),
+            result=rng.random() < 0.7,
+        )
+
+
+def _live(seed: int, steps: int) -> Counter[str]:
+    """One life of a hub; what happened in it, counted."""
+    rng = random.Random(seed)
+    room = Room(
+        topics=3,
+        advertisements_per_client=4,
+        subscriptions_per_client=4,
+        services_per_client=2,
+        calls_per_client=3,
+        message_bytes=3500,
+        client_bytes=4000,
+        latched_bytes=4000,
+        queue_length=3,
+        longest_queue=5,
+        parameters=2,
+    )
+    visitors = [_Visitor(room) for _ in range(4)]
+    happened: Counter[str] = Counter()
+    for number in range(steps):
+        who = rng.randrange(len(visitors))
+        visitor = visitors[who]
+        step = rng.choices(
+            ["operation", "answer", "read", "read all", "wait", "reconnect"], [60, 10, 4, 1, 10, 1]
+        )[0]
+        if step == "operation":
+            visitor.send(_operation(rng), number)
+        elif step == "answer" and visitor.requests:
+            visitor.answer(rng)
+        elif step == "read":
+            visitor.read(happened)
+        elif step == "read all":
+            for each in visitors:
+                each.read(happened)
+        elif step == "wait":
+            room.pass_time(rng.choice([0.01, 0.05, 1.0, 30.0]))
+        elif step == "reconnect":
+            happened["doomed"] += bool(visitor.guest.client.doomed)
+            happened["lost"] += sum(
+                subscription.lane.lost for subscription in visitor.guest.client.subscriptions.values()
+            )
+            visitor.guest.leave()
+            visitors[who] = _Visitor(room)
+        room.check()
+        graph = room.broker.graph
+        happened["latched"] += graph.latched_bytes > 0
+        happened["held"] += bool(room.broker._throttled)
+        ready = room.broker.take_ready()
+        assert len(set(ready)) == len(ready)
+    _end(room, visitors, happened)
+    return happened
+
+
+def _end(room: Room, visitors: list[_Visitor], happened: Counter[str]) -> None:
+    for _ in range(2):
+        for visitor in visitors:
+            visitor.read(happened)
+        room.pass_time(120)
+    for visitor in visitors:
+        visitor.read(happened)
+        if not visitor.guest.client.doomed:
+            assert visitor.calls == visitor.answered, "a call without an answer"
+        visitor.guest.leave()
+        room.check()
+    graph = room.broker.graph
+    assert not graph.topics
+    assert not graph.services
+    assert not room.broker._calls
+    room.pass_time(120)
+    assert not room.broker._throttled
+
+
+@given(st.integers(0, 2**32))
+@settings(max_examples=100, deadline=None)
+@example(0)
+def test_a_hub_stays_well_all_its_life(seed: int) -> None:
+    _live(seed, 400)
+
+
+def test_in_these_lives_everything_happens() -> None:
+    happened: Counter[str] = Counter()
+    for seed in range(20):
+        happened += _live(seed, 400)
+    expected = {"publish", "call_service", "service_response", "failure", "doomed", "lost", "latched", "held"}
+    assert {what for what in expected if happened[what] >= 5} == expected, happened
