@@ -1,0 +1,225 @@
+"""Real processes for the integration tests, and a robot that speaks rosbridge without any code of ours.
+
+Robot (websockets + json) <--> hub (a process) <--> master and its children (processes)
+"""
+
+import asyncio
+import contextlib
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+import uuid
+from pathlib import Path
+
+import psutil
+import pytest
+import websockets
+
+ROOT = Path(__file__).resolve().parents[2]
+BIN = Path(sys.executable).parent
+MARK = "ROSBAYES_TEST_RUN"
+READING = {"D1": 71, "D2": 50, "D3": 50, "B1": 45, "B2": 0, "B3": 90}
+"""What a boat in the middle of the map sees."""
+
+
+class Running:
+    """A command of ours as a process, its output in files."""
+
+    def __init__(
+        self, where: Path, run: str, *command: str, environment: dict[str, str] | None = None
+    ) -> None:
+        self.name = command[0]
+        self._out, self._err = where / f"{self.name}-{uuid.uuid4().hex[:6]}.out", where / f"{self.name}.err"
+        self._err = self._out.with_suffix(".err")
+        with self._out.open("wb") as out, self._err.open("wb") as err:
+            self.process = subprocess.Popen(
+                [str(BIN / command[0]), *command[1:]],
+                stdin=subprocess.DEVNULL,
+                stdout=out,
+                stderr=err,
+                env=dict(os.environ) | {MARK: run, "TMPDIR": str(where)} | (environment or {}),
+                start_new_session=True,
+            )
+
+    @property
+    def out(self) -> str:
+        return self._out.read_text()
+
+    @property
+    def err(self) -> str:
+        return self._err.read_text()
+
+    async def end(self, timeout: float = 40) -> int:
+        """Its exit code."""
+        deadline = time.monotonic() + timeout
+        while self.process.poll() is None:
+            assert time.monotonic() < deadline, f"{self.name} did not end: {self.err}"
+            await asyncio.sleep(0.02)
+        return self.process.returncode
+
+    async def says(self, pattern: str, timeout: float = 20, times: int = 1) -> re.Match[str]:
+        """Wait for a line on its standard error."""
+        deadline = time.monotonic() + timeout
+        while len(found := list(re.finditer(pattern, self.err))) < times:
+            assert self.process.poll() is None, f"{self.name} ended: {self.err}"
+            assert time.monotonic() < deadline, f"{self.name} never said {pattern!r}: {self.err}"
+            await asyncio.sleep(0.02)
+        return found[times - 1]
+
+    def send(self, number: signal.Signals) -> None:
+        self.process.send_signal(number)
+
+
+class Stage:
+    """Starts processes for one test, and knows all that came from them."""
+
+    def __init__(self, where: Path) -> None:
+        self.where = where
+        self.run = uuid.uuid4().hex
+        self.running: list[Running] = []
+
+    def start(self, *command: str, environment: dict[str, str] | None = None) -> Running:
+        running = Running(self.where, self.run, *command, environment=environment)
+        self.running.append(running)
+        return running
+
+    async def hub(self, port: int = 0) -> tuple[Running, str]:
+        hub = self.start("hub", "--port", str(port))
+        return hub, (await hub.says(r"ws://\S+"))[0]
+
+    def processes(self) -> dict[str, list[psutil.Process]]:
+        """Live processes of this test, by command name; a board forked by `board` counts as a board."""
+        found: dict[str, list[psutil.Process]] = {}
+        for process in psutil.process_iter():
+            with contextlib.suppress(psutil.Error):
+                if process.environ().get(MARK) == self.run and process.status() != psutil.STATUS_ZOMBIE:
+                    name = next(
+                        (
+                            Path(part).name
+                            for part in process.cmdline()[:3]
+                            if Path(part).parent == BIN and "python" not in part
+                        ),
+                        "?",
+                    )
+                    found.setdefault(name, []).append(process)
+        return found
+
+    async def nothing_left(self, *except_for: str, timeout: float = 8) -> None:
+        """All processes but the named have ended, and no socket or private directory is left."""
+        deadline = time.monotonic() + timeout
+        while left := {name: all_ for name, all_ in self.processes().items() if name not in except_for}:
+            assert time.monotonic() < deadline, f"still running: {left}"
+            await asyncio.sleep(0.05)
+        while left := list(self.where.glob("rosbayes-*")):
+            assert time.monotonic() < deadline, f"left behind: {[list(each.iterdir()) for each in left]}"
+            await asyncio.sleep(0.05)
+
+    def end_all(self) -> None:
+        for all_ in self.processes().values():
+            for process in all_:
+                with contextlib.suppress(psutil.Error):
+                    process.kill()
+        for running in self.running:
+            running.process.wait(10)
+
+
+class Robot:
+    """A rosbridge client of plain websockets and json; publishes readings and collects results."""
+
+    def __init__(self, uri: str) -> None:
+        self.uri = uri
+        self.results: list[dict] = []
+        self.frames: list[dict] = []
+        self.order: list[str] = []
+        self._tasks: list[asyncio.Task] = []
+        self._socket = None
+
+    async def __aenter__(self):
+        await self.connect()
+        return self
+
+    async def connect(self) -> None:
+        self._socket = await websockets.connect(self.uri, max_size=1 << 22)
+        for topic, type_ in (
+            ("/BMresults", "std_msgs/Float64MultiArray"),
+            ("/bm/frame", "diagnostic_msgs/DiagnosticArray"),
+        ):
+            await self._socket.send(json.dumps({"op": "subscribe", "topic": topic, "type": type_}))
+        await self._socket.send(
+            json.dumps({"op": "advertise", "topic": "/boat/sensors", "type": "boat_msgs/Sensors"})
+        )
+        self._tasks.append(asyncio.ensure_future(self._collect(self._socket)))
+
+    async def __aexit__(self, *_):
+        for task in self._tasks:
+            task.cancel()
+        if self._socket is not None:
+            await self._socket.close()
+
+    async def _collect(self, socket) -> None:
+        with contextlib.suppress(websockets.ConnectionClosed):
+            async for text in socket:
+                message = json.loads(text)
+                if message.get("op") == "publish":
+                    self.order.append(message["topic"])
+                    kept = self.results if message["topic"] == "/BMresults" else self.frames
+                    kept.append(message["msg"])
+
+    async def publish(self, **values) -> None:
+        stamp = divmod(time.time_ns(), 10**9)
+        msg = {"header": {"stamp": {"sec": stamp[0], "nanosec": stamp[1]}, "frame_id": "map"}, **values}
+        await self._socket.send(json.dumps({"op": "publish", "topic": "/boat/sensors", "msg": msg}))
+
+    async def keep_publishing(self, rate: float = 20, **values) -> None:
+        """Publish in the background until the test is over; a lost server is waited for."""
+
+        async def publish() -> None:
+            while True:
+                try:
+                    await self.publish(**(values or READING))
+                except (websockets.ConnectionClosed, OSError):
+                    with contextlib.suppress(OSError, websockets.WebSocketException):
+                        await self.connect()
+                await asyncio.sleep(1 / rate)
+
+        self._tasks.append(asyncio.ensure_future(publish()))
+
+    async def have(self, count: int, timeout: float = 25) -> None:
+        """Wait until so many results have come."""
+        deadline = time.monotonic() + timeout
+        while len(self.results) < count:
+            assert time.monotonic() < deadline, f"{len(self.results)} results of {count}"
+            await asyncio.sleep(0.01)
+
+
+@pytest.fixture
+def stage(tmp_path_factory):
+    # short: a socket's path has 99 bytes
+    made = Stage(tmp_path_factory.mktemp("run"))
+    yield made
+    made.end_all()
+
+
+def build_boat(directory: Path, *options: str, cells: int = 8) -> Path:
+    """A small boat deployment, built by the command as a user builds it."""
+    subprocess.run(
+        [
+            *(str(BIN / "toolchain"), "build", str(ROOT / "casestudies/boat"), "-o", str(directory)),
+            *("--partitions", "4", "--uri", "ws://127.0.0.1:9090", "--topic", "/boat/sensors"),
+            *("--type", "boat_msgs/Sensors", "--set", f"width={cells}", "--set", f"height={cells}", *options),
+        ],
+        check=True,
+        capture_output=True,
+        timeout=60,
+    )
+    return directory
+
+
+@pytest.fixture(scope="session")
+def boat(tmp_path_factory):
+    """The boat on 8 x 8 cells, four boards."""
+    return build_boat(tmp_path_factory.mktemp("boat") / "deployment")

@@ -1,0 +1,121 @@
+"""Frames: which messages make one, from one topic and from several."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from services.errors import OverflowedQueueError, VariableError
+from services.frames import QUEUE_ALL_DEPTH, UNPAIRED_DEPTH, FrameAssembler, WaitingFrames
+from toolchain.deployment import Board, Deployment, Dimension, MachineSection, Source, Variable
+
+HASH = "0" * 64
+
+
+def deployment(*variables: Variable, sources: int = 1, tolerance_s: float = 0.05) -> Deployment:
+    return Deployment(
+        name="test",
+        source=[Source(uri="ws://robot:9090", topic=f"/t{at}", type="a/B") for at in range(sources)],
+        variable=list(variables),
+        searched=[Dimension(label="x", size=4)],
+        machine=MachineSection(lines=4),
+        board=[Board(image="boards/board0.bm", image_hash=HASH, line_offset=0, lines=4)],
+        tolerance_s=tolerance_s,
+    )
+
+
+def variable(name: str, **settings) -> Variable:
+    return Variable(name=name, bits=7, values=101, **settings)
+
+
+def stamped(ms: float, **values):
+    return {"header": {"stamp": {"sec": 100, "nanosec": int(ms * 1e6)}}, **values}
+
+
+def test_one_topic_every_message_is_a_frame_with_its_stamp():
+    frames = FrameAssembler(deployment(variable("D1"), variable("D2")))
+    reading = frames.take(0, stamped(5, D2=7, deep={"D1": 3}), 11, 12)
+    assert reading.addresses == [3, 7]
+    assert reading.stamp_ns == 100_005_000_000
+    assert (reading.received_ns, reading.received_tick) == (11, 12)
+
+
+def test_without_a_stamp_the_receipt_counts():
+    assert FrameAssembler(deployment(variable("D1"))).take(0, {"D1": 1}, 77, 0).stamp_ns == 77
+
+
+@pytest.mark.parametrize("message", [{}, {"D1": None}, {"D1": float("nan")}, {"D1": []}])
+def test_missing_is_an_error_or_a_missing_address(message):
+    with pytest.raises(VariableError, match=r"/t0: .*D1"):
+        FrameAssembler(deployment(variable("D1"))).take(0, message, 0, 0)
+    optional = FrameAssembler(deployment(variable("D1", on_missing="missing")))
+    assert optional.take(0, message, 0, 0).addresses == [None]
+
+
+@pytest.mark.parametrize("value", ["12", 500, {"a": 1}, [1]])
+def test_unusable_values_name_topic_and_variable(value):
+    with pytest.raises(VariableError, match=r"/t0: .*D1"):
+        FrameAssembler(deployment(variable("D1"))).take(0, {"D1": value}, 0, 0)
+
+
+def test_two_topics_are_paired_by_stamp():
+    frames = FrameAssembler(deployment(variable("D1"), variable("D2", source=1), sources=2))
+    assert frames.take(0, stamped(0, D1=1), 1, 1) is None
+    assert frames.take(0, stamped(100, D1=2), 2, 2) is None
+    reading = frames.take(1, stamped(110, D2=9), 3, 3)
+    assert reading.addresses == [2, 9]
+    assert reading.stamp_ns == 100_110_000_000
+    assert frames.unpaired == 1  # the first one's time is over
+    assert frames.take(1, stamped(111, D2=9), 4, 4) is None  # the second one is used
+
+
+def test_two_topics_too_far_apart_wait():
+    frames = FrameAssembler(deployment(variable("D1"), variable("D2", source=1), sources=2))
+    assert frames.take(0, stamped(0, D1=1), 1, 1) is None
+    assert frames.take(1, stamped(51, D2=9), 1, 1) is None
+    assert frames.take(0, stamped(40, D1=3), 1, 1).addresses == [3, 9]
+
+
+def test_an_optional_topic_is_not_waited_for():
+    frames = FrameAssembler(
+        deployment(variable("D1"), variable("D2", source=1, on_missing="missing"), sources=2)
+    )
+    assert frames.take(0, stamped(0, D1=1), 1, 1).addresses == [1, None]
+
+
+def test_an_endless_topic_without_partner_stays_bounded():
+    frames = FrameAssembler(deployment(variable("D1"), variable("D2", source=1), sources=2))
+    for at in range(UNPAIRED_DEPTH + 10):
+        assert frames.take(0, stamped(at, D1=1), 1, 1) is None
+    assert frames.unpaired == 10
+
+
+@given(st.lists(st.tuples(st.integers(0, 1), st.integers(0, 400)), max_size=80))
+def test_paired_readings_are_within_tolerance_and_used_once(arrivals):
+    frames = FrameAssembler(deployment(variable("D1"), variable("D2", source=1), sources=2, tolerance_s=0.01))
+    counts = [0, 0]
+    made = 0
+    for source, ms in arrivals:
+        counts[source] += 1
+        made += frames.take(source, stamped(ms, D1=1, D2=2), 0, 0) is not None
+    assert made <= min(counts)
+    assert made * 2 + frames.unpaired <= len(arrivals)
+
+
+def test_latest_keeps_the_newest_and_counts_the_rest():
+    waiting = WaitingFrames("latest")
+    for frame in range(5):
+        waiting.put(frame)
+    assert waiting.get() == 4
+    assert waiting.get() is None
+    assert waiting.passed_over == 4
+
+
+def test_all_keeps_order_and_names_the_slow_part_when_full():
+    waiting = WaitingFrames("all")
+    for frame in range(QUEUE_ALL_DEPTH):
+        waiting.put(frame)
+    with pytest.raises(OverflowedQueueError, match="pcie-app") as caught:
+        waiting.put(256)
+    assert caught.value.exit_code == 6
+    assert [waiting.get() for _ in range(QUEUE_ALL_DEPTH)] == list(range(QUEUE_ALL_DEPTH))
+    assert waiting.passed_over == 0

@@ -1,0 +1,51 @@
+"""Settings: flag over variable over default, and a sentence for every mistake."""
+
+import pytest
+
+from services.errors import SettingsError
+from services.settings import endpoint_in, load_settings
+
+
+def test_flag_over_variable_over_default(monkeypatch):
+    assert load_settings().connect_timeout == 10
+    monkeypatch.setenv("BM_CONNECT_TIMEOUT", "3")
+    assert load_settings().connect_timeout == 3
+    assert load_settings(connect_timeout=4).connect_timeout == 4
+
+
+def test_boards_are_split_at_commas(monkeypatch):
+    monkeypatch.setenv("BM_BOARDS", "unix:/tmp/a.sock, tcp://10.0.0.2:7000")
+    assert load_settings().boards == ("unix:/tmp/a.sock", "tcp://10.0.0.2:7000")
+
+
+def test_an_unknown_variable_names_the_nearest(monkeypatch):
+    monkeypatch.setenv("BM_CONECT_TIMEOUT", "3")
+    with pytest.raises(
+        SettingsError, match="BM_CONECT_TIMEOUT is no setting.*did you mean BM_CONNECT_TIMEOUT"
+    ):
+        load_settings()
+
+
+@pytest.mark.parametrize(
+    ("flags", "match"),
+    [
+        ({"connect_timeout": -1.0}, "--connect-timeout: .*greater than 0.*-1"),
+        ({"uri": "http://robot:9090"}, "--uri: a rosbridge URI starts with ws://"),
+        ({"queue": "newest"}, "--queue: .*latest.*newest"),
+        ({"boards": "nonsense"}, "--boards: "),
+    ],
+)
+def test_a_wrong_flag_says_which_and_what_was_expected(flags, match):
+    with pytest.raises(SettingsError, match=match):
+        load_settings(**flags)
+
+
+def test_a_wrong_variable_says_which(monkeypatch):
+    monkeypatch.setenv("BM_PEER_TIMEOUT", "soon")
+    with pytest.raises(SettingsError, match="environment variable BM_PEER_TIMEOUT: .*'soon'"):
+        load_settings()
+
+
+def test_a_path_too_long_for_a_socket_is_refused(tmp_path):
+    with pytest.raises(SettingsError, match="too long for a local socket"):
+        endpoint_in(tmp_path / ("x" * 90), "board0")
