@@ -1,0 +1,81 @@
+"""Cells of a rectangle: every point has one, and each centre lies in its own."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from casestudies.grid import Grid
+
+BOAT = Grid(x_low=-50, x_high=50, y_low=-50, y_high=50, width=32, height=32)
+
+
+@st.composite
+def grids(draw):
+    x_low, y_low = draw(st.integers(-100, 100)), draw(st.integers(-100, 100))
+    return Grid(
+        x_low=x_low,
+        x_high=x_low + draw(st.integers(1, 200)),
+        y_low=y_low,
+        y_high=y_low + draw(st.integers(1, 200)),
+        width=draw(st.integers(1, 40)),
+        height=draw(st.integers(1, 40)),
+    )
+
+
+@given(grids(), st.data())
+def test_a_centre_lies_in_its_own_cell(grid, data):
+    line = data.draw(st.integers(0, grid.cells - 1))
+    assert grid.line(*grid.centre(line)) == line
+
+
+@given(grids(), st.data())
+def test_a_point_is_at_most_half_a_cell_from_its_cells_centre(grid, data):
+    x = data.draw(st.floats(grid.x_low, grid.x_high))
+    y = data.draw(st.floats(grid.y_low, grid.y_high))
+    centre_x, centre_y = grid.centre(grid.line(x, y))
+    assert abs(centre_x - x) <= grid.cell_width / 2 * (1 + 1e-9)
+    assert abs(centre_y - y) <= grid.cell_height / 2 * (1 + 1e-9)
+
+
+@given(grids(), st.data())
+def test_the_mean_of_a_certain_cell_is_its_centre(grid, data):
+    line = data.draw(st.integers(0, grid.cells - 1))
+    posterior = [0.0] * grid.cells
+    posterior[line] = 0.25
+    assert grid.mean(posterior) == pytest.approx(grid.centre(line))
+
+
+def test_lines_are_row_major_from_the_lower_left_corner():
+    assert BOAT.line(-49.9, -49.9) == 0
+    assert BOAT.line(49.9, -49.9) == 31
+    assert BOAT.line(-49.9, 49.9) == 31 * 32
+    assert BOAT.cell(0.1, -49.9) == (16, 0)
+
+
+def test_points_outside_belong_to_the_border():
+    assert BOAT.cell(-1000, 1000) == (0, 31)
+    assert BOAT.cell(50, 50) == (31, 31)
+
+
+def test_the_mean_of_two_cells_lies_between_them_by_weight():
+    grid = Grid(x_low=0, x_high=2, y_low=0, y_high=1, width=2, height=1)
+    assert grid.mean([3.0, 1.0]) == pytest.approx((0.75, 0.5))
+
+
+def test_no_mean_of_nothing_nor_of_another_length():
+    with pytest.raises(ValueError, match="without any mass"):
+        BOAT.mean([0.0] * 1024)
+    with pytest.raises(ValueError, match="7 values for a grid of 1024"):
+        BOAT.mean([1.0] * 7)
+
+
+def test_a_grid_needs_cells_and_an_area():
+    with pytest.raises(ValueError, match="at least one cell"):
+        Grid(x_low=0, x_high=1, y_low=0, y_high=1, width=0, height=1)
+    with pytest.raises(ValueError, match="positive area"):
+        Grid(x_low=1, x_high=1, y_low=0, y_high=1, width=1, height=1)
+
+
+def test_lines_that_are_not_there():
+    with pytest.raises(IndexError):
+        BOAT.centre(1024)
