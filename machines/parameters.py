@@ -15,6 +15,12 @@ ADDRESS_BITS_MAX: Final = 16
 COUNTER_BITS_MAX: Final = 32
 """Widest counter, in bits: a result register holds 32."""
 
+STEPS_PER_CLOCK_MAX: Final = 256
+"""Most steps of a generator in a clock: logic unrolls them, and the reference takes them one by one."""
+
+RNG_BANKS_MAX: Final = 65536
+"""Most sets of seeds."""
+
 
 class RngKind(StrEnum):
     """How a column makes its random numbers. `machines.rng` says how each one works."""
@@ -107,8 +113,8 @@ class BM1Parameters:
         _check("prob_bits", self.prob_bits, 1, PROB_BITS_MAX)
         _check("prior_bits", self.prior_bits, 0, ADDRESS_BITS_MAX)
         _check("counter_bits", self.counter_bits, 1, COUNTER_BITS_MAX)
-        _check("steps_per_clock", self.steps_per_clock, 0, 2**32 - 1)
-        _check("rng_banks", self.rng_banks, 1, 2**32 - 1)
+        _check("steps_per_clock", self.steps_per_clock, 0, STEPS_PER_CLOCK_MAX)
+        _check("rng_banks", self.rng_banks, 1, RNG_BANKS_MAX)
         _check("ideal_seed", self.ideal_seed, 0, 2**64 - 1)
         if self.prior_mode is PriorMode.WRITTEN and self.prior_bits != 0:
             raise ParameterError(
