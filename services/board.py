@@ -11,12 +11,13 @@ from pathlib import Path
 from typing import Annotated, NoReturn
 
 import typer
-from pcie_shim.board import Misbehaviour, serve_board
 
+from pcie_shim.board import StopSignal, serve_board
 from pcie_shim.endpoint import Endpoint
+from pcie_shim.misbehaviour import Misbehaviour
 from services import options
 from services.command_line import ends_well, make_app, raise_on_signals
-from services.errors import BoardFailedError, SettingsError, StoppedError, exit_code_of
+from services.errors import BoardFailedError, SettingsError, exit_code_of
 from services.logs import say
 from services.serving import endpoint_from
 from services.settings import endpoint_in
@@ -28,6 +29,21 @@ from services.supervision import (
     how_it_ended,
     leave_private_directory,
 )
+
+
+def serve_one(endpoint: Endpoint, index: int, misbehave: Misbehaviour | None) -> int:
+    """Serve one board in this process until a signal; gives the signal's exit code."""
+    stop = StopSignal()
+    ended_by: list[int] = []
+
+    def end(number: int, _frame: object) -> None:
+        ended_by.append(128 + number)
+        stop.set()
+
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, end)
+    serve_board(endpoint, index=index, stop=stop, misbehave=misbehave)
+    return ended_by[0] if ended_by else 0
 
 
 class BoardProcesses:
@@ -71,10 +87,7 @@ class BoardProcesses:
         try:
             os.environ[PARENT_VARIABLE] = str(parent)
             end_with_parent()
-            serve_board(self._endpoints[at], index=at)
-            code = 0
-        except StoppedError as stopped:
-            code = stopped.exit_code
+            code = serve_one(self._endpoints[at], at, None)
         except BaseException as error:  # the fork must never run on in its parent's code
             code = exit_code_of(error)
             say(f"error: board {at}: {error}")
@@ -116,11 +129,9 @@ class BoardProcesses:
 
     def _forget(self, endpoint: Endpoint) -> None:
         # a board that was killed could not take its sockets away
-        if endpoint.path is not None:
-            path = Path(endpoint.path)
-            for each in (path, path.with_suffix(".program.sock")):
-                with contextlib.suppress(OSError):
-                    each.unlink()
+        for each in (endpoint, endpoint.programming):
+            with contextlib.suppress(OSError):
+                Path(each.path).unlink()
 
 
 app = make_app(
@@ -157,15 +168,11 @@ def board(
             msg = f"--directory {directory or ''} is no folder; name one for the boards' sockets"
             raise SettingsError(msg)
         BoardProcesses(directory, boards, restarts).run()
-    try:
-        wrong = Misbehaviour.parse(misbehave) if misbehave else None
-    except ValueError as error:
-        raise SettingsError(str(error)) from error
+    wrong = Misbehaviour.parse(misbehave) if misbehave else None
     from machines.kernel import warm_up
 
     warm_up()
-    serve_board(endpoint_from(listen or "", "--listen"), index=index, misbehave=wrong)
-    return 0
+    return serve_one(endpoint_from(listen or "", "--listen"), index, wrong)
 
 
 def main() -> None:

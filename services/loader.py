@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from pcie_shim.loader import program
 
+from pcie_shim.loader import program
 from services import options
 from services.command_line import ends_well, make_app
 from services.logs import say

@@ -7,18 +7,15 @@ socket; an asyncio shell and a blocking one stand around it.
 from __future__ import annotations
 
 import asyncio
-import contextlib
-import os
 import socket
 import struct
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Self
 
 import msgspec
 
-from pcie_shim.endpoint import Endpoint
+from pcie_shim.endpoint import Endpoint, no_delay
 from services.errors import LocalSocketError, OtherPeerError
 from services.records import AnyRecord, Hello, Record
 from services.version import VERSION
@@ -107,49 +104,6 @@ def check_hello(record: AnyRecord, expected_role: str, deployment_hash: str, whe
         raise OtherPeerError(msg)
 
 
-def bind(endpoint: Endpoint) -> socket.socket:
-    """A listening socket; a unix one is private (0600) and replaces a dead one of the same name.
-
-    Raises:
-        LocalSocketError: the address is taken or can't be bound.
-    """
-    try:
-        if endpoint.path is None:
-            listener = socket.create_server((endpoint.host, endpoint.port), reuse_port=False)
-        else:
-            path = Path(endpoint.path)
-            _remove_dead_socket(path)
-            listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-            mask = os.umask(0o177)
-            try:
-                listener.bind(str(path))
-            finally:
-                os.umask(mask)
-            listener.listen(8)
-    except OSError as error:
-        msg = f"can't listen on {endpoint}: {error.strerror or error}; is another process using it?"
-        raise LocalSocketError(msg) from error
-    return listener
-
-
-def _remove_dead_socket(path: Path) -> None:
-    if not path.is_socket():
-        return
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
-        probe.settimeout(1)
-        try:
-            probe.connect(str(path))
-        except OSError:
-            path.unlink(missing_ok=True)
-
-
-def unlink(endpoint: Endpoint) -> None:
-    """Take a unix endpoint's file away; nothing for TCP."""
-    if endpoint.path is not None:
-        with contextlib.suppress(OSError):
-            Path(endpoint.path).unlink()
-
-
 class RecordProtocol(asyncio.Protocol):
     """One local connection under asyncio: records go to a callback, without a task in between."""
 
@@ -173,8 +127,8 @@ class RecordProtocol(asyncio.Protocol):
         assert isinstance(transport, asyncio.Transport)  # noqa: S101 - tells mypy what a stream socket gives
         self._transport = transport
         sock = transport.get_extra_info("socket")
-        if sock is not None and sock.family != socket.AF_UNIX:
-            sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        if sock is not None:
+            no_delay(sock)
         self._on_open(self)
 
     def data_received(self, data: bytes) -> None:
@@ -212,10 +166,10 @@ class RecordProtocol(asyncio.Protocol):
 async def open_connection(endpoint: Endpoint, make: Callable[[], RecordProtocol]) -> RecordProtocol:
     """Connect once; raises OSError like the socket would."""
     loop = asyncio.get_running_loop()
-    if endpoint.path is None:
-        _, protocol = await loop.create_connection(make, endpoint.host, endpoint.port)
-    else:
+    if endpoint.path:
         _, protocol = await loop.create_unix_connection(make, endpoint.path)
+    else:
+        _, protocol = await loop.create_connection(make, endpoint.host, endpoint.port)
     return protocol
 
 
@@ -227,8 +181,7 @@ class BlockingRecordSocket:
         self._where = where
         self._splitter = RecordSplitter(where)
         self._send_timeout = send_timeout
-        if sock.family != socket.AF_UNIX:
-            sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        no_delay(sock)
         sock.setblocking(False)
 
     def __enter__(self) -> Self:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import sys
 from typing import Any, TextIO
@@ -42,6 +43,8 @@ def get_logger(role: str) -> FilteringBoundLogger:
     Args:
         role: the process's name, for example "subscriber".
     """
+    # what the libraries log, our own records say in words; only their errors are news
+    logging.basicConfig(level=logging.ERROR, stream=sys.stderr, format="%(name)s: %(message)s")
     colours = sys.stderr.isatty() and "NO_COLOR" not in os.environ
     structlog.configure_once(
         processors=[

@@ -7,6 +7,7 @@ posted to every board, the counts are collected, and the result goes back.
 from __future__ import annotations
 
 import selectors
+import socket
 import sys
 import time
 from collections.abc import Sequence
@@ -15,7 +16,7 @@ import orjson
 from pcie_shim.driver import FrameInput, FrameOutput, MiniCluster
 
 from machines.bm1 import StopReason
-from pcie_shim.endpoint import Endpoint
+from pcie_shim.endpoint import Endpoint, listen, remove_listener
 from pcie_shim.errors import BoardError, PcieShimError
 from pcie_shim.programming_file import Image, read_image
 from services import options
@@ -28,7 +29,7 @@ from services.errors import (
     SettingsError,
     exit_code_of,
 )
-from services.local_socket import BlockingRecordSocket, bind, check_hello, own_hello, unlink
+from services.local_socket import BlockingRecordSocket, check_hello, own_hello
 from services.logs import get_logger, say
 from services.records import BoardOutcome, Frame, FrameFailed, FrameResult, Notice, Ready, Record, Trouble
 from services.results import REASON_WORDS, counts_of
@@ -159,7 +160,7 @@ class PcieApp:
         Raises:
             PcieShimError: the boards can't be opened, or one came back as another.
         """
-        listener = bind(self._endpoint)
+        listener = listen(self._endpoint)
         listener.setblocking(False)
         self._selector.register(listener, selectors.EVENT_READ)
         try:
@@ -168,7 +169,7 @@ class PcieApp:
                 while True:
                     for key, _ in self._selector.select(_TICK):
                         if key.fileobj is listener:
-                            self._accept(listener.accept()[0])
+                            self._accept(listener)
                         else:
                             self._receive()
                     self._look_at_boards()
@@ -179,12 +180,11 @@ class PcieApp:
             self._boards.close()
             if self._master is not None:
                 self._master.close()
-            listener.close()
-            unlink(self._endpoint)
+            remove_listener(self._endpoint, listener)
             leave_private_directory()
 
-    def _accept(self, sock: object) -> None:
-        connection = BlockingRecordSocket(sock, self._where)  # type: ignore[arg-type]  # what accept() gives
+    def _accept(self, listener: socket.socket) -> None:
+        connection = BlockingRecordSocket(listener.accept()[0], self._where)
         if self._master is not None:
             connection.send(Trouble(ExitCode.USAGE, f"the {self._where} serves another master already"))
             connection.close()
@@ -204,13 +204,13 @@ class PcieApp:
         if self._master is not None and self._greeted and not self._master.send(record):
             self._drop()
 
-    def _report(self, listener: object, trouble: Trouble) -> None:
+    def _report(self, listener: socket.socket, trouble: Trouble) -> None:
         # a master that started with us may need a moment to connect
         deadline = time.monotonic() + 2
         while not self._greeted and time.monotonic() < deadline:
             for key, _ in self._selector.select(0.05):
                 if key.fileobj is listener:
-                    self._accept(listener.accept()[0])  # type: ignore[attr-defined]  # it is the listening socket
+                    self._accept(listener)
                 else:
                     self._receive()
         self._send(trouble)
@@ -321,7 +321,7 @@ app = make_app(
 def pcie_app(
     deployment: options.Deployment = None,
     boards: options.Boards = None,
-    listen: options.Listen = None,
+    listen_at: options.Listen = None,
     stop: options.Stop = None,
     peer_timeout: options.PeerTimeout = None,
     board_timeout: options.BoardTimeout = None,
@@ -338,8 +338,8 @@ def pcie_app(
     )
     loaded = deployment_for(settings, images=True)
     opened = Boards(settings, loaded, board_endpoints(settings, loaded))
-    if listen is not None:
-        return PcieApp(opened, loaded.hash, endpoint_from(listen, "--listen")).serve()
+    if listen_at is not None:
+        return PcieApp(opened, loaded.hash, endpoint_from(listen_at, "--listen")).serve()
     if sys.stdin.isatty():
         msg = "pcie-app reads readings from standard input, which is a terminal: pipe them in, or use --listen (pcie-app --help)"
         raise SettingsError(msg)

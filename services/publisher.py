@@ -7,13 +7,14 @@ import contextlib
 import sys
 import time
 from collections.abc import AsyncIterator
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import orjson
 import typer
-from bridge.client import ConnectionState, Publication, Ros, Subscription, connect
 
+from bridge.client import Ros, State, connect
 from bridge.errors import BridgeError, NoMessageError
+from bridge.handles import Publication, Subscription
 from services import options
 from services.command_line import ends_well, make_app, run_async
 from services.errors import InputLineError, SettingsError, exit_code_of
@@ -48,7 +49,7 @@ class ResultTopics:
         self._outputs: list[tuple[Ros, Publication]] = []
         self._frames: Publication | None = None
         self._watched: Subscription | None = None
-        self._ros_version = 2
+        self._ros_version: Literal[1, 2] = 2
         self._previous_out_ns = 0
 
     @contextlib.asynccontextmanager
@@ -78,7 +79,7 @@ class ResultTopics:
             if settings.ros_version == "auto":
                 self._ros_version = await first.detect_ros_version() or 2
             else:
-                self._ros_version = int(settings.ros_version)
+                self._ros_version = 1 if settings.ros_version == "1" else 2
             topics = ", ".join(output.topic for output in deployment.outputs)
             yield f"publishing on {topics} at {', '.join(by_uri)}"
 
@@ -114,7 +115,7 @@ class ResultTopics:
         best = int(posterior.argmax()) if posterior is not None else -1
         outcome = "published" if posterior is not None else "no posterior"
         seen: bool | None = None
-        if all(ros.state is not ConnectionState.CONNECTED for ros, _ in self._outputs):
+        if all(ros.state is not State.CONNECTED for ros, _ in self._outputs):
             outcome = "rosbridge away"
         else:
             try:
@@ -178,9 +179,9 @@ class Publisher:
             except asyncio.QueueFull:
                 self._link.send(Published(record.result.number, "rosbridge away", None, -1, 0.0, 0, 0))
 
-    def _state_changed(self, state: ConnectionState) -> None:
-        if state is ConnectionState.RECONNECTING:
-            self._link.notice("warning", "rosbridge is gone; results are lost until it is back")
+    def _state_changed(self, state: State, reason: str) -> None:
+        if state is State.RECONNECTING:
+            self._link.notice("warning", f"rosbridge is gone ({reason}); results are lost until it is back")
 
     async def run(self) -> int:
         """Serve until a signal; raises what ends it."""

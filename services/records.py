@@ -13,7 +13,7 @@ class Record(msgspec.Struct, array_like=True, frozen=True):
     """Root of all records."""
 
 
-class Hello(Record, tag="hello"):
+class Hello(Record, tag="hello", frozen=True):
     """First record in each direction: who speaks, which version, for which model."""
 
     role: str
@@ -21,33 +21,33 @@ class Hello(Record, tag="hello"):
     deployment_hash: str
 
 
-class Begin(Record, tag="begin"):
+class Begin(Record, tag="begin", frozen=True):
     """Master to a service: go ahead. `once`: this run ends after its first frame."""
 
     once: bool
 
 
-class Ready(Record, tag="ready"):
+class Ready(Record, tag="ready", frozen=True):
     """A service to the master: it has what it needs (a connection, an advertised topic, programmed boards)."""
 
     sentence: str
 
 
-class Notice(Record, tag="notice"):
+class Notice(Record, tag="notice", frozen=True):
     """A service to the master: something that the user should read, but that ends nothing."""
 
     level: str
     sentence: str
 
 
-class Trouble(Record, tag="trouble"):
+class Trouble(Record, tag="trouble", frozen=True):
     """A service to the master: it can't go on, and why."""
 
     exit_code: int
     sentence: str
 
 
-class Reading(Record, tag="reading"):
+class Reading(Record, tag="reading", frozen=True):
     """Subscriber to master: one complete set of addresses, in the order of the machine's columns.
 
     `addresses` holds None for a missing reading; `passed_over` counts the readings that the
@@ -62,14 +62,14 @@ class Reading(Record, tag="reading"):
     passed_over: int
 
 
-class Unusable(Record, tag="unusable"):
+class Unusable(Record, tag="unusable", frozen=True):
     """Subscriber to master: a message that makes no frame. Equal causes have equal `cause`."""
 
     cause: str
     sentence: str
 
 
-class Frame(Record, tag="frame"):
+class Frame(Record, tag="frame", frozen=True):
     """Master to pcie-app: compute this. `number` rises from 1 per master."""
 
     number: int
@@ -77,7 +77,7 @@ class Frame(Record, tag="frame"):
     bank: int
 
 
-class BoardOutcome(Record, tag="board"):
+class BoardOutcome(Record, tag="board", frozen=True):
     """What one board returned: counts as little-endian uint32, one per line of its partition."""
 
     counts: bytes
@@ -85,7 +85,7 @@ class BoardOutcome(Record, tag="board"):
     reason: int
 
 
-class FrameResult(Record, tag="result"):
+class FrameResult(Record, tag="result", frozen=True):
     """pcie-app to master: the boards' counts and where the time went."""
 
     number: int
@@ -96,7 +96,7 @@ class FrameResult(Record, tag="result"):
     boards_compute_ns: int
 
 
-class FrameFailed(Record, tag="failed"):
+class FrameFailed(Record, tag="failed", frozen=True):
     """pcie-app to master: a frame that the boards did not finish."""
 
     number: int
@@ -105,7 +105,7 @@ class FrameFailed(Record, tag="failed"):
     sentence: str
 
 
-class Publish(Record, tag="publish"):
+class Publish(Record, tag="publish", frozen=True):
     """Master to publisher: a result with the frame's own data."""
 
     result: FrameResult
@@ -116,7 +116,7 @@ class Publish(Record, tag="publish"):
     waited_ns: int
 
 
-class Published(Record, tag="published"):
+class Published(Record, tag="published", frozen=True):
     """Publisher to master: what became of a result.
 
     `outcome` is "published", "no posterior" or "rosbridge away"; `seen` says whether it was seen on

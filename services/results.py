@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -85,7 +85,7 @@ def frame_message(
     *,
     published: bool,
     sent_ns: int,
-    ros_version: int,
+    ros_version: Literal[1, 2],
 ) -> dict[str, Any]:
     """The DiagnosticArray that precedes a result: number, cycles, reasons, and times (outputs.md names them)."""
     result = publish.result

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import asyncio
+import socket
 from collections.abc import Callable
 from types import TracebackType
 from typing import Self
 
-from pcie_shim.endpoint import Endpoint, parse_endpoint
+from pcie_shim.endpoint import Endpoint, listen, parse_endpoint, remove_listener
 from pcie_shim.errors import PcieShimError
 from services.errors import OtherPeerError, SettingsError
-from services.local_socket import RecordProtocol, bind, check_hello, own_hello, unlink
+from services.local_socket import RecordProtocol, check_hello, own_hello
 from services.records import AnyRecord, Hello, Notice, Record, Trouble
 from services.settings import Settings
 from services.supervision import leave_private_directory
@@ -33,20 +34,21 @@ class MasterLink:
         self._master: RecordProtocol | None = None
         self._greeted = False
         self._server: asyncio.Server | None = None
+        self._listener: socket.socket | None = None
         self._last: dict[type[Record], Record] = {}
 
     async def __aenter__(self) -> Self:
         """Start listening."""
         loop = asyncio.get_running_loop()
-        listener = bind(self._endpoint)
+        listener = self._listener = listen(self._endpoint)
 
         def make() -> RecordProtocol:
             return RecordProtocol(f"{self._role} at {self._endpoint}", self._take, self._open, self._closed)
 
-        if self._endpoint.path is None:
-            self._server = await loop.create_server(make, sock=listener)
-        else:
+        if self._endpoint.path:
             self._server = await loop.create_unix_server(make, sock=listener)
+        else:
+            self._server = await loop.create_server(make, sock=listener)
         return self
 
     async def __aexit__(
@@ -58,7 +60,8 @@ class MasterLink:
         if self._master is not None:
             self._master.close()
             await asyncio.sleep(0)
-        unlink(self._endpoint)
+        if self._listener is not None:
+            remove_listener(self._endpoint, self._listener)
         leave_private_directory()
 
     def _open(self, protocol: RecordProtocol) -> None:

@@ -109,9 +109,7 @@ def endpoint_in(directory: Path, name: str) -> Endpoint:
     Raises:
         SettingsError: the path is too long for a unix socket.
     """
-    path = directory / f"{name}.sock"
-    # sun_path holds 108 bytes with its terminating zero; the programming port's name is 8 longer
-    if len(os.fsencode(path)) > 99:
-        msg = f"{path} is too long for a local socket (99 bytes at most); choose a shorter directory"
-        raise SettingsError(msg)
-    return parse_endpoint(f"unix:{path}")
+    try:
+        return parse_endpoint(f"unix:{directory.absolute() / name}.sock")
+    except PcieShimError as error:
+        raise SettingsError(str(error)) from error

@@ -7,14 +7,16 @@ import contextlib
 import sys
 import time
 from collections import Counter
+from functools import partial
 from typing import Annotated, Any
 
 import orjson
 import typer
-from bridge.client import ConnectionState, Message, Ros, connect
 
+from bridge.client import Ros, State, connect
 from bridge.errors import BridgeError, NoMessageError
 from bridge.fields import Field
+from bridge.handles import Message
 from services import options
 from services.command_line import ends_well, make_app, run_async
 from services.errors import NoDataError, RosbridgeLostError, SettingsError, VariableError, exit_code_of
@@ -66,14 +68,14 @@ class Subscriber:
             self._once = record.once
             self._begun.set()
 
-    def _state_changed(self, uri: str, state: ConnectionState) -> None:
-        if state is ConnectionState.RECONNECTING:
-            self._link.notice("warning", f"rosbridge at {uri} is gone; waiting for it")
+    def _state_changed(self, uri: str, state: State, reason: str) -> None:
+        if state is State.RECONNECTING:
+            self._link.notice("warning", f"rosbridge at {uri} is gone ({reason}); waiting for it")
             if self._once and self._lost is not None and not self._lost.done():
                 self._lost.set_exception(
-                    RosbridgeLostError(f"rosbridge at {uri} went away before a reading came")
+                    RosbridgeLostError(f"rosbridge at {uri} went away before a reading came ({reason})")
                 )
-        elif state is ConnectionState.CONNECTED and self._begun.is_set():
+        elif state is State.CONNECTED and self._begun.is_set():
             self._link.notice("info", f"rosbridge at {uri} is connected again")
 
     async def run(self) -> int:
@@ -90,7 +92,7 @@ class Subscriber:
                             uri,
                             connect_timeout=settings.connect_timeout,
                             ros_version=settings.ros_version,
-                            on_state=lambda state, uri=uri: self._state_changed(uri, state),
+                            on_state=partial(self._state_changed, uri),
                         )
                     )
                 self._link.keep(Ready(f"connected to {', '.join(by_uri)}"))
@@ -140,7 +142,7 @@ class Subscriber:
             except NoMessageError as error:
                 source = source.model_copy(update={"uri": self._settings.uri or source.uri})
                 sentence = await why_silent(ros, source, timeout)
-                if first and ros.state is ConnectionState.CONNECTED:
+                if first and ros.state is State.CONNECTED:
                     raise NoDataError(sentence) from error
                 self._link.notice("warning", sentence)
                 continue

@@ -4,7 +4,6 @@ encode_record --bytes--> [split anywhere] --> RecordSplitter --> records
 """
 
 import socket
-import stat
 import threading
 from itertools import pairwise
 
@@ -12,13 +11,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pcie_shim.endpoint import parse_endpoint
 from services.errors import LocalSocketError, OtherPeerError
 from services.local_socket import (
     MAX_RECORD,
     BlockingRecordSocket,
     RecordSplitter,
-    bind,
     check_hello,
     encode_record,
     own_hello,
@@ -90,15 +87,6 @@ def test_a_wrong_greeting_says_what_was_expected(record, match):
 
 def test_the_right_greeting_passes():
     check_hello(own_hello("subscriber", "abc"), "subscriber", "abc", "here")
-
-
-def test_a_unix_socket_is_private_and_replaces_a_dead_one(tmp_path):
-    endpoint = parse_endpoint(f"unix:{tmp_path}/a.sock")
-    bind(endpoint).close()  # leaves its file behind, as a killed process does
-    with bind(endpoint):
-        assert stat.S_IMODE((tmp_path / "a.sock").stat().st_mode) == 0o600
-        with pytest.raises(LocalSocketError, match="can't listen on"):
-            bind(endpoint)
 
 
 def test_the_blocking_socket_sends_large_records_whole_and_sees_the_end():
