@@ -1,0 +1,299 @@
+"""What a program holds of a client: subscriptions that it reads, publications it writes, services it serves."""
+
+import asyncio
+import logging
+from collections import deque
+from collections.abc import Awaitable, Callable, Mapping
+from typing import Any, Final, Self
+
+from bridge.errors import (
+    BridgeError,
+    ConcurrentReadError,
+    DisconnectedError,
+    NoMessageError,
+    OptionError,
+    ServiceError,
+    SlowPeerError,
+)
+from bridge.names import absolute, same_type
+from bridge.protocol import ServiceRequested
+from bridge.session import Message, Session, State
+
+#: Messages that wait in a subscription for their reader, unless it says otherwise.
+QUEUE_SIZE: Final = 64
+#: Publications of one topic that may wait for a slow server, unless it says otherwise.
+PUBLISH_QUEUE_SIZE: Final = 100
+#: Seconds that finding out why a topic is silent may take.
+EXPLAIN_TIMEOUT: Final = 0.5
+
+Handler = Callable[[dict[str, Any]], Awaitable[Mapping[str, Any] | None]]
+
+_log = logging.getLogger("bridge")
+
+
+class _Handle:
+    """Something that is closed once: by itself, by leaving its ``async with``, or with its client."""
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self._closed = False
+
+    def _begin(self) -> None:
+        """Take note that the server has been told: from now on there is something to close."""
+        self._session.on_closed.add(self.end)
+        self._session.flush()
+
+    def end(self) -> None:
+        """Take note that the client was closed: nothing more comes or goes."""
+        self._closed = True
+
+    def _take_back(self) -> None:
+        """Tell the server that this is not wanted any more."""
+        raise NotImplementedError
+
+    async def close(self) -> None:
+        """Tell the server that this is not wanted any more. May be called again."""
+        if not self._closed:
+            self.end()
+            self._session.on_closed.discard(self.end)
+            self._take_back()
+            self._session.flush()
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *_exception: object) -> None:
+        await self.close()
+
+
+class Subscription(_Handle):
+    """The messages of one topic, to be read by one task: ``async for message in subscription``.
+
+    If the reader is too slow the oldest messages are dropped, and nothing else slows down. A lost connection does
+    not end the iteration, messages go on after the reconnection; closing this or the client does.
+
+    Attributes:
+        topic: what was subscribed to.
+        lost: how many messages were dropped because the queue was full.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        topic: str,
+        type_name: str | None,
+        *,
+        throttle_rate: int,
+        queue_length: int,
+        queue_size: int,
+    ) -> None:
+        """Subscribe (see `bridge.client.Ros.subscribe`)."""
+        super().__init__(session)
+        if queue_size < 1:
+            raise OptionError(f"queue_size of topic {topic} must be at least 1, not {queue_size}")
+        self.topic = topic
+        self.lost = 0
+        self._type = type_name
+        self._size = queue_size
+        self._queue: deque[Message] = deque(maxlen=queue_size)
+        self._waiter: asyncio.Future[None] | None = None
+        self._number = session.core.subscribe(
+            topic, type_name, throttle_rate=throttle_rate, queue_length=queue_length
+        )
+        session.receivers[self._number] = self._receive
+        self._begin()
+        session.ask_later()
+
+    def _receive(self, message: Message) -> None:
+        queue = self._queue
+        if len(queue) == self._size:
+            self.lost += 1
+        queue.append(message)
+        waiter = self._waiter
+        if waiter is not None and not waiter.done():
+            waiter.set_result(None)
+
+    def __aiter__(self) -> Self:
+        return self
+
+    async def __anext__(self) -> Message:
+        queue = self._queue
+        while not queue:
+            if self._closed:
+                raise StopAsyncIteration
+            if self._waiter is not None:
+                raise ConcurrentReadError(
+                    f"another task waits for messages of {self.topic} already: a second reader needs a "
+                    "subscription of its own"
+                )
+            self._waiter = asyncio.get_running_loop().create_future()
+            try:
+                await self._waiter
+            finally:
+                self._waiter = None
+        return queue.popleft()
+
+    async def next(self, timeout: float) -> Message:  # noqa: ASYNC109  # the limit is part of the error
+        """Wait for one message.
+
+        Args:
+            timeout: seconds.
+
+        Raises:
+            NoMessageError: none came in time; the sentence names topic, server and time, and what the server
+                knows about the topic if it can be asked (which takes half a second more at most).
+            DisconnectedError: subscription or client are closed.
+            ConcurrentReadError: another task waits here.
+        """
+        try:
+            async with asyncio.timeout(timeout):
+                return await self.__anext__()
+        except TimeoutError:
+            why = await self._why_silent()
+        except StopAsyncIteration:
+            raise DisconnectedError(f"the subscription of {self.topic} is closed") from None
+        raise NoMessageError(
+            f"no message of {self.topic} came from {self._session.uri} within {timeout:g} s{why}"
+        )
+
+    async def _why_silent(self) -> str:
+        """What can be known about the topic's silence, as the end of a sentence."""
+        session = self._session
+        if session.state is not State.CONNECTED:
+            return f"; the connection is {session.state}: {session.last_error}"
+        try:
+            async with asyncio.timeout(EXPLAIN_TIMEOUT):
+                known = await ask_rosapi(session, "topic_type", {"topic": self.topic}, EXPLAIN_TIMEOUT)
+                its_type = known.get("type")
+                if its_type == "":
+                    return "; the server does not know the topic"
+                if (
+                    isinstance(its_type, str)
+                    and self._type is not None
+                    and not same_type(its_type, self._type)
+                ):
+                    return f"; the server knows it as {its_type[:80]}, not as {self._type}"
+                found = await ask_rosapi(session, "publishers", {"topic": self.topic}, EXPLAIN_TIMEOUT)
+                if found.get("publishers") == []:
+                    return "; nobody publishes it"
+        except TimeoutError:
+            pass
+        return session.last_status()
+
+    def end(self) -> None:
+        """End the iteration, after what waits in the queue."""
+        super().end()
+        if self._waiter is not None and not self._waiter.done():
+            self._waiter.set_result(None)
+
+    def _take_back(self) -> None:
+        del self._session.receivers[self._number]
+        self._session.core.unsubscribe(self._number)
+
+
+class Publication(_Handle):
+    """One advertised topic.
+
+    Attributes:
+        topic: its name.
+    """
+
+    def __init__(self, session: Session, topic: str, type_name: str, *, latch: bool, queue_size: int) -> None:
+        """Advertise (see `bridge.client.Ros.advertise`)."""
+        super().__init__(session)
+        if queue_size < 1:
+            raise OptionError(f"queue_size of topic {topic} must be at least 1, not {queue_size}")
+        self.topic = topic
+        self._size = queue_size
+        self._waiting = 0
+        self._number = session.core.advertise(topic, type_name, latch=latch, queue_size=queue_size)
+        self._begin()
+
+    async def publish(self, msg: Mapping[str, Any], *, timeout: float = 5.0) -> None:  # noqa: ASYNC109  # as above
+        """Send one message; returns when the socket has it.
+
+        It goes out at once while the server keeps up; if not, it waits for its turn. Nothing is kept for later
+        over a lost connection: old readings are worth nothing after it.
+
+        Args:
+            msg: the ROS message; values may be NumPy arrays.
+            timeout: seconds that it may wait for a slow server.
+
+        Raises:
+            DisconnectedError: there is no connection now, or the publication or the client are closed.
+            SlowPeerError: the server did not take it in time, or as many as ``queue_size`` wait already.
+            EncodeError: it cannot be sent as JSON; a NaN or infinity is named with its place.
+        """
+        session = self._session
+        if session.must_wait():
+            if self._waiting >= self._size:
+                raise SlowPeerError(
+                    f"{session.uri} does not keep up: {self._waiting} messages of {self.topic} wait already"
+                )
+            self._waiting += 1
+            try:
+                await session.wait_turn(f"a message of {self.topic}", timeout)
+            finally:
+                self._waiting -= 1
+        if self._closed:
+            raise DisconnectedError(f"{self.topic} is not advertised any more: its publication was closed")
+        await session.send(session.core.publish(self._number, msg))
+
+    def _take_back(self) -> None:
+        self._session.core.unadvertise(self._number)
+
+
+class Service(_Handle):
+    """One service that this client serves.
+
+    Attributes:
+        name: the service's name.
+    """
+
+    def __init__(
+        self, session: Session, name: str, type_name: str, handler: Handler, handler_timeout: float
+    ) -> None:
+        """Advertise (see `bridge.client.Ros.advertise_service`)."""
+        super().__init__(session)
+        self.name = name
+        self._handler = handler
+        self._limit = handler_timeout
+        session.core.advertise_service(name, type_name)
+        session.servers[absolute(name)] = self._serve
+        self._begin()
+
+    async def _serve(self, request: ServiceRequested) -> None:
+        """Answer one request, whatever its handler does."""
+        values: Mapping[str, Any] | str
+        ok = False
+        try:
+            async with asyncio.timeout(self._limit):
+                values = await self._handler(request.args) or {}
+            ok = True
+        except ServiceError as error:
+            values = error.reason
+        except TimeoutError:
+            values = f"{self.name} did not finish within {self._limit:g} s"
+        except Exception as error:
+            _log.exception("the handler of service %s failed", self.name)
+            values = f"{self.name} failed: {type(error).__name__}"
+        core = self._session.core
+        try:
+            core.answer(request.ticket, values, ok=ok)
+        except BridgeError as error:
+            _log.error("the answer of service %s cannot be sent: %s", self.name, error)
+            core.answer(request.ticket, f"the answer cannot be sent: {error}", ok=False)
+        self._session.flush()
+
+    def _take_back(self) -> None:
+        del self._session.servers[absolute(self.name)]
+        self._session.core.unadvertise_service(self.name)
+
+
+async def ask_rosapi(session: Session, name: str, args: Mapping[str, Any], limit: float) -> dict[str, Any]:
+    """A rosapi service's answer; nothing where there is none: rosapi is an extra that many servers lack."""
+    try:
+        answer = await session.call(f"/rosapi/{name}", args, limit)
+    except BridgeError:
+        return {}
+    return answer if isinstance(answer, dict) else {}

@@ -1,0 +1,429 @@
+"""A connection to a rosbridge server that comes back by itself: states, sending in turn, and who gets what arrives."""
+
+import asyncio
+import logging
+import random
+import time
+from collections import deque
+from collections.abc import Callable, Coroutine, Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any, Final
+
+from bridge.errors import (
+    BridgeError,
+    DisconnectedError,
+    NoAnswerError,
+    ServiceError,
+    SlowPeerError,
+    StateTimeoutError,
+)
+from bridge.protocol import (
+    CallAnswered,
+    ClientCore,
+    Event,
+    MessageReceived,
+    ServiceRequested,
+    StatusReceived,
+    Unusable,
+)
+from bridge.websocket import WebSocket, check_uri, open_websocket
+
+#: Seconds before the first attempt to reconnect, and at most before any.
+FIRST_DELAY: Final = 0.1
+MAX_DELAY: Final = 5.0
+#: Seconds that one attempt to reconnect may take.
+ATTEMPT_TIMEOUT: Final = 5.0
+#: Seconds that a connection must last for the next reconnection to begin with the first delay again.
+STEADY: Final = 5.0
+#: Seconds between two requests for a topic of unknown type that has brought nothing yet.
+ASK_AGAIN: Final = 2.0
+#: Status messages of the server that are kept.
+KEPT_STATUSES: Final = 16
+# So many messages go out in a row before other tasks get their turn.
+_IN_A_ROW: Final = 32
+
+_log = logging.getLogger("bridge")
+
+
+class State(StrEnum):
+    """Where a connection stands."""
+
+    CONNECTING = "connecting"
+    CONNECTED = "connected"
+    RECONNECTING = "reconnecting"
+    CLOSED = "closed"
+
+
+StateCallback = Callable[[State, str], None]
+Server = Callable[[ServiceRequested], Coroutine[Any, Any, None]]
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    """One message of a topic.
+
+    Attributes:
+        topic: as the server names it.
+        msg: the ROS message; shared by all subscriptions of the topic, so not to be changed.
+        received_ns: ``time.time_ns()`` at its arrival.
+        received_monotonic_ns: ``time.monotonic_ns()`` at its arrival.
+    """
+
+    topic: str
+    msg: dict[str, Any]
+    received_ns: int
+    received_monotonic_ns: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Limits:
+    """What a connection may take, in seconds and bytes (see ``bridge.client.connect``)."""
+
+    connect_timeout: float
+    max_size: int
+    ping_interval: float
+    ping_timeout: float
+
+
+class Session:
+    """The one connection of a client, over all of its WebSockets.
+
+    Attributes:
+        uri: the server's.
+        core: what is wanted of the server.
+        state: where the connection stands.
+        reconnections: how often the connection was lost and came back.
+        last_error: why the connection was lost, or why the last attempt failed.
+        unusable: how many messages arrived that no client can use.
+        statuses: what the server said of itself lately, newest last.
+        receivers: by subscription, who takes its messages.
+        servers: by service of this client, who answers its requests.
+        on_closed: are called once, when the connection is closed for good.
+    """
+
+    def __init__(self, uri: str, core: ClientCore, limits: Limits, on_state: StateCallback | None) -> None:
+        """Prepare; `open` connects.
+
+        Raises:
+            UriError: the URI is none of a WebSocket.
+        """
+        self.uri = uri
+        self.core = core
+        self.state = State.CONNECTING
+        self.reconnections = 0
+        self.last_error = ""
+        self.unusable = 0
+        self.statuses: deque[StatusReceived] = deque(maxlen=KEPT_STATUSES)
+        self.receivers: dict[int, Callable[[Message], None]] = {}
+        self.servers: dict[str, Server] = {}
+        self.on_closed: set[Callable[[], None]] = set()
+        self._parsed_uri = check_uri(uri)
+        self._limits = limits
+        self._on_state = on_state
+        self._entered = False
+        self._websocket: WebSocket | None = None
+        self._connected_at = 0.0
+        self._delay = FIRST_DELAY
+        self._reconnecting: asyncio.Task[None] | None = None
+        self._asking: asyncio.TimerHandle | None = None
+        self._in_a_row = 0
+        self._waiting = 0
+        self._serving: set[asyncio.Task[None]] = set()
+        self._calls: dict[str, asyncio.Future[CallAnswered]] = {}
+        self._state_waiters: list[tuple[State, asyncio.Future[None]]] = []
+
+    # Opening, losing, closing
+
+    async def open(self) -> None:
+        """Connect for the first time.
+
+        Raises:
+            UnreachableError: nothing answers at the URI.
+            NotRosbridgeError: something answers, but not as a WebSocket server.
+            DisconnectedError: it was opened before.
+        """
+        if self._entered:
+            raise DisconnectedError(f"this client of {self.uri} was opened before: connect() makes a new one")
+        self._entered = True
+        try:
+            await self._connect(self._limits.connect_timeout)
+        except BaseException as error:
+            await self.close(str(error))
+            raise
+
+    async def close(self, reason: str = "closed by this client") -> None:
+        """Close the connection; what was sent before still goes out. Everything that waits is ended."""
+        if self.state is State.CLOSED:
+            return
+        websocket, self._websocket = self._websocket, None
+        self.core.lost()
+        if self._reconnecting is not None:
+            self._reconnecting.cancel()
+        if self._asking is not None:
+            self._asking.cancel()
+        self._fail_calls(f"the client of {self.uri} was closed")
+        self._set_state(State.CLOSED, reason)
+        for task in self._serving:
+            task.cancel()
+        for end in self.on_closed:
+            end()
+        self.on_closed.clear()
+        if websocket is not None:
+            try:
+                await websocket.close()
+            finally:
+                websocket.abandon()
+
+    async def _connect(self, seconds: float) -> None:
+        websocket = await open_websocket(
+            self._parsed_uri,
+            self.uri,
+            timeout=seconds,
+            max_size=self._limits.max_size,
+            ping_interval=self._limits.ping_interval,
+            ping_timeout=self._limits.ping_timeout,
+            on_message=self._take,
+            on_lost=self._lost,
+        )
+        self._websocket = websocket
+        self._connected_at = websocket.loop.time()
+        if self.state is State.RECONNECTING:
+            self.reconnections += 1
+        self.core.restore()
+        self.flush()
+        self.ask_later()
+        self._set_state(State.CONNECTED, "")
+
+    def _lost(self, websocket: WebSocket, reason: str) -> None:
+        if websocket is not self._websocket:
+            return
+        self._websocket = None
+        self.core.lost()
+        self.last_error = reason
+        _log.warning("the connection to %s is lost: %s", self.uri, reason)
+        self._fail_calls(f"the connection to {self.uri} was lost ({reason})")
+        if websocket.loop.time() - self._connected_at >= STEADY:
+            self._delay = FIRST_DELAY
+        self._reconnecting = websocket.loop.create_task(self._reconnect())
+        self._set_state(State.RECONNECTING, reason)
+
+    async def _reconnect(self) -> None:
+        while True:
+            # Up to a fifth earlier, so that many clients of one server do not come back in step.
+            await asyncio.sleep(self._delay * random.uniform(0.8, 1.0))
+            self._delay = min(2 * self._delay, MAX_DELAY)
+            try:
+                await self._connect(min(self._limits.connect_timeout, ATTEMPT_TIMEOUT))
+            except BridgeError as error:
+                self.last_error = str(error)
+                _log.debug("reconnecting: %s", error)
+            except Exception as error:
+                self.last_error = f"{type(error).__name__}: {error}"
+                _log.exception("reconnecting to %s failed", self.uri)
+            else:
+                _log.info("the connection to %s is back", self.uri)
+                return
+
+    def _fail_calls(self, reason: str) -> None:
+        calls, self._calls = self._calls, {}
+        for call, future in calls.items():
+            if not future.done():
+                future.set_exception(DisconnectedError(f"{reason} while {call.split(':')[1]} was to answer"))
+
+    # States
+
+    def _set_state(self, state: State, reason: str) -> None:
+        self.state = state
+        waiters, self._state_waiters = self._state_waiters, []
+        for awaited, future in waiters:
+            if future.done():
+                continue
+            if awaited is state:
+                future.set_result(None)
+            elif state is State.CLOSED:
+                future.set_exception(DisconnectedError(f"the client of {self.uri} was closed"))
+            else:
+                self._state_waiters.append((awaited, future))
+        if self._on_state is not None:
+            try:
+                self._on_state(state, reason)
+            except Exception:
+                _log.exception("on_state failed")
+
+    async def wait_for_state(self, state: State, limit: float) -> None:
+        """Wait until the connection reaches a state; at once if it is there.
+
+        Raises:
+            StateTimeoutError: it did not within ``limit`` seconds.
+            DisconnectedError: it is or was closed, and will not reach it.
+        """
+        if self.state is state:
+            return
+        if self.state is State.CLOSED:
+            raise DisconnectedError(f"the client of {self.uri} was closed")
+        future: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self._state_waiters.append((state, future))
+        try:
+            async with asyncio.timeout(limit):
+                await future
+        except TimeoutError:
+            because = f" ({self.last_error})" if self.last_error else ""
+            raise StateTimeoutError(
+                f"the connection to {self.uri} was not {state} within {limit:g} s, it is {self.state}{because}"
+            ) from None
+        finally:
+            self._state_waiters = [waiter for waiter in self._state_waiters if waiter[1] is not future]
+
+    # Sending
+
+    def must_wait(self) -> bool:
+        """Whether what is to be sent has to wait for its turn.
+
+        Raises:
+            DisconnectedError: there is no connection.
+        """
+        return self._open_websocket().paused or self._waiting > 0
+
+    def _open_websocket(self) -> WebSocket:
+        websocket = self._websocket
+        if websocket is None or not websocket.is_open:
+            raise DisconnectedError(f"there is no connection to {self.uri} now: {self._why_none()}")
+        return websocket
+
+    def _why_none(self) -> str:
+        if self.state is State.CLOSED:
+            return "this client was closed"
+        if self.state is State.CONNECTING:
+            return "`async with` opens it"
+        return self.last_error or "the server is closing it"
+
+    async def send(self, data: bytes) -> None:
+        """Hand a message to the socket; every now and then other tasks get their turn after it.
+
+        Raises:
+            DisconnectedError: there is no connection.
+        """
+        self._open_websocket().send_now(data)
+        self._in_a_row += 1
+        if self._in_a_row >= _IN_A_ROW:
+            self._in_a_row = 0
+            await asyncio.sleep(0)
+
+    async def wait_turn(self, what: str, limit: float) -> None:
+        """Wait until the server has taken what waits before.
+
+        Args:
+            what: is named in the errors.
+            limit: seconds to wait at most.
+
+        Raises:
+            SlowPeerError: the turn did not come in time.
+            DisconnectedError: the connection was lost.
+        """
+        self._waiting += 1
+        try:
+            async with asyncio.timeout(limit):
+                if self._waiting > 1:
+                    await asyncio.sleep(0)  # behind those who were woken up just now
+                while (websocket := self._open_websocket()).paused:
+                    await _drain(websocket)
+        except TimeoutError:
+            raise SlowPeerError(f"{self.uri} did not take {what} within {limit:g} s") from None
+        finally:
+            self._waiting -= 1
+
+    def flush(self) -> None:
+        """Send what the core wants to be sent: small, seldom and in order, so it never waits."""
+        data = self.core.data_to_send()
+        websocket = self._websocket
+        if websocket is not None and websocket.is_open:
+            for message in data:
+                websocket.send_now(message)
+
+    def ask_later(self) -> None:
+        """Ask again in a while for topics of unknown type, as long as they bring nothing."""
+        if self._asking is None and self._websocket is not None:
+            self._asking = self._websocket.loop.call_later(ASK_AGAIN, self._ask_again)
+
+    def _ask_again(self) -> None:
+        self._asking = None
+        if self.core.ask_again():
+            self.flush()
+            self.ask_later()
+
+    async def call(self, service: str, args: Mapping[str, Any], limit: float) -> Any:
+        """Call a service and wait for its answer.
+
+        Raises:
+            ServiceError: it answered that it failed.
+            NoAnswerError: it did not answer within ``limit`` seconds.
+            SlowPeerError: the server did not even take the call.
+            DisconnectedError: there is no connection, or it was lost meanwhile.
+            EncodeError: the arguments cannot be sent as JSON.
+        """
+        if self.must_wait():
+            await self.wait_turn(f"a call of {service}", limit)
+        call = self.core.call(service, args)
+        future = self._calls[call] = asyncio.get_running_loop().create_future()
+        self.flush()
+        try:
+            async with asyncio.timeout(limit):
+                answer = await future
+        except TimeoutError:
+            raise NoAnswerError(
+                f"service {service} at {self.uri} did not answer within {limit:g} s{self.last_status()}"
+            ) from None
+        finally:
+            self._calls.pop(call, None)
+            self.core.forget_call(call)
+        if not answer.ok:
+            raise ServiceError(answer.values, f"{service} at {self.uri}")
+        return answer.values
+
+    def last_status(self) -> str:
+        """What the server said last, as the end of a sentence."""
+        return f"; the server said last: {self.statuses[-1].text[:200]}" if self.statuses else ""
+
+    # Receiving
+
+    def _take(self, data: bytes) -> None:
+        received_ns, received_monotonic_ns = time.time_ns(), time.monotonic_ns()
+        event = self.core.receive(data, received_monotonic_ns * 1e-9)
+        if type(event) is MessageReceived:
+            message = Message(event.topic, event.msg, received_ns, received_monotonic_ns)
+            for number in event.subscriptions:
+                self.receivers[number](message)
+        else:
+            self._take_other(event)
+
+    def _take_other(self, event: Event | None) -> None:
+        match event:
+            case CallAnswered():
+                future = self._calls.pop(event.call, None)
+                if future is not None and not future.done():
+                    future.set_result(event)
+            case ServiceRequested():
+                task = asyncio.get_running_loop().create_task(self.servers[event.service](event))
+                self._serving.add(task)
+                task.add_done_callback(self._serving.discard)
+            case StatusReceived():
+                self.statuses.append(event)
+                level = logging.WARNING if event.level in {"error", "warning"} else logging.INFO
+                _log.log(level, "%s says (%.20s): %.500s", self.uri, event.level, event.text)
+            case Unusable():
+                self.unusable += 1
+                # The 1st, 2nd, 4th, 8th ...: a server that goes mad does not fill the log.
+                if self.unusable & (self.unusable - 1) == 0:
+                    _log.warning("%s, %d so far: %s", self.uri, self.unusable, event.reason)
+            case _:
+                self.flush()  # a request may have been refused on the spot
+
+
+async def _drain(websocket: WebSocket) -> None:
+    """Wait for room in the socket's buffer; a loss shows in the WebSocket's state, whatever the error."""
+    try:
+        await websocket.drain()
+    except Exception:
+        if websocket.is_open:
+            raise

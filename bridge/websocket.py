@@ -1,0 +1,305 @@
+"""One WebSocket connection: opened with clear errors, each message handed over at once, a silent peer noticed.
+
+A message goes from the socket's callback straight to its receiver: no queue and no task in between. Liveness is
+watched here rather than by the library's keepalive, so that anything the peer sends counts as a sign of life and
+a silent one is given up within ``ping_interval + ping_timeout``.
+"""
+
+import asyncio
+import socket
+import ssl
+from collections.abc import Callable
+from typing import Final
+
+from websockets.asyncio.client import ClientConnection
+from websockets.client import ClientProtocol
+from websockets.exceptions import (
+    InvalidHandshake,
+    InvalidMessage,
+    InvalidStatus,
+    InvalidURI,
+    PayloadTooBig,
+)
+from websockets.frames import DATA_OPCODES, Frame
+from websockets.protocol import Event, State
+from websockets.uri import WebSocketURI, parse_uri
+
+from bridge.errors import NotRosbridgeError, UnreachableError, UriError
+from bridge.json_codec import excerpt
+
+#: Bytes that may wait for the peer before publishers have to wait too.
+WRITE_LIMIT: Final = 1 << 16
+#: Seconds that the closing handshake may take.
+CLOSE_TIMEOUT: Final = 1.0
+#: Seconds by which the watch may be late before that counts as this process having slept, not the peer.
+_OVERSLEPT: Final = 0.5
+
+
+def check_uri(uri: str) -> WebSocketURI:
+    """Read the URI of a rosbridge server.
+
+    Raises:
+        UriError: it is not ``ws://host:port`` or ``wss://host:port`` (a path and credentials may follow).
+    """
+    try:
+        parsed = parse_uri(uri)
+        parsed.host.encode("idna")
+    except (
+        InvalidURI,
+        ValueError,
+    ) as error:  # ValueError: a port that is no number, half a bracket, odd letters
+        reason = error.msg if isinstance(error, InvalidURI) else str(error)
+        raise UriError(
+            f"{uri!r} is no URI of a rosbridge server ({reason}): it must be like ws://192.168.1.10:9090"
+        ) from None
+    return parsed
+
+
+class WebSocket(ClientConnection):
+    """A WebSocket client connection that calls back for every message and for its end.
+
+    Attributes:
+        opened: the handshake is done; only then are messages handed over and the end is told.
+    """
+
+    def __init__(
+        self,
+        protocol: ClientProtocol,
+        *,
+        ping_interval: float,
+        ping_timeout: float,
+        on_message: Callable[[bytes], None],
+        on_lost: Callable[["WebSocket", str], None],
+    ) -> None:
+        """Prepare the connection; `open_websocket` makes and opens it."""
+        super().__init__(
+            protocol,
+            ping_interval=None,
+            ping_timeout=None,
+            close_timeout=CLOSE_TIMEOUT,
+            max_queue=None,
+            write_limit=WRITE_LIMIT,
+        )
+        self.opened = False
+        self.first_bytes = b""
+        self._on_message = on_message
+        self._on_lost = on_lost
+        self._interval = ping_interval
+        self._patience = ping_timeout
+        self._last_heard = self.loop.time()
+        self._pinged = False
+        self._watch: asyncio.TimerHandle | None = None
+        self._begun: bytearray | None = None
+        self._silent_for = 0.0
+
+    @property
+    def is_open(self) -> bool:
+        """Whether messages can be sent."""
+        return self.protocol.state is State.OPEN
+
+    def begin(self) -> None:
+        """Take up the connection after its handshake."""
+        self.opened = True
+        self._last_heard = self.loop.time()
+        self._schedule(self._interval)
+
+    def send_now(self, data: bytes) -> None:
+        """Hand one text message to the socket (or to its buffer, without limit: see ``paused`` and ``drain``)."""
+        self.protocol.send_text(data)
+        self.send_data()
+
+    def abandon(self) -> None:
+        """Give the connection up at once."""
+        self.transport.abort()
+
+    # What the transport tells
+
+    def data_received(self, data: bytes) -> None:
+        """Take bytes from the socket."""
+        self._last_heard = self.loop.time()
+        self._pinged = False
+        if not self.opened:
+            self.first_bytes = (self.first_bytes + data)[:64]
+        super().data_received(data)
+        if self.protocol.state is not State.OPEN:
+            if not self.opened and self.protocol.handshake_exc is not None:
+                self.abandon()  # a peer that speaks something else may never hang up
+            elif self.opened and self.protocol.state is State.CLOSING:
+                # The server ends the connection by the protocol; one that does not is not waited for.
+                self._schedule(CLOSE_TIMEOUT)
+
+    def process_event(self, event: Event) -> None:
+        """Take one event of the WebSocket protocol: hand a whole message over, leave the rest to the library."""
+        if not self.opened or not isinstance(event, Frame) or event.opcode not in DATA_OPCODES:
+            super().process_event(event)
+            return
+        if self._begun is None and event.fin:
+            self._on_message(bytes(event.data))
+            return
+        # In several frames. Their sizes together are limited by the protocol.
+        if self._begun is None:
+            self._begun = bytearray()
+        self._begun += event.data
+        if event.fin:
+            whole, self._begun = bytes(self._begun), None
+            self._on_message(whole)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Take note of the end, and tell it."""
+        super().connection_lost(exc)
+        if self._watch is not None:
+            self._watch.cancel()
+            self._watch = None
+        if self.opened:
+            self._on_lost(self, self._why_lost(exc))
+
+    def _why_lost(self, exc: Exception | None) -> str:
+        if self._silent_for:
+            return f"nothing was heard from the server for {self._silent_for:.3g} s"
+        if isinstance(self.protocol.parser_exc, PayloadTooBig):
+            return (
+                f"the server sent a message of more than {self.protocol.max_message_size} bytes "
+                "(max_size allows larger ones)"
+            )
+        if self.protocol.close_rcvd is not None:
+            return f"the server closed it (code {self.protocol.close_rcvd.code})"
+        if self.protocol.close_sent is not None:
+            return f"the server broke the WebSocket protocol ({self.protocol.close_sent.reason})"
+        return _say(exc) if isinstance(exc, OSError) else "the connection broke off"
+
+    # Watching for silence
+
+    def _schedule(self, seconds: float) -> None:
+        if self._watch is not None:
+            self._watch.cancel()
+        self._watch = self.loop.call_later(seconds, self._look, self.loop.time() + seconds)
+
+    def _look(self, due: float) -> None:
+        self._watch = None
+        now = self.loop.time()
+        if self.protocol.state is not State.OPEN:
+            self.abandon()
+            return
+        silent = now - self._last_heard
+        if silent < self._interval:
+            self._schedule(self._interval - silent)
+        elif not self._pinged or now - due > _OVERSLEPT:
+            self._pinged = True
+            self.protocol.send_ping(b"")
+            self.send_data()
+            self._schedule(self._patience)
+        else:
+            self._silent_for = silent
+            self.abandon()
+
+
+async def open_websocket(
+    uri: WebSocketURI,
+    shown_uri: str,
+    *,
+    timeout: float,  # noqa: ASYNC109  # the limit is part of the errors' sentences
+    max_size: int,
+    ping_interval: float,
+    ping_timeout: float,
+    on_message: Callable[[bytes], None],
+    on_lost: Callable[[WebSocket, str], None],
+) -> WebSocket:
+    """Connect, without permessage-deflate: on a local network it costs more than it saves.
+
+    Args:
+        uri: where to.
+        shown_uri: the same as the user wrote it, for the errors.
+        timeout: seconds for all of it.
+        max_size: bytes of one incoming message; a larger one ends the connection.
+        ping_interval: seconds of silence after which the peer is asked for a sign of life.
+        ping_timeout: seconds that it then has.
+        on_message: is called with each message.
+        on_lost: is called once, with the reason, when the connection ends.
+
+    Returns:
+        The open connection.
+
+    Raises:
+        UnreachableError: nothing answers there.
+        NotRosbridgeError: something answers there, but not as a WebSocket server.
+    """
+    loop = asyncio.get_running_loop()
+    made: list[WebSocket] = []
+
+    def factory() -> WebSocket:
+        websocket = WebSocket(
+            ClientProtocol(uri, max_size=max_size),
+            ping_interval=ping_interval,
+            ping_timeout=ping_timeout,
+            on_message=on_message,
+            on_lost=on_lost,
+        )
+        made.append(websocket)
+        return websocket
+
+    try:
+        async with asyncio.timeout(timeout):
+            _transport, websocket = await loop.create_connection(
+                factory,
+                uri.host,
+                uri.port,
+                ssl=True if uri.secure else None,
+                server_hostname=uri.host if uri.secure else None,
+            )
+            await websocket.handshake()
+    except BaseException as error:
+        attempt = made[-1] if made and hasattr(made[-1], "transport") else None
+        if attempt is not None:
+            attempt.abandon()
+        if not isinstance(error, Exception):
+            raise
+        heard = attempt.first_bytes if attempt is not None else b""
+        raise _connect_error(error, shown_uri, heard, timeout, answered=attempt is not None) from error
+    if not websocket.is_open:
+        raise UnreachableError(f"{shown_uri} is unreachable: it closed the connection at once")
+    websocket.begin()
+    return websocket
+
+
+def _connect_error(
+    error: Exception, uri: str, heard: bytes, seconds: float, *, answered: bool
+) -> UnreachableError | NotRosbridgeError:
+    """The sentence for a connection that did not come about."""
+    if isinstance(error, InvalidStatus):
+        response = error.response
+        seen = f"HTTP {response.status_code} {response.reason_phrase}".rstrip()
+        to = response.headers.get("Location")
+        seen += f", to {to[:200]}" if to else ""
+        return NotRosbridgeError(
+            f"{uri} is no rosbridge server: it answers as a web server ({seen}); check port and path"
+        )
+    if isinstance(error, InvalidMessage) and not heard:
+        return UnreachableError(f"{uri} is unreachable: it closed the connection without an answer")
+    if isinstance(error, InvalidHandshake) or (isinstance(error, TimeoutError) and heard):
+        why = f"within {seconds:g} s " if isinstance(error, TimeoutError) else ""
+        return NotRosbridgeError(
+            f"{uri} is no rosbridge server: it did not answer {why}as a WebSocket server but with {excerpt(heard)}"
+        )
+    if isinstance(error, ssl.SSLCertVerificationError):
+        return UnreachableError(f"{uri} is not to be trusted: its certificate: {error.verify_message}")
+    if isinstance(error, ssl.SSLError):
+        return NotRosbridgeError(
+            f"{uri} does not speak TLS ({error.reason}): is it ws:// rather than wss://?"
+        )
+    if isinstance(error, TimeoutError) and error.errno is None:  # the kernel's own has a number
+        done = "it took the connection but did not answer" if answered else "it did not answer"
+        return UnreachableError(f"{uri} is unreachable: {done} within {seconds:g} s")
+    if isinstance(error, socket.gaierror):
+        return UnreachableError(f"{uri} is unreachable: its host name is not known ({_say(error)})")
+    return UnreachableError(
+        f"{uri} is unreachable: {_say(error)}; is the rosbridge server running, and is the port right?"
+    )
+
+
+def _say(error: Exception) -> str:
+    """An operating system's error in its own words, without numbers."""
+    if isinstance(error, ConnectionRefusedError):
+        return "connection refused"
+    if isinstance(error, ConnectionResetError):
+        return "the connection was reset"
+    return (error.strerror if isinstance(error, OSError) else None) or str(error) or type(error).__name__
