@@ -217,13 +217,21 @@ def read_image(path: Path) -> Image:
         DamagedImageError: Its bytes are not those that were written; the sentence names the hash.
         ImageMismatchError: It is for another register map or format.
     """
+    return image_from_bytes(read_bytes(path), str(path))
+
+
+def read_bytes(path: Path) -> bytes:
+    """The bytes of a file, as :func:`image_from_bytes` takes them; no more than it accepts.
+
+    Raises:
+        ImageError: The file cannot be read.
+    """
     try:
         with path.open("rb") as file:
             # one byte more than allowed, so that a file that is too large is told from one that is not
-            content = file.read(MAX_IMAGE_BYTES + 1)
+            return file.read(MAX_IMAGE_BYTES + 1)
     except OSError as error:
         raise ImageError(f"{path} cannot be read: {error.strerror}.") from error
-    return image_from_bytes(content, str(path))
 
 
 def image_from_bytes(content: bytes, name: str = "the image") -> Image:

@@ -7,7 +7,7 @@ each register means is in docs/registers.md.
 from enum import IntEnum
 from typing import Final, NamedTuple
 
-MAP_SHA256: Final = "674673b05953112b318f8efe2eb02652f1e7c40a9017b2cb2ee89f4c6a5d202b"
+MAP_SHA256: Final = "2cdd2286f58f3ce295fe9147e1f5fa3207314bd3a54bd5fdf458179cfe847d25"
 BAR_SIZE: Final = 0x10000
 
 
@@ -96,7 +96,6 @@ class ErrorCode(IntEnum):
         HELD: another host holds the board, or another loader programs it.
         BAD_FRAME: the frame is broken: operation, length, CRC or sequence number; the link is closed.
         BAD_IMAGE: the image is damaged, or made for another map or board.
-        FAILED: the machine itself failed.
     """
 
     NONE = 0
@@ -112,7 +111,6 @@ class ErrorCode(IntEnum):
     HELD = 10
     BAD_FRAME = 11
     BAD_IMAGE = 12
-    FAILED = 13
 
 
 class Block(NamedTuple):

@@ -1,0 +1,454 @@
+"""Serves an emulated board: one thread, its registers to one host at a time, its programming port beside them.
+
+The loop hears its sockets between two chunks of the machine, so that a reset, a second host or
+the end of the process never waits longer than a chunk takes. A host that vanishes leaves the
+board idle for the next one; a host that sends nonsense is told so and loses its link.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+import select
+import socket
+import struct
+import time
+from contextlib import suppress
+from typing import TYPE_CHECKING, Final
+
+from pcie_shim import framing, register_map
+from pcie_shim.emulated_board import EmulatedBoard, RefusedError
+from pcie_shim.endpoint import Endpoint, listen, no_delay, parse_endpoint, remove_listener
+from pcie_shim.errors import FramingError
+from pcie_shim.misbehaviour import Misbehaviour, MisbehaviourKind
+from pcie_shim.programming_file import MAX_IMAGE_BYTES
+from pcie_shim.register_map import ErrorCode
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from pcie_shim.framing import Frame, ProgramBegin
+
+_LOG: Final = logging.getLogger(__name__)
+
+SEND_S: Final = 5.0
+"""Seconds that a host may leave what the board sends unread, before it loses its link."""
+PROGRAMMING_SILENCE_S: Final = 10.0
+"""Seconds that a loader may say nothing, before another may program the board."""
+
+_READABLE: Final = select.EPOLLIN | select.EPOLLHUP | select.EPOLLERR
+
+
+class StopSignal:
+    """Ends :func:`serve_board`, from a signal handler or another thread. Make it after a fork, not before."""
+
+    def __init__(self) -> None:
+        self._read, self._write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
+
+    def set(self) -> None:
+        """Ask for the end; may be called in a signal handler, and more than once."""
+        with suppress(OSError):
+            os.write(self._write, b"x")
+
+    def fileno(self) -> int:
+        """Readable once :meth:`set` was called."""
+        return self._read
+
+    def close(self) -> None:
+        """Give the descriptors back."""
+        os.close(self._read)
+        os.close(self._write)
+
+
+def serve_board(
+    endpoint: Endpoint | str,
+    *,
+    index: int,
+    stop: StopSignal,
+    misbehave: Misbehaviour | None = None,
+    on_ready: Callable[[], None] | None = None,
+) -> None:
+    """Serve one emulated board, blank at first, until ``stop`` is set; its sockets' files are removed then.
+
+    Args:
+        endpoint: Where the registers are; the programming port lies beside it (``Endpoint.programming``).
+        index: The board's number, for its greeting.
+        stop: Ends the loop.
+        misbehave: What the board does wrong, for tests of hosts.
+        on_ready: Called once both sockets listen.
+
+    Raises:
+        EndpointError: The endpoint is wrong or taken.
+    """
+    where = parse_endpoint(endpoint) if isinstance(endpoint, str) else endpoint
+    registers = listen(where)
+    try:
+        programming = listen(where.programming)
+    except BaseException:
+        remove_listener(where, registers)
+        raise
+    try:
+        server = _Server(registers, programming, index, stop, misbehave)
+        if on_ready is not None:
+            on_ready()
+        server.run()
+    finally:
+        remove_listener(where, registers)
+        remove_listener(where.programming, programming)
+
+
+class _Connection:
+    """A socket with frames: what a host's and a loader's connection have in common."""
+
+    def __init__(self, connection: socket.socket) -> None:
+        no_delay(connection)
+        # the loop reads only what epoll announced; what it sends may take SEND_S
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, struct.pack("@ll", int(SEND_S), 0))
+        self.socket = connection
+        self.decoder = framing.FrameDecoder()
+        self.sequence = 0
+        self.open = True
+        self.stalled = False
+
+    def receive(self) -> bool:
+        """Receive once; False when there was nothing. A closed connection is marked so."""
+        try:
+            count = self.socket.recv_into(self.decoder.room(), 0, socket.MSG_DONTWAIT)
+        except BlockingIOError:
+            return False
+        except OSError:
+            count = 0
+        self.decoder.received(count)
+        self.open = count > 0
+        return self.open
+
+    def in_turn(self, frame: Frame) -> None:
+        """Check that requests come in sequence."""
+        self.sequence = (self.sequence + 1) & 0xFFFFFFFF
+        if frame.sequence != self.sequence:
+            raise FramingError(f"request {frame.sequence} came where {self.sequence} was due")
+
+    def send(self, data: bytes) -> None:
+        try:
+            self.socket.sendall(data)
+        except OSError:
+            self.open = False
+
+
+class _Host(_Connection):
+    """The link to the host that holds the board."""
+
+    def __init__(self, connection: socket.socket, programmed: int) -> None:
+        super().__init__(connection)
+        self.token = os.urandom(8)
+        self.programmed = programmed
+        self.interrupts = 0
+
+
+class _Loader(_Connection):
+    """The programming port's connection, and what has come of the programming file."""
+
+    def __init__(self, connection: socket.socket) -> None:
+        super().__init__(connection)
+        self.begin: ProgramBegin | None = None
+        self.content = bytearray()
+        self.heard = time.monotonic()
+
+
+class _Server:
+    """The loop over the stop signal, two listening sockets, a host and a loader."""
+
+    def __init__(
+        self,
+        registers: socket.socket,
+        programming: socket.socket,
+        index: int,
+        stop: StopSignal,
+        misbehave: Misbehaviour | None,
+    ) -> None:
+        self._registers = registers
+        self._programming = programming
+        self._index = index
+        self._stop = stop
+        self._misbehave = misbehave
+        self._starts = 0
+        self._misbehaved = 0
+        self._board = EmulatedBoard()
+        self._host: _Host | None = None
+        self._loader: _Loader | None = None
+        self._epoll = select.epoll()
+        for descriptor in (stop.fileno(), registers.fileno(), programming.fileno()):
+            self._epoll.register(descriptor, _READABLE)
+
+    def run(self) -> None:
+        board, epoll = self._board, self._epoll
+        try:
+            while True:
+                computing = board.running and not board.stuck
+                wait = 0.0 if computing else (1.0 if self._loader is not None else -1.0)
+                for descriptor, _ in epoll.poll(wait):
+                    if descriptor == self._stop.fileno():
+                        return
+                    self._serve(descriptor)
+                if board.running and not board.stuck:
+                    board.step()
+                    self._interrupt_if_done()
+                self._forget_silent_loader()
+        finally:
+            self._drop_host()
+            self._drop_loader()
+            epoll.close()
+
+    def _serve(self, descriptor: int) -> None:
+        host, loader = self._host, self._loader
+        if host is not None and descriptor == host.socket.fileno():
+            self._serve_host(host)
+        elif loader is not None and descriptor == loader.socket.fileno():
+            self._serve_loader(loader)
+        elif descriptor == self._registers.fileno():
+            self._accept_host()
+        elif descriptor == self._programming.fileno():
+            self._accept_loader()
+
+    # ---- the host -------------------------------------------------------------------------------------
+
+    def _accept_host(self) -> None:
+        try:
+            connection, _ = self._registers.accept()
+        except OSError:
+            return  # whoever it was has gone already
+        if self._host is not None:
+            # The one that holds the board may just have left: hear it out before anyone is turned away.
+            while self._host is not None and self._host.receive():
+                self._answer(self._host)
+            if self._host is not None and not self._host.open:
+                self._drop_host()
+        if self._host is not None:
+            _turn_away(connection, "another host holds the board; one host drives it at a time")
+            return
+        self._host = host = _Host(connection, self._board.programmed)
+        self._epoll.register(connection.fileno(), _READABLE)
+        host.send(self._greeting(host.token))
+        _LOG.info("board %d: a host opened it", self._index)
+
+    def _greeting(self, token: bytes) -> bytes:
+        map_hash = register_map.MAP_SHA256
+        if self._wrong(MisbehaviourKind.WRONG_MAP):
+            map_hash = hashlib.sha256(b"another map").hexdigest()
+        return framing.encode_greeting(
+            framing.Greeting(
+                protocol_version=framing.PROTOCOL_VERSION,
+                bar_size=register_map.BAR_SIZE,
+                board=self._index,
+                map_hash=map_hash,
+                image_hash=self._board.image_hash,
+                token=token,
+            )
+        )
+
+    def _serve_host(self, host: _Host) -> None:
+        if host.stalled:
+            # it may only leave: what it sends is not read
+            if _has_left(host.socket):
+                self._drop_host()
+            else:
+                time.sleep(0.01)
+            return
+        host.receive()
+        self._answer(host)
+        if not host.open:
+            self._drop_host()
+
+    def _answer(self, connection: _Connection) -> None:
+        """Answer all whole frames that have come."""
+        while connection.open and not connection.stalled:
+            sequence = address = 0
+            try:
+                frame = connection.decoder.next_frame()
+                if frame is None:
+                    return
+                sequence, address = frame.sequence, frame.address
+                connection.in_turn(frame)
+                if isinstance(connection, _Host):
+                    self._access(connection, frame)
+                elif isinstance(connection, _Loader):
+                    self._program(connection, frame)
+            except FramingError as error:
+                connection.send(framing.encode_error(sequence, address, ErrorCode.BAD_FRAME, str(error)))
+                connection.open = False
+            except RefusedError as error:
+                connection.send(framing.encode_error(sequence, address, error.code, str(error)))
+
+    def _access(self, host: _Host, frame: Frame) -> None:
+        operation, flags, sequence, address, count, payload = frame
+        board = self._board
+        if host.programmed != board.programmed:
+            raise RefusedError(ErrorCode.STALE, "the board was programmed after it was opened")
+        if operation == framing.READ:
+            words = board.read(address, count)
+            self._send(host, framing.READ, framing.REPLY, sequence, address, words)
+        elif operation == framing.WRITE:
+            done = board.done
+            board.stuck = self._wrong(MisbehaviourKind.NEVER_DONE, ahead=1)
+            board.write(address, payload)
+            # acknowledged before the interrupt that it may cause
+            if not flags & framing.POSTED:
+                self._send(host, framing.WRITE, framing.REPLY, sequence, address, b"")
+            if board.running or board.done != done:
+                self._starts += 1
+                self._interrupt_if_done()
+        else:
+            raise FramingError(f"operation {operation} is no business of the register port")
+
+    def _interrupt_if_done(self) -> None:
+        board, host = self._board, self._host
+        if board.running or host is None or not board.interrupt_enabled:
+            return
+        host.interrupts = (host.interrupts + 1) & 0xFFFFFFFF
+        self._send(host, framing.IRQ, 0, host.interrupts, register_map.DONE, board.interrupt_words())
+        if not host.open:
+            self._drop_host()
+
+    def _drop_host(self) -> None:
+        host, self._host = self._host, None
+        if host is not None:
+            self._board.release()
+            self._epoll.unregister(host.socket.fileno())
+            host.socket.close()
+            _LOG.info("board %d: its host has gone", self._index)
+
+    # ---- misbehaving ----------------------------------------------------------------------------------
+
+    def _wrong(self, kind: MisbehaviourKind, *, ahead: int = 0) -> bool:
+        """Whether to misbehave in this way now, with ``ahead`` more starts than there were; counts it."""
+        wanted = self._misbehave
+        if wanted is None or wanted.kind is not kind:
+            return False
+        if 0 < wanted.after >= self._starts + ahead or 0 < wanted.times <= self._misbehaved:
+            return False
+        self._misbehaved += 1
+        return True
+
+    def _send(
+        self, host: _Host, operation: int, flags: int, sequence: int, address: int, words: bytes
+    ) -> None:
+        """Send an answer or an interrupt, or what misbehaviour makes of it."""
+        if self._misbehave is None:
+            host.send(framing.encode(operation, flags, sequence, address, len(words) // 4, words))
+            return
+        if self._wrong(MisbehaviourKind.DROP):
+            return
+        if self._wrong(MisbehaviourKind.STALL):
+            host.stalled = True
+            return
+        if words and self._wrong(MisbehaviourKind.SHORT_READ):
+            words = words[:-4]
+        if words and self._wrong(MisbehaviourKind.ALL_ONES):
+            words = b"\xff" * len(words)
+        if self._wrong(MisbehaviourKind.WRONG_SEQUENCE):
+            sequence = (sequence + 1) & 0xFFFFFFFF
+        data = framing.encode(operation, flags, sequence, address, len(words) // 4, words)
+        if self._wrong(MisbehaviourKind.WRONG_CRC):
+            data = data[:16] + bytes(byte ^ 0xFF for byte in data[16:20]) + data[20:]
+        if self._wrong(MisbehaviourKind.ENDLESS):
+            data = data[:-2]
+            host.stalled = True
+        host.send(data)
+
+    # ---- the loader -----------------------------------------------------------------------------------
+
+    def _accept_loader(self) -> None:
+        try:
+            connection, _ = self._programming.accept()
+        except OSError:
+            return
+        if self._loader is not None:
+            while self._loader is not None and self._loader.receive():
+                self._answer(self._loader)
+            if self._loader is not None and not self._loader.open:
+                self._drop_loader()
+        if self._loader is not None:
+            _turn_away(connection, "another loader is programming the board")
+            return
+        self._loader = loader = _Loader(connection)
+        self._epoll.register(connection.fileno(), _READABLE)
+        loader.send(self._greeting(framing.NO_TOKEN))
+
+    def _serve_loader(self, loader: _Loader) -> None:
+        loader.heard = time.monotonic()
+        loader.receive()
+        self._answer(loader)
+        if not loader.open:
+            self._drop_loader()
+
+    def _program(self, loader: _Loader, frame: Frame) -> None:
+        operation, flags, sequence, address, count, payload = frame
+        if operation == framing.READ:
+            words = self._board.read(address, count)
+            loader.send(framing.encode(framing.READ, framing.REPLY, sequence, address, count, words))
+            return
+        if operation != framing.PROGRAM:
+            raise FramingError(f"operation {operation} is no business of the programming port")
+        if flags & framing.BEGIN:
+            begin = framing.ProgramBegin.decode(payload)
+            if begin.size > MAX_IMAGE_BYTES:
+                raise RefusedError(
+                    ErrorCode.BAD_IMAGE, f"it has {begin.size} bytes, {MAX_IMAGE_BYTES} are the most"
+                )
+            self._check_not_held(begin)
+            loader.begin = begin
+            loader.content.clear()
+        elif loader.begin is None or address != len(loader.content):
+            raise FramingError(f"a part for offset {address} came out of turn")
+        elif len(loader.content) < loader.begin.size:
+            # the file's last word may be filled up with zeros
+            loader.content += payload[: loader.begin.size - len(loader.content)]
+        if flags & framing.END:
+            self._load(loader)
+        if not flags & framing.POSTED:
+            loader.send(framing.encode(framing.PROGRAM, framing.REPLY, sequence, address, 0))
+
+    def _check_not_held(self, begin: ProgramBegin) -> None:
+        if self._host is not None and begin.token != self._host.token:
+            # as in _accept_host: it may just have left
+            while self._host is not None and self._host.receive():
+                self._answer(self._host)
+            if self._host is not None and not self._host.open:
+                self._drop_host()
+        if self._host is not None and begin.token != self._host.token:
+            raise RefusedError(ErrorCode.HELD, "a host holds the board; end it, or program through it")
+
+    def _load(self, loader: _Loader) -> None:
+        assert loader.begin is not None  # noqa: S101 - BEGIN comes first
+        begin, content = loader.begin, bytes(loader.content)
+        loader.begin = None
+        loader.content.clear()
+        self._check_not_held(begin)
+        if len(content) != begin.size or hashlib.sha256(content).digest() != begin.sha256:
+            raise RefusedError(ErrorCode.BAD_IMAGE, "the bytes that came are not those that were announced")
+        self._board.load(content)
+        _LOG.info("board %d: programmed with image %s", self._index, self._board.image_hash)
+
+    def _forget_silent_loader(self) -> None:
+        if self._loader is not None and time.monotonic() - self._loader.heard > PROGRAMMING_SILENCE_S:
+            self._drop_loader()
+
+    def _drop_loader(self) -> None:
+        loader, self._loader = self._loader, None
+        if loader is not None:
+            self._epoll.unregister(loader.socket.fileno())
+            loader.socket.close()
+
+
+def _turn_away(connection: socket.socket, detail: str) -> None:
+    with suppress(OSError):
+        connection.sendall(framing.encode_error(0, 0, ErrorCode.HELD, detail))
+    connection.close()
+
+
+def _has_left(connection: socket.socket) -> bool:
+    """Whether the other end has closed, as far as can be seen without reading what it sent."""
+    poll = select.poll()
+    poll.register(connection, select.POLLRDHUP)
+    return bool(poll.poll(0))

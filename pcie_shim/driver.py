@@ -1,0 +1,620 @@
+"""Drives the mini-cluster: one blocking thread, all boards (thesis 3.2, figure 3.3).
+
+A frame's sensors and its start are posted to every board before the first is waited for; then the
+results are taken as the boards stop. Boards that hold parts of one model stop together
+(``slices``) or each for itself (``own``, as in the thesis).
+"""
+
+from __future__ import annotations
+
+import select
+import struct
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, Literal, NoReturn, Self
+
+import numpy as np
+
+from machines.bm1 import CYCLES_MAX, StopReason
+from machines.parameters import PriorMode
+from pcie_shim import register_map as rm
+from pcie_shim.doorbell import following
+from pcie_shim.endpoint import parse_endpoint
+from pcie_shim.errors import (
+    AccessError,
+    BoardError,
+    BoardGoneError,
+    BoardHeldError,
+    BoardLinkError,
+    BoardMismatchError,
+    BoardRefusedError,
+    BoardSilentError,
+    BoardStaleError,
+    BoardUnreachableError,
+    DeviceGoneError,
+    FrameInputError,
+    FramingError,
+    GreetingMismatchError,
+    HeldError,
+    ImageError,
+    ImageMismatchError,
+    LinkClosedError,
+    LinkError,
+    LinkTimeoutError,
+    PcieShimError,
+    SequenceError,
+    ShortReadError,
+    StaleHandleError,
+    UnreachableError,
+)
+from pcie_shim.link import ALL_ONES, Done, SocketLink
+from pcie_shim.loader import program
+from pcie_shim.register_map import BoardState
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from types import TracebackType
+
+    import numpy.typing as npt
+
+    from machines.parameters import BM1Parameters
+    from pcie_shim.endpoint import Endpoint
+    from pcie_shim.programming_file import Image
+
+FIRST_SLICE: Final = 256
+"""Cycle at which the first slice ends; the next ones end at twice the last one's end."""
+SLACK_S: Final = 5.0
+"""Seconds that a board may take beyond what its cycles need at its measured speed."""
+PROGRAMMING_S: Final = 30.0
+"""Seconds for each step of programming a blank board, at least."""
+
+_ASSUMED_SPEED: Final = 1e4  # cycles per second of a board that does not say its own
+_SETTINGS: Final = struct.Struct("<IQII")  # TARGET_COUNT, MAX_CYCLES, BANK, PRIOR_SELECT
+_START: Final = struct.Struct("<QI")  # RUN_UNTIL, START
+_RESUME: Final = struct.Struct("<QII")  # RUN_UNTIL, START (0: not rung), RESUME
+_BANK_AT: Final = rm.BANK - rm.TARGET_COUNT
+_REASONS: Final = frozenset(StopReason) - {StopReason.NONE}
+_PRIOR_AT: Final = rm.PRIOR_SELECT - rm.TARGET_COUNT
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FrameInput:
+    """One frame's readings and settings.
+
+    Attributes:
+        addresses: One table address per sensor column, in the model's order; None is a missing reading.
+        prior_address: Row of the prior's table (prior select).
+        prior_codes: uint16[total lines], a written prior; None: the image's own.
+        target_count: Count that stops the machines (thesis figure 3.3: number of target samples).
+        max_cycles: Most cycles, whatever the counts.
+        bank: Set of seeds from which the RNGs restart.
+        stop: ``slices``: all boards stop in the slice in which the first one overflows; ``own``: each for itself.
+    """
+
+    addresses: tuple[int | None, ...]
+    prior_address: int = 0
+    prior_codes: npt.NDArray[np.uint16] | None = None
+    target_count: int
+    max_cycles: int
+    bank: int = 0
+    stop: Literal["slices", "own"] = "slices"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BoardResult:
+    """What one board computed.
+
+    Attributes:
+        counts: uint32[lines of the board].
+        cycles: Cycles that its machine ran.
+        reason: Why it stopped; IMPOSSIBLE boards ran nothing and have no weight.
+        compute_ns: Time that its machine took, in nanoseconds, as the board measured it.
+    """
+
+    counts: npt.NDArray[np.uint32]
+    cycles: int
+    reason: StopReason
+    compute_ns: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FrameOutput:
+    """A frame's results, and where its time went (thesis figure 4.5), in nanoseconds.
+
+    Attributes:
+        boards: One result per board, in the order of the partition.
+        register_writes_ns: Posting settings, sensors, starts and resumes.
+        compute_ns: Waiting for the boards, their computing and the link's way included.
+        reads_ns: Taking the results out of what came.
+        boards_compute_ns: The boards' own computing: the slowest board of each slice, summed. What
+            ``compute_ns`` has above it is transport, and boards that had to share a core.
+        slices: Number of rounds of starting or resuming and waiting.
+    """
+
+    boards: tuple[BoardResult, ...]
+    register_writes_ns: int
+    compute_ns: int
+    reads_ns: int
+    boards_compute_ns: int
+    slices: int
+
+
+class _Board:
+    """One board as the driver sees it: its link, and what its registers are known to hold."""
+
+    def __init__(self, index: int, endpoint: Endpoint, image: Image) -> None:
+        self.index = index
+        self.endpoint = endpoint
+        self.image = image
+        self.lines = image.machine.parameters.lines
+        self.link: SocketLink | None = None
+        self.broken = "it was not opened"
+        self.speed = _ASSUMED_SPEED
+        self._forget()
+
+    def _forget(self) -> None:
+        """Nothing is known of the registers."""
+        self.settings = b""
+        self.prior: npt.NDArray[np.uint16] | None = None
+        self.number = 0
+        self.waiting = False
+        self.done: Done | None = None
+        self.compute_ns = 0
+
+    # ---- opening --------------------------------------------------------------------------------------
+
+    def open(self, timeout: float) -> None:
+        """Open the board: see :meth:`MiniCluster.open`; raises the link's errors."""
+        self.close("it is being opened")
+        self._forget()
+        link = self._identified(timeout)
+        try:
+            if link.greeting.is_blank:
+                program(
+                    self.endpoint, self.image, timeout=max(timeout, PROGRAMMING_S), token=link.greeting.token
+                )
+                link.close("the board was programmed")
+                link = self._identified(timeout)
+            self._check_image(link)
+            link.write32(rm.CONTROL, rm.CONTROL_RESET_MASK | rm.CONTROL_INTERRUPT_ENABLE_MASK)
+            self.number = link.read32(rm.DONE)
+            self.speed = float(link.read32(rm.CAP_SPEED)) or _ASSUMED_SPEED
+        except BaseException:
+            link.close("opening it failed")
+            raise
+        self.link = link
+
+    def _identified(self, timeout: float) -> SocketLink:
+        """A link to what is certainly a board with this register map."""
+        link = SocketLink.open(self.endpoint, timeout=timeout)
+        try:
+            self._check_identity(link)
+        except BaseException:
+            link.close("opening it failed")
+            raise
+        return link
+
+    def _check_identity(self, link: SocketLink) -> None:
+        identity = link.read32(rm.ID)
+        pattern = time.monotonic_ns() & ALL_ONES
+        link.write32(rm.LIVENESS, pattern)
+        alive = link.read32(rm.LIVENESS) == pattern ^ ALL_ONES
+        if identity != rm.ID_VALUE or not alive:
+            raise GreetingMismatchError(
+                f"What answers at {self.endpoint} is no board: its ID is {identity:#010x} (a board's: "
+                f"{rm.ID_VALUE:#010x}), and its LIVENESS register is {'alive' if alive else 'dead'}."
+            )
+        map_hash = link.read_block(rm.MAP_HASH, rm.MAP_HASH_WORDS).hex()
+        if map_hash != rm.MAP_SHA256:
+            raise GreetingMismatchError(
+                f"The board at {self.endpoint} has register map {map_hash}, this software has "
+                f"{rm.MAP_SHA256}: use a board and a host of the same version."
+            )
+
+    def _check_image(self, link: SocketLink) -> None:
+        found = link.read_block(rm.IMAGE_HASH, rm.IMAGE_HASH_WORDS).hex()
+        if found != self.image.image_hash:
+            raise ImageMismatchError(
+                f"The board at {self.endpoint} holds image {found}, the deployment's is "
+                f"{self.image.image_hash}: program it with the loader, or restart it (a blank board is "
+                "programmed when it is opened)."
+            )
+
+    def close(self, reason: str) -> None:
+        """End the link; the board stops what it was doing."""
+        if self.link is not None:
+            self.link.close(reason)
+            self.link = None
+        self.broken = reason
+        self.waiting = False
+
+    # ---- a frame --------------------------------------------------------------------------------------
+
+    def start(self, settings: bytes, sensors: bytes, prior: npt.NDArray[np.uint16] | None, end: int) -> None:
+        """Post a new frame: what changed of the settings, the sensors, the doorbell (figure 3.3)."""
+        assert self.link is not None  # noqa: S101 - MiniCluster.run has checked
+        self.waiting = True  # from here on, whatever interrupts the frame must interrupt the board
+        frames = self.link.posted_write(rm.SENSORS, sensors) if sensors else b""
+        if prior is not None and (self.prior is None or not np.array_equal(prior, self.prior)):
+            frames += self.link.posted_write(rm.PRIOR_CODES, prior.astype("<u4").tobytes())
+            self.prior = prior.copy()
+        # Settings, slice and doorbell lie side by side: one burst from the first one that changed.
+        known = self.settings
+        if settings == known:
+            at = len(settings)
+        elif settings[:_BANK_AT] != known[:_BANK_AT]:
+            at = 0
+        elif settings[_BANK_AT:_PRIOR_AT] != known[_BANK_AT:_PRIOR_AT]:
+            at = _BANK_AT
+        else:
+            at = _PRIOR_AT
+        self.settings = settings
+        self.compute_ns = 0
+        self._ring(frames, rm.TARGET_COUNT + at, settings[at:], _START, end)
+
+    def resume(self, end: int) -> None:
+        """Post the next slice of the frame."""
+        self._ring(b"", rm.RUN_UNTIL, b"", _RESUME, end, 0)
+
+    def _ring(self, frames: bytes, address: int, before: bytes, layout: struct.Struct, *words: int) -> None:
+        assert self.link is not None  # noqa: S101 - MiniCluster.run has checked
+        self.number = following(self.number)
+        self.waiting = True
+        self.done = None
+        burst = before + layout.pack(*words, self.number)
+        self.link.post(frames + self.link.posted_write(address, burst))
+
+    def receive(self) -> bool:
+        """Take what has come, after a poll; True once the board has said done."""
+        assert self.link is not None  # noqa: S101 - a closed link is not polled
+        done = self.link.receive_done()
+        if done is None:
+            return False
+        if not self.waiting or done.number != self.number:
+            raise SequenceError(
+                f"The board at {self.endpoint} said done number {done.number} where {self.number} was due."
+            )
+        if len(done.results) != 4 * self.lines:
+            raise ShortReadError(
+                f"The board at {self.endpoint} said done with {len(done.results) // 4} results where "
+                f"{self.lines} were due."
+            )
+        if done.state != BoardState.DONE or done.reason not in _REASONS:
+            raise FramingError(
+                f"The board at {self.endpoint} said done with a status of {done.status:#010x}, which is none."
+            )
+        self.waiting = False
+        self.done = done
+        self.compute_ns += done.compute_ns
+        return True
+
+    @property
+    def reason(self) -> int:
+        """Why the machine stopped last."""
+        return 0 if self.done is None else self.done.reason
+
+    def result(self) -> BoardResult:
+        """The frame's result; the counts are copied out of the link's buffer."""
+        assert self.done is not None  # noqa: S101 - every board has said done
+        return BoardResult(
+            counts=np.frombuffer(self.done.results, "<u4").astype(np.uint32),
+            cycles=self.done.cycles,
+            reason=StopReason(self.done.reason),
+            compute_ns=self.compute_ns,
+        )
+
+
+class MiniCluster:
+    """All boards of a deployment, in the order of their partition; used by one thread."""
+
+    def __init__(self, boards: Sequence[_Board], *, timeout: float, slack: float) -> None:
+        """Use :meth:`open`."""
+        self._boards = tuple(boards)
+        self._parameters: BM1Parameters = self._boards[0].image.machine.parameters
+        self._timeout = timeout
+        self._slack = slack
+        self._interrupted: list[_Board] = []
+        self._poll = select.poll()
+        self._by_descriptor: dict[int, _Board] = {}
+
+    @classmethod
+    def open(
+        cls,
+        endpoints: Sequence[Endpoint | str],
+        images: Sequence[Image],
+        *,
+        timeout: float = 10.0,
+        slack: float = SLACK_S,
+    ) -> Self:
+        """Open all boards: identity, liveness and image are checked, blank boards programmed, machines reset.
+
+        Args:
+            endpoints: Where the boards listen, in the order of the partition.
+            images: What they (are to) hold.
+            timeout: Seconds for a board to listen, and for each of its answers.
+            slack: Seconds that a frame may take beyond what its cycles need at the boards' speed.
+
+        Raises:
+            EndpointError: An endpoint's text is wrong.
+            ImageMismatchError: The images are not the parts of one model.
+            BoardError: A board cannot be opened; those opened before it are closed.
+        """
+        places = [parse_endpoint(place) if isinstance(place, str) else place for place in endpoints]
+        _check_images(len(places), images)
+        boards = [
+            _Board(index, place, image)
+            for index, (place, image) in enumerate(zip(places, images, strict=True))
+        ]
+        cluster = cls(boards, timeout=timeout, slack=slack)
+        try:
+            for board in boards:
+                cluster._open(board, timeout)
+        except BaseException:
+            cluster.close()
+            raise
+        return cluster
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    @property
+    def total_lines(self) -> int:
+        """Lines of the whole model."""
+        return sum(board.lines for board in self._boards)
+
+    def is_open(self, board: int) -> bool:
+        """Whether board number ``board`` can be used; else :meth:`reopen` it."""
+        return self._boards[board].link is not None or self._boards[board] in self._interrupted
+
+    def reopen(self, board: int, *, timeout: float | None = None) -> None:
+        """Open a board again, after its restart or a broken link; a blank one is programmed.
+
+        Raises:
+            BoardError: It cannot be opened.
+        """
+        self._open(self._boards[board], self._timeout if timeout is None else timeout)
+
+    def close(self) -> None:
+        """Close all links; boards that run stop."""
+        for board in self._boards:
+            self._close(board, "the mini-cluster was closed")
+
+    # ---- a frame --------------------------------------------------------------------------------------
+
+    def run(self, frame: FrameInput) -> FrameOutput:
+        """Compute one frame on all boards.
+
+        After an error the frame is lost, and nothing of it is kept. The boards that did not fail can be used
+        again at once; the one that failed must be opened again (:meth:`reopen`), unless it only refused.
+
+        Raises:
+            FrameInputError: The frame does not fit the machine; no board was touched.
+            BoardError: A board failed; ``error.board`` is its number.
+        """
+        settings, sensors = self._words(frame)
+        priors = self._priors(frame)
+        self._make_ready()
+        try:
+            return self._run(frame, settings, sensors, priors)
+        except BaseException:
+            # What the others still compute is of no use: a closed link stops them, the next frame opens it.
+            for board in self._boards:
+                if board.waiting and board.link is not None:
+                    self._close(board, "another board failed the frame")
+                    self._interrupted.append(board)
+            raise
+
+    def _run(
+        self,
+        frame: FrameInput,
+        settings: bytes,
+        sensors: bytes,
+        priors: Sequence[npt.NDArray[np.uint16] | None],
+    ) -> FrameOutput:
+        boards = self._boards
+        sliced = frame.stop == "slices"
+        end = FIRST_SLICE if sliced and frame.max_cycles > FIRST_SLICE else 0
+        writes = waits = computing = rounds = begun = 0
+        clock = time.perf_counter_ns
+        started = clock()
+        for board, prior in zip(boards, priors, strict=True):
+            try:
+                board.start(settings, sensors, prior, end)
+            except LinkError as error:
+                self._fail(board, error)
+        running: Sequence[_Board] = boards
+        while True:
+            posted = clock()
+            writes += posted - started
+            self._collect(running, (end or frame.max_cycles) - begun)
+            started = clock()
+            waits += started - posted
+            rounds += 1
+            computing += max(board.done.compute_ns for board in running if board.done is not None)
+            running = [board for board in running if board.reason == StopReason.SLICE]
+            if not running or any(board.reason == StopReason.OVERFLOW for board in boards):
+                break
+            begun, end = end, 2 * end
+            if end >= frame.max_cycles:
+                end = 0  # the last slice ends where the frame does
+            for board in running:
+                try:
+                    board.resume(end)
+                except LinkError as error:
+                    self._fail(board, error)
+        results = tuple(board.result() for board in boards)
+        return FrameOutput(
+            boards=results,
+            register_writes_ns=writes,
+            compute_ns=waits,
+            reads_ns=clock() - started,
+            boards_compute_ns=computing,
+            slices=rounds,
+        )
+
+    def _collect(self, running: Sequence[_Board], cycles: int) -> None:
+        """Wait until every running board has said done, ``cycles`` cycles from now at most."""
+        # emulated boards may all share one core
+        limit = self._slack + cycles * len(self._boards) / min(board.speed for board in self._boards)
+        deadline = time.monotonic() + limit
+        left = len(running)
+        while left:
+            events = self._poll.poll(max(deadline - time.monotonic(), 0) * 1000)
+            if not events:
+                late = next(board for board in running if board.waiting)
+                self._fail(
+                    late,
+                    LinkTimeoutError(
+                        f"The board at {late.endpoint} did not say done within {limit:.3g} s, for {cycles} "
+                        "cycles."
+                    ),
+                )
+            for descriptor, _ in events:
+                board = self._by_descriptor[descriptor]
+                try:
+                    left -= board.receive()
+                except LinkError as error:
+                    self._fail(board, error)
+
+    def _fail(self, board: _Board, error: LinkError) -> NoReturn:
+        """The frame fails because of this board; only one that merely refused stays usable."""
+        if isinstance(error, AccessError) and not isinstance(error, StaleHandleError):
+            board.waiting = True  # it may have started all the same: run() has it opened again
+        else:
+            self._close(board, str(error).rstrip("."))
+        raise _board_error(board, error) from error
+
+    def _make_ready(self) -> None:
+        """Open again what the last, failed frame left interrupted."""
+        while self._interrupted:
+            self._open(self._interrupted.pop(), self._timeout)
+        for board in self._boards:
+            if board.link is None:
+                raise BoardGoneError(
+                    f"Board {board.index} at {board.endpoint} is not open ({board.broken}): open it again.",
+                    board=board.index,
+                )
+
+    def _open(self, board: _Board, timeout: float) -> None:
+        self._close(board, "it is being opened")
+        try:
+            board.open(timeout)
+        except PcieShimError as error:
+            board.broken = str(error).rstrip(".")
+            raise _board_error(board, error) from error
+        assert board.link is not None  # noqa: S101 - open() has made it
+        self._by_descriptor[board.link.fileno()] = board
+        self._poll.register(board.link.fileno(), select.POLLIN)
+
+    def _close(self, board: _Board, reason: str) -> None:
+        if board in self._interrupted:
+            self._interrupted.remove(board)
+        if board.link is not None and (descriptor := self._descriptor(board)) is not None:
+            self._poll.unregister(descriptor)
+            del self._by_descriptor[descriptor]
+        board.close(reason)
+
+    def _descriptor(self, board: _Board) -> int | None:
+        """Where a board was polled; a link that closed itself no longer knows."""
+        return next((known for known, owner in self._by_descriptor.items() if owner is board), None)
+
+    # ---- what goes into the registers -----------------------------------------------------------------
+
+    def _words(self, frame: FrameInput) -> tuple[bytes, bytes]:
+        """Settings and sensors as register words."""
+        parameters = self._parameters
+        for name, value, lowest, highest in (
+            ("The target count", frame.target_count, 1, parameters.target_count_max),
+            ("The most cycles", frame.max_cycles, 1, CYCLES_MAX),
+            ("The RNG bank", frame.bank, 0, parameters.rng_banks - 1),
+            ("The prior's address", frame.prior_address, 0, parameters.prior_addresses - 1),
+        ):
+            if not lowest <= value <= highest:
+                raise FrameInputError(f"{name} is {value}; this machine takes {lowest} to {highest}.")
+        if frame.stop not in {"slices", "own"}:
+            raise FrameInputError(f"The boards cannot stop by '{frame.stop}': use slices or own.")
+        if len(frame.addresses) != parameters.sensors:
+            raise FrameInputError(
+                f"The frame has {len(frame.addresses)} readings; this machine has {parameters.sensors} sensors."
+            )
+        words = []
+        for column, (address, bits) in enumerate(
+            zip(frame.addresses, parameters.sensor_bits, strict=True), start=1
+        ):
+            missing = (1 << bits) - 1
+            if address is not None and not 0 <= address <= missing:
+                raise FrameInputError(
+                    f"The address of sensor column {column} is {address}; this machine takes 0 to "
+                    f"{missing - 1}, or none."
+                )
+            words.append(missing if address is None else address)
+        settings = _SETTINGS.pack(frame.target_count, frame.max_cycles, frame.bank, frame.prior_address)
+        return settings, struct.pack(f"<{len(words)}I", *words)
+
+    def _priors(self, frame: FrameInput) -> list[npt.NDArray[np.uint16] | None]:
+        """Each board's part of the written prior; None where the prior is a table."""
+        codes = frame.prior_codes
+        if self._parameters.prior_mode is not PriorMode.WRITTEN:
+            if codes is not None:
+                raise FrameInputError("The frame has a prior to write, but the machine's prior is a table.")
+            return [None] * len(self._boards)
+        if codes is None:
+            return [board.image.machine.prior[0] for board in self._boards]
+        if codes.shape != (self.total_lines,) or int(codes.max()) > self._parameters.ones_code:
+            raise FrameInputError(
+                f"The prior to write has shape {codes.shape} and codes up to {codes.max()}; this machine takes "
+                f"{self.total_lines} codes from 0 to {self._parameters.ones_code}."
+            )
+        offsets = [board.image.partition.line_offset for board in self._boards]
+        return [
+            codes[offset : offset + board.lines] for offset, board in zip(offsets, self._boards, strict=True)
+        ]
+
+
+def _check_images(boards: int, images: Sequence[Image]) -> None:
+    """Refuse images that are not the parts of one model, in order."""
+    if boards != len(images) or not images:
+        raise ImageMismatchError(
+            f"There are {boards} endpoints for {len(images)} images; one each is needed."
+        )
+    offset = 0
+    first = images[0]
+    for index, image in enumerate(images):
+        part = image.partition
+        if (part.index, part.count, part.line_offset) != (index, len(images), offset):
+            raise ImageMismatchError(
+                f"Image {index} is part {part.index} of {part.count} from line {part.line_offset} on; part "
+                f"{index} of {len(images)} from line {offset} on is needed here."
+            )
+        if image.model_hash != first.model_hash or part.total_lines != first.partition.total_lines:
+            raise ImageMismatchError(
+                f"Image {index} belongs to model {image.model_hash}, image 0 to {first.model_hash}."
+            )
+        offset += image.machine.parameters.lines
+    if offset != first.partition.total_lines:
+        raise ImageMismatchError(
+            f"The images hold {offset} lines, the model has {first.partition.total_lines}."
+        )
+
+
+_BOARD_ERRORS: Final[tuple[tuple[tuple[type[PcieShimError], ...], type[BoardError]], ...]] = (
+    ((UnreachableError,), BoardUnreachableError),
+    ((HeldError,), BoardHeldError),
+    ((StaleHandleError,), BoardStaleError),
+    ((AccessError,), BoardRefusedError),
+    ((GreetingMismatchError, ImageError), BoardMismatchError),
+    ((LinkTimeoutError,), BoardSilentError),
+    ((LinkClosedError, DeviceGoneError), BoardGoneError),
+    ((PcieShimError,), BoardLinkError),
+)
+
+
+def _board_error(board: _Board, error: PcieShimError) -> BoardError:
+    """The same, said of a board of the mini-cluster."""
+    kind = next(kind for causes, kind in _BOARD_ERRORS if isinstance(error, causes))
+    return kind(f"Board {board.index}: {error}", board=board.index)

@@ -1,0 +1,446 @@
+"""The emulated FPGA board, without sockets: a register file with a Bayesian machine behind it.
+
+It holds the whole map as bytes, so that a read is a slice; only what has an effect is code. The
+machine runs in chunks of some 50 ms (:meth:`EmulatedBoard.step`), so that whoever serves the board
+can hear a reset between them; chunks do not change results, since a machine that stops at a
+cycle and is resumed gives the same bits.
+"""
+
+from __future__ import annotations
+
+import struct
+import time
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from machines.bm1 import CYCLES_MAX, Start, StopReason
+from machines.errors import MachineError, StartError
+from machines.kernel import make_kernel
+from machines.parameters import PriorMode, RngReset
+from pcie_shim import register_map as rm
+from pcie_shim.doorbell import following
+from pcie_shim.errors import ImageError, PcieShimError
+from pcie_shim.programming_file import image_from_bytes
+from pcie_shim.register_map import BoardState, ErrorCode, MachineKind, RngKind
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    import numpy.typing as npt
+
+    from machines.bm1 import BM1Kernel, BM1Machine
+    from pcie_shim.programming_file import Image
+
+CHUNK_S: Final = 0.05
+"""Seconds that the machine may run before the board hears its host again."""
+
+_NO_ACCESS, _READ, _READ_WRITE = 0, 1, 3
+_WORD: Final = struct.Struct("<I")
+_LONG: Final = struct.Struct("<Q")
+_PAIR: Final = struct.Struct("<II")
+_SETTINGS: Final = struct.Struct("<IQIIQ")  # TARGET_COUNT, MAX_CYCLES, BANK, PRIOR_SELECT, RUN_UNTIL
+_DONE_BYTES: Final = rm.COMPUTE_NS + 8 - rm.DONE
+_ALIGNMENT: Final = 4096  # fast kernels work in blocks of so many cycles: chunks end between them
+
+
+class RefusedError(PcieShimError):
+    """The board refuses an access.
+
+    Attributes:
+        code: Why, for the host.
+    """
+
+    def __init__(self, code: ErrorCode, detail: str) -> None:
+        super().__init__(detail)
+        self.code = code
+
+
+class EmulatedBoard:
+    """A board: blank until an image is loaded, then a BM1 behind registers (docs/registers.md).
+
+    Attributes:
+        image_hash: SHA-256 (hex) of the loaded image; zeros while blank.
+        running: Whether the machine runs: :meth:`step` must be called.
+        stuck: Set by tests: a machine that is started now will run for ever, without a cycle.
+    """
+
+    def __init__(self, make: Callable[[BM1Machine], BM1Kernel] = make_kernel) -> None:
+        self._make = make
+        self._memory = bytearray(rm.BAR_SIZE)
+        self._view = memoryview(self._memory)
+        self._access = bytearray(rm.BAR_SIZE // 4)
+        self._kernel: BM1Kernel | None = None
+        self._latched: dict[int, bytes] = {}
+        self._programmed = 0
+        self._speed = 0.0
+        self._run_until = 0
+        self._compute_ns = 0
+        self._number = 0
+        self.running = False
+        self.stuck = False
+        self._power_up()
+
+    # ---- identity -------------------------------------------------------------------------------------
+
+    @property
+    def image_hash(self) -> str:
+        """SHA-256 (hex) of the loaded image; zeros while blank."""
+        return bytes(self._view[rm.IMAGE_HASH : rm.IMAGE_HASH + 32]).hex()
+
+    @property
+    def programmed(self) -> int:
+        """Images loaded so far."""
+        return self._programmed
+
+    @property
+    def done(self) -> int:
+        """The number of the last start or resume that has stopped."""
+        return self._get(rm.DONE)
+
+    @property
+    def interrupt_enabled(self) -> bool:
+        """Whether the host wants an interrupt when the machine stops."""
+        return bool(self._memory[rm.CONTROL] & rm.CONTROL_INTERRUPT_ENABLE_MASK)
+
+    def _power_up(self) -> None:
+        """Everything as on a blank board."""
+        self._memory[:] = bytes(rm.BAR_SIZE)
+        self._put(rm.ID, rm.ID_VALUE)
+        self._put(rm.MAP_VERSION, rm.MAP_VERSION_VALUE)
+        self._put(rm.LIVENESS, 0xFFFFFFFF)
+        self._put(rm.PROGRAMMED, self._programmed)
+        self._view[rm.MAP_HASH : rm.MAP_HASH + 32] = bytes.fromhex(rm.MAP_SHA256)
+        self._latched.clear()
+        for block in rm.BLOCKS:
+            access = _READ_WRITE if block.writable else _READ
+            self._allow(block.address, block.words, access)
+        for address, words in (
+            (rm.SENSORS, rm.SENSORS_WORDS),
+            (rm.RESULTS, rm.RESULTS_WORDS),
+            (rm.PRIOR_CODES, rm.PRIOR_CODES_WORDS),
+        ):
+            self._allow(address, words, _NO_ACCESS)
+
+    def load(self, content: bytes) -> None:
+        """Program the board with the bytes of a programming file, as the loader sends them.
+
+        The machine runs for a few milliseconds, to measure its speed, and is reset.
+
+        Raises:
+            RefusedError: The machine runs, or the image is damaged or for another map.
+        """
+        if self.running:
+            raise RefusedError(ErrorCode.BUSY, "the machine runs; reset it before programming")
+        try:
+            image = image_from_bytes(content, "the image")
+            kernel = self._make(image.machine)
+        except (ImageError, MachineError) as error:
+            raise RefusedError(ErrorCode.BAD_IMAGE, str(error).rstrip(".")) from error
+        self._kernel = kernel
+        self._programmed += 1
+        self._power_up()
+        self._describe(image)
+        self._speed = _measure_speed(kernel)
+        self._put(rm.CAP_SPEED, min(int(self._speed), 0xFFFFFFFF))
+        self.reset()
+
+    def _describe(self, image: Image) -> None:
+        """The capability registers, and access to what the image implements."""
+        parameters, part = image.machine.parameters, image.partition
+        written = parameters.prior_mode is PriorMode.WRITTEN
+        self._view[rm.IMAGE_HASH : rm.IMAGE_HASH + 32] = bytes.fromhex(image.image_hash)
+        self._put(
+            rm.CAP_MACHINE,
+            MachineKind.BM1 << rm.CAP_MACHINE_KIND_SHIFT
+            | RngKind[parameters.rng.name] << rm.CAP_MACHINE_RNG_SHIFT
+            | parameters.shared << rm.CAP_MACHINE_SHARED_SHIFT
+            | (parameters.rng_reset is RngReset.FREE) << rm.CAP_MACHINE_FREE_SHIFT
+            | written << rm.CAP_MACHINE_PRIOR_WRITTEN_SHIFT,
+        )
+        self._put(rm.CAP_LINES, parameters.lines)
+        self._put(rm.CAP_TOTAL_LINES, part.total_lines)
+        self._put(rm.CAP_LINE_OFFSET, part.line_offset)
+        self._put(
+            rm.CAP_PARTITION,
+            part.index << rm.CAP_PARTITION_INDEX_SHIFT | part.count << rm.CAP_PARTITION_COUNT_SHIFT,
+        )
+        self._put(rm.CAP_SENSORS, parameters.sensors)
+        self._put(
+            rm.CAP_WIDTHS,
+            parameters.prob_bits << rm.CAP_WIDTHS_PROB_BITS_SHIFT
+            | parameters.counter_bits << rm.CAP_WIDTHS_COUNTER_BITS_SHIFT
+            | parameters.prior_bits << rm.CAP_WIDTHS_PRIOR_BITS_SHIFT,
+        )
+        self._put(rm.CAP_BANKS, parameters.rng_banks)
+        self._put(rm.CAP_REPLICAS, 1)
+        self._put(
+            rm.CAP_INTERFACE,
+            image.interface_sensors << rm.CAP_INTERFACE_SENSORS_SHIFT
+            | image.interface_results << rm.CAP_INTERFACE_RESULTS_SHIFT,
+        )
+        self._put(rm.CAP_STEPS, parameters.steps_per_clock)
+        widths = bytes(parameters.sensor_bits)
+        self._view[rm.CAP_SENSOR_BITS : rm.CAP_SENSOR_BITS + len(widths)] = widths
+        self._allow(rm.SENSORS, image.interface_sensors, _READ_WRITE)
+        self._allow(rm.RESULTS, image.interface_results, _READ)
+        if written:
+            self._allow(rm.PRIOR_CODES, parameters.lines, _READ_WRITE)
+            prior = image.machine.prior[0].astype("<u4").tobytes()
+            self._view[rm.PRIOR_CODES : rm.PRIOR_CODES + len(prior)] = prior
+
+    # ---- registers ------------------------------------------------------------------------------------
+
+    def read(self, address: int, count: int) -> bytes:
+        """``count`` words from ``address`` on, little-endian.
+
+        Raises:
+            RefusedError: Not all of them are in the map and implemented.
+        """
+        self._check(address, count, "read")
+        end = address + 4 * count
+        words = bytes(self._view[address:end])
+        if address in _LONG_LOW:
+            # hosts that read 64 bits in two accesses shall see one value: the low word latches the high one
+            self._latched[address + 4] = bytes(self._view[address + 4 : address + 8])
+        elif address in self._latched:
+            return self._latched.pop(address) + words[4:]
+        return words
+
+    def write(self, address: int, words: bytes | memoryview) -> None:
+        """Write little-endian words from ``address`` on; a doorbell among them starts the machine.
+
+        Raises:
+            RefusedError: The board is busy, or an address or value is impossible; an earlier word of the same
+                burst may have been taken.
+        """
+        count = len(words) // 4
+        self._check(address, count, "write")
+        end = address + 4 * count
+        if self.running and not (address == rm.CONTROL and count == 1 and words[0] & rm.CONTROL_RESET_MASK):
+            self._refuse(ErrorCode.BUSY, "the machine runs; only a reset may be written")
+        if address == rm.LIVENESS:
+            self._put(rm.LIVENESS, ~_WORD.unpack(words)[0] & 0xFFFFFFFF)
+            return
+        # The doorbells are the last of their burst: they act on what stands before them.
+        plain = max(min(end, rm.START) - address, 0) if address <= rm.RESUME else 4 * count
+        self._view[address : address + plain] = words[:plain]
+        if address == rm.CONTROL:
+            self._control()
+        for doorbell in (rm.START, rm.RESUME):
+            if address <= doorbell < end:
+                (number,) = _WORD.unpack_from(words, doorbell - address)
+                if number:
+                    self._ring(doorbell, number)
+
+    def _control(self) -> None:
+        if self._memory[rm.CONTROL] & rm.CONTROL_RESET_MASK:
+            self.reset()
+        self._memory[rm.CONTROL] &= rm.CONTROL_INTERRUPT_ENABLE_MASK
+        self._put(rm.CONTROL, self._memory[rm.CONTROL])
+
+    def _check(self, address: int, count: int, verb: str) -> None:
+        """Refuse what is misaligned, outside, too long, or not writable."""
+        if address % 4:
+            self._refuse(ErrorCode.MISALIGNED, f"address {address:#06x} is no multiple of 4")
+        first = address // 4
+        words = self._access[first : first + count]
+        if len(words) == count > 0 and words.count(_READ_WRITE if verb == "write" else 0) == (
+            count if verb == "write" else 0
+        ):
+            return
+        if count == 0 or not words or words[0] == _NO_ACCESS:
+            if self._kernel is None and _is_data(address):
+                self._refuse(ErrorCode.BLANK, "the board is blank; program it first")
+            self._refuse(ErrorCode.OUTSIDE, f"nothing can be {verb} at {address:#06x}")
+        if len(words) < count or _NO_ACCESS in words:
+            self._refuse(ErrorCode.TOO_LONG, f"{count} words from {address:#06x} on run past what is there")
+        read_only = address + 4 * words.index(_READ)
+        self._refuse(ErrorCode.READ_ONLY, f"the register at {read_only:#06x} cannot be written")
+
+    def _refuse(self, code: ErrorCode, detail: str) -> None:
+        status = self._get(rm.STATUS) & ~rm.STATUS_ERROR_MASK
+        self._put(rm.STATUS, status | code << rm.STATUS_ERROR_SHIFT)
+        raise RefusedError(code, detail)
+
+    # ---- the machine ----------------------------------------------------------------------------------
+
+    def reset(self) -> None:
+        """Stop, clear counters and cycles, restart the RNGs from bank 0; DONE and all settings stay."""
+        self.running = False
+        if self._kernel is not None:
+            self._kernel.reset()
+        self._publish(BoardState.BLANK if self._kernel is None else BoardState.IDLE, StopReason.NONE)
+        self._put(rm.STATUS, self._get(rm.STATUS) & ~rm.STATUS_ERROR_MASK)
+        self._put_long(rm.COMPUTE_NS, 0)
+
+    def release(self) -> None:
+        """The host has gone: stop a machine that runs, and send no more interrupts."""
+        if self.running:
+            self.reset()
+        self._put(rm.CONTROL, 0)
+
+    def _ring(self, doorbell: int, number: int) -> None:
+        """A doorbell was written: check it, and run the first chunk."""
+        kernel = self._kernel
+        if kernel is None:
+            self._refuse(ErrorCode.BLANK, "the board is blank; program it first")
+            return
+        due = following(self._get(rm.DONE))
+        if number != due:
+            self._refuse(ErrorCode.DOORBELL, f"number {number} was written, {due} is due")
+        run_until = self._get_long(rm.RUN_UNTIL)
+        if run_until > CYCLES_MAX:
+            self._refuse(ErrorCode.BAD_VALUE, f"a slice to cycle {run_until} is longer than {CYCLES_MAX}")
+        self._compute_ns = 0
+        self._run_until = run_until
+        self._number = number
+        try:
+            if doorbell == rm.START:
+                self._start(kernel)
+            elif kernel.reason is not StopReason.SLICE:
+                self._refuse(ErrorCode.DOORBELL, "there is no slice to resume")
+            elif 0 < run_until <= kernel.cycles:
+                self._refuse(
+                    ErrorCode.BAD_VALUE, f"a slice to cycle {run_until} cannot follow {kernel.cycles} cycles"
+                )
+            else:
+                self._put(doorbell, number)
+                self._run(kernel, None)
+        except StartError as error:
+            self._refuse(ErrorCode.BAD_VALUE, str(error).rstrip("."))
+
+    def _start(self, kernel: BM1Kernel) -> None:
+        parameters = kernel.machine.parameters
+        # The last frame's speed may be that of few live lines; the next one's first chunk assumes all.
+        self._speed = self._get(rm.CAP_SPEED)
+        target, max_cycles, bank, prior_address, _ = _SETTINGS.unpack_from(self._memory, rm.TARGET_COUNT)
+        prior_codes: npt.NDArray[np.uint16] | None = None
+        if parameters.prior_mode is PriorMode.WRITTEN:
+            written = np.frombuffer(self._memory, "<u4", parameters.lines, rm.PRIOR_CODES)
+            # 16 bits are cut off the machine's codes: what would be lost must not become a valid code
+            prior_codes = np.minimum(written, 0xFFFF).astype(np.uint16)
+        start = Start(
+            addresses=struct.unpack_from(f"<{parameters.sensors}I", self._memory, rm.SENSORS),
+            prior_address=prior_address,
+            prior_codes=prior_codes,
+            target_count=target,
+            max_cycles=max_cycles,
+            bank=bank,
+            run_until=self._chunk_end(0),
+        )
+        self._run(kernel, start)
+        self._put(rm.START, self._number)
+
+    def step(self) -> None:
+        """Run the machine for one more chunk; ``running`` says whether it still has to go on."""
+        assert self._kernel is not None  # noqa: S101 - only a machine runs
+        self._run(self._kernel, None)
+
+    def _run(self, kernel: BM1Kernel, start: Start | None) -> None:
+        """One chunk of a new frame (``start``) or of the one that runs."""
+        if self.stuck:
+            self.running = True
+            self._publish(BoardState.RUNNING, StopReason.NONE)
+            return
+        cycles_before = 0 if start is not None else kernel.cycles
+        began = time.perf_counter_ns()
+        end = self._chunk_end(cycles_before)
+        reason = kernel.resume(end) if start is None else kernel.start(start)
+        elapsed = time.perf_counter_ns() - began
+        self._compute_ns += elapsed
+        cycles = kernel.cycles
+        if elapsed > CHUNK_S * 2e8:
+            # long enough to be a measurement; short runs are mostly the call itself
+            self._speed = (cycles - cycles_before) * 1e9 / elapsed
+        self._put_long(rm.COMPUTE_NS, self._compute_ns)
+        if reason is StopReason.SLICE and cycles != self._run_until:
+            self.running = True
+            self._publish(BoardState.RUNNING, StopReason.NONE)
+            return
+        self.running = False
+        self._put(rm.DONE, self._number)
+        self._publish(BoardState.DONE, reason)
+
+    def _chunk_end(self, cycles: int) -> int:
+        """Cycle at which the next chunk ends: the slice's end, if that is near enough; 0 for no end."""
+        end = cycles + max(int(self._speed * CHUNK_S), 64)
+        if end - cycles > _ALIGNMENT:
+            end -= end % _ALIGNMENT
+        max_cycles = self._get_long(rm.MAX_CYCLES)
+        last = min(self._run_until or CYCLES_MAX, max_cycles)
+        return self._run_until if last <= end else end
+
+    def _publish(self, state: BoardState, reason: StopReason) -> None:
+        """Put status, cycles and results where the host reads them."""
+        kernel = self._kernel
+        error = self._get(rm.STATUS) & rm.STATUS_ERROR_MASK
+        self._put(
+            rm.STATUS,
+            error | state << rm.STATUS_STATE_SHIFT | reason << rm.STATUS_STOP_REASON_SHIFT,
+        )
+        if kernel is None:
+            return
+        self._put_long(rm.CYCLES, kernel.cycles)
+        counts = kernel.counts
+        self._view[rm.RESULTS : rm.RESULTS + 4 * len(counts)] = counts.astype("<u4", copy=False).data.cast(
+            "B"
+        )
+
+    def interrupt_words(self) -> bytes:
+        """What an interrupt carries: the registers from DONE to COMPUTE_NS, then one count per line."""
+        lines = self._get(rm.CAP_LINES)
+        return b"".join(
+            (
+                self._view[rm.DONE : rm.DONE + _DONE_BYTES],
+                self._view[rm.RESULTS : rm.RESULTS + 4 * lines],
+            )
+        )
+
+    # ---- memory ---------------------------------------------------------------------------------------
+
+    def _get(self, address: int) -> int:
+        return int(_WORD.unpack_from(self._memory, address)[0])
+
+    def _put(self, address: int, value: int) -> None:
+        _WORD.pack_into(self._memory, address, value)
+
+    def _get_long(self, address: int) -> int:
+        return int(_LONG.unpack_from(self._memory, address)[0])
+
+    def _put_long(self, address: int, value: int) -> None:
+        _LONG.pack_into(self._memory, address, value)
+
+    def _allow(self, address: int, words: int, access: int) -> None:
+        first = address // 4
+        self._access[first : first + words] = bytes([access]) * words
+
+
+_LONG_LOW: Final = frozenset({rm.CYCLES, rm.COMPUTE_NS})
+_DATA: Final = (
+    range(rm.SENSORS, rm.SENSORS + 4 * rm.SENSORS_WORDS),
+    range(rm.RESULTS, rm.RESULTS + 4 * rm.RESULTS_WORDS),
+    range(rm.PRIOR_CODES, rm.PRIOR_CODES + 4 * rm.PRIOR_CODES_WORDS),
+)
+
+
+def _is_data(address: int) -> bool:
+    return any(address in block for block in _DATA)
+
+
+def _measure_speed(kernel: BM1Kernel) -> float:
+    """Machine cycles per second where every line counts (all readings missing): the slowest that it gets."""
+    parameters = kernel.machine.parameters
+    start = Start(
+        addresses=tuple(parameters.missing_address(column + 1) for column in range(parameters.sensors)),
+        target_count=parameters.target_count_max,
+        max_cycles=CYCLES_MAX,
+        run_until=1,
+    )
+    began = time.perf_counter_ns()
+    reason = kernel.start(start)
+    while reason is StopReason.SLICE and kernel.cycles < _ALIGNMENT:
+        if time.perf_counter_ns() - began > CHUNK_S * 1e8:
+            break
+        reason = kernel.resume(2 * kernel.cycles)
+    return kernel.cycles * 1e9 / (time.perf_counter_ns() - began)

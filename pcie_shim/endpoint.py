@@ -1,0 +1,169 @@
+"""Endpoints: where a board listens, ``unix:/path`` or ``tcp://host:port``, and the sockets for them."""
+
+from __future__ import annotations
+
+import errno
+import os
+import socket
+import time
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+from urllib.parse import urlsplit
+
+from pcie_shim.errors import EndpointError, LinkTimeoutError, UnreachableError
+
+UNIX_PATH_BYTES: Final = 107
+"""Longest path of a unix socket that Linux takes."""
+
+_RETRY_S: Final = 0.02
+
+
+@dataclass(frozen=True, slots=True)
+class Endpoint:
+    """A board's address: a unix socket's path, or a TCP host and port.
+
+    Attributes:
+        path: Path of the unix socket; empty for TCP.
+        host: Name or address of the TCP host; empty for a unix socket.
+        port: TCP port; 0 for a unix socket.
+    """
+
+    path: str = ""
+    host: str = ""
+    port: int = 0
+
+    def __str__(self) -> str:
+        if self.path:
+            return f"unix:{self.path}"
+        host = f"[{self.host}]" if ":" in self.host else self.host
+        return f"tcp://{host}:{self.port}"
+
+    @property
+    def programming(self) -> Endpoint:
+        """Where the same board is programmed: ``board0.program.sock`` beside ``board0.sock``, or the next port."""
+        if self.path:
+            path = Path(self.path)
+            return Endpoint(path=str(path.with_name(f"{path.stem}.program{path.suffix}")))
+        return Endpoint(host=self.host, port=self.port + 1)
+
+
+def parse_endpoint(text: str) -> Endpoint:
+    """The endpoint that a text says.
+
+    Raises:
+        EndpointError: The text is neither ``unix:/path`` nor ``tcp://host:port``, or the path too long.
+    """
+    if text.startswith("unix:"):
+        endpoint = Endpoint(path=text.removeprefix("unix:"))
+        if not endpoint.path.startswith("/"):
+            raise EndpointError(f"The endpoint '{text}' is not understood: unix: takes an absolute path.")
+        longest = len(os.fsencode(endpoint.programming.path))
+        if longest > UNIX_PATH_BYTES:
+            raise EndpointError(
+                f"The path in '{text}' is too long: with '.program' it has {longest} bytes, a unix socket's "
+                f"path takes {UNIX_PATH_BYTES}; use a shorter folder."
+            )
+        return endpoint
+    try:
+        parts = urlsplit(text)
+        host, port = parts.hostname, parts.port
+    except ValueError:
+        host, port = None, None
+    if text.startswith("tcp://") and host and port and port < 65535 and text.count("/") == 2:
+        return Endpoint(host=host, port=port)
+    raise EndpointError(
+        f"The endpoint '{text}' is not understood: use unix:/path/board0.sock or tcp://host:port, with a "
+        "port from 1 to 65534 (the next one is for programming)."
+    )
+
+
+def listen(endpoint: Endpoint) -> socket.socket:
+    """A listening socket; a unix socket is its owner's alone (0600) and replaces one that nobody serves.
+
+    Raises:
+        EndpointError: Another process listens there, or the system refuses.
+    """
+    try:
+        if not endpoint.path:
+            family = socket.AF_INET6 if ":" in endpoint.host else socket.AF_INET
+            return socket.create_server((endpoint.host, endpoint.port), family=family)
+        server = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        # Linux gives the socket's file the mode of the socket: at no time can another user connect.
+        os.fchmod(server.fileno(), 0o600)
+        try:
+            server.bind(endpoint.path)
+        except OSError as error:
+            if error.errno != errno.EADDRINUSE or _is_served(endpoint.path):
+                raise
+            Path(endpoint.path).unlink()
+            server.bind(endpoint.path)
+        server.listen()
+    except OSError as error:
+        taken = error.errno == errno.EADDRINUSE
+        reason = "another process listens there" if taken else (error.strerror or str(error))
+        raise EndpointError(f"A board cannot listen at {endpoint}: {reason}.") from error
+    return server
+
+
+def _is_served(path: str) -> bool:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+        try:
+            probe.connect(path)
+        except ConnectionRefusedError:
+            return False
+        return True
+
+
+def connect(endpoint: Endpoint, *, timeout: float) -> socket.socket:
+    """A socket connected to a board that listens, or begins to within ``timeout`` seconds.
+
+    Raises:
+        UnreachableError: Nothing listens there.
+        LinkTimeoutError: The host of a TCP endpoint does not answer.
+    """
+    deadline = time.monotonic() + timeout
+    while True:
+        try:
+            return _connect_once(endpoint, max(deadline - time.monotonic(), _RETRY_S))
+        except TimeoutError:
+            raise LinkTimeoutError(f"{endpoint} did not take a connection within {timeout:g} s.") from None
+        except OSError as error:
+            if time.monotonic() + _RETRY_S >= deadline:
+                reason = error.strerror or str(error)
+                raise UnreachableError(
+                    f"No board listens at {endpoint} ({reason}, for {timeout:g} s): is it started?"
+                ) from error
+        time.sleep(_RETRY_S)
+
+
+def _connect_once(endpoint: Endpoint, timeout: float) -> socket.socket:
+    if not endpoint.path:
+        tcp = socket.create_connection((endpoint.host, endpoint.port), timeout=timeout)
+        no_delay(tcp)
+        tcp.settimeout(None)
+        return tcp
+    unix = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    try:
+        unix.settimeout(timeout)
+        unix.connect(endpoint.path)
+    except OSError:
+        unix.close()
+        raise
+    unix.settimeout(None)
+    return unix
+
+
+def no_delay(connection: socket.socket) -> None:
+    """Send small frames at once, where that is a question at all (TCP)."""
+    if connection.family != socket.AF_UNIX:
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+
+
+def remove_listener(endpoint: Endpoint, server: socket.socket) -> None:
+    """Close a listening socket and take its file away."""
+    server.close()
+    if endpoint.path:
+        with suppress(OSError):
+            Path(endpoint.path).unlink()

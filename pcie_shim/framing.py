@@ -1,0 +1,258 @@
+"""The link's frames, without sockets: bytes to frames and back (docs/boards.md has the wire format).
+
+A frame is a header of 20 bytes (operation, flags, sequence, address, count, CRC-32) and 32-bit words,
+all little-endian: thesis 2.3, where the data link layer adds sequence numbers and CRCs to requests
+to read and write. :class:`FrameDecoder` keeps one buffer for the life of a link.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from typing import Final, NamedTuple, TypeAlias
+from zlib import crc32
+
+from pcie_shim.errors import CrcError, FramingError
+
+Octets: TypeAlias = bytes | bytearray | memoryview
+
+# Plain integers: an enumeration's members cost a look-up and a conversion in every frame.
+GREET: Final = 1
+"""Board to host, first frame of a link: who it is (:class:`Greeting`)."""
+READ: Final = 2
+"""Host to board: ``count`` words from ``address`` on; the reply carries them."""
+WRITE: Final = 3
+"""Host to board: the payload goes to ``address`` and on; acknowledged, unless posted."""
+IRQ: Final = 4
+"""Board to host: the machine has stopped; the payload is the block from DONE on and the results."""
+ERROR: Final = 5
+"""Board to host: what the frame of this sequence number asked was refused (:func:`encode_error`)."""
+PROGRAM: Final = 6
+"""Loader to the programming port: a part of a programming file; ``address`` is its offset in bytes."""
+
+REPLY: Final = 1
+"""Flag: the answer to the request of the same sequence number."""
+POSTED: Final = 2
+"""Flag: no acknowledgement is wanted; a refusal is still answered by ERROR."""
+BEGIN: Final = 4
+"""Flag of PROGRAM: the payload says what will come (:class:`ProgramBegin`)."""
+END: Final = 8
+"""Flag of PROGRAM: the file is complete; the reply comes when the board runs it."""
+
+PROTOCOL_VERSION: Final = 1
+MAX_PAYLOAD_WORDS: Final = 8192
+"""Longest payload; twice the map's longest block."""
+
+_MAGIC: Final = 0x4D42
+_HEAD: Final = struct.Struct("<HBBIII")
+_CRC: Final = struct.Struct("<I")
+_HEADER: Final = struct.Struct("<HBBIIII")
+HEADER_BYTES: Final = _HEADER.size
+_MAX_FRAME: Final = HEADER_BYTES + 4 * MAX_PAYLOAD_WORDS
+_WITHOUT_PAYLOAD: Final = frozenset({(READ, 0), (WRITE, REPLY), (PROGRAM, REPLY)})
+_OPERATIONS: Final = (GREET, READ, WRITE, IRQ, ERROR, PROGRAM)
+
+
+class Frame(NamedTuple):
+    """One frame as received.
+
+    Attributes:
+        operation: One of this module's operations.
+        flags: Sum of this module's flags.
+        sequence: A request's number, from 1 up, modulo 2^32; the same in what answers it.
+        address: Offset in the register map, in bytes.
+        words: Words of payload, or, in a READ request, asked for.
+        payload: The words, as bytes in the decoder's buffer: valid until the next bytes are received.
+    """
+
+    operation: int
+    flags: int
+    sequence: int
+    address: int
+    words: int
+    payload: memoryview
+
+
+def encode(
+    operation: int, flags: int, sequence: int, address: int, count: int, payload: Octets = b""
+) -> bytes:
+    """A frame's bytes. ``payload`` is what its operation carries: ``count`` words, or nothing."""
+    head = _HEAD.pack(_MAGIC, operation, flags, sequence, address, count)
+    return b"".join((head, _CRC.pack(crc32(payload, crc32(head))), payload))
+
+
+class FrameDecoder:
+    """Turns a stream of bytes into frames.
+
+    Receive into :meth:`room`, say how much came with :meth:`received`, then take frames from
+    :meth:`next_frame` until it returns None. After an error the stream cannot be used any more.
+    """
+
+    def __init__(self) -> None:
+        self._buffer = memoryview(bytearray(2 * _MAX_FRAME))
+        self._start = 0
+        self._end = 0
+
+    @property
+    def inside_frame(self) -> bool:
+        """Whether a frame has begun that has not ended."""
+        return self._end > self._start
+
+    def room(self) -> memoryview:
+        """Where the next bytes go; makes the payloads handed out so far invalid."""
+        if self._start == self._end:
+            self._start = self._end = 0
+        elif self._start > _MAX_FRAME:
+            rest = self._end - self._start
+            self._buffer[:rest] = self._buffer[self._start : self._end]
+            self._start, self._end = 0, rest
+        return self._buffer[self._end :]
+
+    def received(self, count: int) -> None:
+        """Say that ``count`` bytes were put at the beginning of :meth:`room`."""
+        self._end += count
+
+    def next_frame(self) -> Frame | None:
+        """The next whole frame, or None until more bytes come.
+
+        Raises:
+            FramingError: The bytes are no frame.
+            CrcError: A frame's CRC is wrong.
+        """
+        start = self._start
+        if self._end - start < HEADER_BYTES:
+            return None
+        magic, operation, flags, sequence, address, count, crc = _HEADER.unpack_from(self._buffer, start)
+        if magic != _MAGIC or operation not in _OPERATIONS or flags > 15:
+            raise FramingError("what came is no frame of the link")
+        if count > MAX_PAYLOAD_WORDS:
+            raise FramingError(f"a frame of {count} words came; {MAX_PAYLOAD_WORDS} are the most")
+        payload_start = start + HEADER_BYTES
+        end = payload_start if (operation, flags & REPLY) in _WITHOUT_PAYLOAD else payload_start + 4 * count
+        if self._end < end:
+            return None
+        payload = self._buffer[payload_start:end]
+        if crc32(payload, crc32(self._buffer[start : start + _HEAD.size])) != crc:
+            raise CrcError("a frame's CRC-32 is wrong")
+        self._start = end
+        return Frame(operation, flags, sequence, address, count, payload)
+
+
+_GREETING: Final = struct.Struct("<8sIII32s32s8s")
+_LINK_MAGIC: Final = b"ROSBAYES"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Greeting:
+    """What a board says of itself when a link opens.
+
+    Attributes:
+        protocol_version: Version of the wire format.
+        bar_size: Size of the register map, in bytes.
+        board: The board's number, as it was started.
+        map_hash: SHA-256 (hex) of the register map's definition.
+        image_hash: SHA-256 (hex) of the loaded image; all zeros on a blank board.
+        token: Proves to the programming port that whoever has it holds this link.
+    """
+
+    protocol_version: int
+    bar_size: int
+    board: int
+    map_hash: str
+    image_hash: str
+    token: bytes
+
+    @property
+    def is_blank(self) -> bool:
+        """Whether no image is loaded."""
+        return not self.image_hash.strip("0")
+
+
+def encode_greeting(greeting: Greeting) -> bytes:
+    """The greeting's frame."""
+    payload = _GREETING.pack(
+        _LINK_MAGIC,
+        greeting.protocol_version,
+        greeting.bar_size,
+        greeting.board,
+        bytes.fromhex(greeting.map_hash),
+        bytes.fromhex(greeting.image_hash),
+        greeting.token,
+    )
+    return encode(GREET, 0, 0, 0, len(payload) // 4, payload)
+
+
+def decode_greeting(frame: Frame) -> Greeting:
+    """The greeting in a frame.
+
+    Raises:
+        FramingError: It is none.
+    """
+    if frame.operation != GREET or len(frame.payload) < _GREETING.size:
+        raise FramingError("the link does not begin with a board's greeting")
+    magic, version, bar_size, board, map_hash, image_hash, token = _GREETING.unpack_from(frame.payload)
+    if magic != _LINK_MAGIC:
+        raise FramingError("the link does not begin with a board's greeting")
+    return Greeting(
+        protocol_version=version,
+        bar_size=bar_size,
+        board=board,
+        map_hash=map_hash.hex(),
+        image_hash=image_hash.hex(),
+        token=token,
+    )
+
+
+def encode_error(sequence: int, address: int, code: int, detail: str) -> bytes:
+    """An ERROR frame: a word with the code, then the board's words for people, UTF-8, padded with zeros."""
+    words = detail.encode()[:1024]
+    payload = _CRC.pack(code) + words + bytes(-len(words) % 4)
+    return encode(ERROR, REPLY, sequence, address, len(payload) // 4, payload)
+
+
+def decode_error(frame: Frame) -> tuple[int, str]:
+    """Code and words of an ERROR frame.
+
+    Raises:
+        FramingError: It has no code.
+    """
+    if frame.words < 1:
+        raise FramingError("an ERROR without a code came")
+    (code,) = _CRC.unpack_from(frame.payload)
+    return code, bytes(frame.payload[4:]).rstrip(b"\0").decode(errors="replace")
+
+
+_PROGRAM_BEGIN: Final = struct.Struct("<Q32s8s")
+NO_TOKEN: Final = bytes(8)
+"""The token of a loader that holds no link."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ProgramBegin:
+    """What a loader says before it sends a programming file.
+
+    Attributes:
+        size: Bytes that will come.
+        sha256: Of those bytes.
+        token: The greeting's token, where the loader holds the board's link; else :data:`NO_TOKEN`.
+    """
+
+    size: int
+    sha256: bytes
+    token: bytes
+
+    def encode(self) -> bytes:
+        """The payload of a PROGRAM frame with BEGIN."""
+        return _PROGRAM_BEGIN.pack(self.size, self.sha256, self.token)
+
+    @classmethod
+    def decode(cls, payload: memoryview) -> ProgramBegin:
+        """The same from a frame's payload.
+
+        Raises:
+            FramingError: It is too short.
+        """
+        if len(payload) < _PROGRAM_BEGIN.size:
+            raise FramingError("a PROGRAM frame with BEGIN is too short")
+        size, sha256, token = _PROGRAM_BEGIN.unpack_from(payload)
+        return cls(size=size, sha256=sha256, token=token)

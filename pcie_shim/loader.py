@@ -1,0 +1,87 @@
+"""Programs boards over their own port, without a restart of the host (thesis 3.4: the SofLoader)."""
+
+from __future__ import annotations
+
+import hashlib
+from typing import TYPE_CHECKING, Final
+
+from pcie_shim import framing, register_map
+from pcie_shim.endpoint import parse_endpoint
+from pcie_shim.errors import AccessError, ImageMismatchError
+from pcie_shim.link import SocketLink
+from pcie_shim.programming_file import Image, image_bytes, image_from_bytes, read_bytes
+from pcie_shim.register_map import ErrorCode
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from pcie_shim.endpoint import Endpoint
+
+PART_BYTES: Final = 4 * framing.MAX_PAYLOAD_WORDS
+
+
+def program(
+    endpoint: Endpoint | str,
+    image: Image | Path | bytes,
+    *,
+    timeout: float = 30.0,
+    token: bytes = framing.NO_TOKEN,
+) -> str:
+    """Program a board, and read back what it then is.
+
+    The file is checked before the board is touched, and so is the board's register map.
+
+    Args:
+        endpoint: The board's (its registers'); the programming port lies beside it.
+        image: An image, the path of a programming file, or its bytes.
+        timeout: Seconds for each step: connecting, taking the file, making the machine.
+        token: The greeting's token of the link that holds the board, where this host holds it.
+
+    Returns:
+        The image hash that the board reads back.
+
+    Raises:
+        ImageError: The file is missing, damaged, or for another register map.
+        GreetingMismatchError: The board has another register map.
+        HeldError: A host holds the board, or another loader programs it.
+        LinkError: The board cannot be reached, or the link broke.
+    """
+    where = parse_endpoint(endpoint) if isinstance(endpoint, str) else endpoint
+    content, expected = _content(image)
+    with SocketLink.open(where.programming, timeout=timeout) as link:
+        begin = framing.ProgramBegin(size=len(content), sha256=hashlib.sha256(content).digest(), token=token)
+        _request(link, framing.BEGIN, 0, begin.encode())
+        for offset in range(0, len(content), PART_BYTES):
+            part = content[offset : offset + PART_BYTES]
+            padded = part + bytes(-len(part) % 4)
+            link.post(link.posted(framing.PROGRAM, offset, padded))
+        _request(link, framing.END, len(content), b"")
+        identity = link.read32(register_map.ID)
+        found = link.read_block(register_map.IMAGE_HASH, register_map.IMAGE_HASH_WORDS).hex()
+    if identity != register_map.ID_VALUE or found != expected:
+        raise ImageMismatchError(
+            f"The board at {where} reads ID {identity:#010x} and image {found} after programming; "
+            f"{register_map.ID_VALUE:#010x} and {expected} were expected."
+        )
+    return found
+
+
+def _content(image: Image | Path | bytes) -> tuple[bytes, str]:
+    """The programming file's bytes and the image hash that the board must show."""
+    if isinstance(image, Image):
+        return image_bytes(image), image.image_hash
+    if isinstance(image, bytes):
+        return image, image_from_bytes(image).image_hash
+    content = read_bytes(image)
+    return content, image_from_bytes(content, str(image)).image_hash
+
+
+def _request(link: SocketLink, flag: int, offset: int, payload: bytes) -> None:
+    try:
+        link.request(framing.PROGRAM, flag, offset, len(payload) // 4, payload)
+    except AccessError as error:
+        if error.code != ErrorCode.BAD_IMAGE:
+            raise
+        raise ImageMismatchError(
+            f"The board at {link.endpoint} does not take the image: {error.detail}."
+        ) from error
