@@ -13,11 +13,11 @@ import time
 from collections.abc import Sequence
 
 import orjson
-from pcie_shim.driver import FrameInput, FrameOutput, MiniCluster
 
 from machines.bm1 import StopReason
+from pcie_shim.driver import FrameInput, FrameOutput, MiniCluster
 from pcie_shim.endpoint import Endpoint, listen, remove_listener
-from pcie_shim.errors import BoardError, PcieShimError
+from pcie_shim.errors import BoardError, BoardMismatchError, PcieShimError
 from pcie_shim.programming_file import Image, read_image
 from services import options
 from services.command_line import ends_well, make_app, raise_on_signals
@@ -40,7 +40,7 @@ from toolchain.deployment import Deployment
 
 ROLE = "pcie-app"
 _TICK = 0.2
-"""Seconds between looks at boards that are gone."""
+"""Seconds between attempts to open a board that is gone, and for each of them."""
 
 
 class Boards:
@@ -66,7 +66,7 @@ class Boards:
             self._endpoints,
             self._images,
             timeout=self._settings.peer_timeout,
-            board_timeout=self._settings.board_timeout,
+            slack=self._settings.board_timeout,
         )
         return f"{len(self._endpoints)} boards programmed and open"
 
@@ -92,29 +92,27 @@ class Boards:
                 )
             )
         except BoardError as error:
-            self.gone[error.board] = str(error)
+            if not self._cluster.is_open(error.board):
+                self.gone[error.board] = str(error)
             raise
-
-    def look(self) -> list[tuple[int, str]]:
-        """Boards that went away since the last look, with the reason."""
-        if self._cluster is None:
-            return []
-        found = []
-        for board in range(len(self._endpoints)):
-            if board not in self.gone and not self._cluster.alive(board):
-                self.gone[board] = f"board {board} at {self._endpoints[board]} closed its link"
-                found.append((board, self.gone[board]))
-        return found
 
     def mend(self) -> list[int]:
         """Try once to open the boards that are gone; the numbers of those that are back.
 
         Raises:
-            PcieShimError: a board is back with another image; waiting would not help.
+            BoardMismatchError: a board is back with another image; waiting would not help.
         """
         back = []
         for board in list(self.gone):
-            if self._cluster is not None and self._cluster.reopen(board, timeout=_TICK):
+            if self._cluster is None:
+                break
+            try:
+                self._cluster.reopen(board, timeout=_TICK)
+            except BoardMismatchError:
+                raise
+            except BoardError as error:
+                self.gone[board] = str(error)
+            else:
                 del self.gone[board]
                 back.append(board)
         return back
@@ -172,7 +170,7 @@ class PcieApp:
                             self._accept(listener)
                         else:
                             self._receive()
-                    self._look_at_boards()
+                    self._mend_boards()
             except PcieShimError as error:
                 self._report(listener, Trouble(exit_code_of(error), str(error)))
                 raise
@@ -245,9 +243,7 @@ class PcieApp:
         else:
             self._send(result_record(frame.number, output))
 
-    def _look_at_boards(self) -> None:
-        for _board, why in self._boards.look():
-            self._send(Notice("warning", f"{why}; waiting for it"))
+    def _mend_boards(self) -> None:
         for board in self._boards.mend():
             self._send(Notice("info", f"board {board} is back, programmed"))
 

@@ -67,7 +67,9 @@ def leave_private_directory() -> None:
 
 
 def own_command(name: str) -> list[str]:
-    """How to start one of our commands in this same environment."""
+    """How to start one of our commands in this same environment; a path stands for itself."""
+    if "/" in name:
+        return [name]
     beside = Path(sys.executable).with_name(name)
     return [str(beside)] if beside.exists() else [shutil.which(name) or name]
 

@@ -1,0 +1,159 @@
+"""Processes that a script starts, listens to and ends: for the demo and the benches."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import re
+import signal
+import sys
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+
+from bridge.errors import BridgeError
+from services.command_line import run_async
+from services.errors import ExitCode, ServiceError, StoppedError
+from services.supervision import own_command
+
+ROOT = Path(__file__).resolve().parent.parent
+BOAT_TOPIC, BOAT_TYPE = "/boat/sensors", "boat_msgs/Sensors"
+
+
+class Process:
+    """One process of a script: its lines go to a log, and to the screen if they are meant for it."""
+
+    def __init__(self, name: str, log: Path, *, shown: bool = False) -> None:
+        self.name = name
+        self._log = log
+        self._shown = shown
+        self._process: asyncio.subprocess.Process | None = None
+        self._reader: asyncio.Task[None] | None = None
+        self._lines: list[str] = []
+        self._news = asyncio.Event()
+
+    async def start(self, *command: str) -> None:
+        """Start it in a session of its own, so that Ctrl-C reaches the script alone."""
+        self._process = await asyncio.create_subprocess_exec(
+            *own_command(command[0]),
+            *command[1:],
+            stdin=asyncio.subprocess.DEVNULL,
+            stdout=asyncio.subprocess.PIPE,
+            stderr=asyncio.subprocess.STDOUT,
+            start_new_session=True,
+        )
+        self._reader = asyncio.create_task(self._read())
+
+    @property
+    def pid(self) -> int:
+        """Its process number; 0 before its start."""
+        return 0 if self._process is None else self._process.pid
+
+    async def _read(self) -> None:
+        assert self._process is not None
+        assert self._process.stdout is not None
+        with self._log.open("w") as log:
+            async for line in self._process.stdout:
+                text = line.decode("utf-8", "replace").rstrip()
+                log.write(text + "\n")
+                log.flush()
+                self._lines.append(text)
+                self._news.set()
+                if self._shown:
+                    print(text, flush=True)
+        self._news.set()
+
+    async def line(self, pattern: str) -> re.Match[str]:
+        """Wait for a line that matches.
+
+        Raises:
+            ServiceError: the process ended before it printed one.
+        """
+        seen = 0
+        while True:
+            for text in self._lines[seen:]:
+                if match := re.search(pattern, text):
+                    return match
+            seen = len(self._lines)
+            if self._reader is not None and self._reader.done():
+                raise self.failure(await self.wait())
+            self._news.clear()
+            await self._news.wait()
+
+    def failure(self, code: int) -> ServiceError:
+        """Its end as an error, in its own last words."""
+        said = self._lines[-1].removeprefix("error: ") if self._lines else "it said nothing"
+        error = ServiceError(f"{self.name}: {said} (all that it said is in {self._log})")
+        error.exit_code = code if code > 0 else ExitCode.CHILD
+        return error
+
+    async def wait(self) -> int:
+        """Its exit code, once it has ended and all its lines are read."""
+        assert self._process is not None
+        if self._reader is not None:
+            await self._reader
+        return await self._process.wait()
+
+    async def succeed(self) -> None:
+        """Wait for its end.
+
+        Raises:
+            ServiceError: it did not exit 0.
+        """
+        if code := await self.wait():
+            raise self.failure(code)
+
+    async def end(self) -> None:
+        """End it: SIGTERM, and SIGKILL after 6 s."""
+        if self._process is None:
+            return
+        if self._process.returncode is None:
+            with contextlib.suppress(ProcessLookupError):
+                self._process.send_signal(signal.SIGTERM)
+            try:
+                await asyncio.wait_for(self._process.wait(), 6)
+            except TimeoutError:
+                self._process.kill()
+                await self._process.wait()
+        if self._reader is not None:
+            await self._reader
+
+
+async def build(case_study: str, deployment: Path, uri: str, topic: str, type_: str, *options: str) -> None:
+    """Build a case study's deployment for four boards; the report goes to DEPLOYMENT.log.
+
+    Raises:
+        ServiceError: the toolchain refuses.
+    """
+    toolchain = Process("toolchain", deployment.with_name(deployment.name + ".log"))
+    await toolchain.start(
+        *("toolchain", "build", str(ROOT / "casestudies" / case_study), "-o", str(deployment)),
+        *("--partitions", "4", "--uri", uri, "--topic", topic, "--type", type_, *options),
+    )
+    await toolchain.succeed()
+
+
+def run_script(work: Callable[[], Awaitable[int]], limit: float) -> int:
+    """Run a script's coroutine with an end to its patience; one sentence for an error.
+
+    Returns:
+        The exit code.
+    """
+
+    async def limited() -> int:
+        try:
+            return await asyncio.wait_for(work(), limit)
+        except TimeoutError:
+            msg = f"this did not end within {limit:.0f} s"
+            raise ServiceError(msg) from None
+
+    try:
+        return run_async(limited())
+    except StoppedError as stopped:
+        print(stopped, file=sys.stderr)
+        return stopped.exit_code
+    except (ServiceError, BridgeError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return error.exit_code
+    except OSError as error:
+        print(f"error: {error.filename or ''}: {error.strerror or error}", file=sys.stderr)
+        return ExitCode.USAGE
