@@ -2,6 +2,7 @@
 
 import asyncio
 import logging
+import time
 from collections import deque
 from collections.abc import Awaitable, Callable, Mapping
 from typing import Any, Final, Self
@@ -145,11 +146,12 @@ class Subscription(_Handle):
             DisconnectedError: subscription or client are closed.
             ConcurrentReadError: another task waits here.
         """
+        begun = time.monotonic()
         try:
             async with asyncio.timeout(timeout):
                 return await self.__anext__()
         except TimeoutError:
-            why = await self._why_silent()
+            why = await self._why_silent() or self._session.said_since(begun)
         except StopAsyncIteration:
             raise DisconnectedError(f"the subscription of {self.topic} is closed") from None
         raise NoMessageError(
@@ -178,7 +180,7 @@ class Subscription(_Handle):
                     return "; nobody publishes it"
         except TimeoutError:
             pass
-        return session.last_status()
+        return ""
 
     def end(self) -> None:
         """End the iteration, after what waits in the queue."""

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from itertools import count
 from typing import Any, Final, Literal
 
-from bridge.errors import BridgeError, DecodeError, OptionError, SlowPeerError, TypeConflictError
+from bridge.errors import BridgeError, DecodeError, EncodeError, OptionError, SlowPeerError, TypeConflictError
 from bridge.json_codec import MAX_DEPTH, MAX_SIZE, decode, encode, excerpt
 from bridge.names import Kind, absolute, check_name, ros1_type, ros2_type, same_type, split_type
 from bridge.stamps import ros_version_of_message
@@ -257,12 +257,17 @@ class ClientCore:
             EncodeError: the message cannot leave as JSON; a NaN or an infinity is named with its place.
         """
         advertised = self._advertisements[advertisement]
-        data = encode(
-            {"op": "publish", "topic": advertised.topic, "msg": msg},
-            nonfinite="refuse",
-            max_size=self._max_size,
-            max_depth=self._max_depth,
-        )
+        before, after = b'{"op":"publish","topic":"%b","msg":' % advertised.topic.encode(), b"}"
+        try:
+            body = encode(
+                msg,
+                nonfinite="refuse",
+                max_size=self._max_size - len(before) - len(after),
+                max_depth=self._max_depth - 1,
+            )
+        except EncodeError as error:
+            raise EncodeError(f"a message of {advertised.topic} cannot be published: {error}") from None
+        data = before + body + after
         if advertised.latch:
             advertised.latched = data
         return data

@@ -115,6 +115,7 @@ class Session:
         self.last_error = ""
         self.unusable = 0
         self.statuses: deque[StatusReceived] = deque(maxlen=KEPT_STATUSES)
+        self._status_at = 0.0
         self.receivers: dict[int, Callable[[Message], None]] = {}
         self.servers: dict[str, Server] = {}
         self.on_closed: set[Callable[[], None]] = set()
@@ -364,6 +365,7 @@ class Session:
         """
         if self.must_wait():
             await self.wait_turn(f"a call of {service}", limit)
+        begun = time.monotonic()
         call = self.core.call(service, args)
         future = self._calls[call] = asyncio.get_running_loop().create_future()
         self.flush()
@@ -372,7 +374,7 @@ class Session:
                 answer = await future
         except TimeoutError:
             raise NoAnswerError(
-                f"service {service} at {self.uri} did not answer within {limit:g} s{self.last_status()}"
+                f"service {service} at {self.uri} did not answer within {limit:g} s{self.said_since(begun)}"
             ) from None
         finally:
             self._calls.pop(call, None)
@@ -381,9 +383,9 @@ class Session:
             raise ServiceError(answer.values, f"{service} at {self.uri}")
         return answer.values
 
-    def last_status(self) -> str:
-        """What the server said last, as the end of a sentence."""
-        return f"; the server said last: {self.statuses[-1].text[:200]}" if self.statuses else ""
+    def said_since(self, since: float) -> str:
+        """What the server said last, if after ``since`` (``time.monotonic()``), as the end of a sentence."""
+        return f"; the server said: {self.statuses[-1].text[:200]}" if self._status_at > since else ""
 
     # Receiving
 
@@ -409,6 +411,7 @@ class Session:
                 task.add_done_callback(self._serving.discard)
             case StatusReceived():
                 self.statuses.append(event)
+                self._status_at = time.monotonic()
                 level = logging.WARNING if event.level in {"error", "warning"} else logging.INFO
                 _log.log(level, "%s says (%.20s): %.500s", self.uri, event.level, event.text)
             case Unusable():
