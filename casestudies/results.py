@@ -296,6 +296,11 @@ class Pairing:
         self._truths: deque[Truth] = deque(maxlen=_TRUTHS_KEPT)
         self._untrue: deque[Instance] = deque()  # frames that still wait for their true pose
 
+    @property
+    def waits(self) -> bool:
+        """Whether there is a result that waits for its report or its truth."""
+        return bool(self._posteriors or self._untrue)
+
     def add_report(self, report: FrameReport) -> list[Instance]:
         """Take a `/bm/frame`; returns the instances that are complete now."""
         self._reports.append(report)

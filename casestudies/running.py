@@ -13,7 +13,7 @@ import uvloop
 from bridge.errors import BridgeError
 from casestudies.errors import CaseStudyError
 
-_ENDING_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_ENDING_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 def say(sentence: str) -> None:
@@ -21,10 +21,19 @@ def say(sentence: str) -> None:
     print(sentence, file=sys.stderr, flush=True)
 
 
+def make_app() -> typer.Typer:
+    """A command line without typer's own tracebacks."""
+    return typer.Typer(
+        pretty_exceptions_enable=False,
+        rich_markup_mode="markdown",
+        context_settings={"help_option_names": ["-h", "--help"]},
+    )
+
+
 def command(app: typer.Typer) -> None:
     """Run a command line as a process of its own: what `main()` of each case study's module does.
 
-    SIGINT ends it with 130 and SIGTERM with 143, whatever it is doing.
+    SIGINT ends it with 130, SIGTERM with 143 and a closed terminal with 129, whatever it is doing.
     """
     _end_at_signals()
     try:
@@ -48,7 +57,7 @@ def run(body: Callable[[], Coroutine[Any, Any, None]]) -> None:
             what they opened.
 
     Raises:
-        typer.Exit: with 130 after SIGINT, 143 after SIGTERM, or the error's own exit code after one sentence
+        typer.Exit: with 128 and the signal's number, or the error's own exit code after one sentence
             on stderr.
     """
     try:

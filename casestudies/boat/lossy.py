@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from typing import Any
 
 from bridge.client import Publication
-
 from bridge.errors import DisconnectedError, SlowPeerError
 from casestudies.running import say
 

@@ -19,7 +19,7 @@ from casestudies.boat.messages import (
     read_raw,
     readings_message,
 )
-from casestudies.running import command, run, say
+from casestudies.running import command, make_app, run, say
 
 
 def normalise_distance(raw: float) -> int:
@@ -49,7 +49,6 @@ async def serve(uri: str, *, raw_topic: str, sensors_topic: str, array: bool) ->
         BridgeError: no rosbridge server answers at the URI.
     """
     from bridge.client import connect
-
     from casestudies.boat.lossy import LossyPublication
 
     said: set[str] = set()
@@ -67,10 +66,10 @@ async def serve(uri: str, *, raw_topic: str, sensors_topic: str, array: bool) ->
             await sensors.publish(readings_message(normalise(values), head, array=array))
 
 
-app = typer.Typer(rich_markup_mode="rich")
+app = make_app()
 
 
-@app.command(epilog="Example:  boat-normaliser --uri ws://127.0.0.1:9090")
+@app.command(epilog="Example: `boat-normaliser --uri ws://127.0.0.1:9090`")
 def boat_normaliser(
     uri: Annotated[str, typer.Option(envvar="BM_URI", help="The rosbridge server.")] = "ws://127.0.0.1:9090",
     raw_topic: Annotated[str, typer.Option(help="Where the raw readings come from.")] = RAW_TOPIC,

@@ -84,7 +84,10 @@ def draw_positions(path: Path, instances: Sequence[Instance], *, route: Sequence
     figure.legend(
         handles, labels, loc="outside lower center", ncols=len(labels), frameon=False, handletextpad=0.4
     )
-    figure.suptitle("Where the boat is (a), and what the Bayesian machine says from its readings (b)")
+    between = " " if across > 1 else "\n"
+    figure.suptitle(
+        f"Where the boat is (a),{between}and what the Bayesian machine says from its readings (b)"
+    )
     _save(figure, path)
 
 
@@ -155,7 +158,16 @@ def _draw_map(axes: Any, grid: Grid, instance: Instance, route: Sequence[Truth],
         return
     for x, y in BEACONS:
         axes.plot([x, truth.x], [y, truth.y], color="0.45", linewidth=0.7, linestyle=(0, (4, 3)), zorder=2)
-    axes.scatter([truth.x], [truth.y], marker="o", s=64, color=_TRUTH_COLOUR, edgecolors="black", zorder=4)
+    axes.scatter(
+        [truth.x],
+        [truth.y],
+        marker="o",
+        s=64,
+        color=_TRUTH_COLOUR,
+        edgecolors="black",
+        clip_on=False,
+        zorder=4,
+    )
     axes.annotate(
         f"({truth.x:.1f}, {truth.y:.1f})",
         (truth.x, truth.y),
@@ -196,6 +208,7 @@ def _draw_posterior(axes: Any, grid: Grid, instance: Instance, scale: float, num
             facecolors="none",
             edgecolors=_TRUTH_COLOUR,
             linewidths=1.8,
+            clip_on=False,
             zorder=4,
             label="true position",
         )

@@ -27,7 +27,7 @@ from casestudies.boat.messages import (
     readings_message,
     true_pose,
 )
-from casestudies.running import command, run, say
+from casestudies.running import command, make_app, run, say
 
 _SHORE = 2.0  # waypoints keep this far from the map's edge
 _SEEDS = 1_000_000
@@ -110,7 +110,6 @@ async def simulate(
         BridgeError: no rosbridge server answers at the URI.
     """
     from bridge.client import connect
-
     from bridge.stamps import header
     from casestudies.boat.lossy import LossyPublication
 
@@ -129,10 +128,10 @@ async def simulate(
             await asyncio.sleep(begin + step / rate - time.monotonic())
 
 
-app = typer.Typer(rich_markup_mode="rich")
+app = make_app()
 
 
-@app.command(epilog="Example:  boat-simulator --uri ws://127.0.0.1:9090 --seed 7 --rate 10")
+@app.command(epilog="Example: `boat-simulator --uri ws://127.0.0.1:9090 --seed 7 --rate 10`")
 def boat_simulator(
     uri: Annotated[str, typer.Option(envvar="BM_URI", help="The rosbridge server.")] = "ws://127.0.0.1:9090",
     seed: Annotated[

@@ -1,0 +1,350 @@
+"""Shows the boat's posteriors beside the truth: hears three topics, and knows nothing else of the stack."""
+
+import json
+import math
+import signal
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+from typing import TYPE_CHECKING, Annotated, Final, Self
+
+import typer
+
+from casestudies.boat.messages import TRUE_POSE_TOPIC
+from casestudies.errors import CaseStudyError, NoResultError, OutputError
+from casestudies.running import command, fail, make_app, run, say
+
+if TYPE_CHECKING:
+    from rich.progress import Progress, TaskID
+
+    from casestudies.boat.shares import StageShare
+    from casestudies.results import Instance, Truth
+
+POSITIONS_PICTURE: Final = "figure-4.4.png"
+SHARES_PICTURE: Final = "figure-4.5.png"
+_WORTH_DRAWING: Final = (NoResultError.exit_code, 128 + signal.SIGINT)
+"""Exit codes after which the pictures of what has come are drawn all the same."""
+HEADING: Final = "frame     true cell  estimated mean  distance     cycles   time (ms)"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Line:
+    """What is said of one frame. Cells are (column, row) from the lower left corner; None is not known.
+
+    `mean` is in cells too, a cell's centre being its whole number, and `distance` is that of the posterior's
+    mean to the centre of the true cell, in cells.
+    """
+
+    frame: int | None
+    true_cell: tuple[int, int] | None
+    mean: tuple[float, float] | None
+    distance: float | None
+    cycles: int | None
+    time_ms: float | None
+    outcome: str
+
+    def __str__(self) -> str:
+        """The line as it is printed, in the columns of `HEADING`."""
+        frame = "-" if self.frame is None else str(self.frame)
+        cell = "not known" if self.true_cell is None else "({:2d}, {:2d})".format(*self.true_cell)
+        if self.mean is None:
+            return f"{frame:>5}  {cell:>12}  no posterior: {self.outcome or 'no reason given'}"
+        mean = "({:4.1f}, {:4.1f})".format(*self.mean)
+        distance = "-" if self.distance is None else f"{self.distance:.2f}"
+        cycles = "-" if self.cycles is None else str(self.cycles)
+        time = "-" if self.time_ms is None else f"{self.time_ms:.2f}"
+        return f"{frame:>5}  {cell:>12}  {mean:>14}  {distance:>8}  {cycles:>9}  {time:>10}"
+
+
+def line_of(instance: "Instance") -> Line:
+    """What there is to say of a frame.
+
+    Raises:
+        OutputError: its posterior is not one over a map.
+    """
+    from casestudies.boat.geometry import map_grid
+    from casestudies.boat.pictures import posterior_grid
+
+    grid = map_grid() if instance.posterior is None else posterior_grid(instance.posterior)
+    true_cell = None if instance.truth is None else grid.cell(instance.truth.x, instance.truth.y)
+    mean = None
+    if instance.posterior is not None:
+        x, y = grid.mean(instance.posterior.values)
+        mean = (x - grid.x_low) / grid.cell_width - 0.5, (y - grid.y_low) / grid.cell_height - 0.5
+    report = instance.report
+    latency_us = instance.latency_us
+    return Line(
+        frame=report.number if report else None,
+        true_cell=true_cell,
+        mean=mean,
+        distance=math.dist(true_cell, mean) if true_cell and mean else None,
+        cycles=report.cycles if report else None,
+        time_ms=None if latency_us is None else latency_us / 1000,
+        outcome=report.outcome if report else "",
+    )
+
+
+class Viewer:
+    """Collects frames, says a line of each, and draws the pictures at the end."""
+
+    def __init__(self, count: int | None) -> None:
+        """Be done after so many results; None: never."""
+        self.count = count
+        self.instances: list[Instance] = []
+        self.route: tuple[Truth, ...] = ()
+        self.lines: list[Line] = []
+
+    @property
+    def results(self) -> int:
+        """How many results have come; a frame without a posterior is none."""
+        return sum(line.mean is not None for line in self.lines)
+
+    @property
+    def done(self) -> bool:
+        """Whether all results that were asked for have come."""
+        return self.count is not None and self.results >= self.count
+
+    def add(self, instance: "Instance") -> Line:
+        """Take a frame; returns what there is to say of it."""
+        line = line_of(instance)
+        self.instances.append(instance)
+        self.lines.append(line)
+        return line
+
+    async def watch(
+        self,
+        uri: str,
+        *,
+        truth_topic: str,
+        truth_tolerance_s: float,
+        first_limit_s: float,
+        limit_s: float,
+    ) -> None:
+        """Listen until all results have come, and print a line of each frame.
+
+        Raises:
+            NoResultError: nothing came in time.
+            BadResultError: something else than a result came.
+            BridgeError: no rosbridge server answers at the URI.
+        """
+        from bridge.client import connect
+        from casestudies.listening import listen
+
+        async with (
+            connect(uri) as ros,
+            listen(ros, truth_topic=truth_topic, truth_tolerance_s=truth_tolerance_s) as listener,
+        ):
+            say(f"boat-viewer: listening to {uri}")
+            with _Shown(self.count) as shown:
+                shown.line(HEADING)
+                try:
+                    while not self.done:
+                        line = self.add(await listener.next(limit_s if self.lines else first_limit_s))
+                        shown.line(str(line))
+                        shown.count(self.results)
+                except NoResultError as error:
+                    if not self.lines:
+                        raise
+                    raise NoResultError(f"after {_results(self.results)}, {error}") from None
+                finally:
+                    self.route = tuple(listener.route)
+
+    def draw(self, folder: Path) -> tuple[Path, ...]:
+        """Write the two pictures; returns their paths.
+
+        Raises:
+            OutputError: no matplotlib, or a folder that refuses.
+        """
+        from casestudies.boat.pictures import draw_positions, draw_shares, far_apart
+        from casestudies.boat.shares import stage_shares
+
+        written = []
+        if chosen := far_apart(self.instances):
+            written.append(folder / POSITIONS_PICTURE)
+            draw_positions(written[-1], chosen, route=self.route)
+        if shares := stage_shares(self.instances):
+            written.append(folder / SHARES_PICTURE)
+            draw_shares(written[-1], shares, frames=self.results)
+        return tuple(written)
+
+    def write_numbers(self, path: Path) -> None:
+        """Write the frames and the shares of time as one JSON object.
+
+        Raises:
+            OutputError: the file cannot be written.
+        """
+        from casestudies.boat.shares import stage_shares
+
+        distances = [line.distance for line in self.lines if line.distance is not None]
+        times = [line.time_ms for line in self.lines if line.time_ms is not None]
+        numbers = {
+            "results": self.results,
+            "frames_without_posterior": len(self.lines) - self.results,
+            "median_distance_cells": median(distances) if distances else None,
+            "median_time_ms": median(times) if times else None,
+            "stages": [_stage_numbers(stage) for stage in stage_shares(self.instances)],
+            "frames": [
+                _frame_numbers(line, instance)
+                for line, instance in zip(self.lines, self.instances, strict=True)
+            ],
+        }
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(json.dumps(numbers, indent=1) + "\n")
+        except OSError as error:
+            raise OutputError(f"{path} cannot be written: {error.strerror or error}") from None
+
+
+class _Shown:
+    """Lines on stdout; on a terminal, a bar below them counts the results."""
+
+    def __init__(self, count: int | None) -> None:
+        self._progress: Progress | None = None
+        self._task: TaskID | None = None
+        if sys.stdout.isatty():
+            from rich import console, progress
+
+            columns = progress.TextColumn("results"), progress.BarColumn(), progress.MofNCompleteColumn()
+            self._progress = progress.Progress(*columns, console=console.Console(), transient=True)
+            self._task = self._progress.add_task("results", total=count)
+
+    def __enter__(self) -> Self:
+        if self._progress is not None:
+            self._progress.start()
+        return self
+
+    def __exit__(self, *_exception: object) -> None:
+        if self._progress is not None:
+            self._progress.stop()
+
+    def line(self, text: str) -> None:
+        """Print one line."""
+        if self._progress is None:
+            print(text, flush=True)
+        else:
+            self._progress.console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+    def count(self, results: int) -> None:
+        """Move the bar."""
+        if self._progress is not None and self._task is not None:
+            self._progress.update(self._task, completed=results)
+
+
+def _frame_numbers(line: Line, instance: "Instance") -> dict[str, object]:
+    """A frame as a JSON object."""
+    truth, report = instance.truth, instance.report
+    return {
+        "frame": line.frame,
+        "stamp_ns": report.stamp_ns if report else None,
+        "true_position": [truth.x, truth.y] if truth else None,
+        "true_position_age_ms": instance.truth_age_ns / 1e6 if truth else None,
+        "true_cell": line.true_cell,
+        "mean_cell": line.mean,
+        "distance_cells": line.distance,
+        "cycles": line.cycles,
+        "counts_total": report.counts_total if report else None,
+        "time_ms": line.time_ms,
+        "outcome": line.outcome,
+        "boards": [
+            {"name": b.name, "stopped": b.stopped, "cycles": b.cycles}
+            for b in (report.boards if report else ())
+        ],
+    }
+
+
+def _stage_numbers(stage: "StageShare") -> dict[str, object]:
+    """A stage as a JSON object."""
+    return {"stage": stage.name, "part": stage.part.value, "mean_us": stage.mean_us, "share": stage.share}
+
+
+def _results(number: int) -> str:
+    return "1 result" if number == 1 else f"{number} results"
+
+
+app = make_app()
+
+
+@app.command(epilog="Example: `boat-viewer --uri ws://127.0.0.1:9090 --count 25 --out out`")
+def boat_viewer(
+    uri: Annotated[str, typer.Option(envvar="BM_URI", help="The rosbridge server.")] = "ws://127.0.0.1:9090",
+    count: Annotated[
+        int | None, typer.Option(min=1, help="End after so many results; by default at Ctrl-C.")
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help=f"Write {POSITIONS_PICTURE} and {SHARES_PICTURE} into this folder.", file_okay=False
+        ),
+    ] = None,
+    numbers: Annotated[
+        Path | None, typer.Option("--json", help="Write the numbers to this file, as one JSON object.")
+    ] = None,
+    truth_topic: Annotated[str, typer.Option(help="Where the true pose comes from.")] = TRUE_POSE_TOPIC,
+    truth_tolerance: Annotated[
+        float,
+        typer.Option(
+            min=0, help="Seconds that a true pose may be older than the reading, if none is of its time."
+        ),
+    ] = 0.5,
+    first_timeout: Annotated[float, typer.Option(min=0.1, help="Seconds until the first result.")] = 60.0,
+    timeout: Annotated[float, typer.Option(min=0.1, help="Seconds between two results.")] = 30.0,
+) -> None:
+    """Show each posterior's mean beside the boat's true cell, and draw the thesis's figures 4.4 and 4.5.
+
+    It hears the topics /BMresults, /bm/frame and that of the true pose, and nothing else.
+    """
+    from casestudies.boat.pictures import check_pictures_possible
+
+    viewer = Viewer(count)
+    try:
+        if out is not None:
+            check_pictures_possible()
+        try:
+            run(
+                lambda: viewer.watch(
+                    uri,
+                    truth_topic=truth_topic,
+                    truth_tolerance_s=truth_tolerance,
+                    first_limit_s=first_timeout,
+                    limit_s=timeout,
+                )
+            )
+        except typer.Exit as ended:
+            if ended.exit_code not in _WORTH_DRAWING:
+                raise
+            _finish(viewer, out, numbers)
+            raise
+        _finish(viewer, out, numbers)
+    except CaseStudyError as error:
+        fail(error)
+
+
+def _finish(viewer: Viewer, out: Path | None, numbers: Path | None) -> None:
+    """Say and write what came out."""
+    if not viewer.results:
+        return
+    distances = [line.distance for line in viewer.lines if line.distance is not None]
+    times = [line.time_ms for line in viewer.lines if line.time_ms is not None]
+    summary = [_results(viewer.results)]
+    if without := len(viewer.lines) - viewer.results:
+        summary.append(f"{without} frames without a posterior")
+    if distances:
+        summary.append(f"median distance {median(distances):.2f} cells")
+    if times:
+        summary.append(f"median time {median(times):.2f} ms")
+    print(", ".join(summary), flush=True)
+    if numbers is not None:
+        viewer.write_numbers(numbers)
+    if out is not None:
+        for path in viewer.draw(out):
+            print(f"wrote {path}", flush=True)
+
+
+def main() -> None:
+    """The command `boat-viewer`."""
+    command(app)
+
+
+if __name__ == "__main__":
+    main()
