@@ -22,8 +22,7 @@ from processes import BOAT_TOPIC, BOAT_TYPE, Process, build, run_script
 from rich.console import Console
 from rich.table import Table
 
-from bridge.client import Ros, connect
-from bridge.handles import Publication, Subscription
+from bridge.client import Publication, Ros, Subscription, connect
 from bridge.stamps import header
 
 STAGES = (

@@ -88,7 +88,7 @@ class Boards:
                     target_count=machine.target_count,
                     max_cycles=machine.max_cycles,
                     bank=frame.bank,
-                    stop=self._settings.stop or machine.stop,
+                    stop="own" if (self._settings.stop or machine.stop) == "own" else "slices",
                 )
             )
         except BoardError as error:

@@ -12,9 +12,8 @@ from typing import Annotated, Any, Literal
 import orjson
 import typer
 
-from bridge.client import Ros, State, connect
+from bridge.client import Publication, Ros, State, Subscription, connect
 from bridge.errors import BridgeError, NoMessageError
-from bridge.handles import Publication, Subscription
 from services import options
 from services.command_line import ends_well, make_app, run_async
 from services.errors import InputLineError, SettingsError, exit_code_of

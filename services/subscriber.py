@@ -13,10 +13,10 @@ from typing import Annotated, Any
 import orjson
 import typer
 
-from bridge.client import Ros, State, connect
+from bridge.client import Message, Ros, State, connect
 from bridge.errors import BridgeError, NoMessageError
 from bridge.fields import Field
-from bridge.handles import Message
+from bridge.names import same_type
 from services import options
 from services.command_line import ends_well, make_app, run_async
 from services.errors import NoDataError, RosbridgeLostError, SettingsError, VariableError, exit_code_of
@@ -39,12 +39,15 @@ async def why_silent(ros: Ros, source: Source, waited: float) -> str:
     """One sentence about a topic that stayed silent, with what the server says of it where it has rosapi."""
     sentence = f"no message came on {source.topic} ({source.type}) from {source.uri} within {waited:g} s"
     try:
-        known = (await ros.call("/rosapi/topic_type", {"topic": source.topic}, timeout=2)).get("type", "")
+        known = await ros.call("/rosapi/publishers", {"topic": source.topic}, timeout=2)
+        if not known.get("publishers"):
+            return f"{sentence}; the server knows of nobody who publishes it: start its publisher, or check the name"
+        found = (await ros.call("/rosapi/topic_type", {"topic": source.topic}, timeout=2)).get("type", "")
     except BridgeError:
-        return f"{sentence}; is its publisher running?"
-    if not known:
-        return f"{sentence}; the server knows no such topic: start its publisher, or check the name"
-    return f"{sentence}; the server knows it as {known}: is its publisher running, and is that the type?"
+        return f"{sentence}; is its publisher running, and is that its type?"
+    if found and not same_type(found, source.type):
+        return f"{sentence}; it is published there as {found}: build the deployment with that type"
+    return f"{sentence}; it has a publisher there, which says nothing"
 
 
 class Subscriber:

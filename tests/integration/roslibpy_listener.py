@@ -1,0 +1,60 @@
+"""A robot of roslibpy, a client that this project did not write: publishes readings if told to, and keeps what it hears.
+
+    python roslibpy_listener.py URI FILE COUNT [READING_JSON]
+
+Writes one JSON line per message heard and ends after COUNT results, or 90 s.
+"""
+
+import json
+import sys
+import time
+
+import roslibpy
+
+TOPICS = {
+    "/BMresults": "std_msgs/Float64MultiArray",
+    "/bm/frame": "diagnostic_msgs/DiagnosticArray",
+    "/boat/true_pose": "geometry_msgs/PoseStamped",
+    "/boat/sensors": "boat_msgs/Sensors",
+}
+
+
+def main(uri: str, file: str, count: int, reading: dict | None) -> int:
+    host, port = uri.removeprefix("ws://").rsplit(":", 1)
+    ros = roslibpy.Ros(host=host, port=int(port))
+    ros.run(timeout=10)
+    heard = []
+    results = [0]
+
+    def keep(topic: str):
+        def take(msg) -> None:
+            heard.append((topic, msg))
+            results[0] += topic == "/BMresults"
+
+        return take
+
+    topics = [roslibpy.Topic(ros, topic, type_) for topic, type_ in TOPICS.items()]
+    for topic in topics:
+        topic.subscribe(keep(topic.name))
+    publisher = roslibpy.Topic(ros, "/boat/sensors", "boat_msgs/Sensors")
+    print("listening", file=sys.stderr, flush=True)
+    deadline = time.monotonic() + 90
+    while results[0] < count and time.monotonic() < deadline:
+        if reading is not None:
+            seconds, nanoseconds = divmod(time.time_ns(), 10**9)
+            stamp = {"sec": seconds, "nanosec": nanoseconds}
+            publisher.publish(roslibpy.Message({"header": {"stamp": stamp, "frame_id": "map"}, **reading}))
+        time.sleep(0.05)
+    ros.terminate()
+    with open(file, "w") as out:
+        for topic, msg in heard:
+            out.write(json.dumps({"topic": topic, "msg": dict(msg)}) + "\n")
+    return 0 if results[0] >= count else 1
+
+
+if __name__ == "__main__":
+    sys.exit(
+        main(
+            sys.argv[1], sys.argv[2], int(sys.argv[3]), json.loads(sys.argv[4]) if len(sys.argv) > 4 else None
+        )
+    )
