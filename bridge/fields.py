@@ -15,6 +15,8 @@ Place = tuple[str | int, ...]
 
 #: Fields that an error lists at most.
 MAX_LISTED: Final = 24
+#: Characters of each of them.
+MAX_SHOWN: Final = 80
 
 _STEP = re.compile(r"([A-Za-z_][A-Za-z0-9_]*)|\[([0-9]{1,9})\]")
 
@@ -71,7 +73,7 @@ class Field:
             if not places:
                 return False, None
             if len(places) > 1:
-                shown = ", ".join(map(format_place, places[:MAX_LISTED]))
+                shown = ", ".join(map(_show, places[:MAX_LISTED]))
                 raise FieldAmbiguousError(
                     f"the message has {len(places)} fields named {self.name!r} ({shown}): "
                     "give the path of the one that is meant"
@@ -94,7 +96,7 @@ class Field:
             return FieldMissingError(f"the message has no field {self.name!r}; it has {listed}")
         value: Any = message
         for depth, step in enumerate(self.place):
-            before = format_place(self.place[:depth])
+            before = _show(self.place[:depth])
             where = f" in {before!r}" if before else ""
             if isinstance(step, int):
                 if not isinstance(value, list):
@@ -198,10 +200,18 @@ def _list_fields(message: dict[str, Any]) -> str:
         if isinstance(value, dict) and value:
             inner.extend(((*place, key), part) for key, part in reversed(value.items()))
         elif isinstance(value, list):
-            listed.append(f"{format_place(place)} ({_kind(value)})")
+            listed.append(f"{_show(place)} ({_kind(value)})")
         else:
-            listed.append(format_place(place))
+            listed.append(_show(place))
     return ", ".join(listed) or "no fields at all"
+
+
+def _show(place: Place) -> str:
+    """A place for an error's sentence: what a message holds may be as long and odd as it likes."""
+    text = format_place(place)
+    if len(text) > MAX_SHOWN:
+        text = text[: MAX_SHOWN - 3] + "..."
+    return text if text.isprintable() else repr(text)
 
 
 def _kind(value: Any) -> str:

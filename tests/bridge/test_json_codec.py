@@ -1,0 +1,221 @@
+import json
+import math
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bridge.errors import DecodeError, EncodeError
+from bridge.json_codec import MAX_DEPTH, MAX_SIZE, decode, depth, encode, find_nonfinite
+
+numbers = st.integers(-(2**63), 2**64 - 1) | st.floats()
+values = st.recursive(
+    st.none() | st.booleans() | numbers | st.text(),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=5), inner, max_size=4),
+    max_leaves=20,
+)
+objects = st.dictionaries(st.text(max_size=5), values, max_size=5)
+
+
+def nested(levels, inner=0):
+    for _ in range(levels):
+        inner = {"a": inner}
+    return inner
+
+
+def numbers_of(value):
+    if isinstance(value, dict):
+        return [n for part in value.values() for n in numbers_of(part)]
+    if isinstance(value, list):
+        return [n for part in value for n in numbers_of(part)]
+    return [value] if isinstance(value, float) else []
+
+
+# Inbound
+
+
+@given(objects)
+def test_what_the_standard_library_writes_is_read(message):
+    read = decode(json.dumps(message))
+    assert all(map(math.isfinite, numbers_of(read)))
+    # Written again without what is not finite, it is the same for both.
+    assert read == json.loads(encode(message))
+
+
+@given(st.binary() | st.text() | values.map(json.dumps))
+def test_any_input_is_an_object_or_an_error(data):
+    try:
+        message = decode(data, max_size=300)
+    except DecodeError as error:
+        assert len(str(error)) < 500
+    else:
+        assert type(message) is dict
+        assert len(data) <= 300
+        assert all(map(math.isfinite, numbers_of(message)))
+        json.dumps(message, allow_nan=False)
+        encode(message)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('{"a": NaN}', {"a": None}),
+        ('{"a": [Infinity, -Infinity, 1]}', {"a": [None, None, 1]}),
+        ('{"a": 1e999, "b": -1e999}', {"a": None, "b": None}),
+        ('{"a": NaN, "b": 1e999}', {"a": None, "b": None}),
+        ('{"a": NaN, "b": 18446744073709551616}', {"a": None, "b": 18446744073709551616.0}),
+        ('{"a": NaN, "b": 1' + "0" * 400 + "}", {"a": None, "b": None}),
+        ('{"a": 18446744073709551615}', {"a": 2**64 - 1}),
+        ('{"a": 18446744073709551616}', {"a": 2.0**64}),
+        ('{"a": 1, "a": 2}', {"a": 2}),
+        ('{"NaN": "Infinity"}', {"NaN": "Infinity"}),
+        ('{"topic": "\\/a\\/b"}', {"topic": "/a/b"}),
+    ],
+)
+def test_what_servers_leak(text, message):
+    read = decode(text)
+    assert read == message
+    assert {key: type(value) for key, value in read.items()} == {k: type(v) for k, v in message.items()}
+    assert decode(text.encode()) == message
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "42",
+        "[1]",
+        "null",
+        '"a"',
+        "{",
+        "{'a': 1}",
+        '{"a": nan}',
+        '{"a": NaN',
+        '{"a": NaN, "b": "\\ud800"}',
+        '{"a": NaN, "b": 1' + "0" * 5000 + "}",
+        '{"a": NaN}' + "{",
+        '{"a": NaN, "b": ' + "[" * 5000 + "]" * 5000 + "}",
+    ],
+)
+def test_what_is_no_message(text):
+    with pytest.raises(DecodeError):
+        decode(text)
+    with pytest.raises(DecodeError):
+        decode(text.encode())
+
+
+def test_bytes_that_are_no_text():
+    with pytest.raises(DecodeError):
+        decode(b'{"a": "\xff"}')
+    with pytest.raises(DecodeError):
+        decode(b'{"a": NaN, "b": "\xff"}')
+
+
+def test_the_limit_of_size():
+    fits = b'{"a":"' + b"x" * (MAX_SIZE - 8) + b'"}'
+    assert len(fits) == MAX_SIZE
+    decode(fits)
+    with pytest.raises(DecodeError, match=f"{MAX_SIZE + 1} bytes.*{MAX_SIZE}"):
+        decode(fits + b" ")
+
+
+@pytest.mark.parametrize("nan", [False, True])
+def test_the_limit_of_depth(nan):
+    leaf = "NaN" if nan else "0"
+    deepest = '{"a":' * MAX_DEPTH + leaf + "}" * MAX_DEPTH
+    assert depth(decode(deepest), 1000) == MAX_DEPTH
+    with pytest.raises(DecodeError, match="deeper than 64"):
+        decode('{"a":' + deepest + "}")
+    with pytest.raises(DecodeError, match="deeper than 64"):
+        decode('{"a":' + "[" * MAX_DEPTH + leaf + "]" * MAX_DEPTH + "}")
+
+
+def test_many_brackets_side_by_side_are_not_deep():
+    assert len(decode(json.dumps({"a": [{}] * 1000}))["a"]) == 1000
+    assert decode(json.dumps({"a": "[" * 1000})) == {"a": "[" * 1000}
+
+
+# Outbound
+
+
+@given(objects)
+def test_nothing_nonfinite_leaves(message):
+    text = encode(message)
+    json.loads(text, parse_constant=pytest.fail)
+    try:
+        assert encode(message, nonfinite="refuse") == text
+    except EncodeError as error:
+        assert "NaN or infinite" in str(error)
+        assert find_nonfinite(message) is not None
+    else:
+        assert find_nonfinite(message) is None
+
+
+@pytest.mark.parametrize(
+    ("message", "place"),
+    [
+        ({"a": math.nan}, "a"),
+        ({"a": {"b": [1.0, {"c": math.inf}]}}, r"a\.b\[1\]\.c"),
+        ({"a": np.array([1.0, 2.0, -math.inf])}, r"a\[2\]"),
+        ({"a": np.float32("nan")}, "a"),
+        ({"a": np.array([[1, 2], [3, math.nan]])}, r"a\[1\]\[1\]"),
+        ({"ok": None, "a": (1.0, math.nan)}, r"a\[1\]"),
+    ],
+)
+def test_a_refused_number_is_named_with_its_place(message, place):
+    with pytest.raises(EncodeError, match=f"^{place} is NaN"):
+        encode(message, nonfinite="refuse")
+    assert b"null" in encode(message)
+
+
+def test_null_is_no_nan():
+    assert encode({"a": None, "b": "null"}, nonfinite="refuse") == b'{"a":null,"b":"null"}'
+
+
+def test_arrays_go_out_without_lists():
+    message = {
+        "data": np.arange(3) / 2,
+        "counts": np.array([1, 2**32 - 1], dtype=np.uint32),
+        "one": np.float32(0.5),
+        "every_second": np.arange(6)[::2],
+        "flag": np.bool_(True),
+    }
+    assert encode(message, nonfinite="refuse") == (
+        b'{"data":[0.0,0.5,1.0],"counts":[1,4294967295],"one":0.5,"every_second":[0,2,4],"flag":true}'
+    )
+
+
+@pytest.mark.parametrize(
+    "message",
+    [{"a": b"bytes"}, {"a": {1, 2}}, {"a": object()}, {1: 2}, {"a": 2**64}, {"a": "\ud800"}, {"a": 1j}],
+    ids=str,
+)
+def test_what_cannot_be_json(message):
+    with pytest.raises(EncodeError, match="cannot be written as JSON"):
+        encode(message)
+
+
+def test_the_limits_of_what_leaves():
+    assert len(encode({"a": "x" * (MAX_SIZE - 8)})) == MAX_SIZE
+    with pytest.raises(EncodeError, match=f"{MAX_SIZE + 1} bytes"):
+        encode({"a": "x" * (MAX_SIZE - 7)})
+    encode(nested(MAX_DEPTH))
+    for levels in (MAX_DEPTH + 1, 250, 260, 5000):
+        with pytest.raises(EncodeError):
+            encode(nested(levels))
+    loop: dict[str, object] = {}
+    loop["a"] = loop
+    with pytest.raises(EncodeError):
+        encode(loop)
+
+
+def test_numpy_is_not_imported():
+    modules = "bridge.client, bridge.fields, bridge.stamps"
+    code = f"import sys, {modules}; from bridge.json_codec import encode; encode({{'a': 1.0}}); print('numpy' in sys.modules)"
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60
+    )
+    assert done.stdout == "False\n"

@@ -1,0 +1,468 @@
+"""A fake rosbridge server for tests: scripted, and able to be silent, late and wrong, to refuse and to vanish.
+
+It is a fake and says so: its HTTP answers bear ``Server: FakeRosbridge, a test double``. It shares no code with
+``bridge``: `websockets` and the standard library's json are all it uses. It knows no message types, so it checks none.
+
+    async with FakeRosbridge() as fake:
+        ...                                  # clients at fake.uri, in this process or in others
+        await fake.wait_for_op("subscribe", topic="/boat/sensors")
+        await fake.publish("/boat/sensors", {"D1": 5})
+        await fake.vanish()                  # every connection is cut, nothing listens
+        await fake.come_back()               # on the same port
+
+What real servers do that it does too (A: rosbridge_suite on ROS 1, B: on ROS 2, R: rosbridge-server-rs):
+
+* a subscription without a type, to a topic that nobody has advertised, is forgotten (A, B, R);
+* a ``throttle_rate`` that is no int kills a subscription (A, B without a word, R with one);
+* nothing is said about any error (A, B), unless ``statuses`` (R: ``{"op": "status", "level": "error", ...}``);
+* a client that subscribes to a topic by two ids gets its first message twice (B), with ``doubles_first`` every
+  client does;
+* NaN and infinities leave as null (A, B, R), with ``leaks_nan`` as bare ``NaN``;
+* null where a published message may hold a number is refused (A, B, R), with ``refuses_null``;
+* after a message that is JSON but no object the connection is open and dead (A, B), with ``zombies``;
+* every ``/`` leaves as ``\\/`` (A, B), with ``escapes``;
+* type names of the ROS 2 form are refused (A), with ``ros=1``; rosapi, if there, answers as that ROS does.
+"""
+
+import asyncio
+import contextlib
+import itertools
+import json
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from http import HTTPStatus
+from typing import Any, Self, TypeGuard
+
+from websockets.asyncio.server import Server, ServerConnection, serve
+from websockets.exceptions import ConnectionClosed
+from websockets.http11 import Request, Response
+
+SERVER = "FakeRosbridge, a test double"
+
+
+@dataclass(frozen=True)
+class Received:
+    """One operation that a client sent; ``op`` is None if it was no JSON object."""
+
+    client: int
+    op: dict[str, Any] | None
+    raw: str
+    at: float
+
+
+@dataclass(eq=False)
+class _Client:
+    number: int
+    connection: ServerConnection
+    dead: bool = False
+    advertised: dict[str, set[Any]] = field(default_factory=dict)
+    subscribed: dict[str, dict[Any, dict[str, Any]]] = field(default_factory=dict)
+    heard: dict[str, float] = field(default_factory=dict)
+    services: set[str] = field(default_factory=set)
+
+
+def _slashed(name: Any) -> str:
+    return name if isinstance(name, str) and name.startswith("/") else f"/{name}"
+
+
+class FakeRosbridge:
+    """A fake server on a port of this machine.
+
+    Attributes (all may be changed while it runs):
+        silent: takes everything, answers pings, says nothing else.
+        delay: seconds by which everything that it says is late.
+        refuses: an HTTP status with which new connections are refused, None to take them.
+        received: all that clients sent, in order.
+        connections: how many connections were ever made.
+    """
+
+    def __init__(
+        self,
+        *,
+        port: int = 0,
+        ros: int = 2,
+        rosapi: bool = False,
+        statuses: bool = False,
+        doubles_first: bool = False,
+        leaks_nan: bool = False,
+        refuses_null: bool = False,
+        zombies: bool = False,
+        escapes: bool = False,
+        silent: bool = False,
+        delay: float = 0.0,
+        refuses: int | None = None,
+    ) -> None:
+        self.port = port
+        self.ros = ros
+        self.rosapi = rosapi
+        self.statuses = statuses
+        self.doubles_first = doubles_first
+        self.leaks_nan = leaks_nan
+        self.refuses_null = refuses_null
+        self.zombies = zombies
+        self.escapes = escapes
+        self.silent = silent
+        self.delay = delay
+        self.refuses = refuses
+        self.received: list[Received] = []
+        self.connections = 0
+        self.types: dict[str, str] = {}
+        self.latched: dict[str, dict[str, Any]] = {}
+        self.services: dict[str, Callable[[dict[str, Any]], Any]] = {}
+        self._clients: set[_Client] = set()
+        self._server: Server | None = None
+        self._numbers = itertools.count(1)
+        self._calls: dict[str, tuple[_Client, Any]] = {}
+        self._news = asyncio.Event()
+        self._late: set[asyncio.Task[None]] = set()
+
+    # Coming and going
+
+    @property
+    def uri(self) -> str:
+        return f"ws://127.0.0.1:{self.port}"
+
+    async def __aenter__(self) -> Self:
+        await self.come_back()
+        return self
+
+    async def __aexit__(self, *_exception: object) -> None:
+        await self.vanish()
+
+    async def come_back(self) -> None:
+        """Listen (again), knowing nothing of what was before."""
+        assert self._server is None, "it is here already"
+        self.types.clear()
+        self.latched.clear()
+        self._server = await serve(
+            self._talk,
+            "127.0.0.1",
+            self.port,
+            compression=None,
+            ping_interval=None,
+            max_size=None,
+            process_request=self._answer_http,
+            server_header=SERVER,
+        )
+        self.port = next(iter(self._server.sockets)).getsockname()[1]
+
+    async def vanish(self) -> None:
+        """Cut every connection without a goodbye, and listen no more."""
+        for task in self._late:
+            task.cancel()
+        server, self._server = self._server, None
+        if server is not None:
+            server.close(close_connections=False)
+        await self.cut()
+        if server is not None:
+            await asyncio.wait_for(server.wait_closed(), 5)
+
+    async def cut(self) -> None:
+        """Cut every connection without a goodbye, but go on listening."""
+        for client in list(self._clients):
+            client.connection.transport.abort()
+        await self._until(lambda: not self._clients, 5, "all connections to be gone")
+
+    async def hang_up(self, code: int = 1001) -> None:
+        """Close every connection as the protocol wants it."""
+        for client in list(self._clients):
+            await client.connection.close(code)
+
+    def freeze(self) -> None:
+        """Read nothing more from the present connections, not even pings: what a lost Wi-Fi looks like."""
+        for client in self._clients:
+            client.connection.transport.pause_reading()
+
+    def thaw(self) -> None:
+        for client in self._clients:
+            client.connection.transport.resume_reading()
+
+    async def _answer_http(self, connection: ServerConnection, _request: Request) -> Response | None:
+        if self.refuses is None:
+            return None
+        return connection.respond(HTTPStatus(self.refuses), "the fake refuses\n")
+
+    # What a test asks and says
+
+    def ops(self, op: str, **fields: Any) -> list[dict[str, Any]]:
+        """The received operations of one kind, with the given fields."""
+        return [
+            received.op
+            for received in self.received
+            if received.op is not None
+            and received.op.get("op") == op
+            and all(received.op.get(name) == value for name, value in fields.items())
+        ]
+
+    async def wait_for_op(
+        self, op: str, *, count: int = 1, timeout: float = 10, **fields: Any
+    ) -> dict[str, Any]:
+        """Wait until so many operations of one kind, with the given fields, have been received; the last of them."""
+        await self._until(lambda: len(self.ops(op, **fields)) >= count, timeout, f"{count} {op} {fields}")
+        return self.ops(op, **fields)[count - 1]
+
+    async def wait_for_connections(self, count: int, timeout: float = 10) -> None:
+        """Wait until so many connections were ever made."""
+        await self._until(lambda: self.connections >= count, timeout, f"{count} connections")
+
+    async def _until(self, condition: Callable[[], bool], timeout: float, what: str) -> None:
+        try:
+            async with asyncio.timeout(timeout):
+                while not condition():
+                    self._news.clear()
+                    await self._news.wait()
+        except TimeoutError:
+            raise AssertionError(
+                f"the fake waited {timeout} s for {what}; it received {[r.raw[:200] for r in self.received]}"
+            ) from None
+
+    def know(self, topic: str, type_name: str) -> None:
+        """Know a topic as if a ROS node had advertised it."""
+        self.types[_slashed(topic)] = type_name
+
+    async def publish(self, topic: str, msg: dict[str, Any]) -> int:
+        """Publish as a ROS node would; says how many clients it went to."""
+        return await self._publish(_slashed(topic), msg)
+
+    def latch(self, topic: str, msg: dict[str, Any]) -> None:
+        """Keep a message for those who subscribe later."""
+        self.latched[_slashed(topic)] = msg
+
+    def serve(self, service: str, handler: Callable[[dict[str, Any]], Any]) -> None:
+        """Serve a service: the handler returns the values, or a str to refuse, or None never to answer."""
+        self.services[_slashed(service)] = handler
+
+    async def say(self, data: str | bytes | dict[str, Any]) -> None:
+        """Say anything at all to every client."""
+        for client in list(self._clients):
+            await self._say(client, data)
+
+    # The server
+
+    async def _talk(self, connection: ServerConnection) -> None:
+        client = _Client(next(self._numbers), connection)
+        self._clients.add(client)
+        self.connections += 1
+        self._news.set()
+        try:
+            with contextlib.suppress(ConnectionClosed):
+                async for raw in connection:
+                    await self._hear(client, raw if isinstance(raw, str) else raw.decode("utf-8", "replace"))
+        finally:
+            self._clients.discard(client)
+            self._news.set()
+
+    async def _hear(self, client: _Client, raw: str) -> None:
+        try:
+            op = json.loads(raw)
+        except ValueError:
+            op = None
+            reason = "no JSON"
+        else:
+            reason = "" if isinstance(op, dict) else "no object"
+        self.received.append(
+            Received(client.number, op if isinstance(op, dict) else None, raw, time.monotonic())
+        )
+        self._news.set()
+        if client.dead:
+            return
+        if not isinstance(op, dict):
+            client.dead = self.zombies and reason == "no object"
+            await self._complain(client, reason)
+            return
+        method = getattr(self, f"_op_{op.get('op')}", None)
+        if method is None:
+            await self._complain(client, f"unknown operation {op.get('op')!r}")
+        else:
+            await method(client, op)
+
+    async def _complain(self, client: _Client, reason: str) -> None:
+        if self.statuses:
+            await self._say(client, {"op": "status", "level": "error", "msg": reason})
+
+    async def _say(self, client: _Client, data: str | bytes | dict[str, Any]) -> None:
+        if isinstance(data, dict):
+            data = json.dumps(data if self.leaks_nan else _without_nan(data))
+            if self.escapes:
+                data = data.replace("/", "\\/")
+        if self.delay:
+            task = asyncio.create_task(self._say_late(client, data))
+            self._late.add(task)
+            task.add_done_callback(self._late.discard)
+        else:
+            await self._send(client, data)
+
+    async def _say_late(self, client: _Client, data: str | bytes) -> None:
+        await asyncio.sleep(self.delay)
+        await self._send(client, data)
+
+    async def _send(self, client: _Client, data: str | bytes) -> None:
+        if self.silent or client.dead:
+            return
+        with contextlib.suppress(ConnectionClosed):
+            await client.connection.send(data)
+
+    def _is_type(self, type_name: Any) -> TypeGuard[str]:
+        parts = type_name.split("/") if isinstance(type_name, str) else []
+        return all(parts) and (len(parts) == 2 or (len(parts) == 3 and self.ros == 2))
+
+    async def _op_advertise(self, client: _Client, op: dict[str, Any]) -> None:
+        topic, type_name = _slashed(op.get("topic")), op.get("type")
+        if not self._is_type(type_name):
+            await self._complain(client, f"cannot load type {type_name!r}")
+            return
+        if _bare(self.types.setdefault(topic, type_name)) != _bare(type_name):
+            await self._complain(client, "topic type mismatch")
+            return
+        client.advertised.setdefault(topic, set()).add(op.get("id"))
+        if op.get("latch"):
+            self.latched.setdefault(topic, {})
+
+    async def _op_unadvertise(self, client: _Client, op: dict[str, Any]) -> None:
+        client.advertised.pop(_slashed(op.get("topic")), None)
+
+    async def _op_publish(self, client: _Client, op: dict[str, Any]) -> None:
+        topic, msg = _slashed(op.get("topic")), op.get("msg")
+        if not isinstance(msg, dict):
+            await self._complain(client, "no message")
+        elif topic not in self.types:
+            await self._complain(client, f"{topic} is not advertised")
+        elif self.refuses_null and _has_null(msg):
+            await self._complain(client, f"null in a message of {topic}")
+        else:
+            if topic in self.latched:
+                self.latched[topic] = msg
+            await self._publish(topic, msg)
+
+    async def _publish(self, topic: str, msg: dict[str, Any]) -> int:
+        reached = 0
+        for client in list(self._clients):
+            times = self._times(client, topic)
+            reached += times > 0
+            for _ in range(times):
+                await self._say(client, {"op": "publish", "topic": topic, "msg": msg})
+        return reached
+
+    def _times(self, client: _Client, topic: str) -> int:
+        """How often a client gets a message: mostly once or never."""
+        subscriptions = client.subscribed.get(topic, {})
+        if not subscriptions:
+            return 0
+        first = topic not in client.heard
+        now = time.monotonic()
+        throttle = min(subscription.get("throttle_rate", 0) for subscription in subscriptions.values()) / 1000
+        if not first and now - client.heard[topic] < throttle:
+            return 0
+        client.heard[topic] = now
+        return 2 if first and (self.doubles_first or len(subscriptions) > 1) else 1
+
+    async def _op_subscribe(self, client: _Client, op: dict[str, Any]) -> None:
+        topic, type_name = _slashed(op.get("topic")), op.get("type")
+        if type_name is None and topic not in self.types:
+            await self._complain(client, f"type is required: {topic} is not known")
+        elif type_name is not None and not self._is_type(type_name):
+            await self._complain(client, f"cannot load type {type_name!r}")
+        elif type_name is not None and _bare(self.types.get(topic, type_name)) != _bare(type_name):
+            await self._complain(client, "topic type mismatch")
+        elif any(type(op.get(name, 0)) is not int for name in ("throttle_rate", "queue_length")):
+            await self._complain(client, "throttle_rate must be an int")
+        else:
+            client.subscribed.setdefault(topic, {})[op.get("id")] = op
+            if self.latched.get(topic):
+                await self._say(client, {"op": "publish", "topic": topic, "msg": self.latched[topic]})
+
+    async def _op_unsubscribe(self, client: _Client, op: dict[str, Any]) -> None:
+        topic = _slashed(op.get("topic"))
+        subscriptions = client.subscribed.get(topic, {})
+        if op.get("id") is None:
+            subscriptions.clear()
+        subscriptions.pop(op.get("id"), None)
+        client.heard.pop(topic, None)
+
+    async def _op_advertise_service(self, client: _Client, op: dict[str, Any]) -> None:
+        client.services.add(_slashed(op.get("service")))
+
+    async def _op_unadvertise_service(self, client: _Client, op: dict[str, Any]) -> None:
+        client.services.discard(_slashed(op.get("service")))
+
+    async def _op_call_service(self, client: _Client, op: dict[str, Any]) -> None:
+        service, args = _slashed(op.get("service")), op.get("args") or {}
+        handler = self.services.get(service) or (self._rosapi(service) if self.rosapi else None)
+        if handler is not None:
+            values = handler(args)
+            if values is not None:
+                await self._respond(client, op, values, ok=not isinstance(values, str))
+            return
+        for server in self._clients:
+            if service in server.services:
+                call = f"service_request:{service}:{next(self._numbers)}"
+                self._calls[call] = (client, op)
+                await self._say(server, {"op": "call_service", "id": call, "service": service, "args": args})
+                return
+        await self._respond(client, op, f"Service {service} does not exist", ok=False)
+
+    async def _op_service_response(self, _client: _Client, op: dict[str, Any]) -> None:
+        caller, call = self._calls.pop(op.get("id") or "", (None, {}))
+        if caller is not None:
+            await self._respond(caller, call, op.get("values"), ok=op.get("result") is True)
+
+    async def _respond(self, client: _Client, call: dict[str, Any], values: Any, *, ok: bool) -> None:
+        answer = {"op": "service_response", "service": call.get("service"), "values": values, "result": ok}
+        if "id" in call:
+            answer["id"] = call["id"]
+        await self._say(client, answer)
+
+    async def _op_status(self, client: _Client, op: dict[str, Any]) -> None:
+        """Clients may send these too; nobody cares."""
+
+    # rosapi
+
+    def _rosapi(self, service: str) -> Callable[[dict[str, Any]], Any] | None:
+        topics = {**self.types, "/rosout": "rosgraph_msgs/Log" if self.ros == 1 else "rcl_interfaces/msg/Log"}
+
+        def publishers(args: dict[str, Any]) -> dict[str, Any]:
+            topic = _slashed(args.get("topic"))
+            return {"publishers": ["/fake"] if any(topic in c.advertised for c in self._clients) else []}
+
+        known: dict[str, Callable[[dict[str, Any]], Any]] = {
+            "/rosapi/topics": lambda _args: {"topics": list(topics), "types": list(topics.values())},
+            "/rosapi/topic_type": lambda args: {"type": topics.get(_slashed(args.get("topic")), "")},
+            "/rosapi/publishers": publishers,
+            "/rosapi/topics_for_type": lambda args: {
+                "topics": [
+                    topic for topic, its in topics.items() if _bare(its) == _bare(args.get("type", ""))
+                ]
+            },
+            "/rosapi/nodes": lambda _args: {"nodes": ["/fake"]},
+            "/rosapi/services": lambda _args: {
+                "services": [*self.services, *(s for c in self._clients for s in c.services)]
+            },
+        }
+        if self.ros == 2:
+            known["/rosapi/get_ros_version"] = lambda _args: {"version": 2, "distro": "fake"}
+        return known.get(service)
+
+
+def _bare(type_name: str) -> tuple[str, str]:
+    parts = type_name.split("/")
+    return parts[0], parts[-1]
+
+
+def _without_nan(value: Any) -> Any:
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, dict):
+        return {key: _without_nan(part) for key, part in value.items()}
+    if isinstance(value, list):
+        return [_without_nan(part) for part in value]
+    return value
+
+
+def _has_null(value: Any) -> bool:
+    if isinstance(value, dict):
+        return any(map(_has_null, value.values()))
+    if isinstance(value, list):
+        return any(map(_has_null, value))
+    return value is None
