@@ -1,0 +1,282 @@
+"""Plays a recording through a rosbridge server, frame by frame, and says how far each posterior is off.
+
+python -m casestudies.mrclam.player DATA_DIR/ds1_robot3.csv --uri ws://127.0.0.1:9090
+"""
+
+import contextlib
+import json
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+from typing import TYPE_CHECKING, Annotated, Final
+
+import typer
+
+from casestudies.errors import BadResultError, CaseStudyError, NoResultError, OutputError
+from casestudies.mrclam.recording import (
+    MAP_FRAME,
+    SIGHTINGS_MSG,
+    SIGHTINGS_TOPIC,
+    SIGHTINGS_TYPE,
+    RecordedFrame,
+    area_grid,
+    read_recording,
+    sightings_message,
+)
+from casestudies.running import command, fail, make_app, run, say
+
+if TYPE_CHECKING:
+    from bridge.client import Publication
+    from bridge.protocol import RosVersion
+    from casestudies.listening import Listener
+    from casestudies.results import Instance, Posterior
+
+LOST_DISTANCE: Final = 9.0
+"""What a frame without a result counts as, in metres: the width of the area."""
+_REPEAT_S: Final = 1.0
+"""The first frame is published again so often, until somebody answers."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlayedFrame:
+    """A recorded frame and what came back: the published posterior, or None and why there is none."""
+
+    frame: RecordedFrame
+    posterior: "Posterior | None"
+    cycles: int | None
+    outcome: str
+
+    def estimate(self) -> tuple[float, float] | None:
+        """The posterior's mean (x, y), in metres.
+
+        Raises:
+            BadResultError: the posterior is not one over the area.
+        """
+        if self.posterior is None:
+            return None
+        if len(self.posterior.sizes) != 2:
+            raise BadResultError(
+                f"the posterior has {' x '.join(map(str, self.posterior.sizes))} values, but one over y and x "
+                "is wanted: is this the deployment of casestudies/mrclam?"
+            )
+        height, width = self.posterior.sizes
+        return area_grid(width, height).mean(self.posterior.values)
+
+    def distance(self) -> float:
+        """How far the estimate is from the reference position, in metres; `LOST_DISTANCE` without one."""
+        estimate = self.estimate()
+        return LOST_DISTANCE if estimate is None else math.dist(estimate, (self.frame.x, self.frame.y))
+
+
+def median_distance(played: Sequence[PlayedFrame]) -> float:
+    """The median distance to the reference position, in metres, over all frames."""
+    return median(frame.distance() for frame in played)
+
+
+async def play(
+    uri: str,
+    frames: Sequence[RecordedFrame],
+    *,
+    topic: str = SIGHTINGS_TOPIC,
+    first_timeout_s: float = 30.0,
+    timeout_s: float = 10.0,
+    on_frame: Callable[[PlayedFrame], None] = lambda _: None,
+) -> list[PlayedFrame]:
+    """Publish each frame and wait for its result before the next one.
+
+    Frames carry the time of their publication, which is how a result is known to be theirs. Until the first one
+    is answered it is published again every second, since nobody may be listening yet; every other frame has
+    one chance.
+
+    Args:
+        uri: the rosbridge server's.
+        frames: what to play.
+        topic: where to.
+        first_timeout_s: seconds that the first answer may take.
+        timeout_s: seconds that any other may take; then the frame has no result.
+        on_frame: is called after each frame.
+
+    Returns:
+        One entry for each frame, in their order.
+
+    Raises:
+        NoResultError: the first frame was never answered.
+        BadResultError: something else than a result came.
+        BridgeError: no rosbridge server answers at the URI, or it was lost.
+    """
+    from bridge.client import connect
+    from casestudies.listening import listen
+
+    played: list[PlayedFrame] = []
+    async with connect(uri) as ros, listen(ros) as listener:
+        version = await ros.detect_ros_version()
+        publication = await ros.advertise(topic, SIGHTINGS_TYPE)
+        for frame in frames:
+            first = not played
+            turn = _Turn(frame, publication, listener, version)
+            instance = await turn.take(
+                first_timeout_s if first else timeout_s, repeat_s=_REPEAT_S if first else math.inf
+            )
+            if first and instance is None:
+                raise NoResultError(
+                    f"the first frame on {topic} had no answer from {uri} within {first_timeout_s:g} s: "
+                    "is the master running, with the deployment of casestudies/mrclam?"
+                )
+            played.append(_played(frame, instance, timeout_s))
+            on_frame(played[-1])
+    return played
+
+
+class _Turn:
+    """One frame's way there and back."""
+
+    def __init__(
+        self,
+        frame: RecordedFrame,
+        publication: "Publication",
+        listener: "Listener",
+        version: "RosVersion | None",
+    ) -> None:
+        self._frame = frame
+        self._publication = publication
+        self._listener = listener
+        self._version = version
+        self._stamps: set[int] = set()
+
+    async def take(self, limit_s: float, *, repeat_s: float) -> "Instance | None":
+        """Publish until answered; the answer, or None if there was none within the limit."""
+        end = time.monotonic() + limit_s
+        while (left := end - time.monotonic()) > 0:
+            await self._publish()
+            with contextlib.suppress(NoResultError):
+                return await self._answer(min(left, repeat_s))
+        return None
+
+    async def _publish(self) -> None:
+        from bridge.stamps import header
+
+        stamp_ns = time.time_ns()
+        self._stamps.add(stamp_ns)
+        await self._publication.publish(
+            sightings_message(self._frame, header(stamp_ns, MAP_FRAME, self._version))
+        )
+
+    async def _answer(self, limit_s: float) -> "Instance":
+        """The next answer to this frame; late ones to earlier frames are passed over."""
+        end = time.monotonic() + limit_s
+        while True:
+            instance = await self._listener.next(max(end - time.monotonic(), 0.0))
+            if instance.report is not None and instance.report.stamp_ns in self._stamps:
+                return instance
+
+
+def _played(frame: RecordedFrame, instance: "Instance | None", timeout_s: float) -> PlayedFrame:
+    if instance is None or instance.report is None:
+        return PlayedFrame(
+            frame=frame, posterior=None, cycles=None, outcome=f"no answer within {timeout_s:g} s"
+        )
+    return PlayedFrame(
+        frame=frame,
+        posterior=instance.posterior,
+        cycles=instance.report.cycles,
+        outcome=instance.report.outcome,
+    )
+
+
+def _line(played: PlayedFrame) -> str:
+    """What is said of one frame."""
+    frame = played.frame
+    seen = len(frame.sightings)
+    start = f"{frame.number:>5}  {seen:>4}  ({frame.x:6.3f}, {frame.y:6.3f})"
+    estimate = played.estimate()
+    if estimate is None:
+        return f"{start}  no posterior: {played.outcome or 'no reason given'}"
+    cycles = "-" if played.cycles is None else str(played.cycles)
+    return f"{start}  ({estimate[0]:6.3f}, {estimate[1]:6.3f})  {played.distance():>12.3f}  {cycles:>7}"
+
+
+_HEADING: Final = "frame  seen  reference (m)       estimate (m)      distance (m)   cycles"
+
+
+def _write_numbers(path: Path, played: Sequence[PlayedFrame]) -> None:
+    numbers = {
+        "frames": len(played),
+        "without_result": sum(frame.posterior is None for frame in played),
+        "median_distance_m": median_distance(played),
+        "distances_m": [frame.distance() for frame in played],
+        "cycles": [frame.cycles for frame in played],
+    }
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(numbers, indent=1) + "\n")
+    except OSError as error:
+        raise OutputError(f"{path} cannot be written: {error.strerror or error}") from None
+
+
+app = make_app()
+
+
+@app.command(epilog="Example: `python -m casestudies.mrclam.player data/ds1_robot3.csv --count 20`")
+def player(
+    recording: Annotated[
+        Path | None, typer.Argument(help="A file like ds1_robot3.csv.", show_default=False)
+    ] = None,
+    uri: Annotated[str, typer.Option(envvar="BM_URI", help="The rosbridge server.")] = "ws://127.0.0.1:9090",
+    topic: Annotated[str, typer.Option(help="Where the sightings go.")] = SIGHTINGS_TOPIC,
+    count: Annotated[int | None, typer.Option(min=1, help="Play so many frames; by default all.")] = None,
+    first_timeout: Annotated[float, typer.Option(min=0.1, help="Seconds until the first result.")] = 30.0,
+    timeout: Annotated[float, typer.Option(min=0.1, help="Seconds that any other result may take.")] = 10.0,
+    numbers: Annotated[
+        Path | None, typer.Option("--json", help="Write the numbers to this file, as one JSON object.")
+    ] = None,
+    print_msg: Annotated[
+        bool, typer.Option("--print-msg", help="Print the .msg file of mrclam_msgs/Sightings and end.")
+    ] = False,
+) -> None:
+    """Play a recorded robot's sightings of landmarks, and compare each posterior's mean with the reference.
+
+    The next frame is published when the last one's result has come.
+    """
+    if print_msg:
+        print(SIGHTINGS_MSG, end="")
+        return
+    if recording is None:
+        raise typer.BadParameter("name a file like ds1_robot3.csv", param_hint="RECORDING")
+    try:
+        frames = read_recording(recording)[:count]
+        played: list[PlayedFrame] = []
+
+        def heard(frame: PlayedFrame) -> None:
+            played.append(frame)
+            print(_line(frame), flush=True)
+
+        async def body() -> None:
+            say(f"player: {len(frames)} frames of {recording} to {topic}, {uri}")
+            print(_HEADING, flush=True)
+            await play(
+                uri, frames, topic=topic, first_timeout_s=first_timeout, timeout_s=timeout, on_frame=heard
+            )
+
+        run(body)
+        without = sum(frame.posterior is None for frame in played)
+        print(
+            f"{len(played)} frames, {without} without a result, median distance "
+            f"{median_distance(played):.3f} m (a frame without a result counts as {LOST_DISTANCE:g} m)",
+            flush=True,
+        )
+        if numbers is not None:
+            _write_numbers(numbers, played)
+    except CaseStudyError as error:
+        fail(error)
+
+
+def main() -> None:
+    """The command line of this module."""
+    command(app)
+
+
+if __name__ == "__main__":
+    main()
