@@ -11,7 +11,7 @@ import socket
 import struct
 import time
 from collections.abc import Callable
-from typing import Self
+from typing import Self, cast
 
 import msgspec
 
@@ -124,8 +124,8 @@ class RecordProtocol(asyncio.Protocol):
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """asyncio's: the socket is open."""
-        assert isinstance(transport, asyncio.Transport)  # noqa: S101 - tells mypy what a stream socket gives
-        self._transport = transport
+        # uvloop's transports are no subclasses of asyncio's, but do what they do
+        self._transport = cast("asyncio.Transport", transport)
         sock = transport.get_extra_info("socket")
         if sock is not None:
             no_delay(sock)
