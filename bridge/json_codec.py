@@ -33,7 +33,8 @@ _SHOWN: Final = 60
 
 def excerpt(data: bytes | str) -> str:
     """The beginning of what arrived, fit for a line of a log."""
-    return repr(data[:_SHOWN]) + ("..." if len(data) > _SHOWN else "")
+    shown = repr(data[:_SHOWN])
+    return shown[: 2 * _SHOWN] + "..." if len(data) > _SHOWN or len(shown) > 2 * _SHOWN else shown
 
 
 def decode(data: bytes | str, *, max_size: int = MAX_SIZE, max_depth: int = MAX_DEPTH) -> dict[str, Any]:
