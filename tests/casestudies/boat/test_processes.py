@@ -1,0 +1,234 @@
+"""The boat's three commands as processes of their own, with a pretend master between them.
+
+boat-simulator -> /boat/raw -> boat-normaliser -> /boat/sensors -> pretend master -> /BMresults -> boat-viewer
+      '---------------------------- /boat/true_pose -------------------------------------------------'
+"""
+
+import asyncio
+import contextlib
+import json
+import signal
+import subprocess
+import sys
+
+import pytest
+from matplotlib.image import imread
+
+from casestudies.boat.geometry import map_grid
+from tests.casestudies.pretend_stack import PretendStack, certain, frame_message, posterior_message
+from tests.fake_rosbridge import FakeRosbridge
+
+LIMIT = 60
+GRID = map_grid()
+
+
+class Process:
+    """One of the boat's commands."""
+
+    def __init__(self, module, *arguments):
+        self.command = (sys.executable, "-m", f"casestudies.boat.{module}", *arguments)
+
+    async def __aenter__(self):
+        self._process = await asyncio.create_subprocess_exec(
+            *self.command, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+        )
+        return self
+
+    async def __aexit__(self, *_exception):
+        with contextlib.suppress(ProcessLookupError):
+            self._process.kill()
+        await self._process.wait()
+
+    def signal(self, number):
+        self._process.send_signal(number)
+
+    async def line(self, beginning):
+        """Wait until it prints a line that begins so."""
+        async with asyncio.timeout(LIMIT):
+            while not (line := (await self._process.stdout.readline()).decode()).startswith(beginning):
+                assert line, "it ended first"
+
+    async def ended(self):
+        """(exit code, stdout, stderr)"""
+        async with asyncio.timeout(LIMIT):
+            out, err = await self._process.communicate()
+        return self._process.returncode, out.decode(), err.decode()
+
+
+def where_the_boat_is(fake):
+    """Answers with certainty in the cell of the pose that has the reading's stamp."""
+
+    def answer(_number, message):
+        for op in fake.ops("publish", topic="/boat/true_pose"):
+            if op["msg"]["header"]["stamp"] == message["header"]["stamp"]:
+                position = op["msg"]["pose"]["position"]
+                return certain(GRID.line(position["x"], position["y"]))
+        raise AssertionError(f"no true pose has the stamp of {message}")
+
+    return answer
+
+
+async def say_result(fake, number):
+    """What the publisher says of one frame."""
+    await fake.publish("/bm/frame", frame_message({"sec": number, "nanosec": 0}, number, published=True))
+    await fake.publish("/BMresults", posterior_message(certain(500)))
+
+
+async def test_from_the_simulator_to_the_pictures(tmp_path):
+    async with (
+        FakeRosbridge(rosapi=True) as fake,
+        PretendStack(fake, "/boat/sensors", where_the_boat_is(fake)),
+    ):
+        viewing = Process(
+            *("viewer", "--uri", fake.uri, "--count", "12", "--out", str(tmp_path / "out")),
+            *("--json", str(tmp_path / "numbers.json")),
+        )
+        async with viewing as viewer, Process("normaliser", "--uri", fake.uri):
+            await fake.wait_for_op("subscribe", topic="/boat/true_pose", timeout=LIMIT)
+            await fake.wait_for_op("subscribe", topic="/boat/raw", timeout=LIMIT)
+            async with Process("simulator", "--uri", fake.uri, "--rate", "50", "--seed", "4"):
+                code, out, err = await viewer.ended()
+        sensors = fake.ops("publish", topic="/boat/sensors")
+        raws = fake.ops("publish", topic="/boat/raw")
+    assert code == 0, err
+    heading, *lines, total, first_picture, second_picture = out.splitlines()
+    assert heading.split() == [
+        "frame",
+        "true",
+        "cell",
+        "estimated",
+        "mean",
+        "distance",
+        "cycles",
+        "time",
+        "(ms)",
+    ]
+    assert [int(line.split()[0]) for line in lines] == list(range(1, 13))
+    assert all("  0.00  " in line for line in lines)
+    assert total.startswith("12 results, median distance 0.00 cells, median time ")
+    for said, name in ((first_picture, "figure-4.4.png"), (second_picture, "figure-4.5.png")):
+        path = tmp_path / "out" / name
+        assert said == f"wrote {path}"
+        assert imread(path).shape[1] > 800
+    numbers = json.loads((tmp_path / "numbers.json").read_text())
+    assert numbers["results"] == len(numbers["frames"]) == 12
+    assert numbers["frames"][0]["true_position_age_ms"] == 0
+    assert [stage["stage"] for stage in numbers["stages"]][::5] == ["rosbridge in", "rosbridge out"]
+    assert sum(stage["share"] for stage in numbers["stages"]) == pytest.approx(1)
+    # the server says that it speaks for ROS 2, and the stamp is kept from the raw reading on
+    first = sensors[0]["msg"]
+    assert set(first) == {"header", "D1", "D2", "D3", "B1", "B2", "B3"}
+    assert set(first["header"]["stamp"]) == {"sec", "nanosec"}
+    assert first["header"] in [op["msg"]["header"] for op in raws]
+
+
+async def test_arrays_are_paired_with_the_pose_before_them(tmp_path):
+    """Without headers the stack stamps a reading when it arrives, which is a little after the true pose."""
+    async with FakeRosbridge() as fake, PretendStack(fake, "/boat/sensors", lambda _n, _m: certain(0)):
+        viewing = Process(
+            "viewer", "--uri", fake.uri, "--count", "3", "--json", str(tmp_path / "numbers.json")
+        )
+        async with viewing as viewer, Process("normaliser", "--uri", fake.uri, "--array"):
+            await fake.wait_for_op("subscribe", topic="/boat/true_pose", timeout=LIMIT)
+            await fake.wait_for_op("subscribe", topic="/boat/raw", timeout=LIMIT)
+            async with Process("simulator", "--uri", fake.uri, "--rate", "20", "--array") as simulator:
+                assert (await viewer.ended())[0] == 0
+                simulator.signal(signal.SIGTERM)
+                assert (await simulator.ended())[0] == 143
+        types = {op["topic"]: op["type"] for op in fake.ops("advertise")}
+    assert types["/boat/raw"] == types["/boat/sensors"] == "std_msgs/Float64MultiArray"
+    for frame in json.loads((tmp_path / "numbers.json").read_text())["frames"]:
+        assert frame["true_position"] is not None
+        assert 0 < frame["true_position_age_ms"] < 500
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize("module", ["simulator", "normaliser", "viewer"])
+async def test_a_signal_ends_a_process_without_a_word(module, number, code):
+    async with FakeRosbridge() as fake, Process(module, "--uri", fake.uri) as process:
+        await fake.wait_for_connections(1, timeout=LIMIT)
+        process.signal(number)
+        returned, out, err = await process.ended()
+    assert returned == code
+    assert "Traceback" not in err
+    assert "error" not in out + err
+
+
+async def test_ctrl_c_ends_an_endless_viewer_with_its_pictures(tmp_path):
+    async with (
+        FakeRosbridge() as fake,
+        Process("viewer", "--uri", fake.uri, "--out", str(tmp_path)) as viewer,
+    ):
+        await fake.wait_for_op("subscribe", topic="/boat/true_pose", timeout=LIMIT)
+        for number in (1, 2):
+            await say_result(fake, number)
+        await viewer.line("    2 ")
+        viewer.signal(signal.SIGINT)
+        code, out, _err = await viewer.ended()
+    assert code == 130
+    assert (tmp_path / "figure-4.4.png").exists()
+    assert "2 results" in out
+
+
+@pytest.mark.parametrize("module", ["simulator", "normaliser", "viewer"])
+async def test_an_unreachable_server_is_one_sentence(module):
+    async with Process(module, "--uri", "ws://127.0.0.1:1") as process:
+        code, _out, err = await process.ended()
+    assert code == 3
+    assert err.splitlines()[-1].startswith("error: ws://127.0.0.1:1 is unreachable")
+    assert "Traceback" not in err
+
+
+async def test_a_viewer_that_hears_nothing_says_what_it_waited_for():
+    async with (
+        FakeRosbridge() as fake,
+        Process("viewer", "--uri", fake.uri, "--first-timeout", "0.3") as viewer,
+    ):
+        code, _out, err = await viewer.ended()
+    assert code == 3
+    assert "error: nothing came on /bm/frame and /BMresults" in err
+    assert "within 0.3 s: is the master running" in err
+
+
+async def test_results_that_end_early_are_drawn_all_the_same(tmp_path):
+    async with FakeRosbridge() as fake:
+        viewing = Process(
+            *("viewer", "--uri", fake.uri, "--count", "5", "--timeout", "0.5", "--out", str(tmp_path))
+        )
+        async with viewing as viewer:
+            await fake.wait_for_op("subscribe", topic="/boat/true_pose", timeout=LIMIT)
+            await say_result(fake, 1)
+            code, _out, err = await viewer.ended()
+    assert code == 3
+    assert "error: after 1 result, nothing came on" in err
+    assert (tmp_path / "figure-4.4.png").exists()
+
+
+async def test_a_simulator_sails_on_while_the_server_is_away():
+    async with FakeRosbridge() as fake, Process("simulator", "--uri", fake.uri, "--rate", "20") as simulator:
+        await fake.wait_for_op("publish", topic="/boat/raw", timeout=LIMIT)
+        await fake.vanish()
+        fake.received.clear()
+        await asyncio.sleep(0.3)
+        await fake.come_back()
+        await fake.wait_for_op("publish", topic="/boat/raw", count=2, timeout=LIMIT)
+        simulator.signal(signal.SIGINT)
+        code, _out, err = await simulator.ended()
+    assert code == 130
+    assert err.count("/boat/raw are dropped until it is back") == 1
+    assert "/boat/raw is published again" in err
+
+
+async def test_a_normaliser_says_each_kind_of_bad_reading_once():
+    good = {"D1": 1.2, "D2": 2, "D3": 3, "B1": 0, "B2": 0, "B3": 0}
+    async with FakeRosbridge() as fake, Process("normaliser", "--uri", fake.uri) as normaliser:
+        await fake.wait_for_op("subscribe", topic="/boat/raw", timeout=LIMIT)
+        for _ in range(3):
+            await fake.publish("/boat/raw", {**good, "B2": None})
+        await fake.publish("/boat/raw", good)
+        await fake.wait_for_op("publish", topic="/boat/sensors", timeout=LIMIT)
+        (sent,) = fake.ops("publish", topic="/boat/sensors")
+        normaliser.signal(signal.SIGTERM)
+        _code, _out, err = await normaliser.ended()
+    assert sent["msg"] == {"D1": 1, "D2": 2, "D3": 3, "B1": 0, "B2": 0, "B3": 0}
+    assert err.count("B2 must be a finite number, not None") == 1

@@ -1,0 +1,174 @@
+"""The player against a pretend master: lock-step, lost and impossible frames, a late start.
+
+player  ->  fake server  ->  pretend master  ->  fake server  ->  player
+"""
+
+import asyncio
+import json
+import subprocess
+import sys
+
+import pytest
+
+from bridge.errors import BridgeError
+from casestudies.errors import BadResultError, NoResultError
+from casestudies.mrclam.player import LOST_DISTANCE, PlayedFrame, median_distance, play
+from casestudies.mrclam.recording import SIGHTINGS_TOPIC, RecordedFrame, Sighting, area_grid
+from casestudies.results import Posterior
+from tests.casestudies.pretend_stack import PretendStack, certain
+from tests.fake_rosbridge import FakeRosbridge
+
+GRID = area_grid()
+
+
+def recorded(number, line):
+    """A frame whose reference position is the centre of a cell."""
+    x, y = GRID.centre(line)
+    seen = (Sighting(landmark=6, range_m=float(line), bearing_rad=0.5),)
+    return RecordedFrame(number=number, time_s=float(number), x=x, y=y, sightings=seen)
+
+
+FRAMES = [recorded(n, 40 * n) for n in range(1, 9)]
+
+
+def right(_number, message):
+    return certain(int(message["range_6"]))
+
+
+async def test_every_frame_gets_its_own_result():
+    async with FakeRosbridge() as fake, PretendStack(fake, SIGHTINGS_TOPIC, right):
+        played = await play(fake.uri, FRAMES)
+    assert [one.frame for one in played] == FRAMES
+    assert [one.distance() for one in played] == pytest.approx([0.0] * 8, abs=1e-9)
+    assert [one.cycles for one in played] == list(range(801, 809))
+
+
+async def test_the_next_frame_waits_for_the_result():
+    """The pretend master looks at the server when it answers: no reading is ahead of it."""
+    ahead = []
+
+    def answer(number, message):
+        ahead.append(len(fake.ops("publish", topic=SIGHTINGS_TOPIC)) - number)
+        return right(number, message)
+
+    async with FakeRosbridge() as fake, PretendStack(fake, SIGHTINGS_TOPIC, answer):
+        await play(fake.uri, FRAMES)
+    assert ahead == [0] * 8
+
+
+async def test_a_lost_and_an_impossible_frame_have_no_result_and_the_rest_goes_on():
+    def answer(number, message):
+        return {3: "silent", 5: None}.get(number, right(number, message))
+
+    heard = []
+    async with FakeRosbridge() as fake, PretendStack(fake, SIGHTINGS_TOPIC, answer):
+        played = await play(fake.uri, FRAMES, timeout_s=0.3, on_frame=heard.append)
+    assert heard == played
+    assert [one.frame.number for one in played if one.posterior is None] == [3, 5]
+    assert played[2].outcome == "no answer within 0.3 s"
+    assert played[4].outcome == "impossible on every board"
+    assert played[2].distance() == LOST_DISTANCE
+    assert played[7].distance() == pytest.approx(0, abs=1e-9)
+
+
+async def test_a_late_answer_is_not_taken_for_that_of_the_next_frame():
+    async with FakeRosbridge() as fake:
+        fake.delay = 0.4
+
+        async def hasten():
+            await fake.wait_for_op("publish", topic=SIGHTINGS_TOPIC, count=4)
+            fake.delay = 0.0
+
+        hastening = asyncio.create_task(hasten())
+        async with PretendStack(fake, SIGHTINGS_TOPIC, right):
+            played = await play(fake.uri, FRAMES, timeout_s=0.25)
+        await hastening
+    assert any(one.posterior is None for one in played)
+    assert all(one.distance() < 1e-9 for one in played if one.posterior is not None)
+
+
+async def test_the_first_frame_is_repeated_until_somebody_listens():
+    def answer(number, message):
+        return "silent" if number == 1 else right(number, message)
+
+    async with FakeRosbridge() as fake, PretendStack(fake, SIGHTINGS_TOPIC, answer):
+        played = await play(fake.uri, FRAMES[:2])
+        assert len(fake.ops("publish", topic=SIGHTINGS_TOPIC)) == 3
+    assert [one.distance() for one in played] == pytest.approx([0, 0], abs=1e-9)
+
+
+async def test_nobody_ever_answers():
+    async with FakeRosbridge() as fake:
+        with pytest.raises(NoResultError, match="had no answer from ws://.*is the master running"):
+            await play(fake.uri, FRAMES, first_timeout_s=0.3)
+
+
+async def test_something_else_on_the_result_topic():
+    async with FakeRosbridge() as fake:
+        playing = asyncio.create_task(play(fake.uri, FRAMES))
+        await fake.wait_for_op("publish", topic=SIGHTINGS_TOPIC)
+        await fake.publish("/BMresults", {"data": ["nonsense"]})
+        with pytest.raises(BadResultError, match="/BMresults is not"):
+            await playing
+
+
+async def test_no_server():
+    with pytest.raises(BridgeError, match="unreachable"):
+        await play("ws://127.0.0.1:1", FRAMES)
+
+
+def test_the_median_counts_frames_without_a_result():
+    result = Posterior(values=tuple(certain(40)), labels=("y", "x"), sizes=(32, 32), heard_ns=0)
+    good = PlayedFrame(frame=FRAMES[0], posterior=result, cycles=1, outcome="")
+    lost = PlayedFrame(frame=FRAMES[0], posterior=None, cycles=None, outcome="")
+    assert median_distance([good, lost, lost]) == LOST_DISTANCE
+    assert median_distance([good, good, lost]) == pytest.approx(0, abs=1e-9)
+
+
+def test_a_posterior_of_something_else():
+    result = Posterior(values=(0.5, 0.5), labels=("x",), sizes=(2,), heard_ns=0)
+    with pytest.raises(BadResultError, match=r"deployment of casestudies/mrclam"):
+        PlayedFrame(frame=FRAMES[0], posterior=result, cycles=1, outcome="").estimate()
+
+
+class TestCommand:
+    def recording(self, tmp_path):
+        path = tmp_path / "robot.csv"
+        lines = ["time_s,ref_x_m,ref_y_m,ref_std_m,heading_rad,range_6_m,bearing_6_rad"]
+        lines += [f"{f.number},{f.x!r},{f.y!r},0.04,0.1,{f.sightings[0].range_m},0.5" for f in FRAMES]
+        path.write_text("\n".join(lines) + "\n")
+        return path
+
+    async def run(self, *arguments):
+        process = await asyncio.create_subprocess_exec(
+            *(sys.executable, "-m", "casestudies.mrclam.player", *arguments),
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+        )
+        async with asyncio.timeout(60):
+            out, err = await process.communicate()
+        return process.returncode, out.decode(), err.decode()
+
+    async def test_a_line_a_frame_and_a_sum(self, tmp_path):
+        def answer(number, message):
+            return None if number == 2 else right(number, message)
+
+        async with FakeRosbridge() as fake, PretendStack(fake, SIGHTINGS_TOPIC, answer):
+            code, out, err = await self.run(
+                str(self.recording(tmp_path)), "--uri", fake.uri, "--json", str(tmp_path / "n.json")
+            )
+        assert code == 0, err
+        lines = out.splitlines()
+        assert len(lines) == 10
+        assert "no posterior: impossible on every board" in lines[2]
+        assert lines[-1].startswith("8 frames, 1 without a result, median distance 0.000 m")
+        numbers = json.loads((tmp_path / "n.json").read_text())
+        assert numbers["without_result"] == 1
+        assert numbers["distances_m"][1] == LOST_DISTANCE
+
+    async def test_a_wrong_file_is_one_sentence(self, tmp_path):
+        code, out, err = await self.run(str(tmp_path / "none.csv"))
+        assert (code, out) == (2, "")
+        assert err.startswith("error: ")
+        assert "none.csv cannot be read" in err
+        assert len(err.splitlines()) == 1

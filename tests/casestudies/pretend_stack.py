@@ -1,0 +1,102 @@
+"""A pretend master for the case studies' tests: answers each reading on a fake server as the publisher would.
+
+reading on TOPIC  ->  fake server  ->  PretendStack  ->  /bm/frame, then /BMresults  ->  viewer, player
+"""
+
+import asyncio
+import contextlib
+import itertools
+import time
+from collections.abc import Callable
+from typing import Any, Self
+
+from tests.fake_rosbridge import FakeRosbridge
+
+Answer = list[float] | None
+"""A posterior over 32 x 32 cells; None for a frame without one."""
+
+
+def certain(line: int) -> list[float]:
+    """All of the probability in one cell."""
+    posterior = [0.0] * 1024
+    posterior[line] = 1.0
+    return posterior
+
+
+def frame_message(stamp: dict[str, int], number: int, *, published: bool) -> dict[str, Any]:
+    now = time.time_ns()
+    values = {
+        "number": number,
+        "cycles": 800 + number,
+        "counts_total": 4000,
+        "published": str(published).lower(),
+        "rosbridge_in_us": 100,
+        "local_hops_us": 200,
+        "register_writes_us": 50,
+        "compute_us": 600,
+        "reads_us": 50,
+        "received_ns": now - 1_000_000,
+        "sent_ns": now,
+    }
+    pairs = [{"key": key, "value": str(value)} for key, value in values.items()]
+    outcome = "overflow" if published else "impossible on every board"
+    return {
+        "header": {"stamp": stamp, "frame_id": "bm"},
+        "status": [
+            {
+                "level": 0,
+                "name": "rosbayes: frame",
+                "message": outcome,
+                "hardware_id": "boat",
+                "values": pairs,
+            },
+            {
+                "level": 0,
+                "name": "rosbayes: board 0",
+                "message": outcome,
+                "hardware_id": "board0",
+                "values": [],
+            },
+        ],
+    }
+
+
+def posterior_message(values: list[float]) -> dict[str, Any]:
+    dims = [{"label": "y", "size": 32, "stride": 1024}, {"label": "x", "size": 32, "stride": 32}]
+    return {"layout": {"dim": dims, "data_offset": 0}, "data": values}
+
+
+class PretendStack:
+    """Answers the n-th reading (from 1) with `answer(n, message)`; a "silent" one not at all."""
+
+    def __init__(
+        self, fake: FakeRosbridge, topic: str, answer: Callable[[int, dict[str, Any]], Answer | str]
+    ) -> None:
+        self.fake = fake
+        self.topic = topic
+        self.answer = answer
+        self._task: asyncio.Task[None] | None = None
+
+    async def __aenter__(self) -> Self:
+        self._task = asyncio.create_task(self._serve())
+        return self
+
+    async def __aexit__(self, *_exception: object) -> None:
+        assert self._task is not None
+        self._task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await self._task
+
+    async def _serve(self) -> None:
+        for number in itertools.count(1):
+            await self.fake.wait_for_op("publish", topic=self.topic, count=number, timeout=60)
+            message = self.fake.ops("publish", topic=self.topic)[number - 1]["msg"]
+            answer = self.answer(number, message)
+            if isinstance(answer, str):
+                continue
+            header = message.get("header")
+            now = time.time_ns()
+            stamp = header["stamp"] if header else {"sec": now // 10**9, "nanosec": now % 10**9}
+            await self.fake.publish("/bm/frame", frame_message(stamp, number, published=answer is not None))
+            if answer is not None:
+                await self.fake.publish("/BMresults", posterior_message(answer))
