@@ -16,6 +16,7 @@ import uvloop
 
 from services.errors import ExitCode, StoppedError, exit_code_of
 from services.logs import say
+from services.supervision import PARENT_VARIABLE
 
 Parameters = ParamSpec("Parameters")
 
@@ -60,7 +61,9 @@ def ends_well(command: Callable[Parameters, int | None]) -> Callable[Parameters,
                 say(traceback.format_exc().rstrip())
                 say("error: this is a bug in rosbayes; please report it with the lines above")
             elif isinstance(error, StoppedError):
-                say(str(error))
+                # a child ends because its parent says so, which is no news
+                if PARENT_VARIABLE not in os.environ:
+                    say(str(error))
             else:
                 say(f"error: {error}")
         raise typer.Exit(int(code))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import sys
 from typing import Any, TextIO
 
@@ -45,13 +44,11 @@ def get_logger(role: str) -> FilteringBoundLogger:
     """
     # what the libraries log, our own records say in words; only their errors are news
     logging.basicConfig(level=logging.ERROR, stream=sys.stderr, format="%(name)s: %(message)s")
-    colours = sys.stderr.isatty() and "NO_COLOR" not in os.environ
     structlog.configure_once(
         processors=[
             structlog.processors.add_log_level,
             structlog.processors.TimeStamper(fmt="%H:%M:%S.%f", utc=False),
-            _short_time,
-            structlog.dev.ConsoleRenderer(colors=colours, pad_event_to=0, pad_level=False),
+            _one_line,
         ],
         wrapper_class=structlog.make_filtering_bound_logger(20),
         logger_factory=structlog.PrintLoggerFactory(file=_SurvivingStream(sys.stderr)),  # type: ignore[arg-type]  # only write and flush are used
@@ -61,6 +58,10 @@ def get_logger(role: str) -> FilteringBoundLogger:
     return logger
 
 
-def _short_time(_: Any, __: str, event: structlog.typing.EventDict) -> structlog.typing.EventDict:
-    event["timestamp"] = str(event["timestamp"])[:12]
-    return event
+def _one_line(_: Any, level: str, event: structlog.typing.EventDict) -> str:
+    """`12:00:00.123 master: the event (frame=7)`; the level stands there when it is no mere information."""
+    time, process, sentence = str(event.pop("timestamp"))[:12], event.pop("process"), event.pop("event")
+    event.pop("level", None)
+    rest = f" ({', '.join(f'{key}={value}' for key, value in event.items())})" if event else ""
+    urgency = "" if level == "info" else f"{level}: "
+    return f"{time} {process}: {urgency}{sentence}{rest}"

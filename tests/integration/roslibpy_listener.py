@@ -8,6 +8,7 @@ Writes one JSON line per message heard and ends after COUNT results, or 90 s.
 import json
 import sys
 import time
+from pathlib import Path
 
 import roslibpy
 
@@ -46,7 +47,7 @@ def main(uri: str, file: str, count: int, reading: dict | None) -> int:
             publisher.publish(roslibpy.Message({"header": {"stamp": stamp, "frame_id": "map"}, **reading}))
         time.sleep(0.05)
     ros.terminate()
-    with open(file, "w") as out:
+    with Path(file).open("w") as out:
         for topic, msg in heard:
             out.write(json.dumps({"topic": topic, "msg": dict(msg)}) + "\n")
     return 0 if results[0] >= count else 1

@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from casestudies.boat.model import model as boat_model
+from machines.posterior import joint_posterior
 
 from casestudies.boat.correctness import correctness
 from casestudies.boat.geometry import map_grid
 from casestudies.boat.messages import SENSOR_NAMES
-from casestudies.boat.model import model as boat_model
-from machines.posterior import joint_posterior
 from machines.reference import ReferenceBM1
 from pcie_shim.programming_file import read_image
 from tests.integration.conftest import READING, build_boat
@@ -132,5 +132,5 @@ async def test_a_thousand_frames_are_as_good_as_float64_fusion(stage, whole_boat
     figures = correctness(lines, np.array(posteriors), np.array(exact), width=grid.width)
     print(figures)
     assert abs(figures.coverage - figures.exact_coverage) <= 0.03, figures
-    assert figures.means_within_a_cell >= 0.99, figures
-    assert figures.total_variation <= 0.06, figures
+    assert figures.mean_within_one_cell >= 0.99, figures
+    assert figures.total_variation_mean <= 0.06, figures

@@ -1,0 +1,153 @@
+"""A hub on a real socket for tests, WebSocket clients of it, and a bare TCP one that can misbehave."""
+
+import asyncio
+import base64
+import json
+import os
+import socket
+import struct
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from typing import Any
+
+from websockets.asyncio.client import ClientConnection, connect
+from websockets.frames import Frame, Opcode
+
+from bridge.hub.limits import HubLimits
+from bridge.hub.server import serve_hub
+
+#: No wait in these tests may take longer; none should take a tenth of it.
+PATIENCE = 20.0
+
+
+class Ears:
+    """A WebSocket client that speaks in operations."""
+
+    def __init__(self, websocket: ClientConnection) -> None:
+        self.websocket = websocket
+
+    async def send(self, **operation: Any) -> None:
+        await self.websocket.send(json.dumps(operation))
+
+    async def hear(self) -> dict[str, Any]:
+        async with asyncio.timeout(PATIENCE):
+            operation: dict[str, Any] = json.loads(await self.websocket.recv())
+            return operation
+
+    async def ask(self, service: str, **args: Any) -> Any:
+        await self.send(op="call_service", service=service, args=args, id="ask")
+        answer = await self.hear()
+        assert (answer["op"], answer["id"]) == ("service_response", "ask"), answer
+        return answer["values"]
+
+    async def settle(self) -> None:
+        """Come back when the hub has done all that was sent before."""
+        await self.ask("/rosapi/get_time")
+
+    async def closed(self) -> int:
+        """Wait for the hub to end the connection; the close code."""
+        async with asyncio.timeout(PATIENCE):
+            await self.websocket.wait_closed()
+        code = self.websocket.close_code
+        assert code is not None
+        return code
+
+
+@asynccontextmanager
+async def running_hub(
+    *, limits: HubLimits | None = None, origins: tuple[str, ...] = ()
+) -> AsyncIterator[int]:
+    """A hub on a free port of this machine; its port."""
+    stop = asyncio.Event()
+    port: asyncio.Future[int] = asyncio.get_running_loop().create_future()
+    served = asyncio.create_task(
+        serve_hub("127.0.0.1", 0, limits=limits, origins=origins, on_ready=port.set_result, stop=stop)
+    )
+    try:
+        async with asyncio.timeout(PATIENCE):
+            yield await port
+    finally:
+        stop.set()
+        await asyncio.wait_for(served, PATIENCE)
+
+
+@asynccontextmanager
+async def client(port: int, **options: Any) -> AsyncIterator[Ears]:
+    async with connect(f"ws://127.0.0.1:{port}", **options) as websocket:
+        yield Ears(websocket)
+
+
+class Bare:
+    """A WebSocket client that does nothing by itself: it answers no ping, reads only when told."""
+
+    def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self.reader = reader
+        self.writer = writer
+
+    @classmethod
+    async def connect(cls, port: int, *, handshake: bool = True, receive_buffer: int = 0) -> "Bare":
+        sock = socket.socket()
+        if receive_buffer:
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, receive_buffer)
+        sock.setblocking(False)
+        await asyncio.get_running_loop().sock_connect(sock, ("127.0.0.1", port))
+        # A small limit keeps the stream from reading ahead of the test.
+        bare = cls(*await asyncio.open_connection(sock=sock, limit=1024))
+        if handshake:
+            await bare.request()
+        return bare
+
+    async def request(self, *headers: str, path: str = "/") -> str:
+        """Ask for a WebSocket; the status line of the answer."""
+        key = base64.b64encode(os.urandom(16)).decode()
+        lines = [
+            f"GET {path} HTTP/1.1",
+            "Host: localhost",
+            "Upgrade: websocket",
+            "Connection: Upgrade",
+            f"Sec-WebSocket-Key: {key}",
+            "Sec-WebSocket-Version: 13",
+            *headers,
+        ]
+        self.writer.write(("\r\n".join(lines) + "\r\n\r\n").encode())
+        answer = await self.reader.readuntil(b"\r\n\r\n")
+        return answer.split(b"\r\n")[0].decode()
+
+    def send(self, data: bytes, *, opcode: Opcode = Opcode.TEXT, fin: bool = True) -> None:
+        self.writer.write(Frame(opcode, data, fin).serialize(mask=True))
+
+    def send_operation(self, **operation: Any) -> None:
+        self.send(json.dumps(operation).encode())
+
+    async def frame(self) -> tuple[int, bytes]:
+        """The next frame's opcode and payload."""
+        first, length = await self.reader.readexactly(2)
+        if length == 126:
+            (length,) = struct.unpack("!H", await self.reader.readexactly(2))
+        elif length == 127:
+            (length,) = struct.unpack("!Q", await self.reader.readexactly(8))
+        return first & 15, await self.reader.readexactly(length)
+
+    async def ended(self) -> bytes:
+        """Wait until the hub ends the connection; what came before that."""
+        async with asyncio.timeout(PATIENCE):
+            data = b""
+            try:
+                while chunk := await self.reader.read(65536):
+                    data += chunk
+            except ConnectionResetError:
+                pass
+            return data
+
+    def hang_up(self) -> None:
+        """Leave without a word: TCP reset."""
+        sock: socket.socket = self.writer.get_extra_info("socket")
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        self.writer.transport.abort()
+
+
+async def until(condition: Callable[[], bool]) -> None:
+    """Wait for what will become true."""
+    async with asyncio.timeout(PATIENCE):
+        while not condition():
+            await asyncio.sleep(0.01)

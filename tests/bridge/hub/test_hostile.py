@@ -1,0 +1,343 @@
+"""The hub on a socket, with clients that are broken, silent, greedy or hostile.
+
+Each test ends with a well-behaved client being served as if nothing had happened.
+"""
+
+import asyncio
+import json
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from websockets.frames import Opcode
+
+from bridge.hub.limits import HubLimits
+from tests.bridge.hub.sockets import PATIENCE, Bare, Ears, client, running_hub
+
+
+@asynccontextmanager
+async def _hub_and_witness(limits: HubLimits | None = None) -> AsyncIterator[tuple[int, Ears]]:
+    """A hub, and a client of it that hears its own messages before, and must do so after."""
+    async with running_hub(limits=limits) as port, client(port) as witness:
+        await witness.send(op="advertise", topic="/witness", type="a/B")
+        await witness.send(op="subscribe", topic="/witness")
+        await _serves(witness)
+        yield port, witness
+        await _serves(witness)
+
+
+async def _serves(witness: Ears) -> None:
+    await witness.send(op="publish", topic="/witness", msg={"well": True})
+    assert (await witness.hear())["msg"] == {"well": True}
+
+
+# --- wrong messages
+
+
+@pytest.mark.parametrize("fragments", [1, 3])
+async def test_a_message_that_is_too_large_costs_the_connection(fragments: int) -> None:
+    limits = HubLimits(message_bytes=10_000)
+    async with _hub_and_witness(limits) as (port, _witness), client(port) as greedy:
+        await greedy.settle()
+        part = "x" * (10_001 // fragments + 1)
+        await greedy.websocket.send(part if fragments == 1 else [part] * fragments)
+        assert await greedy.closed() == 1009
+
+
+async def test_a_huge_message_is_refused_before_it_has_come() -> None:
+    async with _hub_and_witness() as (port, _witness):
+        bare = await Bare.connect(port)
+        bare.writer.write(b"\x81\xff" + (1 << 62).to_bytes(8, "big") + b"mask" + b"x" * 100)
+        data = await bare.ended()
+        assert data[:1] == b"\x88"
+        assert data[2:4] == (1009).to_bytes(2, "big")
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"42",
+        b"[1,2,3]",
+        b"",
+        b"{",
+        b"\xff\xfe\xfd",
+        b'{"op":"publish","topic":"/witness","msg":{"a":"\xff"}}',
+        b'{"op":"publish","topic":"/witness","msg":{"a":%b%b}}' % (b"[" * 100_000, b"]" * 100_000),
+        b'{"op":"publish","topic":"/witness","msg":{"a":%bNaN%b}}' % (b"[" * 100_000, b"]" * 100_000),
+    ],
+    ids=lambda data: repr(data[:50]),
+)
+@pytest.mark.parametrize("opcode", [Opcode.TEXT, Opcode.BINARY])
+async def test_nonsense_leaves_no_zombie(data: bytes, opcode: Opcode) -> None:
+    async with _hub_and_witness() as (port, _witness):
+        bare = await Bare.connect(port)
+        bare.send(data, opcode=opcode)
+        bare.send_operation(op="call_service", service="/rosapi/get_ros_version", id=1)
+        opcode_heard, answer = await bare.frame()
+        assert opcode_heard == Opcode.TEXT
+        assert json.loads(answer)["values"]["version"] == 1
+        bare.hang_up()
+
+
+@pytest.mark.parametrize(
+    "frame",
+    [
+        b"\x81\x02{}",  # not masked
+        b"\x83\x80mask",  # no opcode
+        b"\xc1\x80mask",  # a reserved bit
+        b"\x80\x80mask",  # continues nothing
+        b"\x09\x80mask",  # a control frame in fragments
+        b"\x89\xfe\x00\x7emask" + b"x" * 126,  # a control frame that is too long
+        b"\x88\x81maskx",  # a close frame of one byte
+    ],
+)
+async def test_broken_frames_cost_the_connection(frame: bytes) -> None:
+    async with _hub_and_witness() as (port, _witness):
+        bare = await Bare.connect(port)
+        bare.writer.write(frame)
+        data = await bare.ended()
+        assert data[:1] == b"\x88"
+        assert data[2:4] == (1002).to_bytes(2, "big")
+
+
+async def test_fragments_without_end_and_without_content_take_nothing() -> None:
+    limits = HubLimits(message_bytes=1000)
+    async with _hub_and_witness(limits) as (port, witness):
+        bare = await Bare.connect(port)
+        bare.send(b"", fin=False)
+        for _ in range(20_000):
+            bare.send(b"", opcode=Opcode.CONT, fin=False)
+        await bare.writer.drain()
+        await witness.settle()
+        bare.send(b'{"op":"call_service","service":"/rosapi/get_ros_version"}', opcode=Opcode.CONT)
+        assert json.loads((await bare.frame())[1])["result"] is True
+        bare.hang_up()
+
+
+@given(st.lists(st.binary(max_size=200), max_size=5), st.booleans())
+@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+async def test_any_bytes_after_the_handshake(chunks: list[bytes], handshake: bool) -> None:
+    async with _hub_and_witness() as (port, witness):
+        bare = await Bare.connect(port, handshake=handshake)
+        for chunk in chunks:
+            bare.writer.write(chunk)
+            await witness.settle()
+        bare.hang_up()
+
+
+# --- floods
+
+
+async def test_a_flood_of_nonsense_leaves_others_served() -> None:
+    async with _hub_and_witness() as (port, witness):
+        bare = await Bare.connect(port)
+        flood = b"\x81\x82mask\x59\x53" * 20_000  # "42"
+        flooding = asyncio.create_task(_flood(bare, flood))
+        for _ in range(30):
+            await _serves(witness)
+        flooding.cancel()
+        bare.hang_up()
+
+
+async def _flood(bare: Bare, data: bytes) -> None:
+    while True:
+        bare.writer.write(data)
+        await bare.writer.drain()
+
+
+async def test_a_flood_of_messages_reaches_its_readers_and_leaves_others_served() -> None:
+    async with _hub_and_witness() as (port, witness), client(port) as reader:
+        await reader.send(op="subscribe", topic="/flood", type="a/B", queue_length=1)
+        await reader.settle()
+        bare = await Bare.connect(port)
+        for index in range(5000):
+            bare.send_operation(op="publish", topic="/flood", msg={"i": index})
+        for _ in range(10):
+            await _serves(witness)
+        heard = -1
+        while heard < 4999:  # some may be dropped, the last never, and none comes out of order
+            index = (await reader.hear())["msg"]["i"]
+            assert index > heard
+            heard = index
+        bare.hang_up()
+
+
+async def test_a_flood_of_calls_without_reading_costs_the_connection(quick_sweeps: None) -> None:
+    limits = HubLimits(message_bytes=200_000, client_bytes=200_000, topics=2000)
+    async with _hub_and_witness(limits) as (port, witness):
+        for index in range(1500):  # so that one answer has 50 kB
+            await witness.send(op="subscribe", topic=f"/a/long/name/of/a/topic/{index}")
+        await witness.settle()
+        bare = await Bare.connect(port, receive_buffer=4096)
+        for _ in range(1000):
+            bare.send_operation(op="call_service", service="/rosapi/topics")
+        await _gone(witness, bare)
+
+
+async def test_thousands_of_topics() -> None:
+    async with _hub_and_witness() as (port, witness), client(port) as many:
+        for index in range(3000):
+            await many.send(op="advertise", topic=f"/t{index}", type="a/B")
+            await many.send(op="subscribe", topic=f"/t{index}")
+        for index in range(3000):
+            await many.send(op="publish", topic=f"/t{index}", msg={"i": index})
+        for index in range(3000):
+            assert (await many.hear())["msg"] == {"i": index}
+        assert len((await witness.ask("/rosapi/topics"))["topics"]) == 3001
+
+
+# --- those who take nothing
+
+
+async def test_a_slow_client_misses_the_oldest_and_then_has_the_newest() -> None:
+    async with _hub_and_witness() as (port, witness):
+        slow = await Bare.connect(port, receive_buffer=4096)
+        slow.send_operation(op="subscribe", topic="/big", type="a/B", queue_length=2)
+        await until_subscribed(witness, "/big")
+        for count in range(300):  # 15 MB: more than socket buffers take
+            await witness.send(op="publish", topic="/big", msg={"i": count, "data": "x" * 50_000})
+        await witness.settle()
+        heard = []
+        while not heard or heard[-1] < 299:
+            async with asyncio.timeout(PATIENCE):
+                heard.append(json.loads((await slow.frame())[1])["msg"]["i"])
+        assert heard == sorted(set(heard))
+        assert len(heard) < 250
+        assert heard[-2:] == [298, 299]
+        slow.hang_up()
+
+
+async def until_subscribed(witness: Ears, topic: str) -> None:
+    async with asyncio.timeout(PATIENCE):
+        while not (await witness.ask("/rosapi/subscribers", topic=topic))["subscribers"]:
+            await asyncio.sleep(0.01)
+
+
+async def _gone(witness: Ears, bare: Bare) -> None:
+    """Wait until the hub has forgotten all clients but the witness."""
+    async with asyncio.timeout(PATIENCE):
+        while len((await witness.ask("/rosapi/nodes"))["nodes"]) > 2:
+            await asyncio.sleep(0.01)
+    await bare.ended()
+
+
+async def test_a_client_that_never_reads_is_closed_and_costs_others_nothing(quick_sweeps: None) -> None:
+    limits = HubLimits(stuck_timeout=0.2)
+    async with _hub_and_witness(limits) as (port, witness), client(port) as reader:
+        await reader.send(op="subscribe", topic="/big", type="a/B")
+        await reader.settle()
+        stuck = await Bare.connect(port, receive_buffer=4096)
+        stuck.send_operation(op="subscribe", topic="/big")
+        async with asyncio.timeout(PATIENCE):
+            while len((await witness.ask("/rosapi/subscribers", topic="/big"))["subscribers"]) < 2:
+                await asyncio.sleep(0.01)
+        count = 0
+        async with asyncio.timeout(PATIENCE):
+            while len((await witness.ask("/rosapi/subscribers", topic="/big"))["subscribers"]) == 2:
+                await witness.send(op="publish", topic="/big", msg={"i": count, "data": "x" * 50_000})
+                assert (await reader.hear())["msg"]["i"] == count
+                count += 1
+        assert count > 5
+        await stuck.ended()
+
+
+async def test_a_client_that_only_publishes_and_never_reads_may_stay(quick_sweeps: None) -> None:
+    limits = HubLimits(ping_interval=0.05, ping_timeout=0.1)
+    async with _hub_and_witness(limits) as (port, witness):
+        bare = await Bare.connect(port)
+        bare.send_operation(op="advertise", topic="/t", type="a/B")
+        for _ in range(20):
+            bare.send_operation(op="publish", topic="/t", msg={})
+            await asyncio.sleep(0.02)
+        assert (await witness.ask("/rosapi/publishers", topic="/t"))["publishers"]
+        bare.hang_up()
+
+
+# --- those who vanish
+
+
+async def test_a_silent_client_is_pinged_and_then_closed(quick_sweeps: None) -> None:
+    limits = HubLimits(ping_interval=0.1, ping_timeout=0.2)
+    async with _hub_and_witness(limits) as (port, witness):
+        bare = await Bare.connect(port)
+        assert await bare.frame() == (Opcode.PING, b"")
+        await _gone(witness, bare)
+
+
+async def test_a_client_that_answers_pings_may_be_silent(quick_sweeps: None) -> None:
+    limits = HubLimits(ping_interval=0.02, ping_timeout=0.1)
+    async with _hub_and_witness(limits) as (port, _witness):
+        bare = await Bare.connect(port)
+        for _ in range(10):
+            assert (await bare.frame())[0] == Opcode.PING
+            bare.send(b"", opcode=Opcode.PONG)
+        bare.send_operation(op="call_service", service="/rosapi/get_ros_version")
+        assert json.loads((await bare.frame())[1])["result"] is True
+        bare.hang_up()
+
+
+async def test_a_connection_without_a_handshake_is_closed(quick_sweeps: None) -> None:
+    async with _hub_and_witness(HubLimits(handshake_timeout=0.1)) as (port, _witness):
+        silent = await Bare.connect(port, handshake=False)
+        assert await silent.ended() == b""
+        slow = await Bare.connect(port, handshake=False)
+        slow.writer.write(b"GET / HTTP/1.1\r\n")
+        assert await slow.ended() == b""
+
+
+async def test_connections_without_a_handshake_do_not_fill_the_hub(quick_sweeps: None) -> None:
+    limits = HubLimits(clients=3, handshake_timeout=0.2)
+    async with _hub_and_witness(limits) as (port, _witness):
+        crowd = [await Bare.connect(port, handshake=False) for _ in range(100)]
+        for bare in crowd:
+            assert await bare.ended() == b""
+        async with client(port) as late:
+            await late.settle()
+
+
+async def test_a_server_that_hangs_up_during_a_call_fails_it() -> None:
+    async with _hub_and_witness() as (port, witness):
+        server = await Bare.connect(port)
+        server.send_operation(op="advertise_service", service="/add", type="a/Add")
+        async with asyncio.timeout(PATIENCE):
+            while "/add" not in (await witness.ask("/rosapi/services"))["services"]:
+                await asyncio.sleep(0.01)
+        await witness.send(op="call_service", service="/add", id="x")
+        assert json.loads((await server.frame())[1])["op"] == "call_service"
+        server.hang_up()
+        answer = await witness.hear()
+        assert (answer["id"], answer["result"]) == ("x", False)
+
+
+@pytest.mark.parametrize("how", ["reset", "eof", "mid-message"])
+async def test_whoever_vanishes_leaves_nothing(how: str) -> None:
+    async with _hub_and_witness() as (port, witness):
+        bare = await Bare.connect(port)
+        bare.send_operation(op="subscribe", topic="/t", type="a/B")
+        bare.send_operation(op="advertise", topic="/t", type="a/B", latch=True)
+        bare.send_operation(op="publish", topic="/t", msg={})
+        await until_subscribed(witness, "/t")
+        if how == "mid-message":
+            bare.writer.write(b"\x81\xfe\x01\x00maskpart of it")
+            await bare.writer.drain()
+        if how == "eof":
+            bare.writer.write_eof()
+        else:
+            bare.hang_up()
+        async with asyncio.timeout(PATIENCE):
+            while "/t" in (await witness.ask("/rosapi/topics"))["topics"]:
+                await asyncio.sleep(0.01)
+
+
+async def test_clients_that_come_and_go_leave_nothing() -> None:
+    async with _hub_and_witness() as (port, witness):
+        for _ in range(100):
+            bare = await Bare.connect(port)
+            bare.send_operation(op="subscribe", topic="/witness")
+            await _serves(witness)
+            bare.hang_up()
+        async with asyncio.timeout(PATIENCE):
+            while len((await witness.ask("/rosapi/nodes"))["nodes"]) > 2:
+                await asyncio.sleep(0.01)

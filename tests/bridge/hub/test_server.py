@@ -1,0 +1,232 @@
+"""The hub on a socket, with well-behaved clients."""
+
+import asyncio
+import socket
+from contextlib import AsyncExitStack
+
+import pytest
+from websockets.asyncio.client import connect
+from websockets.exceptions import InvalidStatus
+
+from bridge.hub.errors import HubError
+from bridge.hub.limits import HubLimits
+from bridge.hub.server import serve_hub
+from tests.bridge.hub.sockets import PATIENCE, Bare, client, running_hub
+
+
+async def test_a_message_passes_from_client_to_client() -> None:
+    async with running_hub() as port, client(port) as publisher, client(port) as subscriber:
+        await subscriber.send(op="subscribe", topic="/t", type="a/B")
+        await subscriber.settle()
+        await publisher.send(op="advertise", topic="/t", type="a/B")
+        await publisher.send(op="publish", topic="/t", msg={"data": [1.5, None]})
+        assert await subscriber.hear() == {"op": "publish", "topic": "/t", "msg": {"data": [1.5, None]}}
+
+
+@pytest.mark.parametrize("size", [0, 60, 80, 100, 200, 65_400, 65_500, 65_600, 200_000, (1 << 20) - 60])
+async def test_messages_of_every_length_arrive_whole(size: int) -> None:
+    async with running_hub() as port, client(port) as ears:
+        await ears.send(op="advertise", topic="/t", type="a/B")
+        await ears.send(op="subscribe", topic="/t")
+        for text in ("x" * size, "y" * size):
+            await ears.send(op="publish", topic="/t", msg={"data": text})
+        assert (await ears.hear())["msg"]["data"] == "x" * size
+        assert (await ears.hear())["msg"]["data"] == "y" * size
+
+
+async def test_many_messages_arrive_in_order_through_many_clients() -> None:
+    async with running_hub(limits=HubLimits(queue_length=5000)) as port, AsyncExitStack() as stack:
+        clients = [await stack.enter_async_context(client(port)) for _ in range(10)]
+        for ears in clients:
+            await ears.send(op="subscribe", topic="/t", type="a/B", queue_length=5000)
+            await ears.settle()
+        for index in range(500):
+            await clients[0].send(op="publish", topic="/t", msg={"i": index})
+        for ears in clients:
+            assert [(await ears.hear())["msg"]["i"] for _ in range(500)] == list(range(500))
+
+
+async def test_a_service_between_clients() -> None:
+    async with running_hub() as port, client(port) as server, client(port) as caller:
+        await server.send(op="advertise_service", service="/add", type="a/Add")
+        await server.settle()
+        await caller.send(op="call_service", service="/add", args={"a": 1}, id="x")
+        request = await server.hear()
+        await server.send(op="service_response", id=request["id"], values={"sum": 2}, result=True)
+        assert (await caller.hear())["values"] == {"sum": 2}
+
+
+async def test_what_a_throttle_held_comes_later_by_itself() -> None:
+    async with running_hub() as port, client(port) as ears:
+        await ears.send(op="subscribe", topic="/t", type="a/B", throttle_rate=30, queue_length=10)
+        for index in range(4):
+            await ears.send(op="publish", topic="/t", msg={"i": index})
+        assert [(await ears.hear())["msg"]["i"] for _ in range(4)] == [0, 1, 2, 3]
+
+
+async def test_a_call_without_an_answer_fails_by_itself() -> None:
+    limits = HubLimits(call_timeout=0.1)
+    async with running_hub(limits=limits) as port, client(port) as server, client(port) as caller:
+        await server.send(op="advertise_service", service="/add", type="a/Add")
+        await server.settle()
+        for number in range(2):
+            await caller.send(op="call_service", service="/add", id=number)
+            answer = await caller.hear()
+            assert (answer["id"], answer["result"]) == (number, False)
+            assert "/add" in answer["values"]
+
+
+async def test_binary_and_fragmented_messages_are_messages() -> None:
+    async with running_hub() as port, client(port) as ears:
+        await ears.send(op="subscribe", topic="/t", type="a/B")
+        await ears.websocket.send(b'{"op":"publish","topic":"/t","msg":{"a":1}}')
+        await ears.websocket.send(['{"op":"publish",', '"topic":"/t","m', "", 'sg":{"a":2}}'])
+        assert [(await ears.hear())["msg"] for _ in range(2)] == [{"a": 1}, {"a": 2}]
+
+
+@pytest.mark.parametrize("path", ["/", "/rosbridge", "/a/b?c=d"])
+async def test_any_path_will_do(path: str) -> None:
+    async with running_hub() as port:
+        bare = await Bare.connect(port, handshake=False)
+        assert " 101 " in await bare.request(path=path)
+        bare.hang_up()
+
+
+async def test_nothing_is_compressed() -> None:
+    async with running_hub() as port, client(port, compression="deflate") as ears:
+        assert ears.websocket.response is not None
+        assert "Sec-WebSocket-Extensions" not in ears.websocket.response.headers
+
+
+async def test_a_client_can_leave_politely() -> None:
+    async with running_hub() as port, client(port) as stays:
+        async with client(port) as leaves:
+            await leaves.send(op="subscribe", topic="/t", type="a/B")
+            await leaves.settle()
+        assert await leaves.closed() == 1000
+        assert (await stays.ask("/rosapi/topics"))["topics"] == []
+
+
+async def test_the_end_of_the_hub_is_told_to_its_clients() -> None:
+    async with AsyncExitStack() as clients, AsyncExitStack() as hub:
+        port = await hub.enter_async_context(running_hub())
+        ears = await clients.enter_async_context(client(port))
+        await ears.settle()
+        await hub.aclose()
+        assert await ears.closed() == 1001
+        with pytest.raises(OSError):  # noqa: PT011 - refused, by whichever loop's class
+            await connect(f"ws://127.0.0.1:{port}")
+
+
+async def test_the_hub_ends_although_a_client_does_not(quick_sweeps: None) -> None:
+    async with AsyncExitStack() as stack:
+        port = await stack.enter_async_context(running_hub())
+        deaf = await Bare.connect(port)
+        half = await Bare.connect(port, handshake=False)
+        await asyncio.wait_for(stack.aclose(), PATIENCE)
+        assert await deaf.ended() == b"\x88\x0e\x03\xe9the hub ends"
+        assert await half.ended() == b""
+
+
+async def test_the_port_can_be_used_again_at_once() -> None:
+    async with running_hub() as port, client(port) as ears:
+        await ears.settle()
+    stop = asyncio.Event()
+    stop.set()
+    await serve_hub("127.0.0.1", port, stop=stop)
+
+
+async def test_an_address_in_use_is_one_sentence() -> None:
+    async with running_hub() as port:
+        with pytest.raises(HubError, match=f"127.0.0.1 port {port}.*ddress.*in use") as caught:
+            await serve_hub("127.0.0.1", port, stop=asyncio.Event())
+        assert caught.value.exit_code == 2
+        assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("host", "port"), [("192.0.2.1", 0), ("no-such-host.invalid", 0), ("127.0.0.1", 70000)]
+)
+async def test_an_address_that_is_not_ours_is_one_sentence(host: str, port: int) -> None:
+    with pytest.raises(HubError, match=f"{host} port {port}"):
+        await serve_hub(host, port, stop=asyncio.Event())
+
+
+# --- who may come in
+
+
+@pytest.mark.parametrize(
+    ("origin", "status"),
+    [
+        (None, 101),
+        ("http://localhost", 101),
+        ("http://localhost:8000", 101),
+        ("https://127.0.0.1:8443", 101),
+        ("http://[::1]:3000", 101),
+        ("https://robot.example", 101),
+        ("https://robot.example:8080", 403),
+        ("http://robot.example", 403),
+        ("https://evil.example", 403),
+        ("http://localhost.evil.example", 403),
+        ("http://localhost:80@evil.example", 403),
+        ("null", 403),
+        ("", 403),
+    ],
+)
+async def test_web_pages_from_elsewhere_are_refused(origin: str | None, status: int) -> None:
+    async with running_hub(origins=("https://robot.example",)) as port:
+        bare = await Bare.connect(port, handshake=False)
+        headers = [] if origin is None else [f"Origin: {origin}"]
+        assert f" {status} " in await bare.request(*headers)
+        bare.hang_up()
+
+
+async def test_too_many_clients_are_told_so() -> None:
+    async with running_hub(limits=HubLimits(clients=2)) as port:
+        async with client(port) as one, client(port):
+            with pytest.raises(InvalidStatus) as caught:
+                await connect(f"ws://127.0.0.1:{port}")
+            assert caught.value.response.status_code == 503
+            await one.settle()
+        async with client(port) as late:
+            await late.settle()
+
+
+async def test_a_web_browser_is_told_what_this_is() -> None:
+    async with running_hub() as port:
+        bare = await Bare.connect(port, handshake=False)
+        bare.writer.write(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        answer = await bare.ended()
+        assert answer.startswith(b"HTTP/1.1 426 ")
+        assert b"WebSocket" in answer
+
+
+@pytest.mark.parametrize(
+    "garbage", [b"\r\n\r\n", b"SSH-2.0-x\r\n\r\n", b"\x16\x03\x01" + b"\0" * 300, b"x" * 100_000]
+)
+async def test_what_is_no_http_is_ended(garbage: bytes) -> None:
+    async with running_hub() as port, client(port) as ears:
+        bare = await Bare.connect(port, handshake=False)
+        bare.writer.write(garbage)
+        bare.writer.write_eof()
+        await bare.ended()
+        await ears.settle()
+
+
+def test_the_loop_is_left_as_it_was() -> None:
+    """A hub leaves no task, timer or socket behind in its event loop."""
+
+    async def life() -> int:
+        async with running_hub() as port, client(port) as ears:
+            await ears.send(op="subscribe", topic="/t", type="a/B", throttle_rate=60_000, queue_length=9)
+            for index in range(3):
+                await ears.send(op="publish", topic="/t", msg={"i": index})
+            await ears.hear()
+            await ears.settle()
+        tasks = asyncio.all_tasks() - {asyncio.current_task()}
+        assert not tasks
+        return port
+
+    port = asyncio.run(life())
+    with socket.socket() as sock, pytest.raises(ConnectionRefusedError):
+        sock.connect(("127.0.0.1", port))
