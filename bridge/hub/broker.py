@@ -14,6 +14,7 @@ strict JSON, with ``null`` for every NaN and infinity that came in.
 
 import itertools
 import logging
+import re
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -37,12 +38,14 @@ from bridge.hub.limits import HubLimits
 from bridge.hub.outbox import Outbox
 from bridge.hub.rosapi import PREFIX, Rosapi, RosapiError
 from bridge.json_codec import decode
-from bridge.names import absolute, check_name, same_type, split_type
+from bridge.names import MAX_NAME, absolute, same_type, split_type
 
 log = logging.getLogger(__name__)
 
 _Operation = dict[str, Any]
 
+#: What both ROS 1 and ROS 2 would take, and a little more: parts that start with a digit (``/camera/0``).
+_NAME: Final = re.compile(r"[~/]?[A-Za-z0-9_]+(?:/[A-Za-z0-9_]+)*")
 #: Characters of an operation's id at most: the hub remembers those of what is open.
 _LONGEST_ID: Final = 1024
 #: No rate, length or time is as large.
@@ -215,7 +218,7 @@ class Broker:
         if type_needed and not known and type_name is None:
             raise _RefusedError(f"nobody said of which type {name} is: advertise it first")
         if topic is None:
-            check_name(name)
+            _checked_name(name)
             if len(self.graph.topics) >= self.limits.topics:
                 raise _RefusedError(f"{name} would be one topic more than {self.limits.topics}")
             topic = self.graph.topics[absolute(name)] = Topic(absolute(name))
@@ -361,7 +364,7 @@ class Broker:
     # --- services
 
     def _advertise_service(self, client: Client, operation: _Operation, _now: float) -> None:
-        name, type_name = check_name(_text(operation, "service")), _text(operation, "type")
+        name, type_name = _checked_name(_text(operation, "service")), _text(operation, "type")
         split_type(type_name)
         key = absolute(name)
         if key.startswith(PREFIX):
@@ -479,6 +482,12 @@ def _prefix(name: str) -> bytes:
 
 #: Bytes around a topic's name and a message's JSON.
 _AROUND: Final = len(_prefix("")) + 1
+
+
+def _checked_name(name: str) -> str:
+    if len(name) > MAX_NAME or _NAME.fullmatch(name) is None:
+        raise _RefusedError(f"{name[:80]!r} cannot be a name: letters, digits, _ and / make one")
+    return name
 
 
 def _is_round(count: int) -> bool:

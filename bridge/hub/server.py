@@ -37,14 +37,16 @@ _LOCAL_ORIGIN: Final = re.compile(r"https?://(localhost|127\.\d+\.\d+\.\d+|\[::1
 _WRITE_BUFFER: Final = 64 * 1024
 #: Bytes that wait in the kernel for one socket: more would only be older when they arrive.
 _SEND_BUFFER: Final = 256 * 1024
-#: Bytes of one client that are worked on before others have their turn.
-_SLICE: Final = 32 * 1024
+#: Frames of one client that are worked on before others have their turn, looked at after so many bytes.
+_TURN: Final = 64
+_SLICE: Final = 4 * 1024
 #: Seconds between two looks for silent and stuck clients.
 _SWEEP: Final = 1.0
 #: Seconds that a peer has to end a connection which we closed.
 _CLOSE_TIMEOUT: Final = 2.0
 #: Connections whose handshake is under way, beyond the clients.
 _HANDSHAKES: Final = 64
+_LAST_PORT: Final = 65535
 #: Payloads from these lengths on have a longer header (RFC 6455, section 5.2).
 _MEDIUM_FRAME: Final = 126
 _LONG_FRAME: Final = 1 << 16
@@ -74,13 +76,17 @@ async def serve_hub(
     Raises:
         HubError: the address cannot be served.
     """
+    if not 0 <= port <= _LAST_PORT:
+        raise HubError(
+            f"the hub cannot listen on {host} port {port}: a port is a number from 0 to {_LAST_PORT}"
+        )
     hub = _Hub(limits or HubLimits(), origins)
     loop = asyncio.get_running_loop()
     try:
         server = await loop.create_server(lambda: _Connection(hub), host, port)
-    except (OSError, OverflowError) as error:  # OverflowError: no port has this number
+    except OSError as error:
         raise HubError(
-            f"the hub cannot listen on {host} port {port} ({getattr(error, 'strerror', None) or error}): "
+            f"the hub cannot listen on {host} port {port} ({error.strerror or error}): "
             "end what listens there already, or choose another host or port"
         ) from None
     try:
@@ -202,13 +208,15 @@ class _Connection(asyncio.Protocol):
         transport.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
 
     def data_received(self, data: bytes) -> None:
-        """Do what arrived, to the last answer it causes; but after a slice of it others have their turn."""
+        """Do what arrived, to the last answer it causes; but after many frames others have their turn."""
         self._heard = time.monotonic()
         if len(data) <= _SLICE:
             self._take(data)
         else:
-            self._transport.pause_reading()
-            self._take_slice(memoryview(data))
+            rest = self._take_turn(memoryview(data))
+            if rest:
+                self._transport.pause_reading()
+                asyncio.get_running_loop().call_soon(self._go_on, rest)
 
     def eof_received(self) -> None:
         """A client that ends its half ends the whole."""
@@ -280,23 +288,32 @@ class _Connection(asyncio.Protocol):
 
     # --- the rest
 
-    def _take_slice(self, data: memoryview) -> None:
-        if self._transport.is_closing():
-            return
-        self._take(bytes(data[:_SLICE]))
-        if len(data) > _SLICE:
-            asyncio.get_running_loop().call_soon(self._take_slice, data[_SLICE:])
+    def _go_on(self, data: memoryview) -> None:
+        rest = self._take_turn(data)
+        if rest:
+            asyncio.get_running_loop().call_soon(self._go_on, rest)
         elif not self._transport.is_closing():
             self._transport.resume_reading()
 
-    def _take(self, data: bytes) -> None:
+    def _take_turn(self, data: memoryview) -> memoryview:
+        """Work on a client's data until its turn is over; what is left of it."""
+        frames = 0
+        while data and frames < _TURN and not self._transport.is_closing():
+            frames += self._take(bytes(data[:_SLICE]))
+            data = data[_SLICE:]
+        return data[:0] if self._transport.is_closing() else data
+
+    def _take(self, data: bytes) -> int:
+        """Do what the next bytes ask for; how many frames they had."""
         self._protocol.receive_data(data)
-        for event in self._protocol.events_received():
+        events = self._protocol.events_received()
+        for event in events:
             if isinstance(event, Frame):
                 self._take_frame(event)
             elif isinstance(event, Request):
                 self._answer_request(event)
         self._after_protocol()
+        return len(events)
 
     def _answer_request(self, request: Request) -> None:
         protocol = self._protocol
