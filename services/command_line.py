@@ -47,28 +47,38 @@ def ends_well(command: Callable[Parameters, int | None]) -> Callable[Parameters,
     @functools.wraps(command)
     def run(*args: Parameters.args, **kwargs: Parameters.kwargs) -> None:
         try:
-            code = command(*args, **kwargs) or ExitCode.DONE
-        except KeyboardInterrupt:
-            code = ExitCode.INTERRUPTED
-            say("interrupted (Ctrl-C)")
-        except BrokenPipeError:
-            # whoever read our output has what it wanted (as `| head` does)
-            code = ExitCode.DONE
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        except Exception as error:
-            code = exit_code_of(error)
-            if code == ExitCode.BUG:
-                say(traceback.format_exc().rstrip())
-                say("error: this is a bug in rosbayes; please report it with the lines above")
-            elif isinstance(error, StoppedError):
-                # a child ends because its parent says so, which is no news
-                if PARENT_VARIABLE not in os.environ:
-                    say(str(error))
-            else:
-                say(f"error: {error}")
-        raise typer.Exit(int(code))
+            code = _outcome(functools.partial(command, *args, **kwargs))
+        except StoppedError as stopped:  # a signal came while another end was being told
+            code = stopped.exit_code
+        raise typer.Exit(code)
 
     return run
+
+
+def _outcome(command: Callable[[], int | None]) -> int:
+    """Run a command, tell its failure, and give its exit code; from then on signals are ignored."""
+    try:
+        code = int(command() or ExitCode.DONE)
+    except KeyboardInterrupt:
+        code = ExitCode.INTERRUPTED
+        say("interrupted (Ctrl-C)")
+    except BrokenPipeError:
+        # whoever read our output has what it wanted (as `| head` does)
+        code = ExitCode.DONE
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except Exception as error:
+        code = exit_code_of(error)
+        if code == ExitCode.BUG:
+            say(traceback.format_exc().rstrip())
+            say("error: this is a bug in rosbayes; please report it with the lines above")
+        elif not isinstance(error, StoppedError):
+            say(f"error: {error}")
+        elif PARENT_VARIABLE not in os.environ:
+            # a child ends because its parent says so, which is no news
+            say(str(error))
+    for number in _SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
+    return code
 
 
 def run_async(main: Coroutine[Any, Any, int | None]) -> int:

@@ -143,8 +143,8 @@ def edited(boat, directory, old: str, new: str):
     [
         ("format = 1", "format = 2", ["format 2", "format 1"]),
         ("target_count = 255", "target_count = 200", ["not as it was built", "hash"]),
-        ("target_count", "target_cuont", ["target_cuont", "target_count", "deployment.toml:"]),
-        ("prob_bits = 8", 'prob_bits = "8"', ["prob_bits", "deployment.toml:"]),
+        ("target_count", "target_cuont", ["target_cuont", "target_count", "deployment.toml, line"]),
+        ("prob_bits = 8", 'prob_bits = "8"', ["prob_bits", "deployment.toml, line"]),
     ],
     ids=["another version", "edited", "wrong key", "wrong value"],
 )
@@ -164,7 +164,7 @@ async def test_a_damaged_image_is_named_with_its_hash(stage, boat, server, tmp_p
     code, sentence = await once(stage, tmp_path / "d", server[0])
     assert code == 2
     assert "board2.bm" in sentence
-    assert "hash" in sentence or "SHA-256" in sentence
+    assert "sha256" in sentence
 
 
 async def test_no_deployment(stage, tmp_path):
@@ -186,7 +186,7 @@ async def test_a_board_with_another_image(stage, boat, server, tmp_path):
     endpoints = ",".join(f"unix:{sockets}/board{at}.sock" for at in range(4))
     code, sentence = await once(stage, boat, server[0], "--boards", endpoints)
     assert code == 2
-    assert "board 1" in sentence
+    assert "board 1" in sentence.lower()
     assert sentence.count("image") >= 1
 
 
@@ -208,7 +208,7 @@ async def test_a_board_that_never_says_done(stage, boat, server, tmp_path):
     await robot.keep_publishing()
     code, sentence = await once(stage, boat, uri, "--boards", endpoints, "--board-timeout", "0.5")
     assert code == 5
-    assert "board 1" in sentence
+    assert "board 1" in sentence.lower()
 
 
 async def test_in_a_loop_a_board_that_stops_answering_ends_the_run_after_the_fourth_time(
