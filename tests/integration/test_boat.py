@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from casestudies.boat.model import model as boat_model
-from machines.posterior import joint_posterior
 
 from casestudies.boat.correctness import correctness
 from casestudies.boat.geometry import map_grid
 from casestudies.boat.messages import SENSOR_NAMES
+from casestudies.boat.model import model as boat_model
+from machines.posterior import joint_posterior
 from machines.reference import ReferenceBM1
 from pcie_shim.programming_file import read_image
 from tests.integration.conftest import READING, build_boat
