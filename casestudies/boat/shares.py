@@ -40,7 +40,7 @@ _STAGES: Final[tuple[tuple[str, Part, Callable[[Instance], float | None]], ...]]
     ("rosbridge in", Part.ROSBRIDGE, _reported("rosbridge_in")),
     ("local hops", Part.HOST, _reported("local_hops")),
     ("register writes", Part.REGISTERS, _reported("register_writes")),
-    ("compute", Part.COMPUTING, _reported("compute")),
+    ("computing", Part.COMPUTING, _reported("compute")),
     ("register reads", Part.REGISTERS, _reported("reads")),
     ("rosbridge out", Part.ROSBRIDGE, lambda instance: instance.rosbridge_out_us),
 )

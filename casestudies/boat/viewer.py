@@ -244,6 +244,7 @@ def _frame_numbers(line: Line, instance: "Instance") -> dict[str, object]:
         "distance_cells": line.distance,
         "cycles": line.cycles,
         "counts_total": report.counts_total if report else None,
+        "boards_compute_us": report.stages.boards_compute if report else None,
         "time_ms": line.time_ms,
         "outcome": line.outcome,
         "boards": [

@@ -130,7 +130,7 @@ class TestShares:
             "rosbridge in",
             "local hops",
             "register writes",
-            "compute",
+            "computing",
             "register reads",
             "rosbridge out",
         ]
@@ -141,7 +141,10 @@ class TestShares:
 
     def test_stages_that_nobody_told_are_left_out(self):
         shares = stage_shares([instance(1, compute=500), instance(2)])
-        assert [(stage.name, stage.mean_us) for stage in shares] == [("compute", 500), ("rosbridge out", 500)]
+        assert [(stage.name, stage.mean_us) for stage in shares] == [
+            ("computing", 500),
+            ("rosbridge out", 500),
+        ]
 
     def test_nothing_heard(self):
         assert stage_shares([]) == ()
