@@ -12,12 +12,14 @@ import json
 import math
 import re
 from collections import Counter
+from enum import StrEnum
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Any, Final, Literal, Self, TypeVar
 
 import tomli_w
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
 
+from machines.parameters import PriorMode, RngKind, RngReset
 from toolchain.errors import DamagedDeploymentError, DeploymentError, DeploymentVersionError
 from toolchain.toml_file import parse_toml, read_text, validate
 
@@ -79,8 +81,27 @@ Sha256 = Annotated[str, AfterValidator(_sha256)]
 Step = Annotated[float, AfterValidator(_not_zero)]
 
 Item = TypeVar("Item")
-# TOML has arrays, we keep tuples; the items stay strict.
+# TOML has arrays and strings, we keep tuples and enums; what is inside them stays strict.
 Sequence = Annotated[tuple[Item, ...], Field(strict=False)]
+Choice = Annotated[Item, Field(strict=False)]
+
+
+class Stop(StrEnum):
+    """When the boards of a partitioned machine stop."""
+
+    SLICES = "slices"
+    """All at the end of the slice in which the first one overflows."""
+    OWN = "own"
+    """Each at its own overflow, as in the thesis."""
+
+
+class Queue(StrEnum):
+    """What happens to frames that come faster than they are computed."""
+
+    LATEST = "latest"
+    """The newest wins; what was passed over is counted."""
+    ALL = "all"
+    """All are computed, in order."""
 
 
 class _Section(BaseModel):
@@ -106,7 +127,7 @@ class Variable(_Section):
     source: int = Field(default=0, ge=0)
     path: str = ""
     kind: Literal["sensor"] = "sensor"
-    bits: int = Field(ge=1, le=24)
+    bits: int = Field(ge=1, le=16)
     offset: float = 0.0
     step: Step = 1.0
     period: int | None = Field(default=None, ge=1)
@@ -146,16 +167,16 @@ class MachineSection(_Section):
     interface: str = "20x1200"
     prob_bits: int = Field(default=8, ge=1, le=16)
     prior_bits: int = Field(default=0, ge=0, le=16)
-    prior_mode: Literal["table", "written"] = "table"
+    prior_mode: Choice[PriorMode] = PriorMode.TABLE
     counter_bits: int = Field(default=8, ge=1, le=32)
-    rng: Literal["lfsr8", "lfsr16", "lfsr24", "lfsr32", "table", "ideal"] = "lfsr32"
+    rng: Choice[RngKind] = RngKind.LFSR32
     rng_banks: int = Field(default=16, ge=1)
-    rng_reset: Literal["bank", "free"] = "bank"
+    rng_reset: Choice[RngReset] = RngReset.BANK
     shared: bool = True
     steps_per_clock: int = Field(default=8, ge=1)
     target_count: int = Field(default=255, ge=1)
     max_cycles: int = Field(default=2**17, ge=1)
-    stop: Literal["slices", "own"] = "slices"
+    stop: Choice[Stop] = Stop.SLICES
 
     @field_validator("interface")
     @classmethod
@@ -222,7 +243,7 @@ class DeploymentFile(_Section):
     format: Literal[1] = FORMAT
     name: Name
     hash: str = ""
-    queue: Literal["latest", "all"] = "latest"
+    queue: Choice[Queue] = Queue.LATEST
     tolerance_s: float = Field(default=0.05, ge=0)
     sources: Sequence[Source] = Field(validation_alias="source", min_length=1)
     variables: Sequence[Variable] = Field(default=(), validation_alias="variable")
@@ -386,7 +407,7 @@ def deployment_text(deployment: DeploymentFile) -> str:
 
 def _check_images(deployment: Deployment) -> None:
     # Here, not above: a subscriber loads a deployment without NumPy.
-    from pcie_shim.errors import PcieShimError
+    from pcie_shim.errors import DamagedImageError, PcieShimError
     from pcie_shim.programming_file import read_image
 
     for index, board in enumerate(deployment.boards):
@@ -398,8 +419,10 @@ def _check_images(deployment: Deployment) -> None:
             raise DamagedDeploymentError(message)
         try:
             image = read_image(path)
-        except PcieShimError as reason:
+        except DamagedImageError as reason:
             raise DamagedDeploymentError(str(reason)) from reason
+        except PcieShimError as reason:
+            raise DeploymentError(str(reason)) from reason
         if image.image_hash != board.image_hash:
             message = (
                 f"{path} is another board's or another build's image: its hash is {image.image_hash[:16]}, "

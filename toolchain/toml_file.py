@@ -125,7 +125,7 @@ def _sentence(model: type[BaseModel], detail: ErrorDetails, text: str, path: Pat
             return f"{where}: unknown key '{place[-1]}'{section}; {_nearest(str(place[-1]), known)}"
         case "missing":
             return f"{where}: the key '{place[-1]}' is missing{section}"
-        case "literal_error":
+        case "literal_error" | "enum":
             expected = [word.strip("' ") for word in re.split(r",| or ", str(detail["ctx"]["expected"]))]
             nearest = _nearest(str(detail["input"]), expected)
             return f"{where}: {key} = {detail['input']!r}{section} is not a value it can have; {nearest}"

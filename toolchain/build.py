@@ -1,0 +1,320 @@
+"""Builds a deployment from a model: codes, partitions, programming files and `deployment.toml` (thesis 3.4)."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+from pydantic import ValidationError
+
+from machines.bm1 import BM1Machine
+from machines.errors import MachineError
+from machines.parameters import BM1Parameters, RngKind
+from pcie_shim import register_map
+from pcie_shim.errors import PcieShimError
+from pcie_shim.programming_file import Image, Partition, tool_version, write_image
+from toolchain.deployment import (
+    FILE_NAME,
+    Board,
+    Deployment,
+    MachineSection,
+    Output,
+    Source,
+    write_deployment,
+)
+from toolchain.errors import BuildError
+from toolchain.partition import Block, partition_lines
+from toolchain.quantise import Quantised, quantise
+
+if TYPE_CHECKING:
+    from toolchain.model import Model
+    from toolchain.options import BuildOptions
+
+DEFAULT_INTERFACE: Final = (20, 1200)
+"""Inputs and results of the thesis's PCIe interface (3.2)."""
+
+REPORT_NAME: Final = "report.txt"
+
+_FLAGS: Final = {"uri": "--uri", "topic": "--topic", "type": "--type"}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Built:
+    """A deployment that was written, and what there is to say about it."""
+
+    deployment: Deployment
+    quantised: Quantised
+    report: str
+
+
+def build_deployment(model: Model, directory: Path, options: BuildOptions) -> Built:
+    """Write a model's deployment: `deployment.toml`, an image per board, and a report.
+
+    The same model and options give the same bytes.
+
+    Args:
+        model: The model.
+        directory: Where to; made if it is not there. A deployment that is there is replaced.
+        options: Everything else.
+
+    Raises:
+        BuildError: Options that don't fit each other, the model or the register map, or a folder that can't be
+            written.
+    """
+    blocks = partition_lines(model.lines, options.partitions)
+    interface, interface_reason = _interface(model, blocks, options.interface)
+    try:
+        parameters = BM1Parameters(
+            lines=model.lines,
+            sensor_bits=tuple(known.bits for known in model.known),
+            prob_bits=options.prob_bits,
+            counter_bits=options.counter_bits,
+            rng=options.rng,
+            rng_banks=options.rng_banks,
+            rng_reset=options.rng_reset,
+        )
+        if parameters.rng is RngKind.TABLE:
+            message = (
+                "rng = table plays a table of random numbers, which this toolchain doesn't make: use an LFSR"
+            )
+            raise BuildError(message)
+        quantised = quantise(model, prob_bits=options.prob_bits, scale=options.scale)
+        images = _images(model, quantised, parameters, blocks, interface, options)
+    except (MachineError, PcieShimError) as reason:
+        raise BuildError(str(reason)) from reason
+    deployment = _deployment(model, parameters, images, blocks, interface, options)
+    written = _write(Path(directory), deployment, images)
+    report = _report(model, written, quantised, interface_reason, options)
+    try:
+        (written.directory / REPORT_NAME).write_text(report, encoding="utf-8")
+    except OSError as reason:
+        raise _not_writable(written.directory / REPORT_NAME, reason) from None
+    return Built(deployment=written, quantised=quantised, report=report)
+
+
+def build_date(model_file: Path) -> str:
+    """Return the date that a build of this model file carries, ISO 8601 in UTC.
+
+    It is `SOURCE_DATE_EPOCH` where that is set, else the file's last change: the same input gives the same bytes.
+
+    Raises:
+        BuildError: `SOURCE_DATE_EPOCH` is no time.
+    """
+    epoch = os.environ.get("SOURCE_DATE_EPOCH")
+    try:
+        seconds = int(model_file.stat().st_mtime) if epoch is None else int(epoch)
+        return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(seconds))
+    except (ValueError, OverflowError, OSError):
+        message = f"SOURCE_DATE_EPOCH is {epoch!r}, expected a number of seconds since 1970"
+        raise BuildError(message) from None
+
+
+def _interface(
+    model: Model, blocks: tuple[Block, ...], given: tuple[int, int] | None
+) -> tuple[tuple[int, int], str]:
+    """Return the boards' inputs and results, and a clause that says why where they are not the default."""
+    sensors, lines = len(model.known), max(block.lines for block in blocks)
+    room = (register_map.SENSORS_WORDS, register_map.RESULTS_WORDS)
+    if sensors > room[0] or lines > room[1]:
+        partitions = -(-model.lines // room[1])
+        message = (
+            f"the model has {sensors} known variables and {lines} lines on a board, but the register map has room "
+            f"for {room[0]} and {room[1]}"
+        )
+        if lines > room[1]:
+            message += f": use --partitions {partitions} or more"
+        raise BuildError(message)
+    if given is None:
+        larger = (max(sensors, DEFAULT_INTERFACE[0]), max(lines, DEFAULT_INTERFACE[1]))
+        if larger == DEFAULT_INTERFACE:
+            return larger, ""
+        return larger, (
+            f", larger than the default {DEFAULT_INTERFACE[0]}x{DEFAULT_INTERFACE[1]}: a board needs {sensors} inputs "
+            f"and {lines} results"
+        )
+    if sensors > given[0] or lines > given[1]:
+        message = (
+            f"the model is larger than the interface {given[0]}x{given[1]}: a board needs {sensors} inputs and "
+            f"{lines} results; use --interface {max(sensors, given[0])}x{max(lines, given[1])} or leave it out"
+        )
+        if lines > given[1]:
+            message += f", or --partitions {-(-model.lines // given[1])}"
+        raise BuildError(message)
+    if given[0] > room[0] or given[1] > room[1]:
+        message = f"the interface {given[0]}x{given[1]} is larger than the register map's {room[0]}x{room[1]}"
+        raise BuildError(message)
+    return given, ", as asked for"
+
+
+def model_hash(model: Model, quantised: Quantised, parameters: BM1Parameters) -> str:
+    """Return the SHA-256 (hexadecimal) of the machine that all boards are parts of, and of its names.
+
+    It covers codes, not probabilities: these differ in their last bit from one mathematics library to another.
+    """
+    words = {
+        "name": model.name,
+        "searched": [dimension.model_dump(mode="json") for dimension in model.searched],
+        "known": [known.as_variable().model_dump(mode="json") for known in model.known],
+        "prob_bits": parameters.prob_bits,
+    }
+    digest = hashlib.sha256(json.dumps(words, sort_keys=True, separators=(",", ":")).encode())
+    for codes in (quantised.prior, *quantised.tables):
+        digest.update(codes.astype("<u2", copy=False).tobytes())
+    return digest.hexdigest()
+
+
+def _images(
+    model: Model,
+    quantised: Quantised,
+    parameters: BM1Parameters,
+    blocks: tuple[Block, ...],
+    interface: tuple[int, int],
+    options: BuildOptions,
+) -> tuple[Image, ...]:
+    identity = model_hash(model, quantised, parameters)
+    images = []
+    for index, block in enumerate(blocks):
+        lines = slice(block.offset, block.end)
+        machine = BM1Machine(
+            replace(parameters, lines=block.lines),
+            np.ascontiguousarray(quantised.prior[:, lines]),
+            tuple(np.ascontiguousarray(table[:, lines]) for table in quantised.tables),
+        )
+        images.append(
+            Image(
+                machine=machine,
+                partition=Partition(index, len(blocks), block.offset, model.lines),
+                interface_sensors=interface[0],
+                interface_results=interface[1],
+                model_hash=identity,
+                build_date=options.build_date,
+                tool_version=tool_version(),
+            )
+        )
+    return tuple(images)
+
+
+def _deployment(
+    model: Model,
+    parameters: BM1Parameters,
+    images: tuple[Image, ...],
+    blocks: tuple[Block, ...],
+    interface: tuple[int, int],
+    options: BuildOptions,
+) -> Deployment:
+    target = parameters.target_count_max if options.target_count is None else options.target_count
+    try:
+        return Deployment(
+            name=model.name,
+            queue=options.queue,
+            tolerance_s=options.tolerance_s,
+            sources=(Source(uri=options.uri, topic=options.topic, type=options.type),),
+            variables=tuple(known.as_variable() for known in model.known),
+            searched=model.searched,
+            machine=MachineSection(
+                lines=model.lines,
+                interface=f"{interface[0]}x{interface[1]}",
+                prob_bits=parameters.prob_bits,
+                counter_bits=parameters.counter_bits,
+                rng=parameters.rng,
+                rng_banks=parameters.rng_banks,
+                rng_reset=parameters.rng_reset,
+                shared=parameters.shared,
+                steps_per_clock=parameters.steps_per_clock,
+                target_count=target,
+                max_cycles=options.max_cycles,
+                stop=options.stop,
+            ),
+            boards=tuple(
+                Board(
+                    image=f"boards/board{index}.bm",
+                    image_hash=image.image_hash,
+                    line_offset=block.offset,
+                    lines=block.lines,
+                )
+                for index, (image, block) in enumerate(zip(images, blocks, strict=True))
+            ),
+            outputs=(Output(topic=options.output),),
+        )
+    except ValidationError as reason:
+        detail = reason.errors()[0]
+        key = str(detail["loc"][0]) if detail["loc"] else ""
+        flag = _FLAGS.get(key, "--" + key.replace("_", "-") if key else "")
+        if reason.title == "Output":
+            flag = "--output"
+        if detail["type"] == "value_error":
+            raise BuildError(f"{flag}: {detail['ctx']['error']}".removeprefix(": ")) from None
+        what = detail["msg"].removeprefix("Input should be ")
+        raise BuildError(f"{flag} is {detail['input']!r}, expected {what}") from None
+
+
+def _write(directory: Path, deployment: Deployment, images: tuple[Image, ...]) -> Deployment:
+    boards = directory / "boards"
+    try:
+        boards.mkdir(parents=True, exist_ok=True)
+        # Whoever reads the folder half-way finds no deployment, not one of two builds.
+        (directory / FILE_NAME).unlink(missing_ok=True)
+        for old in boards.iterdir():
+            if re.fullmatch(r"board\d+\.bm", old.name):
+                old.unlink()
+    except OSError as reason:
+        raise _not_writable(directory, reason) from None
+    try:
+        for image, board in zip(images, deployment.boards, strict=True):
+            write_image(directory / board.image, image)
+    except PcieShimError as reason:
+        raise BuildError(str(reason)) from reason
+    return write_deployment(directory, deployment)
+
+
+def _not_writable(path: Path, reason: OSError) -> BuildError:
+    return BuildError(f"{path} can't be written: {reason.strerror or reason}; choose another folder with -o")
+
+
+def _report(
+    model: Model, deployment: Deployment, quantised: Quantised, interface_reason: str, options: BuildOptions
+) -> str:
+    """Return what was built and what was lost, in plain sentences; no dates or paths: same input, same bytes."""
+    machine, source = deployment.machine, deployment.sources[0]
+    grid = " x ".join(f"{d.label} {d.size}" for d in model.searched)
+    names = ", ".join(known.name for known in model.known)
+    paragraphs = [
+        f"Model {model.name}: {model.lines} lines ({grid}), {len(model.known)} known variables"
+        + (f" in the columns' order {names}." if names else "."),
+        f"Machine: BM1, codes of {machine.prob_bits} bits (scale = {options.scale}), counters of "
+        f"{machine.counter_bits} bits, stops at a count of {machine.target_count} or after {machine.max_cycles} "
+        f"cycles, stop = {machine.stop}; {machine.rng} with {machine.rng_banks} banks, rng_reset = "
+        f"{machine.rng_reset}, {machine.steps_per_clock} steps a clock.",
+        f"Interface: {machine.interface}{interface_reason}.",
+        f"Boards: {len(deployment.boards)}.\n"
+        + "\n".join(
+            f"  {board.image}: lines {board.line_offset} to {board.line_offset + board.lines - 1}, "
+            f"image {board.image_hash[:16]}"
+            for board in deployment.boards
+        ),
+        "Lost by quantising (mass: how often the true line has code 0; KL: of the column's own posterior, bits):\n"
+        + _loss_table(quantised),
+    ]
+    paragraphs += [f"Warning: {warning}" for warning in quantised.warnings]
+    paragraphs.append(
+        f"Readings come from {source.uri}, topic {source.topic} ({source.type}); posteriors go to "
+        f"{deployment.outputs[0].topic}. Deployment {deployment.hash[:16]}."
+    )
+    return "\n\n".join(paragraphs) + "\n"
+
+
+def _loss_table(quantised: Quantised) -> str:
+    width = max(len(loss.name) for loss in quantised.losses)
+    rows = [f"  {'column':{max(width, 6)}}  bits  values       mass         KL"]
+    rows += [
+        f"  {loss.name:{max(width, 6)}}  {loss.bits:4d}  {loss.values:6d}  {loss.mass:9.2e}  {loss.kl_bits:9.2e}"
+        for loss in quantised.losses
+    ]
+    return "\n".join(rows)

@@ -1,0 +1,210 @@
+"""A model for a BM1: a searched variable on a grid, and what is known given each of its values (thesis 2.1.2).
+
+The machine computes P(S | k_1 ... k_N), proportional to P(S) P(k_1 | S) ... P(k_N | S) (equation 2.2). A
+model is the prior P(S), a table of P(K_i | S) for each known variable, and their order: the columns'.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, Literal
+
+import numpy as np
+from pydantic import ValidationError
+
+from toolchain.deployment import Dimension, Variable
+from toolchain.errors import ModelError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+_SUM_TOLERANCE: Final = 1e-6
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Known:
+    """A known variable K: its conditional distribution, and how a reading becomes an address of it.
+
+    Attributes:
+        name: The variable's name: the field in the message, unless `path` says where it is.
+        table: P(K | S), float64[values, lines]; row k is address k, and every line's column sums to 1.
+        bits: Address bits of its column; 0 takes as few as hold all values and the missing reading's address.
+        offset: The reading that is address 0, in the variable's unit.
+        step: From one address to the next, in the variable's unit.
+        period: After how many addresses the readings begin again (a turn of a bearing), or None.
+        on_range: What a reading out of range is: an error, the nearest end, or a missing reading.
+        on_missing: Whether a reading may be missing.
+        path: Where in the message it is; empty to search the message for the name.
+        floor: The least probability of an outlier that the table was made with, relative to the peak of the
+            likelihood; 0 for none. Quantising says when codes are too coarse to hold it.
+    """
+
+    name: str
+    table: NDArray[np.float64]
+    bits: int = 0
+    offset: float = 0.0
+    step: float = 1.0
+    period: int | None = None
+    on_range: Literal["error", "clamp", "missing"] = "error"
+    on_missing: Literal["error", "missing"] = "error"
+    path: str = ""
+    floor: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Check the table by itself.
+
+        Raises:
+            ModelError: The table is no conditional distribution, or the addresses don't fit.
+        """
+        table = np.array(self.table, dtype=np.float64)
+        if table.ndim != 2 or 0 in table.shape:
+            message = f"P({self.name} | S) has shape {table.shape}, expected (values, lines)"
+            raise ModelError(message)
+        _check_distribution(f"P({self.name} | S)", table)
+        table.flags.writeable = False
+        object.__setattr__(self, "table", table)
+        object.__setattr__(self, "bits", self.bits or len(table).bit_length())
+        self.as_variable()
+
+    @property
+    def values(self) -> int:
+        """How many addresses it serves."""
+        return len(self.table)
+
+    def as_variable(self) -> Variable:
+        """Return how its readings become addresses, as `deployment.toml` says it.
+
+        Raises:
+            ModelError: The name is empty, the addresses don't fit the bits, or the step is 0.
+        """
+        try:
+            return Variable(
+                name=self.name,
+                path=self.path,
+                bits=self.bits,
+                offset=self.offset,
+                step=self.step,
+                period=self.period,
+                values=self.values,
+                on_range=self.on_range,
+                on_missing=self.on_missing,
+            )
+        except ValidationError as reason:
+            message = f"variable {self.name!r}: {_first(reason)}"
+            raise ModelError(message) from None
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Model:
+    """A naive Bayesian fusion: what a BM1 computes.
+
+    Attributes:
+        name: What the deployment is called.
+        searched: The searched variable's dimensions, the slowest first; line = y * width + x for (y, x).
+        known: The known variables in the order of the machine's columns 1..N.
+        prior: P(S), float64[lines] summing to 1; None for a uniform one.
+    """
+
+    name: str
+    searched: tuple[Dimension, ...]
+    known: tuple[Known, ...]
+    prior: NDArray[np.float64] | None = None
+
+    def __post_init__(self) -> None:
+        """Check that the parts belong together.
+
+        Raises:
+            ModelError: A wrong shape or a name that is there twice; says which.
+        """
+        if not self.searched:
+            message = f"model {self.name!r} searches nothing: it needs at least one searched dimension"
+            raise ModelError(message)
+        for kind, names in (
+            ("known variable", [known.name for known in self.known]),
+            ("searched dimension", [dimension.label for dimension in self.searched]),
+        ):
+            twice = [name for name, count in Counter(names).items() if count > 1]
+            if twice:
+                message = f"model {self.name!r} has the {kind} {twice[0]!r} twice"
+                raise ModelError(message)
+        for known in self.known:
+            if known.table.shape[1] != self.lines:
+                message = (
+                    f"P({known.name} | S) has {known.table.shape[1]} lines, but the searched dimensions "
+                    f"({' x '.join(str(d.size) for d in self.searched)}) have {self.lines} cells"
+                )
+                raise ModelError(message)
+        prior = np.full(self.lines, 1 / self.lines) if self.prior is None else np.array(self.prior, float)
+        if prior.shape != (self.lines,):
+            message = f"the prior P(S) has shape {prior.shape}, expected ({self.lines},)"
+            raise ModelError(message)
+        _check_distribution("the prior P(S)", prior)
+        prior.flags.writeable = False
+        object.__setattr__(self, "prior", prior)
+
+    @property
+    def lines(self) -> int:
+        """How many values the searched variable has (M of thesis 2.1.2)."""
+        return math.prod(dimension.size for dimension in self.searched)
+
+    @property
+    def prior_distribution(self) -> NDArray[np.float64]:
+        """P(S), float64[lines]."""
+        if self.prior is None:  # __post_init__ has put one there
+            raise AssertionError
+        return self.prior
+
+
+def dimension(label: str, *, size: int, offset: float = 0.0, step: float = 1.0) -> Dimension:
+    """Return a searched dimension: `size` cells, the first centred at `offset`, the next a `step` further.
+
+    Raises:
+        ModelError: No cells, no name, or a step of 0.
+    """
+    try:
+        return Dimension(label=label, size=size, offset=offset, step=step)
+    except ValidationError as reason:
+        message = f"searched dimension {label!r}: {_first(reason)}"
+        raise ModelError(message) from None
+
+
+def interval(label: str, low: float, high: float, *, cells: int) -> Dimension:
+    """Return a searched dimension that cuts [low, high] into equal cells.
+
+    Raises:
+        ModelError: No cells, or no interval.
+    """
+    if cells < 1 or not low < high:
+        message = f"searched dimension {label!r}: [{low:g}, {high:g}] can't be cut into {cells} cells"
+        raise ModelError(message)
+    step = (high - low) / cells
+    return dimension(label, size=cells, offset=low + step / 2, step=step)
+
+
+def cell_centres(*searched: Dimension) -> tuple[NDArray[np.float64], ...]:
+    """Return each dimension's value at the centre of every line's cell: float64[lines] per dimension."""
+    axes = [d.offset + np.arange(d.size) * d.step for d in searched]
+    return tuple(axis.ravel() for axis in np.meshgrid(*axes, indexing="ij"))
+
+
+def _check_distribution(what: str, table: NDArray[np.float64]) -> None:
+    if not np.all(np.isfinite(table)) or np.any(table < 0):
+        message = f"{what} holds a number that is no probability: negative, infinite or NaN"
+        raise ModelError(message)
+    sums = np.atleast_1d(table.sum(axis=0))
+    wrong = np.abs(sums - 1) > _SUM_TOLERANCE
+    if np.any(wrong):
+        line = int(np.argmax(wrong))
+        where = f" over its values on line {line}" if table.ndim == 2 else ""
+        message = f"{what} sums to {sums[line]:.9g}{where}; a distribution sums to 1"
+        raise ModelError(message)
+
+
+def _first(reason: ValidationError) -> str:
+    detail = reason.errors()[0]
+    if detail["type"] == "value_error":
+        return str(detail["ctx"]["error"])
+    what = detail["msg"].removeprefix("Input should be ")
+    return f"{detail['loc'][0]} = {detail['input']!r}, expected {what}"

@@ -1,0 +1,66 @@
+"""How a model becomes a deployment, beside the model itself: the options of thesis 3.2 and 3.4."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+from machines.parameters import RngKind, RngReset
+from toolchain.deployment import Queue, Stop
+
+
+class Scale(StrEnum):
+    """What is divided by its maximum before quantising."""
+
+    ADDRESS = "address"
+    """Every address of a column by itself: the fewest cycles."""
+    COLUMN = "column"
+    """A column's whole table."""
+    NONE = "none"
+    """Nothing: the raw probabilities."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BuildOptions:
+    """How a model becomes a deployment, beside the model itself.
+
+    Attributes:
+        uri: The rosbridge server on which readings come.
+        topic: The topic on which they come.
+        type: That topic's type.
+        output: The topic on which posteriors go out.
+        partitions: How many boards the lines are split over.
+        interface: Inputs and results of the boards' registers; None for the thesis's 20 x 1200, or the model's
+            size where that is larger.
+        scale: What is divided by its maximum before quantising.
+        prob_bits: Bits of a code (W).
+        counter_bits: Bits of a line's counter.
+        target_count: The count that stops a machine; None for the counters' largest.
+        max_cycles: The cycles after which a machine stops anyway.
+        stop: Whether boards stop together after slices, or each at its own overflow.
+        rng: Kind of the random number generators.
+        rng_banks: Sets of seeds.
+        rng_reset: Whether a frame restarts the generators.
+        queue: What happens to frames that come faster than they are computed.
+        tolerance_s: Within what time readings from several topics belong together, seconds.
+        build_date: When it was built, ISO 8601; the images' manifests say it, their hashes don't cover it.
+    """
+
+    uri: str
+    topic: str
+    type: str
+    output: str = "/BMresults"
+    partitions: int = 1
+    interface: tuple[int, int] | None = None
+    scale: Scale = Scale.ADDRESS
+    prob_bits: int = 8
+    counter_bits: int = 8
+    target_count: int | None = None
+    max_cycles: int = 2**17
+    stop: Stop = Stop.SLICES
+    rng: RngKind = RngKind.LFSR32
+    rng_banks: int = 16
+    rng_reset: RngReset = RngReset.BANK
+    queue: Queue = Queue.LATEST
+    tolerance_s: float = 0.05
+    build_date: str = ""

@@ -1,0 +1,146 @@
+"""Probabilities become codes of W bits, after normalising, with a report of what was lost on the way.
+
+A line-independent factor changes nothing in the posterior, so every address (a row of a column's table) is
+divided by its maximum over all lines of all boards: without it a machine would run for ever.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from machines.encode import decode_code, encode_probability
+from machines.parameters import PROB_BITS_MAX
+from toolchain.options import Scale
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from toolchain.model import Model
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ColumnLoss:
+    """What quantising took from one column.
+
+    Attributes:
+        name: The known variable's name, or `prior`.
+        bits: Address bits.
+        values: Served addresses.
+        mass: Share of P(S, K) that lies in cells whose code became 0: how often a reading meets such a cell
+            on the true line.
+        kl_bits: Divergence of the column's own posterior from the exact one, KL(Q(S | k) || P(S | k)) in bits,
+            the expectation over k. (The other way round it would be infinite wherever a tail became 0.)
+        dead_values: Served addresses that are possible, but have code 0 on every line.
+    """
+
+    name: str
+    bits: int
+    values: int
+    mass: float
+    kl_bits: float
+    dead_values: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Quantised:
+    """A model's codes for all lines, before they are split over boards.
+
+    Attributes:
+        prior: uint16[1, lines].
+        tables: uint16[2**bits, lines] per known variable; addresses beyond the served ones hold 0, the top one,
+            a missing reading's, all ones.
+        losses: The prior's and one per known variable.
+        warnings: What a user should know, a sentence each.
+    """
+
+    prior: NDArray[np.uint16]
+    tables: tuple[NDArray[np.uint16], ...]
+    losses: tuple[ColumnLoss, ...]
+    warnings: tuple[str, ...]
+
+
+def quantise(model: Model, *, prob_bits: int = 8, scale: Scale = Scale.ADDRESS) -> Quantised:
+    """Return the model's codes, and what making them has lost.
+
+    Args:
+        model: The model.
+        prob_bits: Bits of a code (W), 1 to 16.
+        scale: What is divided by its maximum first.
+
+    Raises:
+        machines.errors.ParameterError: `prob_bits` is not 1 to 16.
+    """
+    prior = model.prior_distribution
+    prior_codes = encode_probability(scaled(prior[np.newaxis], scale), prob_bits)
+    losses = [_loss("prior", 0, prior[np.newaxis], decode_code(prior_codes, prob_bits))]
+    warnings: list[str] = []
+    tables = []
+    for known in model.known:
+        ratios = scaled(known.table, scale)
+        served = encode_probability(ratios, prob_bits)
+        table = np.zeros((1 << known.bits, model.lines), dtype=np.uint16)
+        table[: known.values] = served
+        table[-1] = (1 << prob_bits) - 1
+        tables.append(table)
+        loss = _loss(known.name, known.bits, prior * known.table, prior * decode_code(served, prob_bits))
+        losses.append(loss)
+        if known.floor:
+            warnings += _vanished_floor(known.name, known.floor, ratios, served, prob_bits)
+        if loss.dead_values:
+            warnings.append(
+                f"Variable {known.name}: {loss.dead_values} of its {known.values} values are possible but have "
+                "code 0 on every line, so such a reading gives no posterior; use --scale address or more "
+                "--prob-bits."
+            )
+    return Quantised(prior=prior_codes, tables=tuple(tables), losses=tuple(losses), warnings=tuple(warnings))
+
+
+def scaled(table: NDArray[np.float64], scale: Scale) -> NDArray[np.float64]:
+    """Return a table divided by its maxima, float64[values, lines] in 0..1; rows of zeros stay as they are."""
+    if scale is Scale.NONE:
+        return table
+    largest = table.max(axis=1, keepdims=True) if scale is Scale.ADDRESS else np.asarray(table.max())
+    ratios: NDArray[np.float64] = table / np.where(largest > 0, largest, 1.0)
+    return ratios
+
+
+def _loss(name: str, bits: int, exact: NDArray[np.float64], quantised: NDArray[np.float64]) -> ColumnLoss:
+    """Compare P(S, K) with its quantised likeness, float64[values, lines]; the latter's rows up to factors."""
+    weight = exact.sum(axis=1)
+    remaining = quantised.sum(axis=1)
+    alive = (remaining > 0) & (weight > 0)
+    p = exact[alive] / weight[alive, np.newaxis]
+    q = quantised[alive] / remaining[alive, np.newaxis]
+    # q is 0 wherever p is; there and in the vanished cells q log q/p is 0.
+    ratio = np.divide(q, p, out=np.ones_like(q), where=q > 0)
+    divergence = (q * np.log2(ratio)).sum(axis=1)
+    return ColumnLoss(
+        name=name,
+        bits=bits,
+        values=len(exact),
+        mass=float(exact[quantised == 0].sum()),
+        kl_bits=max(0.0, float(weight[alive] @ divergence)),
+        dead_values=int(np.count_nonzero((weight > 0) & (remaining == 0))),
+    )
+
+
+def _vanished_floor(
+    name: str, floor: float, ratios: NDArray[np.float64], codes: NDArray[np.uint16], prob_bits: int
+) -> list[str]:
+    vanished = (codes == 0) & (ratios > 0)
+    addresses = int(np.count_nonzero(vanished.any(axis=1)))
+    if not addresses:
+        return []
+    least = float(ratios[vanished].min())
+    needed = math.ceil(-math.log2(least) - 1)
+    wider = f" or --prob-bits {needed}" if needed <= PROB_BITS_MAX else ""
+    half_code = 0.5 ** (prob_bits + 1)
+    return [
+        f"Variable {name}: its outlier floor of {floor:g} vanishes at {addresses} of its {len(codes)} values "
+        f"(below 2^-{prob_bits + 1} of the largest probability there), so one outlier makes the true line "
+        f"impossible; use a floor of about {floor * half_code / least:.2g}{wider}."
+    ]
