@@ -149,6 +149,10 @@ class Viewer:
                     raise NoResultError(f"after {_results(self.results)}, {error}") from None
                 finally:
                     self.route = tuple(listener.route)
+                    if listener.announced_only:
+                        say(
+                            f"warning: results that never came after their /bm/frame: {listener.announced_only}"
+                        )
 
     def draw(self, folder: Path) -> tuple[Path, ...]:
         """Write the two pictures; returns their paths.

@@ -232,3 +232,14 @@ async def test_a_normaliser_says_each_kind_of_bad_reading_once():
         _code, _out, err = await normaliser.ended()
     assert sent["msg"] == {"D1": 1, "D2": 2, "D3": 3, "B1": 0, "B2": 0, "B3": 0}
     assert err.count("B2 must be a finite number, not None") == 1
+
+
+async def test_a_viewer_says_which_results_never_came():
+    async with FakeRosbridge() as fake, Process("viewer", "--uri", fake.uri, "--count", "1") as viewer:
+        await fake.wait_for_op("subscribe", topic="/boat/true_pose", timeout=LIMIT)
+        await fake.publish("/bm/frame", frame_message({"sec": 1, "nanosec": 0}, 1, published=True))
+        await say_result(fake, 2)
+        code, out, err = await viewer.ended()
+    assert code == 0
+    assert out.splitlines()[1].split()[0] == "2"
+    assert "warning: results that never came after their /bm/frame: 1" in err

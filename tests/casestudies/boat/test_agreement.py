@@ -1,0 +1,33 @@
+"""Simulator, normaliser and model speak of the same boat: float64 fusion finds it as often as it says.
+
+Boat.measure  ->  normalise  ->  the model's exact posterior  ->  coverage of its 95 % region
+"""
+
+import numpy as np
+import pytest
+
+from casestudies.boat.correctness import correctness
+from casestudies.boat.geometry import SENSOR_NAMES, map_grid
+from casestudies.boat.model import model
+from casestudies.boat.normaliser import normalise
+from casestudies.boat.simulator import Boat
+from toolchain.fusion import exact_posterior
+
+
+def test_the_columns_are_in_the_order_of_the_sensors():
+    assert tuple(known.name for known in model().known) == SENSOR_NAMES
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_float64_fusion_covers_the_truth(seed):
+    the_model, grid, boat = model(), map_grid(), Boat(seed, 60)
+    lines, posteriors = [], []
+    for _ in range(500):
+        boat.sail(0.5)
+        readings = normalise(boat.measure())
+        posteriors.append(exact_posterior(the_model, readings))
+        lines.append(grid.line(boat.x, boat.y))
+    exact = np.array(posteriors)
+    result = correctness(lines, exact, exact, width=grid.width)
+    assert result.coverage == pytest.approx(0.95, abs=0.03)
+    assert result.truth_distance_median < 3
