@@ -285,13 +285,16 @@ def _report(
     machine, source = deployment.machine, deployment.sources[0]
     grid = " x ".join(f"{d.label} {d.size}" for d in model.searched)
     names = ", ".join(known.name for known in model.known)
-    paragraphs = [
-        f"Model {model.name}: {model.lines} lines ({grid}), {len(model.known)} known variables"
-        + (f" in the columns' order {names}." if names else "."),
+    machine_sentence = (
         f"Machine: BM1, codes of {machine.prob_bits} bits (scale = {options.scale}), counters of "
         f"{machine.counter_bits} bits, stops at a count of {machine.target_count} or after {machine.max_cycles} "
         f"cycles, stop = {machine.stop}; {machine.rng} with {machine.rng_banks} banks, rng_reset = "
-        f"{machine.rng_reset}, {machine.steps_per_clock} steps a clock.",
+        f"{machine.rng_reset}, {machine.steps_per_clock} steps a clock."
+    )
+    paragraphs = [
+        f"Model {model.name}: {model.lines} lines ({grid}), {len(model.known)} known variables"
+        + (f" in the columns' order {names}." if names else "."),
+        machine_sentence,
         f"Interface: {machine.interface}{interface_reason}.",
         f"Boards: {len(deployment.boards)}.\n"
         + "\n".join(

@@ -71,9 +71,7 @@ def build(
 ) -> None:
     """Build a deployment: programming files for the boards, deployment.toml and a report.
 
-    Example:
-
-    `toolchain build casestudies/boat -o build/boat --partitions 4 --uri ws://localhost:9090
+    For example `toolchain build casestudies/boat -o build/boat --partitions 4 --uri ws://localhost:9090
     --topic /boat/sensors --type boat_msgs/Sensors`
     """
     try:

@@ -19,7 +19,7 @@ from toolchain.options import Scale
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from toolchain.model import Model
+    from toolchain.model import Known, Model
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -88,8 +88,9 @@ def quantise(model: Model, *, prob_bits: int = 8, scale: Scale = Scale.ADDRESS) 
         tables.append(table)
         loss = _loss(known.name, known.bits, prior * known.table, prior * decode_code(served, prob_bits))
         losses.append(loss)
-        if known.floor:
-            warnings += _vanished_floor(known.name, known.floor, ratios, served, prob_bits)
+        vanished = (served == 0) & (ratios > 0)
+        if known.floor and vanished.any():
+            warnings.append(_vanished_floor(known, ratios, vanished, prob_bits))
         if loss.dead_values:
             warnings.append(
                 f"Variable {known.name}: {loss.dead_values} of its {known.values} values are possible but have "
@@ -129,18 +130,16 @@ def _loss(name: str, bits: int, exact: NDArray[np.float64], quantised: NDArray[n
 
 
 def _vanished_floor(
-    name: str, floor: float, ratios: NDArray[np.float64], codes: NDArray[np.uint16], prob_bits: int
-) -> list[str]:
-    vanished = (codes == 0) & (ratios > 0)
-    addresses = int(np.count_nonzero(vanished.any(axis=1)))
-    if not addresses:
-        return []
+    known: Known, ratios: NDArray[np.float64], vanished: NDArray[np.bool_], prob_bits: int
+) -> str:
+    """Say that a variable's floor is too low for the codes, and how high or wide would do."""
     least = float(ratios[vanished].min())
+    enough = known.floor * 0.5 ** (prob_bits + 1) / least
     needed = math.ceil(-math.log2(least) - 1)
     wider = f" or --prob-bits {needed}" if needed <= PROB_BITS_MAX else ""
-    half_code = 0.5 ** (prob_bits + 1)
-    return [
-        f"Variable {name}: its outlier floor of {floor:g} vanishes at {addresses} of its {len(codes)} values "
-        f"(below 2^-{prob_bits + 1} of the largest probability there), so one outlier makes the true line "
-        f"impossible; use a floor of about {floor * half_code / least:.2g}{wider}."
-    ]
+    return (
+        f"Variable {known.name}: its outlier floor of {known.floor:g} vanishes at "
+        f"{np.count_nonzero(vanished.any(axis=1))} of its {known.values} values (below 2^-{prob_bits + 1} of the "
+        f"largest probability there), so that one outlier makes the true line impossible; use a floor of about "
+        f"{enough:.2g}{wider}."
+    )

@@ -1,71 +1,75 @@
-"""The boat's model: where on the map it is, given distances and bearings to three beacons (thesis 2.1.2.1)."""
+"""The boat's model: P(distance | cell) and P(bearing | cell) for three beacons (thesis 2.1.2.1, 4.2).
 
-from __future__ import annotations
+Column order D1, D2, D3, B1, B2, B3; line = y * width + x from the lower left corner.
+"""
 
-from typing import Final, Literal
+import math
 
 import numpy as np
 
-from casestudies.boat.geometry import BEACONS, BEARING_SIGMA, MAP_HIGH, MAP_LOW
+from casestudies.boat.geometry import (
+    BEACONS,
+    BEARING_NAMES,
+    BEARING_SIGMA,
+    DISTANCE_NAMES,
+    LONGEST_DISTANCE,
+    MAP_HIGH,
+    MAP_LOW,
+    distance_sigma,
+)
 from toolchain.conditional import normal, wrapped_normal
 from toolchain.errors import ModelError
 from toolchain.model import Known, Model, cell_centres, interval
 
-DISTANCE_BITS: Final = 7
-BEARING_BITS: Final = 9
+DISTANCE_BITS = 7
+BEARING_BITS = 9
+TURN = 360
 
 
-def model(
-    width: int = 32,
-    height: int = 32,
-    distance_step: int = 1,
-    bearing_step: int = 1,
-    on_range: Literal["error", "clamp", "missing"] = "clamp",
-    array: bool = False,
-) -> Model:
-    """The published model (Bessiere et al., Bayesian Programming, ch. 7) on a grid of cells.
+def model(width: int = 32, height: int = 32, distance_step: int = 1, bearing_step: int = 1) -> Model:
+    """Return the boat's model; a cell's likelihood is that of its centre.
 
     Args:
         width: Cells along x; the thesis ran 32 and describes 64.
         height: Cells along y.
-        distance_step: Distances per address; 1 serves 0..100.
-        bearing_step: Degrees per address; a divisor of 360.
-        on_range: What a distance beyond 100 is; `clamp` takes it for the largest.
-        array: The six readings come as `data[0]` to `data[5]` of an array instead of fields by name.
+        distance_step: Map units between the distances told apart; readings are whole numbers 0..100, those
+            beyond clamp and the end bins hold the tails.
+        bearing_step: Degrees between the bearings told apart; must divide a turn.
 
     Raises:
-        ModelError: A step that does not fit.
+        ModelError: A grid without cells, or a step that does not fit.
     """
-    if distance_step < 1 or bearing_step < 1 or 360 % bearing_step:
-        raise ModelError("distance_step must be 1 or more, and bearing_step a divisor of 360")
+    if not 1 <= distance_step <= LONGEST_DISTANCE:
+        message = f"distance_step is {distance_step}, expected 1 to {LONGEST_DISTANCE}"
+        raise ModelError(message)
+    if bearing_step < 1 or TURN % bearing_step:
+        message = f"bearing_step is {bearing_step}, expected a number of degrees that divides {TURN}"
+        raise ModelError(message)
     rows = interval("y", MAP_LOW, MAP_HIGH, cells=height)
     columns = interval("x", MAP_LOW, MAP_HIGH, cells=width)
     y, x = cell_centres(rows, columns)
-    distances: list[Known] = []
-    bearings: list[Known] = []
-    for at, (beacon_x, beacon_y) in enumerate(BEACONS):
-        distance = np.hypot(x - beacon_x, y - beacon_y)
-        distances.append(
+    known: list[Known] = []
+    for name, (beacon_x, beacon_y) in zip(DISTANCE_NAMES, BEACONS, strict=True):
+        true_distance = np.hypot(x - beacon_x, y - beacon_y)
+        known.append(
             normal(
-                f"D{at + 1}",
-                mean=distance,
-                sigma=distance / 10 + 5,
-                values=100 // distance_step + 1,
+                name,
+                mean=true_distance,
+                sigma=np.array([distance_sigma(d) for d in true_distance.tolist()]),
+                values=math.floor(LONGEST_DISTANCE / distance_step) + 1,
                 step=distance_step,
                 bits=DISTANCE_BITS,
-                on_range=on_range,
-                path=f"data[{at}]" if array else "",
             )
         )
-        bearings.append(
+    for name, (beacon_x, beacon_y) in zip(BEARING_NAMES, BEACONS, strict=True):
+        known.append(
             wrapped_normal(
-                f"B{at + 1}",
-                mean=np.degrees(np.arctan2(y - beacon_y, x - beacon_x)) % 360,
+                name,
+                mean=np.degrees(np.arctan2(y - beacon_y, x - beacon_x)),
                 sigma=BEARING_SIGMA,
-                values=360 // bearing_step,
+                values=TURN // bearing_step,
                 step=bearing_step,
                 bits=BEARING_BITS,
-                path=f"data[{at + 3}]" if array else "",
             )
         )
-    return Model(name="boat", searched=(rows, columns), known=(*distances, *bearings))
+    return Model(name="boat", searched=(rows, columns), known=tuple(known))
