@@ -6,7 +6,7 @@ import random
 import time
 from collections import deque
 from collections.abc import Callable, Coroutine, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from enum import StrEnum
 from typing import Any, Final
 
@@ -14,6 +14,7 @@ from bridge.errors import (
     BridgeError,
     DisconnectedError,
     NoAnswerError,
+    OptionError,
     ServiceError,
     SlowPeerError,
     StateTimeoutError,
@@ -84,6 +85,13 @@ class Limits:
     max_size: int
     ping_interval: float
     ping_timeout: float
+
+    def __post_init__(self) -> None:
+        """Refuse what is no limit."""
+        for limit in fields(self):
+            value = getattr(self, limit.name)
+            if not value > 0:
+                raise OptionError(f"{limit.name} must be more than 0, not {value!r}")
 
 
 class Session:

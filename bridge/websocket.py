@@ -251,9 +251,16 @@ async def open_websocket(
         attempt = made[-1] if made and hasattr(made[-1], "transport") else None
         if attempt is not None:
             attempt.abandon()
-        if not isinstance(error, Exception):
-            raise
         heard = attempt.first_bytes if attempt is not None else b""
+        if (
+            isinstance(error, Exception)
+            and attempt is not None
+            and attempt.protocol.handshake_exc is not None
+        ):
+            # What was heard says more than what came of it: a service that greets first breaks off the request.
+            error = attempt.protocol.handshake_exc
+        if not isinstance(error, OSError | InvalidHandshake):
+            raise
         raise _connect_error(error, shown_uri, heard, timeout, answered=attempt is not None) from error
     if not websocket.is_open:
         raise UnreachableError(f"{shown_uri} is unreachable: it closed the connection at once")

@@ -1,0 +1,315 @@
+"""A lost connection comes back by itself, with everything that was wanted."""
+
+import asyncio
+import socket
+import time
+from typing import Any
+
+import pytest
+
+from bridge.client import Ros, State, connect
+from bridge.errors import DisconnectedError, StateTimeoutError
+from bridge.session import FIRST_DELAY, MAX_DELAY
+from tests.fake_rosbridge import FakeRosbridge
+
+
+@pytest.fixture
+def delays(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """The waits before attempts to reconnect, which take no time."""
+    waits: list[float] = []
+    sleep = asyncio.sleep
+
+    async def no_sleep(delay: float, *_result: Any) -> None:
+        if delay > 0:
+            waits.append(delay)
+        await sleep(0.001 if delay > 0 else 0)
+
+    monkeypatch.setattr("bridge.session.asyncio.sleep", no_sleep)
+    return waits
+
+
+async def gone_and_back(fake: FakeRosbridge, ros: Ros) -> None:
+    await fake.vanish()
+    await ros.wait_for_state(State.RECONNECTING, 10)
+    fake.received.clear()
+    await fake.come_back()
+    await ros.wait_for_state(State.CONNECTED, 20)
+
+
+async def test_everything_is_restored():
+    states: list[tuple[State, str]] = []
+    async with FakeRosbridge() as fake:
+        async with connect(fake.uri, on_state=lambda *news: states.append(news)) as ros:
+            subscription = ros.subscribe("/in", "p/T", throttle_rate=20, queue_length=3)
+            publication = await ros.advertise("/out", "p/T", latch=True)
+
+            async def handler(args: dict[str, Any]) -> dict[str, Any]:
+                return args
+
+            await ros.advertise_service("/echo", "p/Echo", handler)
+            closed = ros.subscribe("/closed", "p/T")
+            await closed.close()
+            await publication.publish({"n": 1})
+            await fake.wait_for_op("publish")
+            before = [received.op for received in fake.received]
+
+            await gone_and_back(fake, ros)
+            assert ros.reconnections == 1
+            await fake.wait_for_op("subscribe", topic="/in")
+            after = [received.op for received in fake.received]
+            assert after == [before[1], before[-1], before[2], before[0]]
+            # In both directions, on the same handles.
+            await fake.publish("/in", {"n": 2})
+            assert (await subscription.next(5)).msg == {"n": 2}
+            await publication.publish({"n": 3})
+            await fake.wait_for_op("publish", msg={"n": 3})
+            async with connect(fake.uri) as other:
+                assert await other.call("/echo", {"n": 4}) == {"n": 4}
+        assert [state for state, _reason in states] == [
+            State.CONNECTED,
+            State.RECONNECTING,
+            State.CONNECTED,
+            State.CLOSED,
+        ]
+        assert states[1][1]
+        assert ros.last_error
+
+
+async def test_an_iteration_goes_on():
+    async with FakeRosbridge() as fake, connect(fake.uri) as ros:
+        got: list[int] = []
+
+        async def read() -> None:
+            async for message in ros.subscribe("/a", "p/T"):
+                got.append(message.msg["n"])
+                if len(got) == 3:
+                    return
+
+        reader = asyncio.create_task(read())
+        for n in range(3):
+            await fake.wait_for_op("subscribe")
+            await fake.publish("/a", {"n": n})
+            if n < 2:
+                await gone_and_back(fake, ros)
+        await asyncio.wait_for(reader, 5)
+        assert got == [0, 1, 2]
+        assert ros.reconnections == 2
+
+
+async def test_nothing_is_published_into_the_void():
+    async with FakeRosbridge() as fake, connect(fake.uri) as ros:
+        publication = await ros.advertise("/a", "p/T")
+        await fake.vanish()
+        await ros.wait_for_state(State.RECONNECTING, 10)
+        with pytest.raises(DisconnectedError, match=f"there is no connection to {fake.uri} now"):
+            await publication.publish({"n": 1})
+        with pytest.raises(DisconnectedError):
+            await ros.call("/s")
+        # What is wanted meanwhile is asked for later.
+        later = ros.subscribe("/later", "p/T")
+        new = await ros.advertise("/new", "p/T")
+        await publication.close()
+        await fake.come_back()
+        await ros.wait_for_state(State.CONNECTED, 20)
+        await fake.wait_for_op("subscribe", topic="/later")
+        assert fake.ops("publish") == []
+        await fake.publish("/later", {"n": 2})
+        assert (await later.next(5)).msg == {"n": 2}
+        await new.publish({"n": 3})
+        await fake.wait_for_op("publish", topic="/new")
+
+
+async def test_the_waits_double_up_to_five_seconds(delays):
+    assert (FIRST_DELAY, MAX_DELAY) == (0.1, 5.0)
+    async with FakeRosbridge() as fake, connect(fake.uri) as ros:
+        await fake.vanish()
+        while len(delays) < 12:
+            await asyncio.get_running_loop().run_in_executor(None, time.sleep, 0.01)
+        for number, delay in enumerate(delays):
+            longest = min(0.1 * 2**number, 5.0)
+            assert 0.8 * longest <= delay <= longest
+        assert "refused" in ros.last_error
+
+
+async def test_a_server_that_drops_everyone_is_not_stormed(delays):
+    async with FakeRosbridge() as fake, connect(fake.uri) as ros:
+        for number in range(6):
+            await fake.cut()
+            await fake.wait_for_connections(number + 2)
+            await ros.wait_for_state(State.CONNECTED, 10)
+        assert 0.8 * 3.2 <= max(delays) <= 3.2
+
+
+async def test_a_steady_connection_begins_with_the_first_wait_again(delays, monkeypatch):
+    monkeypatch.setattr("bridge.session.STEADY", 0.0)
+    async with FakeRosbridge() as fake, connect(fake.uri) as ros:
+        for number in range(6):
+            await fake.cut()
+            await fake.wait_for_connections(number + 2)
+            await ros.wait_for_state(State.CONNECTED, 10)
+        assert max(delays) <= 0.1
+
+
+@pytest.mark.parametrize("trouble", ["refuses", "something else listens"])
+async def test_it_comes_back_whatever_was_there_meanwhile(trouble):
+    async with FakeRosbridge() as fake, connect(fake.uri) as ros:
+        if trouble == "refuses":
+            fake.refuses = 503
+            await fake.cut()
+            await ros.wait_for_state(State.RECONNECTING, 10)
+            await asyncio.sleep(0.3)
+            assert "HTTP 503" in ros.last_error
+            fake.refuses = None
+        else:
+            await fake.vanish()
+            greeter = await asyncio.start_server(
+                lambda _r, w: w.write(b"220 mail\r\n"), "127.0.0.1", fake.port
+            )
+            await asyncio.sleep(0.3)
+            greeter.close()
+            assert "220 mail" in ros.last_error
+            await fake.come_back()
+        await ros.wait_for_state(State.CONNECTED, 20)
+
+
+async def test_a_goodbye_of_the_server_is_told():
+    async with FakeRosbridge() as fake, connect(fake.uri) as ros:
+        await fake.hang_up(1001)
+        await ros.wait_for_state(State.RECONNECTING, 10)
+        assert ros.last_error == "the server closed it (code 1001)"
+        await ros.wait_for_state(State.CONNECTED, 10)
+
+
+async def test_a_silent_peer_is_noticed():
+    async with FakeRosbridge() as fake, connect(fake.uri, ping_interval=0.2, ping_timeout=0.2) as ros:
+        begun = time.monotonic()
+        fake.freeze()
+        await ros.wait_for_state(State.RECONNECTING, 10)
+        assert 0.35 < time.monotonic() - begun < 5
+        assert "nothing was heard from the server for 0." in ros.last_error
+        await ros.wait_for_state(State.CONNECTED, 10)
+
+
+async def test_a_quiet_server_that_answers_pings_is_kept():
+    async with (
+        FakeRosbridge(silent=True) as fake,
+        connect(fake.uri, ping_interval=0.05, ping_timeout=0.3) as ros,
+    ):
+        await asyncio.sleep(0.8)
+        assert (ros.state, ros.reconnections, fake.connections) == (State.CONNECTED, 0, 1)
+
+
+async def test_a_sleep_of_this_process_is_not_the_servers_silence():
+    async with FakeRosbridge() as fake, connect(fake.uri, ping_interval=0.1, ping_timeout=0.1) as ros:
+        await asyncio.sleep(0.15)
+        time.sleep(1.0)  # noqa: ASYNC251  # the whole process stands still
+        await asyncio.sleep(0.3)
+        assert (ros.state, ros.reconnections) == (State.CONNECTED, 0)
+        assert fake.connections == 1
+
+
+async def test_a_message_that_is_too_large_ends_the_connection_and_says_so():
+    async with FakeRosbridge() as fake, connect(fake.uri, max_size=1000) as ros:
+        subscription = ros.subscribe("/a", "p/T", queue_size=5)
+        await fake.wait_for_op("subscribe")
+        await fake.publish("/a", {"n": "x" * 2000})
+        await ros.wait_for_state(State.RECONNECTING, 10)
+        assert (
+            ros.last_error
+            == "the server sent a message of more than 1000 bytes (max_size allows larger ones)"
+        )
+        await fake.wait_for_op("subscribe", count=2)
+        await fake.publish("/a", {"n": 1})
+        assert (await subscription.next(5)).msg == {"n": 1}
+
+
+async def test_a_peer_that_breaks_the_protocol():
+    async with FakeRosbridge() as fake, connect(fake.uri) as ros:
+        (client,) = fake._clients
+        client.connection.transport.write(b"\xff\xff not a frame")
+        await ros.wait_for_state(State.RECONNECTING, 10)
+        assert "broke the WebSocket protocol" in ros.last_error
+        await ros.wait_for_state(State.CONNECTED, 10)
+
+
+async def test_waiting_for_a_state_is_bounded():
+    async with FakeRosbridge() as fake, connect(fake.uri) as ros:
+        await ros.wait_for_state(State.CONNECTED, 1)
+        await fake.vanish()
+        await ros.wait_for_state(State.RECONNECTING, 10)
+        with pytest.raises(StateTimeoutError) as caught:
+            await ros.wait_for_state(State.CONNECTED, 0.05)
+        assert str(caught.value).startswith(
+            f"the connection to {fake.uri} was not connected within 0.05 s, it is reconnecting ("
+        )
+        assert caught.value.exit_code == 3
+        waiting = asyncio.create_task(ros.wait_for_state(State.CONNECTED, 30))
+        await asyncio.sleep(0)
+        await ros.close()
+        with pytest.raises(DisconnectedError, match="was closed"):
+            await waiting
+        with pytest.raises(DisconnectedError):
+            await ros.wait_for_state(State.CONNECTED, 30)
+
+
+async def test_closing_while_it_reconnects_ends_it():
+    async with FakeRosbridge() as fake:
+        async with connect(fake.uri) as ros:
+            subscription = ros.subscribe("/a", "p/T")
+            await fake.vanish()
+            await ros.wait_for_state(State.RECONNECTING, 10)
+        assert ros.state is State.CLOSED
+        await fake.come_back()
+        await asyncio.sleep(0.4)
+        assert fake.connections == 1
+        assert [message async for message in subscription] == []
+
+
+async def test_closing_from_the_callback():
+    async with FakeRosbridge() as fake:
+        closing: list[asyncio.Task[None]] = []
+
+        def on_state(state: State, _reason: str) -> None:
+            if state is State.RECONNECTING:
+                closing.append(asyncio.get_running_loop().create_task(ros.close()))
+
+        ros = connect(fake.uri, on_state=on_state)
+        async with ros:
+            await fake.cut()
+            await ros.wait_for_state(State.CLOSED, 10)
+        await asyncio.gather(*closing)
+
+
+async def test_a_callback_that_fails_breaks_nothing(caplog):
+    def on_state(_state: State, _reason: str) -> None:
+        raise RuntimeError("oh")
+
+    async with FakeRosbridge() as fake, connect(fake.uri, on_state=on_state) as ros:
+        await fake.cut()
+        await fake.wait_for_connections(2)
+        await ros.wait_for_state(State.CONNECTED, 10)
+        assert "on_state failed" in caplog.text
+
+
+async def test_a_peer_that_does_not_say_goodbye_is_not_waited_for():
+    async with FakeRosbridge() as fake:
+        ros = connect(fake.uri)
+        await ros.__aenter__()
+        fake.freeze()
+        begun = time.monotonic()
+        await ros.close()
+        assert time.monotonic() - begun < 4
+
+
+async def test_nothing_is_left_open():
+    async with FakeRosbridge() as fake:
+        for _ in range(3):
+            async with connect(fake.uri) as ros:
+                ros.subscribe("/a", "p/T")
+                await fake.cut()
+        await asyncio.sleep(0.05)
+        assert not fake._clients
+        assert len(asyncio.all_tasks()) <= 2, "this one, and the fake's accepting one"
+    with socket.socket() as again:
+        again.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        again.bind(("127.0.0.1", fake.port))
