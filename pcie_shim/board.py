@@ -123,13 +123,30 @@ class _Connection:
         self.open = count > 0
         return self.open
 
-    def in_turn(self, frame: Frame) -> None:
-        """Check that requests come in sequence."""
-        self.sequence = (self.sequence + 1) & 0xFFFFFFFF
-        if frame.sequence != self.sequence:
-            raise FramingError(f"request {frame.sequence} came where {self.sequence} was due")
+    def answer(self, handle: Callable[[Frame], None]) -> None:
+        """Have all whole frames that have come handled, and refusals answered."""
+        while self.open and not self.stalled:
+            sequence = address = 0
+            try:
+                frame = self.decoder.next_frame()
+                if frame is None:
+                    return
+                _, _, sequence, address, _, _ = frame
+                self.sequence = due = (self.sequence + 1) & 0xFFFFFFFF
+                if sequence == due:
+                    handle(frame)
+                    continue
+                problem = f"request {sequence} came where {due} was due"
+            except FramingError as error:
+                problem = str(error)
+            except RefusedError as error:
+                self.send(framing.encode_error(sequence, address, error.code, str(error)))
+                continue
+            self.send(framing.encode_error(sequence, address, ErrorCode.BAD_FRAME, problem))
+            self.open = False
 
     def send(self, data: bytes) -> None:
+        """Send all of it; a connection that takes none for SEND_S is given up."""
         try:
             self.socket.sendall(data)
         except OSError:
@@ -194,6 +211,8 @@ class _Server:
                 if board.running and not board.stuck:
                     board.step()
                     self._interrupt_if_done()
+                    if self._host is not None and not self._host.open:
+                        self._drop_host()
                 self._forget_silent_loader()
         finally:
             self._drop_host()
@@ -218,19 +237,37 @@ class _Server:
             connection, _ = self._registers.accept()
         except OSError:
             return  # whoever it was has gone already
-        if self._host is not None:
-            # The one that holds the board may just have left: hear it out before anyone is turned away.
-            while self._host is not None and self._host.receive():
-                self._answer(self._host)
-            if self._host is not None and not self._host.open:
-                self._drop_host()
-        if self._host is not None:
-            _turn_away(connection, "another host holds the board; one host drives it at a time")
+        if self._is_held():
+            _turn_away(connection, "another host has it; one host drives a board at a time")
             return
         self._host = host = _Host(connection, self._board.programmed)
         self._epoll.register(connection.fileno(), _READABLE)
         host.send(self._greeting(host.token))
         _LOG.info("board %d: a host opened it", self._index)
+
+    def _is_held(self) -> bool:
+        """Whether a host holds the board; one that has just left is heard out and does not."""
+        host = self._host
+        if host is None:
+            return False
+        if host.stalled:
+            host.open = not _has_left(host.socket)
+        while host.open and host.receive():
+            host.answer(self._access)
+        if not host.open:
+            self._drop_host()
+        return self._host is not None
+
+    def _serve_host(self, host: _Host) -> None:
+        if host.stalled:
+            # misbehaving: what the host sends is not read, but it may leave
+            host.open = not _has_left(host.socket)
+            time.sleep(0.01)
+        else:
+            host.receive()
+            host.answer(self._access)
+        if not host.open:
+            self._drop_host()
 
     def _greeting(self, token: bytes) -> bytes:
         map_hash = register_map.MAP_SHA256
@@ -247,55 +284,25 @@ class _Server:
             )
         )
 
-    def _serve_host(self, host: _Host) -> None:
-        if host.stalled:
-            # it may only leave: what it sends is not read
-            if _has_left(host.socket):
-                self._drop_host()
-            else:
-                time.sleep(0.01)
-            return
-        host.receive()
-        self._answer(host)
-        if not host.open:
-            self._drop_host()
-
-    def _answer(self, connection: _Connection) -> None:
-        """Answer all whole frames that have come."""
-        while connection.open and not connection.stalled:
-            sequence = address = 0
-            try:
-                frame = connection.decoder.next_frame()
-                if frame is None:
-                    return
-                sequence, address = frame.sequence, frame.address
-                connection.in_turn(frame)
-                if isinstance(connection, _Host):
-                    self._access(connection, frame)
-                elif isinstance(connection, _Loader):
-                    self._program(connection, frame)
-            except FramingError as error:
-                connection.send(framing.encode_error(sequence, address, ErrorCode.BAD_FRAME, str(error)))
-                connection.open = False
-            except RefusedError as error:
-                connection.send(framing.encode_error(sequence, address, error.code, str(error)))
-
-    def _access(self, host: _Host, frame: Frame) -> None:
+    def _access(self, frame: Frame) -> None:
+        """Do what a frame of the host asks for."""
         operation, flags, sequence, address, count, payload = frame
-        board = self._board
+        board, host = self._board, self._host
+        if host is None:
+            return
         if host.programmed != board.programmed:
             raise RefusedError(ErrorCode.STALE, "the board was programmed after it was opened")
         if operation == framing.READ:
-            words = board.read(address, count)
-            self._send(host, framing.READ, framing.REPLY, sequence, address, words)
+            self._send(host, framing.READ, framing.REPLY, sequence, address, board.read(address, count))
         elif operation == framing.WRITE:
             done = board.done
-            board.stuck = self._wrong(MisbehaviourKind.NEVER_DONE, ahead=1)
+            if self._misbehave is not None:
+                board.stuck = self._wrong(MisbehaviourKind.NEVER_DONE, ahead=1)
             board.write(address, payload)
             # acknowledged before the interrupt that it may cause
             if not flags & framing.POSTED:
                 self._send(host, framing.WRITE, framing.REPLY, sequence, address, b"")
-            if board.running or board.done != done:
+            if board.done != done or board.running:
                 self._starts += 1
                 self._interrupt_if_done()
         else:
@@ -307,8 +314,6 @@ class _Server:
             return
         host.interrupts = (host.interrupts + 1) & 0xFFFFFFFF
         self._send(host, framing.IRQ, 0, host.interrupts, register_map.DONE, board.interrupt_words())
-        if not host.open:
-            self._drop_host()
 
     def _drop_host(self) -> None:
         host, self._host = self._host, None
@@ -363,26 +368,36 @@ class _Server:
             connection, _ = self._programming.accept()
         except OSError:
             return
-        if self._loader is not None:
-            while self._loader is not None and self._loader.receive():
-                self._answer(self._loader)
-            if self._loader is not None and not self._loader.open:
-                self._drop_loader()
-        if self._loader is not None:
-            _turn_away(connection, "another loader is programming the board")
+        if self._is_being_programmed():
+            _turn_away(connection, "another loader is programming it")
             return
         self._loader = loader = _Loader(connection)
         self._epoll.register(connection.fileno(), _READABLE)
         loader.send(self._greeting(framing.NO_TOKEN))
 
+    def _is_being_programmed(self) -> bool:
+        """Whether a loader is connected; one that has just left is heard out and is not."""
+        loader = self._loader
+        if loader is None:
+            return False
+        while loader.open and loader.receive():
+            loader.answer(self._program)
+        if not loader.open:
+            self._drop_loader()
+        return self._loader is not None
+
     def _serve_loader(self, loader: _Loader) -> None:
         loader.heard = time.monotonic()
         loader.receive()
-        self._answer(loader)
+        loader.answer(self._program)
         if not loader.open:
             self._drop_loader()
 
-    def _program(self, loader: _Loader, frame: Frame) -> None:
+    def _program(self, frame: Frame) -> None:
+        """Do what a frame of the loader asks for."""
+        loader = self._loader
+        if loader is None:
+            return
         operation, flags, sequence, address, count, payload = frame
         if operation == framing.READ:
             words = self._board.read(address, count)
@@ -410,14 +425,8 @@ class _Server:
             loader.send(framing.encode(framing.PROGRAM, framing.REPLY, sequence, address, 0))
 
     def _check_not_held(self, begin: ProgramBegin) -> None:
-        if self._host is not None and begin.token != self._host.token:
-            # as in _accept_host: it may just have left
-            while self._host is not None and self._host.receive():
-                self._answer(self._host)
-            if self._host is not None and not self._host.open:
-                self._drop_host()
-        if self._host is not None and begin.token != self._host.token:
-            raise RefusedError(ErrorCode.HELD, "a host holds the board; end it, or program through it")
+        if self._is_held() and self._host is not None and begin.token != self._host.token:
+            raise RefusedError(ErrorCode.HELD, "a host has it; end that host, or program through it")
 
     def _load(self, loader: _Loader) -> None:
         assert loader.begin is not None  # noqa: S101 - BEGIN comes first
