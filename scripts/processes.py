@@ -11,9 +11,11 @@ from collections.abc import Awaitable, Callable
 from pathlib import Path
 
 from bridge.errors import BridgeError
+from casestudies.errors import CaseStudyError
 from services.command_line import run_async
 from services.errors import ExitCode, ServiceError, StoppedError
 from services.supervision import own_command
+from toolchain.errors import ToolchainError
 
 ROOT = Path(__file__).resolve().parent.parent
 BOAT_TOPIC, BOAT_TYPE = "/boat/sensors", "boat_msgs/Sensors"
@@ -151,7 +153,7 @@ def run_script(work: Callable[[], Awaitable[int]], limit: float) -> int:
     except StoppedError as stopped:
         print(stopped, file=sys.stderr)
         return stopped.exit_code
-    except (ServiceError, BridgeError) as error:
+    except (ServiceError, BridgeError, CaseStudyError, ToolchainError) as error:
         print(f"error: {error}", file=sys.stderr)
         return error.exit_code
     except OSError as error:
