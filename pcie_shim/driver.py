@@ -163,18 +163,17 @@ class _Board:
 
     # ---- opening --------------------------------------------------------------------------------------
 
-    def open(self, timeout: float) -> None:
+    def open(self, timeout: float, connect_timeout: float) -> None:
         """Open the board: see :meth:`MiniCluster.open`; raises the link's errors."""
         self.close("it is being opened")
         self._forget()
-        link = self._identified(timeout)
+        link = self._identified(timeout, connect_timeout)
         try:
             if link.greeting.is_blank:
-                program(
-                    self.endpoint, self.image, timeout=max(timeout, PROGRAMMING_S), token=link.greeting.token
-                )
+                limit = max(timeout, PROGRAMMING_S)
+                program(self.endpoint, self.image, timeout=limit, token=link.greeting.token)
                 link.close("the board was programmed")
-                link = self._identified(timeout)
+                link = self._identified(timeout, connect_timeout)
             self._check_image(link)
             link.write32(rm.CONTROL, rm.CONTROL_RESET_MASK | rm.CONTROL_INTERRUPT_ENABLE_MASK)
             self.number = link.read32(rm.DONE)
@@ -184,9 +183,9 @@ class _Board:
             raise
         self.link = link
 
-    def _identified(self, timeout: float) -> SocketLink:
+    def _identified(self, timeout: float, connect_timeout: float) -> SocketLink:
         """A link to what is certainly a board with this register map."""
-        link = SocketLink.open(self.endpoint, timeout=timeout)
+        link = SocketLink.open(self.endpoint, timeout=timeout, connect_timeout=connect_timeout)
         try:
             self._check_identity(link)
         except BaseException:
@@ -202,13 +201,13 @@ class _Board:
         if identity != rm.ID_VALUE or not alive:
             raise GreetingMismatchError(
                 f"What answers at {self.endpoint} is no board: its ID is {identity:#010x} (a board's: "
-                f"{rm.ID_VALUE:#010x}), and its LIVENESS register is {'alive' if alive else 'dead'}."
+                f"{rm.ID_VALUE:#010x}), and its LIVENESS register is {'alive' if alive else 'dead'}"
             )
         map_hash = link.read_block(rm.MAP_HASH, rm.MAP_HASH_WORDS).hex()
         if map_hash != rm.MAP_SHA256:
             raise GreetingMismatchError(
                 f"The board at {self.endpoint} has register map {map_hash}, this software has "
-                f"{rm.MAP_SHA256}: use a board and a host of the same version."
+                f"{rm.MAP_SHA256}: use a board and a host of the same version"
             )
 
     def _check_image(self, link: SocketLink) -> None:
@@ -217,7 +216,7 @@ class _Board:
             raise ImageMismatchError(
                 f"The board at {self.endpoint} holds image {found}, the deployment's is "
                 f"{self.image.image_hash}: program it with the loader, or restart it (a blank board is "
-                "programmed when it is opened)."
+                "programmed when it is opened)"
             )
 
     def close(self, reason: str) -> None:
@@ -272,16 +271,16 @@ class _Board:
             return False
         if not self.waiting or done.number != self.number:
             raise SequenceError(
-                f"The board at {self.endpoint} said done number {done.number} where {self.number} was due."
+                f"The board at {self.endpoint} said done number {done.number} where {self.number} was due"
             )
         if len(done.results) != 4 * self.lines:
             raise ShortReadError(
                 f"The board at {self.endpoint} said done with {len(done.results) // 4} results where "
-                f"{self.lines} were due."
+                f"{self.lines} were due"
             )
         if done.state != BoardState.DONE or done.reason not in _REASONS:
             raise FramingError(
-                f"The board at {self.endpoint} said done with a status of {done.status:#010x}, which is none."
+                f"The board at {self.endpoint} said done with a status of {done.status:#010x}, which is none"
             )
         self.waiting = False
         self.done = done
@@ -373,6 +372,10 @@ class MiniCluster:
 
     def reopen(self, board: int, *, timeout: float | None = None) -> None:
         """Open a board again, after its restart or a broken link; a blank one is programmed.
+
+        Args:
+            board: Its number.
+            timeout: Seconds for it to listen and greet; None: as when the mini-cluster was opened.
 
         Raises:
             BoardError: It cannot be opened.
@@ -471,7 +474,7 @@ class MiniCluster:
                     late,
                     LinkTimeoutError(
                         f"The board at {late.endpoint} did not say done within {limit:.3g} s, for {cycles} "
-                        "cycles."
+                        "cycles"
                     ),
                 )
             for descriptor, _ in events:
@@ -486,7 +489,7 @@ class MiniCluster:
         if isinstance(error, AccessError) and not isinstance(error, StaleHandleError):
             board.waiting = True  # it may have started all the same: run() has it opened again
         else:
-            self._close(board, str(error).rstrip("."))
+            self._close(board, str(error))
         raise _board_error(board, error) from error
 
     def _make_ready(self) -> None:
@@ -496,16 +499,16 @@ class MiniCluster:
         for board in self._boards:
             if board.link is None:
                 raise BoardGoneError(
-                    f"Board {board.index} at {board.endpoint} is not open ({board.broken}): open it again.",
+                    f"Board {board.index} at {board.endpoint} is not open ({board.broken}): open it again",
                     board=board.index,
                 )
 
-    def _open(self, board: _Board, timeout: float) -> None:
+    def _open(self, board: _Board, connect_timeout: float) -> None:
         self._close(board, "it is being opened")
         try:
-            board.open(timeout)
+            board.open(self._timeout, connect_timeout)
         except PcieShimError as error:
-            board.broken = str(error).rstrip(".")
+            board.broken = str(error)
             raise _board_error(board, error) from error
         assert board.link is not None  # noqa: S101 - open() has made it
         self._by_descriptor[board.link.fileno()] = board
@@ -535,12 +538,12 @@ class MiniCluster:
             ("The prior's address", frame.prior_address, 0, parameters.prior_addresses - 1),
         ):
             if not lowest <= value <= highest:
-                raise FrameInputError(f"{name} is {value}; this machine takes {lowest} to {highest}.")
+                raise FrameInputError(f"{name} is {value}; this machine takes {lowest} to {highest}")
         if frame.stop not in {"slices", "own"}:
-            raise FrameInputError(f"The boards cannot stop by '{frame.stop}': use slices or own.")
+            raise FrameInputError(f"The boards cannot stop by '{frame.stop}': use slices or own")
         if len(frame.addresses) != parameters.sensors:
             raise FrameInputError(
-                f"The frame has {len(frame.addresses)} readings; this machine has {parameters.sensors} sensors."
+                f"The frame has {len(frame.addresses)} readings; this machine has {parameters.sensors} sensors"
             )
         words = []
         for column, (address, bits) in enumerate(
@@ -550,7 +553,7 @@ class MiniCluster:
             if address is not None and not 0 <= address <= missing:
                 raise FrameInputError(
                     f"The address of sensor column {column} is {address}; this machine takes 0 to "
-                    f"{missing - 1}, or none."
+                    f"{missing - 1}, or none"
                 )
             words.append(missing if address is None else address)
         settings = _SETTINGS.pack(frame.target_count, frame.max_cycles, frame.bank, frame.prior_address)
@@ -561,14 +564,14 @@ class MiniCluster:
         codes = frame.prior_codes
         if self._parameters.prior_mode is not PriorMode.WRITTEN:
             if codes is not None:
-                raise FrameInputError("The frame has a prior to write, but the machine's prior is a table.")
+                raise FrameInputError("The frame has a prior to write, but the machine's prior is a table")
             return [None] * len(self._boards)
         if codes is None:
             return [board.image.machine.prior[0] for board in self._boards]
         if codes.shape != (self.total_lines,) or int(codes.max()) > self._parameters.ones_code:
             raise FrameInputError(
                 f"The prior to write has shape {codes.shape} and codes up to {codes.max()}; this machine takes "
-                f"{self.total_lines} codes from 0 to {self._parameters.ones_code}."
+                f"{self.total_lines} codes from 0 to {self._parameters.ones_code}"
             )
         offsets = [board.image.partition.line_offset for board in self._boards]
         return [
@@ -579,9 +582,7 @@ class MiniCluster:
 def _check_images(boards: int, images: Sequence[Image]) -> None:
     """Refuse images that are not the parts of one model, in order."""
     if boards != len(images) or not images:
-        raise ImageMismatchError(
-            f"There are {boards} endpoints for {len(images)} images; one each is needed."
-        )
+        raise ImageMismatchError(f"There are {boards} endpoints for {len(images)} images; one each is needed")
     offset = 0
     first = images[0]
     for index, image in enumerate(images):
@@ -589,16 +590,16 @@ def _check_images(boards: int, images: Sequence[Image]) -> None:
         if (part.index, part.count, part.line_offset) != (index, len(images), offset):
             raise ImageMismatchError(
                 f"Image {index} is part {part.index} of {part.count} from line {part.line_offset} on; part "
-                f"{index} of {len(images)} from line {offset} on is needed here."
+                f"{index} of {len(images)} from line {offset} on is needed here"
             )
         if image.model_hash != first.model_hash or part.total_lines != first.partition.total_lines:
             raise ImageMismatchError(
-                f"Image {index} belongs to model {image.model_hash}, image 0 to {first.model_hash}."
+                f"Image {index} belongs to model {image.model_hash}, image 0 to {first.model_hash}"
             )
         offset += image.machine.parameters.lines
     if offset != first.partition.total_lines:
         raise ImageMismatchError(
-            f"The images hold {offset} lines, the model has {first.partition.total_lines}."
+            f"The images hold {offset} lines, the model has {first.partition.total_lines}"
         )
 
 

@@ -58,12 +58,12 @@ def parse_endpoint(text: str) -> Endpoint:
     if text.startswith("unix:"):
         endpoint = Endpoint(path=text.removeprefix("unix:"))
         if not endpoint.path.startswith("/"):
-            raise EndpointError(f"The endpoint '{text}' is not understood: unix: takes an absolute path.")
+            raise EndpointError(f"The endpoint '{text}' is not understood: unix: takes an absolute path")
         longest = len(os.fsencode(endpoint.programming.path))
         if longest > UNIX_PATH_BYTES:
             raise EndpointError(
                 f"The path in '{text}' is too long: with '.program' it has {longest} bytes, a unix socket's "
-                f"path takes {UNIX_PATH_BYTES}; use a shorter folder."
+                f"path takes {UNIX_PATH_BYTES}; use a shorter folder"
             )
         return endpoint
     try:
@@ -75,7 +75,7 @@ def parse_endpoint(text: str) -> Endpoint:
         return Endpoint(host=host, port=port)
     raise EndpointError(
         f"The endpoint '{text}' is not understood: use unix:/path/board0.sock or tcp://host:port, with a "
-        "port from 1 to 65534 (the next one is for programming)."
+        "port from 1 to 65534 (the next one is for programming)"
     )
 
 
@@ -103,7 +103,7 @@ def listen(endpoint: Endpoint) -> socket.socket:
     except OSError as error:
         taken = error.errno == errno.EADDRINUSE
         reason = "another process listens there" if taken else (error.strerror or str(error))
-        raise EndpointError(f"A board cannot listen at {endpoint}: {reason}.") from error
+        raise EndpointError(f"Nothing can be served at {endpoint}: {reason}") from error
     return server
 
 
@@ -128,7 +128,7 @@ def connect(endpoint: Endpoint, *, timeout: float) -> socket.socket:
         try:
             return _connect_once(endpoint, max(deadline - time.monotonic(), _RETRY_S))
         except TimeoutError:
-            raise LinkTimeoutError(f"{endpoint} did not take a connection within {timeout:g} s.") from None
+            raise LinkTimeoutError(f"{endpoint} did not take a connection within {timeout:g} s") from None
         except OSError as error:
             if time.monotonic() + _RETRY_S >= deadline:
                 reason = error.strerror or str(error)

@@ -83,7 +83,7 @@ class SocketLink:
         timeout: Seconds that an answer may take.
     """
 
-    def __init__(self, endpoint: Endpoint, *, timeout: float) -> None:
+    def __init__(self, endpoint: Endpoint, *, timeout: float, connect_timeout: float) -> None:
         """Connect and hear the greeting; use :meth:`open`, which also checks it."""
         self.endpoint = endpoint
         self.timeout = timeout
@@ -92,11 +92,12 @@ class SocketLink:
         self._sequence = 0
         self._interrupts = 0
         self._done: Done | None = None
-        deadline = time.monotonic() + timeout
-        self._socket = connect(endpoint, timeout=timeout)
+        deadline = time.monotonic() + connect_timeout
+        self._socket = connect(endpoint, timeout=connect_timeout)
         try:
+            self._limit(connect_timeout)
+            frame = self._receive(deadline, connect_timeout, "its greeting")
             self._limit(timeout)
-            frame = self._receive(deadline, "its greeting")
             if frame.operation == framing.ERROR:
                 self._refused(frame)
             self.greeting = framing.decode_greeting(frame)
@@ -104,12 +105,13 @@ class SocketLink:
             self._give_up(error)
 
     @classmethod
-    def open(cls, endpoint: Endpoint, *, timeout: float) -> Self:
+    def open(cls, endpoint: Endpoint, *, timeout: float, connect_timeout: float | None = None) -> Self:
         """A link to a board that speaks this protocol and has this register map.
 
         Args:
             endpoint: The board's registers, or its programming port.
-            timeout: Seconds for the board to listen and greet, and later for each answer.
+            timeout: Seconds for each answer.
+            connect_timeout: Seconds for the board to listen and greet; None: as ``timeout``.
 
         Raises:
             UnreachableError: Nothing listens there.
@@ -117,7 +119,9 @@ class SocketLink:
             GreetingMismatchError: It has another protocol version, register map or BAR size.
             LinkError: It does not greet, or is no board.
         """
-        link = cls(endpoint, timeout=timeout)
+        link = cls(
+            endpoint, timeout=timeout, connect_timeout=timeout if connect_timeout is None else connect_timeout
+        )
         greeting = link.greeting
         for what, theirs, ours in (
             ("protocol version", greeting.protocol_version, framing.PROTOCOL_VERSION),
@@ -128,7 +132,7 @@ class SocketLink:
                 link.close()
                 raise GreetingMismatchError(
                     f"The board at {endpoint} has {what} {theirs}, this software has {ours}: "
-                    "use a board and a host of the same version."
+                    "use a board and a host of the same version"
                 )
         return link
 
@@ -168,7 +172,7 @@ class SocketLink:
         (value,) = _WORD.unpack(self.read_block(address, 1))
         if value == ALL_ONES and address == register_map.ID:
             self._give_up(
-                DeviceGoneError(f"The ID of the board at {self.endpoint} reads all ones: no device answers.")
+                DeviceGoneError(f"The ID of the board at {self.endpoint} reads all ones: no device answers")
             )
         return int(value)
 
@@ -194,7 +198,7 @@ class SocketLink:
             self._give_up(
                 ShortReadError(
                     f"The board at {self.endpoint} answered a read of {count} words at {address:#06x} with "
-                    f"{frame.words}: the link is closed."
+                    f"{frame.words}: the link is closed"
                 )
             )
         return bytes(frame.payload)
@@ -225,7 +229,7 @@ class SocketLink:
             self._give_up(
                 SequenceError(
                     f"The board at {self.endpoint} said done number {done.number} where {number} was due: "
-                    "the link is closed."
+                    "the link is closed"
                 )
             )
         return done
@@ -303,7 +307,7 @@ class SocketLink:
         deadline = time.monotonic() + self.timeout
         while True:
             try:
-                frame = self._receive(deadline, f"an answer about {address:#06x}")
+                frame = self._receive(deadline, self.timeout, f"an answer about {address:#06x}")
             except LinkError as error:
                 self._give_up(error)
             if frame.operation == framing.IRQ:
@@ -318,15 +322,15 @@ class SocketLink:
 
     # ---- receiving ------------------------------------------------------------------------------------
 
-    def _receive(self, deadline: float, what: str) -> Frame:
+    def _receive(self, deadline: float, timeout: float, what: str) -> Frame:
         """The next frame, whatever it is; the socket's own limit bounds each receive."""
         while (frame := self._decoder.next_frame()) is None:
             if time.monotonic() > deadline:
-                raise self._late(self.timeout, what)
+                raise self._late(timeout, what)
             try:
                 count = self._socket.recv_into(self._decoder.room())
             except BlockingIOError:
-                raise self._late(self.timeout, what) from None
+                raise self._late(timeout, what) from None
             except OSError as error:
                 raise self._gone(error.strerror or str(error)) from error
             if count == 0:
@@ -357,7 +361,7 @@ class SocketLink:
         if frame.words < _DONE_WORDS:
             self._give_up(
                 ShortReadError(
-                    f"The board at {self.endpoint} sent an interrupt of {frame.words} words: the link is closed."
+                    f"The board at {self.endpoint} sent an interrupt of {frame.words} words: the link is closed"
                 )
             )
         self._interrupts = (self._interrupts + 1) & ALL_ONES
@@ -369,7 +373,7 @@ class SocketLink:
         if number == status == ALL_ONES:
             self._give_up(
                 DeviceGoneError(
-                    f"The registers of the board at {self.endpoint} read all ones: no device answers."
+                    f"The registers of the board at {self.endpoint} read all ones: no device answers"
                 )
             )
         return Done(number, status, cycles, compute_ns, frame.payload[_DONE.size :])
@@ -383,14 +387,14 @@ class SocketLink:
         except FramingError as error:
             self._give_up(error)
         name = ErrorCode(code).name if code in ErrorCode.__members__.values() else f"code {code}"
-        sentence = f"The board at {self.endpoint} refused access to {frame.address:#06x} ({name}): {detail}."
+        sentence = f"The board at {self.endpoint} refused access to {frame.address:#06x} ({name}): {detail}"
         if code in _CLOSING_CODES:
             self.close(f"the board said {name}")
         if code == ErrorCode.HELD:
-            raise HeldError(f"The board at {self.endpoint} is held: {detail}.", code=code, detail=detail)
+            raise HeldError(f"The board at {self.endpoint} is held: {detail}", code=code, detail=detail)
         if code == ErrorCode.STALE:
             raise StaleHandleError(
-                f"The handle of the board at {self.endpoint} is stale: {detail}; open the board again.",
+                f"The handle of the board at {self.endpoint} is stale: {detail}; open the board again",
                 code=code,
                 detail=detail,
             )
@@ -402,7 +406,8 @@ class SocketLink:
         # A board that closes says why first: that word may be waiting.
         frame = None
         with suppress(LinkError):
-            while (frame := self._receive(time.monotonic() + self.timeout, "")).operation != framing.ERROR:
+            deadline = time.monotonic() + self.timeout
+            while (frame := self._receive(deadline, self.timeout, "")).operation != framing.ERROR:
                 pass
         if frame is not None and frame.operation == framing.ERROR:
             self.close("the board closed it")
@@ -412,25 +417,25 @@ class SocketLink:
     def _late(self, timeout: float, what: str) -> LinkTimeoutError:
         rest = ": a frame began and did not end" if self._decoder.inside_frame else ""
         return LinkTimeoutError(
-            f"The board at {self.endpoint} did not give {what} within {timeout:g} s{rest}: the link is closed."
+            f"The board at {self.endpoint} did not give {what} within {timeout:g} s{rest}: the link is closed"
         )
 
     def _gone(self, reason: str) -> LinkClosedError:
-        return LinkClosedError(f"The board at {self.endpoint} is gone: {reason}.")
+        return LinkClosedError(f"The board at {self.endpoint} is gone: {reason}")
 
     def _give_up(self, error: LinkError) -> NoReturn:
         """Close the link, and raise the error that says why."""
         if type(error) in {FramingError, CrcError, SequenceError}:
             # the decoder knows no endpoint
-            text = str(error).rstrip(".")
+            text = str(error)
             if str(self.endpoint) not in text:
-                error = type(error)(f"The link to the board at {self.endpoint} is broken and closed: {text}.")
-        self.close(str(error).rstrip("."))
+                error = type(error)(f"The link to the board at {self.endpoint} is broken and closed: {text}")
+        self.close(str(error))
         raise error
 
     def _check_open(self) -> None:
         if self._closed:
-            raise LinkClosedError(f"The link to the board at {self.endpoint} is closed: {self._closed}.")
+            raise LinkClosedError(f"The link to the board at {self.endpoint} is closed: {self._closed}")
 
     def _limit(self, seconds: float) -> None:
         """Let the kernel bound every blocking call: cheaper than Python's own time-outs, a system call each."""

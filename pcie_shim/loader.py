@@ -61,7 +61,7 @@ def program(
     if identity != register_map.ID_VALUE or found != expected:
         raise ImageMismatchError(
             f"The board at {where} reads ID {identity:#010x} and image {found} after programming; "
-            f"{register_map.ID_VALUE:#010x} and {expected} were expected."
+            f"{register_map.ID_VALUE:#010x} and {expected} were expected"
         )
     return found
 
@@ -83,5 +83,5 @@ def _request(link: SocketLink, flag: int, offset: int, payload: bytes) -> None:
         if error.code != ErrorCode.BAD_IMAGE:
             raise
         raise ImageMismatchError(
-            f"The board at {link.endpoint} does not take the image: {error.detail}."
+            f"The board at {link.endpoint} does not take the image: {error.detail}"
         ) from error

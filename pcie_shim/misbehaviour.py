@@ -64,6 +64,6 @@ class Misbehaviour:
         if match is None or match[1] not in list(MisbehaviourKind):
             raise UnknownMisbehaviourError(
                 f"'{text}' is no misbehaviour: use KIND[:AFTER[:TIMES]] with one of "
-                f"{', '.join(MisbehaviourKind)}."
+                f"{', '.join(MisbehaviourKind)}"
             )
         return cls(MisbehaviourKind(match[1]), int(match[2] or 0), int(match[3] or 0))

@@ -93,19 +93,19 @@ class Image:
         if not (0 < self.interface_sensors <= words[0] and 0 < self.interface_results <= words[1]):
             raise ImageError(
                 f"The interface {self.interface_sensors}x{self.interface_results} does not fit the register "
-                f"map, which has room for 1x1 to {words[0]}x{words[1]}."
+                f"map, which has room for 1x1 to {words[0]}x{words[1]}"
             )
         if sensors > self.interface_sensors or lines > self.interface_results:
             raise ImageError(
                 f"The machine has {sensors} sensors and {lines} lines; the interface "
                 f"{self.interface_sensors}x{self.interface_results} is smaller: use --interface "
                 f"{max(sensors, self.interface_sensors)}x{max(lines, self.interface_results)}, "
-                "or more partitions."
+                "or more partitions"
             )
         if not (0 <= part.index < part.count < 1 << 16 and 0 <= part.line_offset <= part.total_lines - lines):
             raise ImageError(
                 f"Part {part.index} of {part.count} cannot hold {lines} lines from line {part.line_offset} "
-                f"on: the model has {part.total_lines}."
+                f"on: the model has {part.total_lines}"
             )
 
     @property
@@ -177,7 +177,7 @@ def build_date() -> str:
         return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(None if epoch is None else int(epoch)))
     except (ValueError, OverflowError, OSError):
         raise ImageError(
-            f"SOURCE_DATE_EPOCH is {epoch!r}; it must be a number of seconds since 1970."
+            f"SOURCE_DATE_EPOCH is {epoch!r}; it must be a number of seconds since 1970"
         ) from None
 
 
@@ -206,7 +206,7 @@ def write_image(path: Path, image: Image) -> None:
         part.replace(path)
     except OSError as error:
         part.unlink(missing_ok=True)
-        raise ImageError(f"{path} cannot be written: {error.strerror}.") from error
+        raise ImageError(f"{path} cannot be written: {error.strerror}") from error
 
 
 def read_image(path: Path) -> Image:
@@ -231,7 +231,7 @@ def read_bytes(path: Path) -> bytes:
             # one byte more than allowed, so that a file that is too large is told from one that is not
             return file.read(MAX_IMAGE_BYTES + 1)
     except OSError as error:
-        raise ImageError(f"{path} cannot be read: {error.strerror}.") from error
+        raise ImageError(f"{path} cannot be read: {error.strerror}") from error
 
 
 def image_from_bytes(content: bytes, name: str = "the image") -> Image:
@@ -249,13 +249,13 @@ def image_from_bytes(content: bytes, name: str = "the image") -> Image:
     if manifest.identity.map_hash != register_map.MAP_SHA256:
         raise ImageMismatchError(
             f"{name} was built for register map {manifest.identity.map_hash}, this software has "
-            f"{register_map.MAP_SHA256}: build the deployment again."
+            f"{register_map.MAP_SHA256}: build the deployment again"
         )
     sections = _read_sections(content, name, manifest, data_start)
     if manifest.identity.hash != manifest.image_hash:
         raise DamagedImageError(
             f"{name} is damaged: the image hash is {manifest.identity.hash}, its manifest says "
-            f"{manifest.image_hash}; build the deployment again."
+            f"{manifest.image_hash}; build the deployment again"
         )
     part, interface = manifest.identity.partition, manifest.identity.interface
     columns = [array for section, array in sections if section.startswith("column ")]
@@ -274,7 +274,7 @@ def image_from_bytes(content: bytes, name: str = "the image") -> Image:
             tool_version=manifest.tool_version,
         )
     except KeyError:
-        raise ImageMismatchError(f"{name} has no prior: it is no image of a BM1.") from None
+        raise ImageMismatchError(f"{name} has no prior: it is no image of a BM1") from None
     except MachineError as error:
         raise ImageMismatchError(f"{name} holds a machine that cannot be built: {error}") from error
 
@@ -282,16 +282,13 @@ def image_from_bytes(content: bytes, name: str = "the image") -> Image:
 def _read_manifest(content: bytes, name: str) -> tuple[_Manifest, int]:
     """The manifest, and where the sections start."""
     if len(content) > MAX_IMAGE_BYTES:
-        raise ImageMismatchError(f"{name} is larger than {MAX_IMAGE_BYTES} bytes: it is no programming file.")
+        raise ImageMismatchError(f"{name} is larger than {MAX_IMAGE_BYTES} bytes: it is no programming file")
     if len(content) < _HEADER.size or content[:7] != MAGIC[:7]:
-        raise DamagedImageError(
-            f"{name} is no programming file: it does not start with {MAGIC[:7].decode()}."
-        )
+        raise DamagedImageError(f"{name} is no programming file: it does not start with {MAGIC[:7].decode()}")
     magic, length, _, digest = _HEADER.unpack_from(content)
     if magic != MAGIC:
         raise ImageMismatchError(
-            f"{name} has format {magic[7]}, this software reads format {MAGIC[7]}: "
-            "build the deployment again."
+            f"{name} has format {magic[7]}, this software reads format {MAGIC[7]}: build the deployment again"
         )
     start = _HEADER.size + length
     text = content[_HEADER.size : start]
@@ -310,7 +307,7 @@ def _read_sections(
     for section in manifest.identity.sections:
         if section.dtype not in {"<u2", "<u4"} or any(size < 0 for size in section.shape):
             raise ImageMismatchError(
-                f"{name} has a section '{section.name}' of an unknown kind: {section.dtype}."
+                f"{name} has a section '{section.name}' of an unknown kind: {section.dtype}"
             )
         dtype = np.dtype(section.dtype)
         end = start + dtype.itemsize * int(np.prod(section.shape, dtype=object))
@@ -319,7 +316,7 @@ def _read_sections(
         sections.append((section.name, np.frombuffer(data, dtype).reshape(section.shape)))
         start = end
     if start != len(content):
-        raise DamagedImageError(f"{name} is damaged: {len(content) - start} bytes follow its last section.")
+        raise DamagedImageError(f"{name} is damaged: {len(content) - start} bytes follow its last section")
     return sections
 
 
@@ -328,7 +325,7 @@ def _check_hash(name: str, what: str, data: bytes, expected: str, source: str) -
     if found != expected:
         raise DamagedImageError(
             f"{name} is damaged: the sha256 of {what} is {found}, {source} says {expected}; "
-            "build the deployment again."
+            "build the deployment again"
         )
 
 
