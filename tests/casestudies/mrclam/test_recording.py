@@ -3,6 +3,7 @@
 import pytest
 
 from casestudies.errors import DataFileError
+from casestudies.mrclam.model import X_LIMITS, Y_LIMITS
 from casestudies.mrclam.recording import (
     SIGHTINGS_MSG,
     RecordedFrame,
@@ -81,8 +82,9 @@ def test_files_that_are_no_files(tmp_path):
         read_recording(binary)
 
 
-def test_the_area():
+def test_the_area_is_the_models():
     grid = area_grid()
+    assert ((grid.x_low, grid.x_high), (grid.y_low, grid.y_high)) == (X_LIMITS, Y_LIMITS)
     assert grid.centre(0) == pytest.approx((-2 + 9 / 64, -7 + 14 / 64))
     assert grid.cells == 1024
 
