@@ -465,7 +465,7 @@ class Master:
                 )
         elif self._once:
             if record.outcome == "no posterior":
-                msg = f"frame {record.number} has no posterior: its readings are impossible for every line of the model; nothing was published"
+                msg = f"frame {record.number} has no posterior: no line of the model counted for its readings; nothing was published"
                 self._fail(VariableError(msg))
             else:
                 self._fail(RosbridgeLostError("rosbridge went away before the result could be published"))

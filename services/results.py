@@ -111,7 +111,12 @@ def frame_message(
         *((name, f"{value:.1f}") for name, value in times_us),
     ]
     ok = 0 if published else 1
-    overall = "posterior" if published else "no posterior: the readings are impossible for every line"
+    if published:
+        overall = "posterior"
+    elif all(reason is StopReason.IMPOSSIBLE for reason in reasons):
+        overall = "no posterior: the readings are impossible for every line"
+    else:
+        overall = "no posterior: no line counted within max_cycles"
     statuses = [_status(ok, "rosbayes: frame", overall, deployment.name, values)]
     for index, (board, reason, total) in enumerate(zip(result.boards, reasons, totals, strict=True)):
         words = REASON_WORDS[reason]
