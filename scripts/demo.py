@@ -35,12 +35,16 @@ async def demo(arguments: argparse.Namespace) -> int:
             print(f"using the rosbridge server at {uri}, building the boat's deployment ...")
         count = str(arguments.count)
         await viewer.start("boat-viewer", "--uri", uri, "--count", count, "--out", str(out))
-        building = asyncio.create_task(build("boat", deployment, uri, BOAT_TOPIC, BOAT_TYPE))
+        # a real server knows installed message types only, so there the readings travel as plain arrays
+        array = [] if arguments.uri is None else ["--array"]
+        type_ = "std_msgs/Float64MultiArray" if array else BOAT_TYPE
+        options = ("--set", "array=true") if array else ()
+        building = asyncio.create_task(build("boat", deployment, uri, BOAT_TOPIC, type_, *options))
         await asyncio.gather(building, viewer.line("listening"))
         await master.start("master", "--loop", "--count", count, "-d", str(deployment), "--uri", uri)
-        await normaliser.start("boat-normaliser", "--uri", uri)
+        await normaliser.start("boat-normaliser", "--uri", uri, *array)
         seed = ["--seed", str(arguments.seed)] if arguments.seed is not None else []
-        await simulator.start("boat-simulator", "--uri", uri, "--rate", str(arguments.rate), *seed)
+        await simulator.start("boat-simulator", "--uri", uri, "--rate", str(arguments.rate), *seed, *array)
         await master.succeed()
         await viewer.succeed()
         print(f"done in {time.monotonic() - started:.1f} s; pictures are in {out}", flush=True)

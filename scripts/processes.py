@@ -14,7 +14,7 @@ from bridge.errors import BridgeError
 from casestudies.errors import CaseStudyError
 from services.command_line import run_async
 from services.errors import ExitCode, ServiceError, StoppedError
-from services.supervision import own_command
+from services.supervision import ask_for_end_with_parent, own_command
 from toolchain.errors import ToolchainError
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -42,6 +42,7 @@ class Process:
             stdout=asyncio.subprocess.PIPE,
             stderr=asyncio.subprocess.STDOUT,
             start_new_session=True,
+            preexec_fn=ask_for_end_with_parent,
         )
         self._reader = asyncio.create_task(self._read())
 

@@ -8,10 +8,10 @@ from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-from machines.posterior import joint_posterior
 
 from bridge.stamps import header
 from machines.bm1 import StopReason
+from machines.posterior import joint_posterior
 from services.records import FrameResult, Publish
 from toolchain.deployment import Deployment
 

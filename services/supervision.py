@@ -44,6 +44,11 @@ def make_private_directory() -> Path:
         raise ServiceError(msg) from error
 
 
+def ask_for_end_with_parent() -> None:
+    """Have the kernel send this process SIGTERM when its parent ends; an exec does not undo it."""
+    ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
+
+
 def end_with_parent() -> None:
     """In a child: have the kernel send SIGTERM when the parent ends, even by SIGKILL.
 
@@ -52,7 +57,7 @@ def end_with_parent() -> None:
     parent = os.environ.get(PARENT_VARIABLE)
     if parent is None or not parent.isdigit():
         return
-    ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
+    ask_for_end_with_parent()
     # the parent may have ended before the kernel was told
     if os.getppid() != int(parent):
         raise SystemExit(ExitCode.TERMINATED)
