@@ -111,6 +111,7 @@ class _Hub:
         self._timer: asyncio.TimerHandle | None = None
         self._timer_deadline = inf
         self._sweeper: asyncio.TimerHandle | None = None
+        self._swept = time.monotonic()
         self._nobody_left = asyncio.Event()
 
     def admit(self, connection: "_Connection", address: str) -> Client:
@@ -135,8 +136,11 @@ class _Hub:
     def sweep(self) -> None:
         """Look after those who say nothing and take nothing, now and then."""
         now = time.monotonic()
-        for connection in list(self.connections):
-            connection.sweep(now)
+        # When the hub itself was held up, its clients' answers may be waiting to be read: next time, then.
+        if now < self._swept + 3 * _SWEEP:
+            for connection in list(self.connections):
+                connection.sweep(now)
+        self._swept = now
         self._sweeper = asyncio.get_running_loop().call_later(_SWEEP, self.sweep)
 
     async def close(self) -> None:

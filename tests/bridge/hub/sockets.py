@@ -55,17 +55,17 @@ class Ears:
 
 @asynccontextmanager
 async def running_hub(
-    *, limits: HubLimits | None = None, origins: tuple[str, ...] = ()
+    *, port: int = 0, limits: HubLimits | None = None, origins: tuple[str, ...] = ()
 ) -> AsyncIterator[int]:
-    """A hub on a free port of this machine; its port."""
+    """A hub on a port of this machine (0: any free one); its port."""
     stop = asyncio.Event()
-    port: asyncio.Future[int] = asyncio.get_running_loop().create_future()
+    ready: asyncio.Future[int] = asyncio.get_running_loop().create_future()
     served = asyncio.create_task(
-        serve_hub("127.0.0.1", 0, limits=limits, origins=origins, on_ready=port.set_result, stop=stop)
+        serve_hub("127.0.0.1", port, limits=limits, origins=origins, on_ready=ready.set_result, stop=stop)
     )
     try:
         async with asyncio.timeout(PATIENCE):
-            yield await port
+            yield await ready
     finally:
         stop.set()
         await asyncio.wait_for(served, PATIENCE)

@@ -4,6 +4,7 @@ Each test ends with a well-behaved client being served as if nothing had happene
 """
 
 import asyncio
+import contextlib
 import json
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -11,6 +12,7 @@ from contextlib import asynccontextmanager
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from websockets.exceptions import InvalidMessage
 from websockets.frames import Opcode
 
 from bridge.hub.limits import HubLimits
@@ -244,7 +246,7 @@ async def test_a_client_that_never_reads_is_closed_and_costs_others_nothing(quic
 
 
 async def test_a_client_that_only_publishes_and_never_reads_may_stay(quick_sweeps: None) -> None:
-    limits = HubLimits(ping_interval=0.05, ping_timeout=0.1)
+    limits = HubLimits(ping_interval=0.05, ping_timeout=0.3)
     async with _hub_and_witness(limits) as (port, witness):
         bare = await Bare.connect(port)
         bare.send_operation(op="advertise", topic="/t", type="a/B")
@@ -259,7 +261,7 @@ async def test_a_client_that_only_publishes_and_never_reads_may_stay(quick_sweep
 
 
 async def test_a_silent_client_is_pinged_and_then_closed(quick_sweeps: None) -> None:
-    limits = HubLimits(ping_interval=0.1, ping_timeout=0.2)
+    limits = HubLimits(ping_interval=0.1, ping_timeout=0.3)
     async with _hub_and_witness(limits) as (port, witness):
         bare = await Bare.connect(port)
         assert await bare.frame() == (Opcode.PING, b"")
@@ -267,7 +269,7 @@ async def test_a_silent_client_is_pinged_and_then_closed(quick_sweeps: None) -> 
 
 
 async def test_a_client_that_answers_pings_may_be_silent(quick_sweeps: None) -> None:
-    limits = HubLimits(ping_interval=0.02, ping_timeout=0.1)
+    limits = HubLimits(ping_interval=0.02, ping_timeout=1.0)
     async with _hub_and_witness(limits) as (port, _witness):
         bare = await Bare.connect(port)
         for _ in range(10):
@@ -290,11 +292,26 @@ async def test_a_connection_without_a_handshake_is_closed(quick_sweeps: None) ->
 async def test_connections_without_a_handshake_do_not_fill_the_hub(quick_sweeps: None) -> None:
     limits = HubLimits(clients=3, handshake_timeout=0.2)
     async with _hub_and_witness(limits) as (port, _witness):
+        for _ in range(100):
+            await Bare.connect(port, handshake=False)
+        async with asyncio.timeout(PATIENCE):
+            while True:
+                with contextlib.suppress(OSError, InvalidMessage):
+                    async with client(port) as late:
+                        await late.settle()
+                        break
+                await asyncio.sleep(0.01)
+
+
+async def test_connections_without_a_handshake_are_counted() -> None:
+    limits = HubLimits(clients=3, handshake_timeout=1000)
+    async with _hub_and_witness(limits) as (port, _witness):
         crowd = [await Bare.connect(port, handshake=False) for _ in range(100)]
-        for bare in crowd:
+        for bare in crowd[3 + 64 - 1 :]:
             assert await bare.ended() == b""
-        async with client(port) as late:
-            await late.settle()
+        assert not crowd[0].reader.at_eof()
+        for bare in crowd:
+            bare.hang_up()
 
 
 async def test_a_server_that_hangs_up_during_a_call_fails_it() -> None:

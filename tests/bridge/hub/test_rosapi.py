@@ -1,4 +1,5 @@
 import json
+from pathlib import Path
 
 import pytest
 
@@ -78,6 +79,12 @@ def test_every_service_that_is_listed_can_be_called(guest: Guest) -> None:
     for service in guest.rosapi("node_details", node="/rosapi")["services"]:
         answer = guest.ask(service)
         assert answer["result"] is (service != "/rosapi/set_param"), answer  # a parameter needs a name
+
+
+def test_every_service_is_documented(guest: Guest) -> None:
+    documentation = (Path(__file__).parents[3] / "docs" / "hub.md").read_text()
+    for service in guest.rosapi("node_details", node="/rosapi")["services"]:
+        assert f"`{service.removeprefix('/rosapi/')}`" in documentation
 
 
 def test_what_the_hub_cannot_know_does_not_exist(guest: Guest) -> None:

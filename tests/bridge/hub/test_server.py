@@ -7,7 +7,9 @@ from contextlib import AsyncExitStack
 import pytest
 from websockets.asyncio.client import connect
 from websockets.exceptions import InvalidStatus
+from websockets.frames import Frame, Opcode
 
+from bridge.hub import server
 from bridge.hub.errors import HubError
 from bridge.hub.limits import HubLimits
 from bridge.hub.server import serve_hub
@@ -21,6 +23,12 @@ async def test_a_message_passes_from_client_to_client() -> None:
         await publisher.send(op="advertise", topic="/t", type="a/B")
         await publisher.send(op="publish", topic="/t", msg={"data": [1.5, None]})
         assert await subscriber.hear() == {"op": "publish", "topic": "/t", "msg": {"data": [1.5, None]}}
+
+
+@pytest.mark.parametrize("length", [0, 1, 125, 126, 127, 65_535, 65_536, 1 << 20])
+def test_frames_are_those_of_the_standard(length: int) -> None:
+    payload = b"x" * length
+    assert server._header(length) + payload == Frame(Opcode.TEXT, payload).serialize(mask=False)
 
 
 @pytest.mark.parametrize("size", [0, 60, 80, 100, 200, 65_400, 65_500, 65_600, 200_000, (1 << 20) - 60])
@@ -47,12 +55,12 @@ async def test_many_messages_arrive_in_order_through_many_clients() -> None:
 
 
 async def test_a_service_between_clients() -> None:
-    async with running_hub() as port, client(port) as server, client(port) as caller:
-        await server.send(op="advertise_service", service="/add", type="a/Add")
-        await server.settle()
+    async with running_hub() as port, client(port) as offers, client(port) as caller:
+        await offers.send(op="advertise_service", service="/add", type="a/Add")
+        await offers.settle()
         await caller.send(op="call_service", service="/add", args={"a": 1}, id="x")
-        request = await server.hear()
-        await server.send(op="service_response", id=request["id"], values={"sum": 2}, result=True)
+        request = await offers.hear()
+        await offers.send(op="service_response", id=request["id"], values={"sum": 2}, result=True)
         assert (await caller.hear())["values"] == {"sum": 2}
 
 
@@ -66,9 +74,9 @@ async def test_what_a_throttle_held_comes_later_by_itself() -> None:
 
 async def test_a_call_without_an_answer_fails_by_itself() -> None:
     limits = HubLimits(call_timeout=0.1)
-    async with running_hub(limits=limits) as port, client(port) as server, client(port) as caller:
-        await server.send(op="advertise_service", service="/add", type="a/Add")
-        await server.settle()
+    async with running_hub(limits=limits) as port, client(port) as offers, client(port) as caller:
+        await offers.send(op="advertise_service", service="/add", type="a/Add")
+        await offers.settle()
         for number in range(2):
             await caller.send(op="call_service", service="/add", id=number)
             answer = await caller.hear()
@@ -230,3 +238,21 @@ def test_the_loop_is_left_as_it_was() -> None:
     port = asyncio.run(life())
     with socket.socket() as sock, pytest.raises(ConnectionRefusedError):
         sock.connect(("127.0.0.1", port))
+
+
+async def test_a_hub_that_was_held_up_blames_nobody() -> None:
+    swept = []
+
+    class Connection:
+        def sweep(self, now: float) -> None:
+            swept.append(now)
+
+    hub = server._Hub(HubLimits(), ())
+    hub.connections.add(Connection())  # type: ignore[arg-type]
+    hub._swept -= 10
+    hub.sweep()
+    assert not swept
+    hub.sweep()
+    assert swept
+    hub.connections.clear()
+    await hub.close()
