@@ -117,6 +117,7 @@ class Ros:
             NameFormError: of topic or type.
             TypeConflictError: this client advertises the topic already, as something else.
             OptionError: the queue has no room.
+            DisconnectedError: the client was closed.
         """
         return Publication(self._session, topic, type, latch=latch, queue_size=queue_size)
 
@@ -143,6 +144,7 @@ class Ros:
             NameFormError: of topic or type.
             TypeConflictError: this client subscribes to the topic already, as another type.
             OptionError: a number is out of its range.
+            DisconnectedError: the client was closed.
         """
         return Subscription(
             self._session,
@@ -201,6 +203,7 @@ class Ros:
         Raises:
             NameFormError: of service or type.
             TypeConflictError: this client serves it already.
+            DisconnectedError: the client was closed.
         """
         return Service(self._session, service, type, handler, handler_timeout)
 

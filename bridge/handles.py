@@ -36,6 +36,8 @@ class _Handle:
     """Something that is closed once: by itself, by leaving its ``async with``, or with its client."""
 
     def __init__(self, session: Session) -> None:
+        if session.state is State.CLOSED:
+            raise DisconnectedError(f"the client of {session.uri} was closed: connect() makes a new one")
         self._session = session
         self._closed = False
 

@@ -137,6 +137,7 @@ class Session:
         self._reconnecting: asyncio.Task[None] | None = None
         self._asking: asyncio.TimerHandle | None = None
         self._in_a_row = 0
+        self._turn = asyncio.Lock()  # fair: who waits longer comes first
         self._waiting = 0
         self._serving: set[asyncio.Task[None]] = set()
         self._calls: dict[str, asyncio.Future[CallAnswered]] = {}
@@ -169,8 +170,6 @@ class Session:
         self.core.lost()
         if self._reconnecting is not None:
             self._reconnecting.cancel()
-        if self._asking is not None:
-            self._asking.cancel()
         self._fail_calls(f"the client of {self.uri} was closed")
         self._set_state(State.CLOSED, reason)
         for task in self._serving:
@@ -332,9 +331,7 @@ class Session:
         """
         self._waiting += 1
         try:
-            async with asyncio.timeout(limit):
-                if self._waiting > 1:
-                    await asyncio.sleep(0)  # behind those who were woken up just now
+            async with asyncio.timeout(limit), self._turn:
                 while (websocket := self._open_websocket()).paused:
                     await _drain(websocket)
         except TimeoutError:

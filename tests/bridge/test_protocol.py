@@ -22,6 +22,7 @@ from bridge.errors import (
     SlowPeerError,
     TypeConflictError,
 )
+from bridge.json_codec import MAX_DEPTH
 from bridge.protocol import (
     MAX_CALLS,
     MAX_REQUESTS,
@@ -108,6 +109,21 @@ def test_the_limits_of_a_published_message():
     assert len(core.publish(number, {"d": "x" * room})) == 100
     with pytest.raises(EncodeError, match="bytes"):
         core.publish(number, {"d": "x" * (room + 1)})
+
+
+def test_the_depth_of_a_published_message():
+    core = connected()
+    number = core.advertise("/a", "p/T")
+
+    def nested(levels: int) -> dict[str, Any]:
+        return {"a": nested(levels - 1)} if levels else {}
+
+    receiver = connected()
+    receiver.subscribe("/a")
+    deepest = core.publish(number, nested(MAX_DEPTH - 2))
+    assert isinstance(receiver.receive(deepest, 0.0), MessageReceived), "what leaves can also arrive"
+    with pytest.raises(EncodeError, match="nested deeper"):
+        core.publish(number, nested(MAX_DEPTH - 1))
 
 
 @pytest.mark.parametrize(

@@ -180,6 +180,15 @@ async def test_a_goodbye_of_the_server_is_told():
         await ros.wait_for_state(State.CONNECTED, 10)
 
 
+async def test_a_goodbye_without_hanging_up_is_not_waited_for():
+    async with FakeRosbridge() as fake, connect(fake.uri) as ros:
+        fake.freeze()
+        (client,) = fake._clients
+        client.connection.transport.write(b"\x88\x02\x03\xe9")
+        await ros.wait_for_state(State.RECONNECTING, 3)
+        assert ros.last_error == "the server closed it (code 1001)"
+
+
 async def test_a_silent_peer_is_noticed():
     async with FakeRosbridge() as fake, connect(fake.uri, ping_interval=0.2, ping_timeout=0.2) as ros:
         begun = time.monotonic()
@@ -200,9 +209,12 @@ async def test_a_quiet_server_that_answers_pings_is_kept():
 
 
 async def test_a_sleep_of_this_process_is_not_the_servers_silence():
-    async with FakeRosbridge() as fake, connect(fake.uri, ping_interval=0.1, ping_timeout=0.1) as ros:
-        await asyncio.sleep(0.15)
-        time.sleep(1.0)  # noqa: ASYNC251  # the whole process stands still
+    async with FakeRosbridge() as fake, connect(fake.uri, ping_interval=0.1, ping_timeout=0.3) as ros:
+        fake.freeze()
+        while not ros._session._open_websocket()._pinged:
+            await asyncio.sleep(0)
+        fake.thaw()
+        time.sleep(1.0)  # noqa: ASYNC251  # the whole process stands still while the answer is on its way
         await asyncio.sleep(0.3)
         assert (ros.state, ros.reconnections) == (State.CONNECTED, 0)
         assert fake.connections == 1

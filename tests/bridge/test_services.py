@@ -53,6 +53,7 @@ async def test_a_late_answer_is_nobodys():
         fake.serve("/s", lambda args: args)
         with pytest.raises(NoAnswerError):
             await ros.call("/s", {"n": 1}, timeout=0.05)
+        assert not ros._session.core._calls
         assert await ros.call("/s", {"n": 2}) == {"n": 2}
         assert ros.unusable == 0
 
@@ -143,6 +144,27 @@ async def test_a_handler_that_fails(outcome, said, caplog):
         assert caught.value.reason.startswith(said)
         assert "secret" not in str(caught.value)
         assert ("secret" in caplog.text) == isinstance(outcome, ValueError)
+
+
+async def test_closing_ends_what_is_being_handled():
+    began, ended = asyncio.Event(), asyncio.Event()
+
+    async def handler(_args: dict[str, Any]) -> None:
+        began.set()
+        try:
+            await asyncio.sleep(60)
+        finally:
+            ended.set()
+
+    async with FakeRosbridge() as fake, connect(fake.uri) as caller:
+        async with connect(fake.uri) as server:
+            await server.advertise_service("/s", "p/T", handler)
+            await fake.wait_for_op("advertise_service")
+            call = asyncio.create_task(caller.call("/s", timeout=0.5))
+            await asyncio.wait_for(began.wait(), 5)
+        await asyncio.wait_for(ended.wait(), 5)
+        with pytest.raises(NoAnswerError):
+            await call
 
 
 async def test_more_requests_than_can_be_handled_are_refused():

@@ -68,6 +68,18 @@ async def test_iteration_ends_with_the_subscription_or_the_client():
             await two.next(1)
 
 
+async def test_a_closed_client_gives_nothing_more():
+    async with FakeRosbridge() as fake:
+        async with connect(fake.uri) as ros:
+            publication = await ros.advertise("/a", "p/T")
+        with pytest.raises(DisconnectedError, match="was closed"):
+            ros.subscribe("/a")
+        with pytest.raises(DisconnectedError, match="was closed"):
+            await ros.advertise("/b", "p/T")
+        with pytest.raises(DisconnectedError, match="was closed"):
+            await publication.publish({})
+
+
 async def test_handles_close_with_their_block():
     async with FakeRosbridge() as fake, connect(fake.uri) as ros:
         async with ros.subscribe("/a", "p/T"), await ros.advertise("/b", "p/T"):
@@ -205,6 +217,21 @@ async def test_a_topic_of_unknown_type_is_found_when_it_appears(monkeypatch):
         asked = len(fake.ops("subscribe"))
         await asyncio.sleep(0.3)
         assert len(fake.ops("subscribe")) <= asked + 1, "it is not asked for any more"
+        ros.subscribe("/later")
+        await fake.wait_for_op("subscribe", count=3, topic="/later")
+
+
+async def test_what_was_subscribed_before_connecting_is_asked_for_too(monkeypatch):
+    monkeypatch.setattr("bridge.session.ASK_AGAIN", 0.05)
+    async with FakeRosbridge() as fake:
+        ros = connect(fake.uri)
+        subscription = ros.subscribe("/late")
+        async with ros:
+            await fake.wait_for_op("subscribe", count=2)
+            fake.know("/late", "p/T")
+            await fake.wait_for_op("subscribe", count=4)
+            await fake.publish("/late", {"n": 1})
+            assert (await subscription.next(5)).msg == {"n": 1}
 
 
 async def test_a_nan_is_not_published():
@@ -237,6 +264,20 @@ async def test_a_tight_loop_of_publications_lets_others_live():
         task.cancel()
         assert turns > 10
         await fake.wait_for_op("publish", count=500)
+
+
+async def test_who_waits_comes_first():
+    async with FakeRosbridge() as fake, connect(fake.uri) as ros:
+        publication = await ros.advertise("/a", "p/T")
+        websocket = ros._session._open_websocket()
+        websocket.pause_writing()
+        waiting = [asyncio.create_task(publication.publish({"n": n})) for n in range(3)]
+        await asyncio.sleep(0)
+        websocket.resume_writing()
+        await publication.publish({"n": 3})
+        await asyncio.gather(*waiting)
+        await fake.wait_for_op("publish", count=4)
+        assert [op["msg"]["n"] for op in fake.ops("publish")] == [0, 1, 2, 3]
 
 
 async def test_a_server_that_takes_nothing_more():
@@ -381,6 +422,9 @@ async def test_stamps_tell_the_version(ros):
         assert client.ros_version == ros
         assert await client.detect_ros_version() == ros
         assert fake.ops("call_service") == []
+        client.subscribe("/b", "p/msg/T")
+        op = await fake.wait_for_op("subscribe", topic="/b")
+        assert op["type"] == ("p/T" if ros == 1 else "p/msg/T")
 
 
 async def test_without_rosapi_the_version_is_unknown():

@@ -1,0 +1,99 @@
+"""Names of ROS topics, services and types: ``pkg/Type`` of ROS 1 and ``pkg/msg/Type`` of ROS 2 alike.
+
+Sources: http://wiki.ros.org/Names, https://design.ros2.org/articles/topic_and_service_names.html.
+"""
+
+import re
+from functools import lru_cache
+from typing import Literal
+
+from bridge.errors import NameFormError
+
+Kind = Literal["msg", "srv", "action"]
+
+#: Characters in a name at most. ROS 2 allows 255 for a topic; nothing sensible is longer.
+MAX_NAME = 255
+
+_TYPE = re.compile(r"([A-Za-z][A-Za-z0-9_]*)/(?:(msg|srv|action)/)?([A-Za-z][A-Za-z0-9_]*)")
+_TOPIC = re.compile(r"[~/]?[A-Za-z_][A-Za-z0-9_]*(?:/[A-Za-z_][A-Za-z0-9_]*)*")
+_EDGE_NAME_SIZE = 1024
+
+
+@lru_cache(maxsize=_EDGE_NAME_SIZE)
+def split_type(name: str) -> tuple[str, str, str]:
+    """Take a type's name apart.
+
+    Args:
+        name: ``std_msgs/String``, ``std_msgs/msg/String`` or ``std_srvs/srv/SetBool``.
+
+    Returns:
+        Package, kind (``msg``, ``srv``, ``action``, or nothing in the ROS 1 form) and the type's own name.
+
+    Raises:
+        NameFormError: the name has neither form.
+    """
+    match = _TYPE.fullmatch(name) if len(name) <= MAX_NAME else None
+    if match is None:
+        raise NameFormError(
+            f"type name {name[:80]!r} is neither package/Type (ROS 1) nor package/msg/Type (ROS 2)"
+        )
+    package, kind, own = match.groups()
+    return package, kind or "", own
+
+
+def ros1_type(name: str) -> str:
+    """The ROS 1 form of a type's name: ``std_msgs/String``."""
+    package, _kind, own = split_type(name)
+    return f"{package}/{own}"
+
+
+def ros2_type(name: str, kind: Kind = "msg") -> str:
+    """The ROS 2 form of a type's name, ``std_msgs/msg/String``; ``kind`` serves where the name has none."""
+    package, its_kind, own = split_type(name)
+    return f"{package}/{its_kind or kind}/{own}"
+
+
+def same_type(one: str, other: str) -> bool:
+    """Whether two names in any form mean one type. Malformed names are the same only if they are equal."""
+    if one == other:
+        return True
+    try:
+        package_1, kind_1, own_1 = split_type(one)
+        package_2, kind_2, own_2 = split_type(other)
+    except NameFormError:
+        return False
+    return (package_1, own_1) == (package_2, own_2) and (kind_1 == kind_2 or not kind_1 or not kind_2)
+
+
+def ros_version_of_type(name: str) -> Literal[1, 2] | None:
+    """Which ROS writes a type like this, None for what is no type's name."""
+    try:
+        return 2 if split_type(name)[1] else 1
+    except NameFormError:
+        return None
+
+
+def check_name(name: str) -> str:
+    """Refuse what can't be the name of a topic or a service.
+
+    Returns:
+        The name as it was: a relative one stays so, the server resolves it.
+
+    Raises:
+        NameFormError: empty, too long, or with characters that ROS does not allow.
+    """
+    if len(name) > MAX_NAME:
+        raise NameFormError(
+            f"name {name[:40]!r}... has {len(name)} characters, at most {MAX_NAME} are allowed"
+        )
+    if _TOPIC.fullmatch(name) is None:
+        raise NameFormError(
+            f"{name!r} cannot be the name of a topic or service: letters, digits, _ and / are allowed, "
+            "and no part may be empty or start with a digit (example: /boat/sensors)"
+        )
+    return name
+
+
+def absolute(name: str) -> str:
+    """The name with its leading slash: some clients leave it out, and both name the same topic."""
+    return name if name.startswith("/") else "/" + name
