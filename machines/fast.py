@@ -1,10 +1,10 @@
 """The fast BM1 for shared LFSRs: 64 cycles to a word, and the same results as the reference, to the bit.
 
 A cell's bits of 64 cycles are one word, which depends only on its column's generator and on its code, so that
-cells of a column with the same code share it. A line is the AND of its words, and it counts their ones.
-Cycles are run in passes over all lines that can count at all; a pass that would take a counter past the target
-is not committed: the exact cycle is looked up in the words of the lines concerned, and the pass runs again,
-up to there.
+cells of a column with the same code share it. A line is the AND of its words, and it counts their ones. Lines
+with a code 0 can't count and are left out. Cycles are run in blocks of 512; a block that takes a counter to the
+target is rolled back: the exact cycle is looked up in the words of the lines concerned, and the block is
+counted again, up to there.
 
 Where frames restart from a bank, the words of a frame's first cycles are constants of the machine: those that
 were needed once are kept, and a later frame from that bank finds them ready.
@@ -16,7 +16,9 @@ from typing import Any, Final, NamedTuple, TypeVar, cast
 
 import numpy as np
 import numpy.typing as npt
+from llvmlite import ir  # type: ignore[import-untyped]  # llvmlite ships no types
 from numba import njit, types
+from numba.core import cgutils as untyped_cgutils
 from numba.extending import intrinsic
 
 from machines.bm1 import BM1Machine, Start, StopReason, addressed_codes, check_resume, check_start
@@ -32,11 +34,11 @@ KEPT_CYCLES: Final = 2**17
 
 _WORD_BITS: Final = 64
 _WORD_JUMP: Final = 6  # 2**6 clocks are a word
-_BLOCK_WORDS: Final = 64
+_BLOCK_WORDS: Final = 8  # one register of AVX-512, two of AVX2, four of NEON
 _BLOCK_CYCLES: Final = _WORD_BITS * _BLOCK_WORDS
-_FIRST_PASS: Final = 512
-_GROUP: Final = 4  # a line's rows are ANDed four at a time
+_NO_ROW: Final = -1
 
+cgutils: Any = untyped_cgutils
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 _jit = cast("Callable[[_Function], _Function]", njit(cache=True, nogil=True))
 
@@ -52,26 +54,26 @@ class _Store(NamedTuple):
     """The words, by slot (a block of cycles of a bank; the last one is scratch) and row (a column's code)."""
 
     words: Words  # [slots, rows * _BLOCK_WORDS]
-    filled: npt.NDArray[np.uint8]  # [slots, rows]: whether those words are there
-    inverted: Words  # [slots, columns, prob_bits, _BLOCK_WORDS]: the shown bits, inverted
-    shown: npt.NDArray[np.uint8]  # [slots]: whether those are there
-    row_column: npt.NDArray[np.uint32]  # [rows]
-    row_code: npt.NDArray[np.uint32]  # [rows]
-    row_of_code: npt.NDArray[np.uint32]  # [columns, 2**prob_bits]: 0 where a code has no row
+    filled: npt.NDArray[np.uint8]  # [slots, rows]: whether those words are there to stay
+    row_column: npt.NDArray[np.int64]  # [rows]
+    row_code: npt.NDArray[np.int64]  # [rows]
+    row_of_code: npt.NDArray[np.int32]  # [columns, 2**prob_bits]; _NO_ROW where a code has none
     row_frame: npt.NDArray[np.int64]  # [rows]: the last frame that used the row
 
 
 class _Frame(NamedTuple):
-    """What a frame uses, of the lines that can count, in their order."""
+    """What a frame uses. Arrays by line hold the lines that can count, without gaps."""
 
     lines: npt.NDArray[np.int64]  # [lines]: which line of the machine it is
-    places: Words  # [lines, columns up to a multiple of _GROUP]: where in the slot the rows to AND begin
-    groups: npt.NDArray[np.int64]  # [lines]: how many groups of rows
+    places: npt.NDArray[np.uint32]  # [lines, columns]: where in a slot the words to AND begin
+    widths: npt.NDArray[np.int64]  # [lines]: how many of those there are
     counts: npt.NDArray[np.int64]  # [lines]
-    added: npt.NDArray[np.int64]  # [lines]: what a pass adds to the counts
-    used: npt.NDArray[np.uint32]  # [rows]: all rows that the frame uses, once each
+    added: npt.NDArray[np.int64]  # [lines]: what a block adds to the counts
+    used: npt.NDArray[np.int64]  # [rows]: the rows that the frame uses, once each
     starts: Words  # [columns]: states before the frame's first cycle
     states: Words  # [columns]: working space
+    inverted: Words  # [columns, prob_bits, _BLOCK_WORDS]: working space
+    mask: Words  # [_BLOCK_WORDS]: the cycles of a block that are run
 
 
 class FastBM1:
@@ -101,14 +103,13 @@ class FastBM1:
             bits=_bit_tables(parameters.rng, parameters.steps_per_clock, parameters.prob_bits).copy(),
         )
         occurring = _occurring_codes(machine)
-        self._kept_blocks = _kept_blocks(parameters, int(occurring.sum()) + 1, kept_bytes)
+        self._kept_blocks = _kept_blocks(parameters, int(occurring.sum()), kept_bytes)
         self._store = _store(parameters, occurring, self._kept_blocks)
         self._frame = _frame(parameters, len(self._store.row_code))
         self._frames = 0
         self._live = 0
         self._used = 0
         self._first_slot = 0
-        self._scratch_block = -1
         self._target_count = 1
         self._max_cycles = 1
         self.reset()
@@ -169,13 +170,12 @@ class FastBM1:
         self._target_count = int(start.target_count)
         self._max_cycles = int(start.max_cycles)
         self._cycles = 0
-        self._scratch_block = -1
         self._frames += 1
         codes = addressed_codes(self._machine, start)
         if self._kept_blocks == 0:
             # There may be more codes than could have rows for good: rows are the frame's own.
-            codes_of_rows = self._store.row_column[: self._used], self._store.row_code[: self._used]
-            self._store.row_of_code[codes_of_rows] = 0
+            last_codes = self._store.row_column[: self._used], self._store.row_code[: self._used]
+            self._store.row_of_code[last_codes] = _NO_ROW
         self._live, self._used = _select(
             codes, parameters.ones_code, self._store, self._frame, self._frames, self._kept_blocks == 0
         )
@@ -206,7 +206,7 @@ class FastBM1:
 
     def _run(self, run_until: int) -> None:
         limit = min(run_until, self._max_cycles) if run_until else self._max_cycles
-        self._cycles, overflow, self._scratch_block = _run(
+        self._cycles, overflow = _run(
             self._generators,
             self._store,
             self._frame,
@@ -217,7 +217,6 @@ class FastBM1:
             self._target_count,
             self._first_slot,
             self._kept_blocks,
-            self._scratch_block,
             self._period,
         )
         if overflow:
@@ -252,33 +251,38 @@ def _kept_blocks(parameters: BM1Parameters, rows: int, kept_bytes: int) -> int:
     """How many blocks of every bank fit into the memory for kept words."""
     if parameters.rng_reset is RngReset.FREE:
         return 0  # a frame's states are not a bank's, and hardly ever come again
-    row_bytes = _BLOCK_WORDS * np.dtype(np.uint64).itemsize
-    block_bytes = (rows + parameters.columns * parameters.prob_bits) * row_bytes
+    block_bytes = max(rows, 1) * (_BLOCK_WORDS * _WORD_BITS // 8 + 1)
     return min(kept_bytes // (block_bytes * parameters.rng_banks), KEPT_CYCLES // _BLOCK_CYCLES)
 
 
 def _store(parameters: BM1Parameters, occurring: npt.NDArray[np.bool_], kept_blocks: int) -> _Store:
-    """The memory for words, none of them there yet; row 0 is all ones."""
-    columns = parameters.columns
+    """The memory for words, none of them there yet."""
     slots = parameters.rng_banks * kept_blocks + 1
-    row_of_code = np.zeros(occurring.shape, dtype=np.uint32)
+    row_of_code = np.full(occurring.shape, _NO_ROW, dtype=np.int32)
     if kept_blocks:
-        column_of, code_of = np.nonzero(occurring)
-        rows = len(code_of) + 1
-        row_of_code[occurring] = np.arange(1, rows, dtype=np.uint32)
+        row_column, row_code = np.nonzero(occurring)
+        row_of_code[occurring] = np.arange(len(row_code), dtype=np.int32)
     else:
-        rows = min(int(occurring.sum()), parameters.lines * columns) + 1
-        column_of = code_of = np.zeros(rows - 1, dtype=np.int64)
+        rows = min(int(occurring.sum()), parameters.lines * parameters.columns)
+        row_column = row_code = np.zeros(rows, dtype=np.int64)
+    rows = len(row_code)
     return _Store(
-        words=np.empty((slots, rows * _BLOCK_WORDS), dtype=np.uint64),
+        words=_aligned((slots, rows * _BLOCK_WORDS)),
         filled=np.zeros((slots, rows), dtype=np.uint8),
-        inverted=np.empty((slots, columns, parameters.prob_bits, _BLOCK_WORDS), dtype=np.uint64),
-        shown=np.zeros(slots, dtype=np.uint8),
-        row_column=np.concatenate(([0], column_of)).astype(np.uint32),
-        row_code=np.concatenate(([parameters.ones_code], code_of)).astype(np.uint32),
+        row_column=row_column.astype(np.int64),
+        row_code=row_code.astype(np.int64),
         row_of_code=row_of_code,
         row_frame=np.zeros(rows, dtype=np.int64),
     )
+
+
+def _aligned(shape: tuple[int, int]) -> Words:
+    """Words that are not set yet, beginning at a cache line, or else every block would lie in two."""
+    count = shape[0] * shape[1]
+    line = 64 // np.dtype(np.uint64).itemsize
+    words = np.empty(count + line, dtype=np.uint64)
+    skip = -words.ctypes.data // words.itemsize % line
+    return words[skip : skip + count].reshape(shape)
 
 
 def _frame(parameters: BM1Parameters, rows: int) -> _Frame:
@@ -286,13 +290,15 @@ def _frame(parameters: BM1Parameters, rows: int) -> _Frame:
     lines, columns = parameters.lines, parameters.columns
     return _Frame(
         lines=np.zeros(lines, dtype=np.int64),
-        places=np.zeros((lines, -(-columns // _GROUP) * _GROUP), dtype=np.uint64),
-        groups=np.zeros(lines, dtype=np.int64),
+        places=np.zeros((lines, columns), dtype=np.uint32),
+        widths=np.zeros(lines, dtype=np.int64),
         counts=np.zeros(lines, dtype=np.int64),
         added=np.zeros(lines, dtype=np.int64),
-        used=np.zeros(rows, dtype=np.uint32),
+        used=np.zeros(rows, dtype=np.int64),
         starts=np.zeros(columns, dtype=np.uint64),
         states=np.zeros(columns, dtype=np.uint64),
+        inverted=np.zeros((columns, parameters.prob_bits, _BLOCK_WORDS), dtype=np.uint64),
+        mask=np.zeros(_BLOCK_WORDS, dtype=np.uint64),
     )
 
 
@@ -310,7 +316,7 @@ def _bit_tables(kind: RngKind, steps_per_clock: int, prob_bits: int) -> Words:
 
 
 # What follows is machine code. Types are the same for every machine (contiguous arrays, int64 and uint64), so it
-# is compiled once and cached on disk. A uint64 and an int64 in one operation would make a float: words only meet
+# is compiled once and cached on disk. A uint64 and an int64 in one operation would make a float: words meet only
 # uint64 constants, and counts are int64 throughout.
 
 _0: Final = np.uint64(0)
@@ -319,9 +325,80 @@ _8: Final = np.uint64(8)
 _BYTE: Final = np.uint64(255)
 _ALL: Final = np.uint64(2**64 - 1)
 
+# numba makes no vector of so short a loop as a block's 8 words (it was 2.5 times slower), so the two loops that
+# all the time goes to are written in LLVM's terms, where a block's words are one vector of any processor's.
+_I64: Final = ir.IntType(_WORD_BITS)
+_BLOCK: Final = ir.VectorType(_I64, _BLOCK_WORDS)
 
-def _ctpop(_context: Any, _word: Any) -> Any:
-    """The processor's count of a word's ones."""
+
+def _constant_block(word: int) -> ir.Constant:
+    return ir.Constant(_BLOCK, [ir.Constant(_I64, word)] * _BLOCK_WORDS)
+
+
+def _block_pointer(builder: Any, data: Any, place: Any) -> Any:
+    """The address of the block of words that begins at a place of an array."""
+    return builder.bitcast(builder.gep(data, [place]), _BLOCK.as_pointer())
+
+
+def _load_block(builder: Any, data: Any, place: Any) -> Any:
+    block = builder.load(_block_pointer(builder, data, place))
+    block.align = _WORD_BITS // 8  # arrays promise no more
+    return block
+
+
+def _call_on_block(builder: Any, name: str, result: Any, block: Any) -> Any:
+    """A call of one of LLVM's own functions with a block of words."""
+    function = cgutils.get_or_insert_function(builder.module, ir.FunctionType(result, [_BLOCK]), name)
+    return builder.call(function, [block])
+
+
+def _count_code(_context: Any, words: Any, places: Any, _line: Any, _width: Any, mask: Any) -> Any:
+    """How many ones a line makes in a block: in the AND of its rows and the mask."""
+
+    def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        data, where, masks = (
+            context.make_array(signature.args[i])(context, builder, arguments[i]) for i in (0, 1, 4)
+        )
+        anded = cgutils.alloca_once_value(builder, _load_block(builder, masks.data, ir.Constant(_I64, 0)))
+        first = builder.mul(arguments[2], builder.extract_value(where.shape, 1))
+        with cgutils.for_range(builder, arguments[3]) as loop:
+            place = builder.load(builder.gep(where.data, [builder.add(first, loop.index)]))
+            row = _load_block(builder, data.data, builder.zext(place, _I64))
+            builder.store(builder.and_(builder.load(anded), row), anded)
+        ones = _call_on_block(builder, f"llvm.ctpop.v{_BLOCK_WORDS}i64", _BLOCK, builder.load(anded))
+        return _call_on_block(builder, f"llvm.vector.reduce.add.v{_BLOCK_WORDS}i64", _I64, ones)
+
+    return types.int64(words, places, types.int64, types.int64, mask), code
+
+
+_count = cast("Callable[[Words, npt.NDArray[np.uint32], int, int, Words], int]", intrinsic(_count_code))
+
+
+def _fill_code(_context: Any, _code: Any, inverted: Any, words: Any, _place: Any) -> Any:
+    """Make a block of words of a code in a column: what the generator shows < code, from the low bit up."""
+
+    def make(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        shown, into = (context.make_array(signature.args[i])(context, builder, arguments[i]) for i in (1, 2))
+        less = cgutils.alloca_once_value(builder, _constant_block(0))
+        with cgutils.for_range(builder, builder.extract_value(shown.shape, 0)) as loop:
+            first = builder.mul(loop.index, ir.Constant(_I64, _BLOCK_WORDS))
+            zeros = _load_block(builder, shown.data, first)
+            bit = builder.trunc(builder.lshr(arguments[0], loop.index), ir.IntType(1))
+            # A 0 is less than the code's 1, and a 1 is more than the code's 0, whatever the lower bits said.
+            before = builder.load(less)
+            builder.store(builder.select(bit, builder.or_(before, zeros), builder.and_(before, zeros)), less)
+        store = builder.store(builder.load(less), _block_pointer(builder, into.data, arguments[3]))
+        store.align = _WORD_BITS // 8
+        return context.get_dummy_value()
+
+    return types.void(types.int64, inverted, words, types.int64), make
+
+
+_fill = cast("Callable[[int, Words, Words, int], None]", intrinsic(_fill_code))
+
+
+def _popcount_code(_context: Any, _word: Any) -> Any:
+    """A word's ones."""
 
     def code(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
         return builder.ctpop(arguments[0])
@@ -329,13 +406,13 @@ def _ctpop(_context: Any, _word: Any) -> Any:
     return types.int64(types.uint64), code
 
 
-_popcount = cast("Callable[[np.uint64], int]", intrinsic(_ctpop))
+_popcount = cast("Callable[[np.uint64], int]", intrinsic(_popcount_code))
 
 
 @_jit
 def _image(tables: Words, state: np.uint64) -> np.uint64:
     """The image of a state under a linear map."""
-    image = np.uint64(0)
+    image = _0
     for byte in range(tables.shape[0]):
         image ^= tables[byte, state & _BYTE]
         state >>= _8
@@ -363,22 +440,21 @@ def _select(
     """
     columns, lines = codes.shape
     live = 0
-    used = 1  # row 0, in case a line has nothing but all-ones codes
-    frame.used[0] = 0
+    used = 0
     for line in range(lines):
         dead = False
         for column in range(columns):
             dead |= codes[column, line] == 0
         if dead:
             continue
-        n = 0
+        width = 0
         for column in range(columns):
             code = codes[column, line]
             if code == ones:
                 continue
-            row = store.row_of_code[column, code]
-            if new_rows and row == 0:
-                row = np.uint32(used)
+            row = int(store.row_of_code[column, code])
+            if new_rows and row == _NO_ROW:
+                row = used
                 store.row_of_code[column, code] = row
                 store.row_column[row] = column
                 store.row_code[row] = code
@@ -386,16 +462,9 @@ def _select(
                 store.row_frame[row] = frame_number
                 frame.used[used] = row
                 used += 1
-            frame.places[live, n] = row * _BLOCK_WORDS
-            n += 1
-        if n == 0:
-            frame.places[live, 0] = 0
-            n = 1
-        # A row twice changes no AND, so the last group is filled up with it.
-        while n % _GROUP:
-            frame.places[live, n] = frame.places[live, n - 1]
-            n += 1
-        frame.groups[live] = n // _GROUP
+            frame.places[live, width] = row * _BLOCK_WORDS
+            width += 1
+        frame.widths[live] = width
         frame.lines[live] = line
         frame.counts[live] = 0
         live += 1
@@ -403,95 +472,43 @@ def _select(
 
 
 @_jit
-def _show(generators: _Generators, frame: _Frame, first_cycle: int, inverted: Words) -> None:
-    """Make a block of what all generators show, from the cycle on, inverted."""
-    _jump(generators.jumps, frame.starts, first_cycle, frame.states)
-    for column in range(inverted.shape[0]):
+def _show(generators: _Generators, frame: _Frame, clocks: int) -> None:
+    """Make a block's words of all bits that the generators show, inverted, from so many clocks on."""
+    _jump(generators.jumps, frame.starts, clocks, frame.states)
+    for column in range(frame.states.shape[0]):
         state = frame.states[column]
         for word in range(_BLOCK_WORDS):
-            for bit in range(inverted.shape[1]):
-                inverted[column, bit, word] = ~_image(generators.bits[bit], state)
+            for bit in range(generators.bits.shape[0]):
+                frame.inverted[column, bit, word] = ~_image(generators.bits[bit], state)
             state = _image(generators.jumps[_WORD_JUMP], state)
 
 
 @_jit
-def _fill(code: int, ones: int, inverted: Words, words: Words) -> None:
-    """Make the words of a code in a column: shown < code, by a comparison from the low bit up."""
-    if code == ones:
-        words[:] = _ALL
-        return
-    words[:] = _0
-    for bit in range(inverted.shape[0]):
-        # A 0 in the shown number is less than the code's 1, and a 1 is more than its 0, whatever the lower bits are.
-        if (code >> bit) & 1:
-            for word in range(_BLOCK_WORDS):
-                words[word] |= inverted[bit, word]
-        else:
-            for word in range(_BLOCK_WORDS):
-                words[word] &= inverted[bit, word]
+def _mask(first: int, end: int, mask: Words) -> None:
+    """Mark a block's cycles `first` to `end` - 1."""
+    for word in range(_BLOCK_WORDS):
+        start = word * _WORD_BITS
+        low = min(max(first - start, 0), _WORD_BITS)
+        high = min(max(end - start, 0), _WORD_BITS)
+        ones = _0
+        if low < high:  # a shift by 64 is none
+            ones = (_ALL >> np.uint64(_WORD_BITS - (high - low))) << np.uint64(low)
+        mask[word] = ones
 
 
 @_jit
-def _word(words: Words, places: Words, line: int, groups: int, word: int) -> np.uint64:
-    """One word of a line: the AND of its rows."""
-    made = _ALL
-    for i in range(groups * _GROUP):
-        made &= words[places[line, i] + np.uint64(word)]
-    return made
-
-
-@_jit
-def _ones(words: Words, places: Words, line: int, groups: int, first: int, end: int) -> int:
-    """How many ones a line makes in a block's cycles `first` to `end` - 1."""
-    word, end_word = first // _WORD_BITS, end // _WORD_BITS
-    before, after = first % _WORD_BITS, end % _WORD_BITS
-    ones = 0
-    if before:
-        made = _word(words, places, line, groups, word) >> np.uint64(before)
-        if word == end_word:
-            return _popcount(made & ((_1 << np.uint64(after - before)) - _1))
-        ones += _popcount(made)
-        word += 1
-    if after:
-        ones += _popcount(_word(words, places, line, groups, end_word) & ((_1 << np.uint64(after)) - _1))
-    # Whole words, one loop for each number of groups that is common: nothing is written, so that it is fast.
-    whole = np.uint64(max(end_word - word, 0))
-    skip = np.uint64(word)
-    a = places[line, 0] + skip
-    b = places[line, 1] + skip
-    c = places[line, 2] + skip
-    d = places[line, 3] + skip
-    if groups == 1:
-        for i in range(whole):
-            ones += _popcount(words[a + i] & words[b + i] & words[c + i] & words[d + i])
-        return ones
-    e = places[line, 4] + skip
-    f = places[line, 5] + skip
-    g = places[line, 6] + skip
-    h = places[line, 7] + skip
-    if groups == 2:
-        for i in range(whole):
-            ones += _popcount(
-                words[a + i] & words[b + i] & words[c + i] & words[d + i]
-                & words[e + i] & words[f + i] & words[g + i] & words[h + i]
-            )
-        return ones
-    for i in range(end_word-word):
-        ones += _popcount(_word(words, places, line, groups, word + i))
-    return ones
-
-
-@_jit
-def _cycle_of(words: Words, places: Words, line: int, groups: int, first: int, nth: int) -> int:
-    """The block's cycle, from `first` on, in which a line makes its `nth` one (from 1), which must be there."""
-    word = first // _WORD_BITS
-    made = _word(words, places, line, groups, word) & (_ALL << np.uint64(first % _WORD_BITS))
-    ones = _popcount(made)
-    while ones < nth:
+def _cycle_of(words: Words, frame: _Frame, line: int, nth: int) -> int:
+    """The block's cycle in which a line makes its `nth` one (from 1) under the mask, which must be there."""
+    word = 0
+    while True:
+        made = frame.mask[word]
+        for i in range(frame.widths[line]):
+            made &= words[frame.places[line, i] + word]
+        ones = _popcount(made)
+        if nth <= ones:
+            break
         nth -= ones
         word += 1
-        made = _word(words, places, line, groups, word)
-        ones = _popcount(made)
     for _ in range(nth - 1):
         made &= made - _1  # takes the lowest one away
     return word * _WORD_BITS + _popcount(~made & (made - _1))
@@ -509,43 +526,34 @@ def _run(
     target_count: int,
     first_slot: int,
     kept_blocks: int,
-    scratch_block: int,
     period: int,
-) -> tuple[int, bool, int]:
+) -> tuple[int, bool]:
     """Run from `cycles` to `limit`, or to the cycle in which a counter reaches the target.
 
-    Returns the cycles run in the frame, whether a counter overflowed, and the block that the scratch slot holds.
+    Returns the cycles run in the frame, and whether a counter overflowed.
     """
-    ones_code = store.row_of_code.shape[1] - 1
-    block, slot = -1, 0
     overflow = False
     while cycles < limit and not overflow:
-        if cycles // _BLOCK_CYCLES != block:
-            block = cycles // _BLOCK_CYCLES
-            if block < kept_blocks:
-                slot = first_slot + block
-            else:
-                slot = store.shown.shape[0] - 1
-                if block != scratch_block:
-                    scratch_block = block
-                    store.shown[slot] = 0
-                    store.filled[slot, :] = 0
-            for i in range(used):
-                row = frame.used[i]
-                if store.filled[slot, row] == 0:
-                    if store.shown[slot] == 0:
-                        _show(generators, frame, (block * _BLOCK_CYCLES) % period, store.inverted[slot])
-                        store.shown[slot] = 1
-                    inverted = store.inverted[slot, store.row_column[row]]
-                    _fill(store.row_code[row], ones_code, inverted, store.words[slot, row * _BLOCK_WORDS : (row + 1) * _BLOCK_WORDS])
-                    store.filled[slot, row] = 1
+        block = cycles // _BLOCK_CYCLES
+        keep = block < kept_blocks
+        slot = first_slot + block if keep else store.words.shape[0] - 1
         words = store.words[slot]
-        # Passes double in length, so that what a rolled back pass costs is no more than what was run before it.
-        block_start = block * _BLOCK_CYCLES
-        first = cycles - block_start
-        end = min(limit - block_start, _BLOCK_CYCLES, max(_FIRST_PASS, 2 * first))
+        filled = store.filled[slot]
+        shown = False
+        for i in range(used):
+            row = frame.used[i]
+            if keep and filled[row]:
+                continue
+            if not shown:
+                _show(generators, frame, (block * _BLOCK_CYCLES) % period)
+                shown = True
+            _fill(store.row_code[row], frame.inverted[store.row_column[row]], words, row * _BLOCK_WORDS)
+            filled[row] = keep
+        first = cycles - block * _BLOCK_CYCLES
+        end = min(limit - block * _BLOCK_CYCLES, _BLOCK_CYCLES)
+        _mask(first, end, frame.mask)
         for i in range(live):
-            added = _ones(words, frame.places, i, frame.groups[i], first, end)
+            added = _count(words, frame.places, i, frame.widths[i], frame.mask)
             frame.added[i] = added
             overflow |= frame.counts[i] + added >= target_count
         if overflow:
@@ -553,10 +561,11 @@ def _run(
             for i in range(live):
                 missing = target_count - frame.counts[i]
                 if frame.added[i] >= missing:
-                    end = min(end, _cycle_of(words, frame.places, i, frame.groups[i], first, missing) + 1)
+                    end = min(end, _cycle_of(words, frame, i, missing) + 1)
+            _mask(first, end, frame.mask)
             for i in range(live):
-                frame.added[i] = _ones(words, frame.places, i, frame.groups[i], first, end)
+                frame.added[i] = _count(words, frame.places, i, frame.widths[i], frame.mask)
         for i in range(live):
             frame.counts[i] += frame.added[i]
-        cycles = block_start + end
-    return cycles, overflow, scratch_block
+        cycles = block * _BLOCK_CYCLES + end
+    return cycles, overflow
