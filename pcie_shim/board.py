@@ -303,8 +303,9 @@ class _Server:
             self._send(host, framing.READ, framing.REPLY, sequence, address, board.read(address, count))
         elif operation == framing.WRITE:
             done = board.done
-            if self._misbehave is not None:
-                board.stuck = self._wrong(MisbehaviourKind.NEVER_DONE, ahead=1)
+            if self._misbehave is not None and not board.running:
+                rings = address <= register_map.RESUME and address + 4 * count > register_map.START
+                board.stuck = rings and self._wrong(MisbehaviourKind.NEVER_DONE, ahead=1)
             board.write(address, payload)
             # acknowledged before the interrupt that it may cause
             if not flags & framing.POSTED:

@@ -47,7 +47,7 @@ from pcie_shim.errors import (
     StaleHandleError,
     UnreachableError,
 )
-from pcie_shim.link import ALL_ONES, Done, SocketLink
+from pcie_shim.link import ALL_ONES, LONGEST_POLL_S, Done, SocketLink
 from pcie_shim.loader import program
 from pcie_shim.register_map import BoardState
 
@@ -467,16 +467,12 @@ class MiniCluster:
         deadline = time.monotonic() + limit
         left = len(running)
         while left:
-            events = self._poll.poll(max(deadline - time.monotonic(), 0) * 1000)
-            if not events:
+            remaining = deadline - time.monotonic()
+            events = self._poll.poll(min(max(remaining, 0.0), LONGEST_POLL_S) * 1000)
+            if not events and remaining <= LONGEST_POLL_S:
                 late = next(board for board in running if board.waiting)
-                self._fail(
-                    late,
-                    LinkTimeoutError(
-                        f"The board at {late.endpoint} did not say done within {limit:.3g} s, for {cycles} "
-                        "cycles"
-                    ),
-                )
+                assert late.link is not None  # noqa: S101 - it is waited for
+                self._fail(late, late.link.late(limit, f"say done after {cycles} cycles"))
             for descriptor, _ in events:
                 board = self._by_descriptor[descriptor]
                 try:

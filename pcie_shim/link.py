@@ -40,6 +40,9 @@ if TYPE_CHECKING:
 ALL_ONES: Final = 0xFFFFFFFF
 """What a bus reads where no device answers."""
 
+LONGEST_POLL_S: Final = 3600.0
+"""Longest single wait: poll takes milliseconds in 31 bits."""
+
 _WORD: Final = struct.Struct("<I")
 _DONE: Final = struct.Struct("<IIQQ")  # the registers DONE, STATUS, CYCLES and COMPUTE_NS
 _DONE_WORDS: Final = _DONE.size // 4
@@ -96,7 +99,7 @@ class SocketLink:
         self._socket = connect(endpoint, timeout=connect_timeout)
         try:
             self._limit(connect_timeout)
-            frame = self._receive(deadline, connect_timeout, "its greeting")
+            frame = self._receive(deadline, connect_timeout, "greet")
             self._limit(timeout)
             if frame.operation == framing.ERROR:
                 self._refused(frame)
@@ -221,7 +224,7 @@ class SocketLink:
             LinkError: The link broke; it is closed.
         """
         deadline = time.monotonic() + timeout
-        what = f"done number {number}"
+        what = f"say done number {number}"
         while (done := self.take_done()) is None:
             self._wait_readable(deadline, timeout, what)
             self._receive_some()
@@ -307,7 +310,7 @@ class SocketLink:
         deadline = time.monotonic() + self.timeout
         while True:
             try:
-                frame = self._receive(deadline, self.timeout, f"an answer about {address:#06x}")
+                frame = self._receive(deadline, self.timeout, f"answer about {address:#06x}")
             except LinkError as error:
                 self._give_up(error)
             if frame.operation == framing.IRQ:
@@ -326,11 +329,11 @@ class SocketLink:
         """The next frame, whatever it is; the socket's own limit bounds each receive."""
         while (frame := self._decoder.next_frame()) is None:
             if time.monotonic() > deadline:
-                raise self._late(timeout, what)
+                raise self.late(timeout, what)
             try:
                 count = self._socket.recv_into(self._decoder.room())
             except BlockingIOError:
-                raise self._late(timeout, what) from None
+                raise self.late(timeout, what) from None
             except OSError as error:
                 raise self._gone(error.strerror or str(error)) from error
             if count == 0:
@@ -351,11 +354,12 @@ class SocketLink:
         self._decoder.received(count)
 
     def _wait_readable(self, deadline: float, timeout: float, what: str) -> None:
-        remaining = deadline - time.monotonic()
         poll = select.poll()
         poll.register(self._socket, select.POLLIN)
-        if remaining <= 0 or not poll.poll(remaining * 1000):
-            self._give_up(self._late(timeout, what))
+        while (remaining := deadline - time.monotonic()) > 0:
+            if poll.poll(min(remaining, LONGEST_POLL_S) * 1000):
+                return
+        self._give_up(self.late(timeout, what))
 
     def _interrupt(self, frame: Frame) -> Done:
         if frame.words < _DONE_WORDS:
@@ -402,7 +406,7 @@ class SocketLink:
 
     def _broken_send(self, error: OSError) -> NoReturn:
         if isinstance(error, BlockingIOError):
-            self._give_up(self._late(self.timeout, "what was written"))
+            self._give_up(self.late(self.timeout, "take what was written"))
         # A board that closes says why first: that word may be waiting.
         frame = None
         with suppress(LinkError):
@@ -414,10 +418,11 @@ class SocketLink:
             self._refused(frame)
         self._give_up(self._gone(error.strerror or str(error)))
 
-    def _late(self, timeout: float, what: str) -> LinkTimeoutError:
+    def late(self, timeout: float, what: str) -> LinkTimeoutError:
+        """The error that says that the board did not (do) ``what`` within ``timeout`` seconds."""
         rest = ": a frame began and did not end" if self._decoder.inside_frame else ""
         return LinkTimeoutError(
-            f"The board at {self.endpoint} did not give {what} within {timeout:g} s{rest}: the link is closed"
+            f"The board at {self.endpoint} did not {what} within {timeout:.3g} s{rest}: the link is closed"
         )
 
     def _gone(self, reason: str) -> LinkClosedError:

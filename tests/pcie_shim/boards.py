@@ -1,0 +1,152 @@
+"""Machines, images and board processes for the tests of the boards."""
+
+import multiprocessing
+import os
+import select
+import signal
+import struct
+from collections.abc import Sequence
+
+import numpy as np
+
+from machines.bm1 import BM1Machine, Start, StopReason
+from machines.kernel import make_kernel
+from machines.parameters import BM1Parameters, RngKind
+from pcie_shim.board import StopSignal, serve_board
+from pcie_shim.driver import FrameInput
+from pcie_shim.misbehaviour import Misbehaviour
+from pcie_shim.programming_file import Image, Partition
+
+_FORK = multiprocessing.get_context("fork")
+
+
+def machine(
+    seed: int = 0, *, lines: int = 8, sensor_bits: Sequence[int] = (3, 4), zeros: float = 0.1, **parameters
+) -> BM1Machine:
+    """A machine with random tables, ``zeros`` of its codes 0."""
+    built = BM1Parameters(lines=lines, sensor_bits=tuple(sensor_bits), **parameters)
+    random = np.random.default_rng(seed)
+
+    def table(rows: int) -> np.ndarray:
+        codes = random.integers(0, built.ones_code + 1, (rows, lines))
+        codes[random.random((rows, lines)) < zeros] = 0
+        return codes.astype(np.uint16)
+
+    tables = [table(1 << bits) for bits in built.sensor_bits]
+    for each in tables:
+        each[-1] = built.ones_code
+    numbers = None
+    if built.rng is RngKind.TABLE:
+        numbers = random.integers(0, 1 << built.prob_bits, 500).astype(np.uint32)
+    return BM1Machine(built, table(built.prior_addresses), tuple(tables), numbers)
+
+
+def never_stopping() -> BM1Machine:
+    """A machine that runs for minutes once it is started with the widest target and limit."""
+    built = BM1Parameters(lines=4, sensor_bits=(2,), counter_bits=32)
+    table = np.full((4, 4), 100, np.uint16)
+    table[-1] = built.ones_code
+    return BM1Machine(built, np.full((1, 4), 100, np.uint16), (table,))
+
+
+def image(of: BM1Machine, *, index: int = 0, count: int = 1, offset: int = 0, total: int = 0) -> Image:
+    """An image of one part of a model."""
+    lines = of.parameters.lines
+    return Image(
+        machine=of,
+        partition=Partition(index, count, offset, total or lines),
+        interface_sensors=20,
+        interface_results=1200,
+        model_hash="ab" * 32,
+        build_date="2026-01-02T03:04:05Z",
+        tool_version="0",
+    )
+
+
+def images(seed: int, lines: Sequence[int], **parameters) -> list[Image]:
+    """The images of a model split over boards with so many lines each."""
+    total = sum(lines)
+    return [
+        image(
+            machine(seed + index, lines=own, **parameters),
+            index=index,
+            count=len(lines),
+            offset=sum(lines[:index]),
+            total=total,
+        )
+        for index, own in enumerate(lines)
+    ]
+
+
+class BoardProcess:
+    """An emulated board in a process of its own."""
+
+    def __init__(self, endpoint: str, *, index: int = 0, misbehave: str = "") -> None:
+        self.endpoint = endpoint
+        ready, self._tell = os.pipe()
+        self.process = _FORK.Process(target=self._run, args=(index, misbehave), daemon=True)
+        self.process.start()
+        os.close(self._tell)
+        readable, _, _ = select.select([ready], [], [], 20)
+        said = os.read(ready, 1) if readable else b""
+        os.close(ready)
+        assert said, f"the board at {endpoint} did not start"
+
+    def _run(self, index: int, misbehave: str) -> None:
+        stop = StopSignal()
+        signal.signal(signal.SIGTERM, lambda *_: stop.set())
+        serve_board(
+            self.endpoint,
+            index=index,
+            stop=stop,
+            misbehave=Misbehaviour.parse(misbehave) if misbehave else None,
+            on_ready=lambda: os.write(self._tell, b"r") and None,
+        )
+
+    def stop(self) -> int | None:
+        """End it in order; its exit code."""
+        self.process.terminate()
+        self.process.join(10)
+        return self.process.exitcode
+
+    def kill(self) -> None:
+        self.process.kill()
+        self.process.join(10)
+
+
+def expected(parts: Sequence[Image], frame: FrameInput) -> list[tuple[list[int], int, StopReason]]:
+    """What the machines give for a frame, computed here with kernels and no board: counts, cycles, reason."""
+    kernels = [make_kernel(part.machine) for part in parts]
+    sliced = frame.stop == "slices"
+    end = 256 if sliced else 0
+    for kernel, part in zip(kernels, parts, strict=True):
+        parameters = part.machine.parameters
+        offset = part.partition.line_offset
+        prior = frame.prior_codes
+        kernel.start(
+            Start(
+                addresses=tuple(
+                    parameters.missing_address(column) if address is None else address
+                    for column, address in enumerate(frame.addresses, start=1)
+                ),
+                prior_address=frame.prior_address,
+                prior_codes=None if prior is None else prior[offset : offset + parameters.lines],
+                target_count=frame.target_count,
+                max_cycles=frame.max_cycles,
+                bank=frame.bank,
+                run_until=end if end < frame.max_cycles else 0,
+            )
+        )
+    while sliced and not any(kernel.reason is StopReason.OVERFLOW for kernel in kernels):
+        going = [kernel for kernel in kernels if kernel.reason is StopReason.SLICE]
+        if not going:
+            break
+        end *= 2
+        for kernel in going:
+            kernel.resume(end if end < frame.max_cycles else 0)
+    return [(kernel.counts.tolist(), kernel.cycles, kernel.reason) for kernel in kernels]
+
+
+def words(*values: int) -> bytes:
+    """32-bit words, little-endian."""
+    return struct.pack(f"<{len(values)}I", *values)

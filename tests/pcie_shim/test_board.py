@@ -1,0 +1,421 @@
+#   this process ──socket── board process (registers, machine)
+#        └────────socket──── its programming port
+# What one host, a second one, one that vanishes, one that talks nonsense, and loaders get.
+import hashlib
+import socket
+import struct
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from machines.bm1 import Start, StopReason
+from machines.kernel import make_kernel
+from pcie_shim import board as board_module
+from pcie_shim import framing
+from pcie_shim import register_map as rm
+from pcie_shim.endpoint import connect, parse_endpoint
+from pcie_shim.errors import (
+    AccessError,
+    EndpointError,
+    HeldError,
+    ImageMismatchError,
+    LinkClosedError,
+    SequenceError,
+    StaleHandleError,
+)
+from pcie_shim.link import SocketLink
+from pcie_shim.loader import program
+from pcie_shim.programming_file import image_bytes
+from pcie_shim.register_map import BoardState, ErrorCode
+from tests.pcie_shim.boards import BoardProcess, image, machine, never_stopping, words
+
+ENABLE = rm.CONTROL_INTERRUPT_ENABLE_MASK
+StartBoard = Callable[..., BoardProcess]
+MACHINE = machine(1)
+
+
+def open_link(board: BoardProcess) -> SocketLink:
+    return SocketLink.open(parse_endpoint(board.endpoint), timeout=5)
+
+
+def refused(code: ErrorCode):
+    return pytest.raises(AccessError, check=lambda error: error.code == code)
+
+
+def run_for_minutes(link: SocketLink) -> None:
+    """Start a machine that does not stop by itself."""
+    link.write32(rm.CONTROL, ENABLE)
+    link.write_block(rm.SENSORS, words(1))
+    link.write_block(rm.TARGET_COUNT, struct.pack("<IQ", 2**32 - 1, 2**60))
+    link.write32(rm.START, link.read32(rm.DONE) + 1)
+    assert link.read32(rm.STATUS) & 15 == BoardState.RUNNING
+
+
+# ---- the register port ----
+
+
+@pytest.mark.parametrize("kind", ["unix", "tcp"])
+def test_a_frame_over_a_link(start_board: StartBoard, kind: str) -> None:
+    board = start_board("" if kind == "unix" else f"tcp://127.0.0.1:{free_ports()}", index=3)
+    program(board.endpoint, image(MACHINE))
+    kernel = make_kernel(MACHINE)
+    kernel.start(Start(addresses=(2, 5), target_count=50, max_cycles=4000, bank=1, run_until=30))
+    with open_link(board) as link:
+        assert link.greeting.board == 3
+        assert link.greeting.image_hash == image(MACHINE).image_hash
+        assert link.read32(rm.ID) == rm.ID_VALUE
+        link.write32(rm.LIVENESS, 0x55AA0001)
+        assert link.read32(rm.LIVENESS) == 0xAA55FFFE
+        link.write32(rm.CONTROL, ENABLE)
+        link.write_block(rm.SENSORS, words(2, 5))
+        link.write_block(rm.TARGET_COUNT, struct.pack("<IQIIQI", 50, 4000, 1, 0, 30, 1))
+        done = link.wait_done(1, timeout=5)
+        assert (done.number, done.state, done.reason) == (1, BoardState.DONE, StopReason.SLICE)
+        assert done.cycles == kernel.cycles == 30
+        assert bytes(done.results) == kernel.counts.tobytes() == link.read_block(rm.RESULTS, 8)
+        assert done.compute_ns == struct.unpack("<Q", link.read_block(rm.COMPUTE_NS, 2))[0] > 0
+        # posted: both frames in one send, nothing acknowledged but by the interrupt
+        link.post(
+            link.posted_write(rm.RUN_UNTIL, struct.pack("<Q", 0)) + link.posted_write(rm.RESUME, words(2))
+        )
+        done = link.wait_done(2, timeout=5)
+        kernel.resume(0)
+        assert (done.reason, done.cycles) == (kernel.reason, kernel.cycles)
+        assert bytes(done.results) == kernel.counts.tobytes()
+
+
+def free_ports() -> int:
+    """A port that is free, and so is the next one."""
+    while True:
+        with socket.create_server(("127.0.0.1", 0)) as first:
+            port = first.getsockname()[1]
+            try:
+                socket.create_server(("127.0.0.1", port + 1)).close()
+            except OSError:
+                continue
+            return port
+
+
+def test_without_interrupts_the_host_reads_done(start_board: StartBoard) -> None:
+    board = start_board()
+    program(board.endpoint, image(MACHINE))
+    with open_link(board) as link:
+        link.write_block(rm.SENSORS, words(1, 1))
+        link.write_block(rm.TARGET_COUNT, struct.pack("<IQIIQI", 5, 4000, 0, 0, 0, 1))
+        assert link.read32(rm.DONE) == 1
+        assert link.take_done() is None
+
+
+def test_a_refused_access_leaves_the_link_usable(start_board: StartBoard) -> None:
+    with open_link(start_board()) as link:
+        with refused(ErrorCode.OUTSIDE):
+            link.read32(0x3FFC)
+        with refused(ErrorCode.MISALIGNED):
+            link.write32(2, 0)
+        with pytest.raises(
+            AccessError, match=r"unix:.* refused access to 0x0000 \(READ_ONLY\): the register"
+        ):
+            link.write32(rm.ID, 0)
+        with refused(ErrorCode.BLANK):
+            link.write32(rm.START, 1)
+        assert link.read32(rm.STATUS) >> 8 == ErrorCode.BLANK
+        link.write32(rm.CONTROL, rm.CONTROL_RESET_MASK)
+        assert link.read32(rm.STATUS) == 0
+
+
+def test_a_refused_posted_write_is_heard_of(start_board: StartBoard) -> None:
+    with open_link(start_board()) as link:
+        link.post(link.posted_write(rm.RESULTS, words(1)))
+        with refused(ErrorCode.BLANK):
+            link.wait_done(1, timeout=5)
+
+
+def test_a_running_board_answers_and_can_be_reset(start_board: StartBoard) -> None:
+    board = start_board()
+    program(board.endpoint, image(never_stopping()))
+    with open_link(board) as link:
+        run_for_minutes(link)
+        with refused(ErrorCode.BUSY):
+            link.write32(rm.TARGET_COUNT, 1)
+        first = link.read_block(rm.CYCLES, 2)
+        time.sleep(0.2)
+        assert link.read_block(rm.CYCLES, 2) != first
+        link.write32(rm.CONTROL, rm.CONTROL_RESET_MASK | ENABLE)
+        assert link.read32(rm.STATUS) == BoardState.IDLE | ErrorCode.NONE << 8
+        link.write32(rm.TARGET_COUNT, 10)
+        link.write32(rm.START, 1)
+        assert link.wait_done(1, timeout=5).reason == StopReason.OVERFLOW
+
+
+# ---- one host at a time ----
+
+
+def test_a_second_host_is_refused_and_the_first_goes_on(start_board: StartBoard) -> None:
+    board = start_board()
+    program(board.endpoint, image(never_stopping()))
+    with open_link(board) as link:
+        with pytest.raises(HeldError, match=r"board0\.sock is held: another host has it; one host drives"):
+            open_link(board)
+        run_for_minutes(link)
+        with pytest.raises(HeldError):
+            open_link(board)
+        assert link.read32(rm.STATUS) & 15 == BoardState.RUNNING
+    with open_link(board) as link:
+        assert link.read32(rm.ID) == rm.ID_VALUE
+
+
+def test_a_host_that_vanishes_leaves_the_board_well(start_board: StartBoard) -> None:
+    board = start_board()
+    program(board.endpoint, image(never_stopping()))
+    for _ in range(20):
+        link = open_link(board)
+        run_for_minutes(link)
+        link.close()
+    with open_link(board) as link:
+        assert link.read32(rm.STATUS) == BoardState.IDLE
+        assert link.read32(rm.CONTROL) == 0
+        assert link.read32(rm.DONE) == 0
+    with pytest.raises(LinkClosedError, match="it was closed"):
+        link.read32(rm.ID)
+
+
+@pytest.mark.parametrize(
+    ("nonsense", "answer"),
+    [
+        (b"GET / HTTP/1.1\r\nHost: board\r\n\r\n", "no frame of the link"),
+        (framing.encode(framing.READ, 0, 2, 0, 1), "request 2 came where 1 was due"),
+        (framing.encode(framing.READ, 0, 1, 0, 1)[:-1] + b"\xff", "CRC-32 is wrong"),
+        (framing.encode(framing.READ, 0, 1, 0, 9000), "8192 are the most"),
+        (framing.encode(framing.IRQ, 0, 1, 0, 0), "no business of the register port"),
+        (framing.encode(framing.PROGRAM, 0, 1, 0, 0), "no business of the register port"),
+    ],
+)
+def test_a_host_that_talks_nonsense_is_told_and_loses_its_link(
+    start_board: StartBoard, nonsense: bytes, answer: str
+) -> None:
+    board = start_board()
+    with connect(parse_endpoint(board.endpoint), timeout=5) as raw:
+        raw.settimeout(5)
+        raw.sendall(nonsense)
+        came = b""
+        while part := raw.recv(4096):
+            came += part
+    assert answer.encode() in came
+    with open_link(board) as link:
+        assert link.read32(rm.ID) == rm.ID_VALUE
+
+
+def test_the_host_hears_why_its_link_was_closed(start_board: StartBoard) -> None:
+    with open_link(start_board()) as link:
+        link._sequence += 1
+        with pytest.raises(AccessError, match=r"BAD_FRAME\): request 2 came where 1 was due"):
+            link.read32(rm.ID)
+        assert not link.is_open
+        with pytest.raises(LinkClosedError, match="the board said BAD_FRAME"):
+            link.read32(rm.ID)
+
+
+def test_a_wrong_done_number_closes_the_link(start_board: StartBoard) -> None:
+    board = start_board()
+    program(board.endpoint, image(MACHINE))
+    with open_link(board) as link:
+        link.write32(rm.CONTROL, ENABLE)
+        link.write_block(rm.TARGET_COUNT, struct.pack("<IQIIQI", 5, 4000, 0, 0, 0, 1))
+        with pytest.raises(SequenceError, match="done number 1 where 7 was due: the link is closed"):
+            link.wait_done(7, timeout=5)
+        assert not link.is_open
+
+
+# ---- starting and stopping ----
+
+
+def test_sockets_are_private_and_go_away(start_board: StartBoard, folder: Path) -> None:
+    board = start_board()
+    names = {"board0.sock", "board0.program.sock"}
+    assert {path.name for path in folder.iterdir()} == names
+    assert all(path.stat().st_mode & 0o777 == 0o600 for path in folder.iterdir())
+    with open_link(board):
+        assert board.stop() == 0
+    assert list(folder.iterdir()) == []
+
+
+def test_a_running_machine_does_not_keep_a_board_from_stopping(start_board: StartBoard, folder: Path) -> None:
+    board = start_board()
+    program(board.endpoint, image(never_stopping()))
+    with open_link(board) as link:
+        run_for_minutes(link)
+        assert board.stop() == 0
+        with pytest.raises(LinkClosedError, match="is gone: "):
+            link.read32(rm.ID)
+    assert list(folder.iterdir()) == []
+
+
+def test_a_killed_boards_place_is_taken_by_the_next(start_board: StartBoard) -> None:
+    board = start_board()
+    board.kill()
+    with open_link(start_board(board.endpoint)) as link:
+        assert link.greeting.is_blank
+
+
+def test_a_taken_place_is_refused_and_left_alone(start_board: StartBoard) -> None:
+    board = start_board()
+    with pytest.raises(EndpointError, match="another process listens there"):
+        board_module.serve_board(board.endpoint, index=1, stop=board_module.StopSignal(), pin=False)
+    with open_link(board) as link:
+        assert link.greeting.board == 0
+
+
+def test_a_taken_programming_port_leaves_no_socket_behind(start_board: StartBoard, folder: Path) -> None:
+    start_board(f"unix:{folder}/a.program.sock")
+    with pytest.raises(EndpointError):
+        board_module.serve_board(f"unix:{folder}/a.sock", index=1, stop=board_module.StopSignal(), pin=False)
+    assert not (folder / "a.sock").exists()
+
+
+def test_a_stop_signal_can_be_set_early_and_often(folder: Path) -> None:
+    stop = board_module.StopSignal()
+    for _ in range(100_000):
+        stop.set()
+    board_module.serve_board(f"unix:{folder}/a.sock", index=0, stop=stop, pin=False)
+    stop.close()
+    stop.set()
+    assert list(folder.iterdir()) == []
+
+
+# ---- programming ----
+
+
+def test_a_blank_board_is_programmed_and_programmed_again(start_board: StartBoard) -> None:
+    board = start_board()
+    first, second = image(MACHINE), image(machine(2, lines=3))
+    with open_link(board) as link:
+        assert link.greeting.is_blank
+    assert program(board.endpoint, first) == first.image_hash
+    assert program(board.endpoint, image_bytes(second)) == second.image_hash
+    with open_link(board) as link:
+        assert link.read_block(rm.IMAGE_HASH, 8).hex() == link.greeting.image_hash == second.image_hash
+        assert link.read32(rm.CAP_LINES) == 3
+        assert link.read32(rm.PROGRAMMED) == 2
+
+
+def test_large_images_come_in_parts(start_board: StartBoard) -> None:
+    board = start_board()
+    large = image(machine(3, lines=300, sensor_bits=(7, 7, 7, 7)))
+    assert len(image_bytes(large)) > 300_000
+    assert program(board.endpoint, large) == large.image_hash
+
+
+def test_the_loader_is_refused_while_a_host_holds_the_board(start_board: StartBoard) -> None:
+    board = start_board()
+    program(board.endpoint, image(MACHINE))
+    with open_link(board) as link:
+        with pytest.raises(HeldError, match="is held: a host has it; end that host, or program through it"):
+            program(board.endpoint, image(machine(2)))
+        assert link.read32(rm.PROGRAMMED) == 1
+    assert program(board.endpoint, image(machine(2))) == image(machine(2)).image_hash
+
+
+def test_a_handle_open_across_a_reprogramming_is_stale(start_board: StartBoard) -> None:
+    board = start_board()
+    program(board.endpoint, image(MACHINE))
+    link = open_link(board)
+    program(board.endpoint, image(machine(2)), token=link.greeting.token)
+    with pytest.raises(
+        StaleHandleError, match=r"is stale: the board was programmed after it was opened; open"
+    ):
+        link.read32(rm.ID)
+    with pytest.raises(LinkClosedError, match="the board said STALE"):
+        link.read32(rm.ID)
+    with open_link(board) as link:
+        assert link.read32(rm.CAP_LINES) == 8
+
+
+def test_a_running_board_is_not_programmed_even_by_its_host(start_board: StartBoard) -> None:
+    board = start_board()
+    program(board.endpoint, image(never_stopping()))
+    with open_link(board) as link:
+        run_for_minutes(link)
+        with refused(ErrorCode.BUSY):
+            program(board.endpoint, image(MACHINE), token=link.greeting.token)
+        assert link.read32(rm.STATUS) & 15 == BoardState.RUNNING
+
+
+def test_one_loader_at_a_time(start_board: StartBoard) -> None:
+    board = start_board()
+    first = SocketLink.open(parse_endpoint(board.endpoint).programming, timeout=5)
+    with pytest.raises(HeldError, match="another loader is programming it"):
+        program(board.endpoint, image(MACHINE))
+    first.close()
+    program(board.endpoint, image(MACHINE))
+
+
+def test_a_loader_that_says_nothing_loses_its_turn(
+    start_board: StartBoard, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(board_module, "PROGRAMMING_SILENCE_S", 0.1)
+    board = start_board()
+    silent = SocketLink.open(parse_endpoint(board.endpoint).programming, timeout=5)
+    with pytest.raises(LinkClosedError):
+        silent.wait_done(1, timeout=5)
+    program(board.endpoint, image(MACHINE))
+
+
+def begin(content: bytes, size: int | None = None) -> bytes:
+    """What a loader says before it sends ``content``."""
+    digest = hashlib.sha256(content).digest()
+    wanted = len(content) if size is None else size
+    return framing.ProgramBegin(size=wanted, sha256=digest, token=framing.NO_TOKEN).encode()
+
+
+def test_a_file_that_changes_on_the_way_is_refused(start_board: StartBoard) -> None:
+    board = start_board()
+    content = image_bytes(image(MACHINE))
+    changed = content[:-4] + bytes(4)
+    with SocketLink.open(parse_endpoint(board.endpoint).programming, timeout=5) as link:
+        payload = begin(content)
+        link.request(framing.PROGRAM, framing.BEGIN, 0, len(payload) // 4, payload)
+        padded = changed + bytes(-len(changed) % 4)
+        link.request(framing.PROGRAM, 0, 0, len(padded) // 4, padded)
+        with pytest.raises(AccessError, match="are not those that were announced"):
+            link.request(framing.PROGRAM, framing.END, len(content), 0)
+        assert link.read_block(rm.IMAGE_HASH, 8) == bytes(32)
+
+
+def test_an_endless_file_is_refused(start_board: StartBoard) -> None:
+    with SocketLink.open(parse_endpoint(start_board().endpoint).programming, timeout=5) as link:
+        payload = begin(b"", size=2**40)
+        with pytest.raises(AccessError, match="1099511627776 bytes, 1073741824 are the most"):
+            link.request(framing.PROGRAM, framing.BEGIN, 0, len(payload) // 4, payload)
+
+
+def test_the_programming_port_takes_no_registers_writes_and_no_part_out_of_turn(
+    start_board: StartBoard,
+) -> None:
+    board = start_board()
+    port = parse_endpoint(board.endpoint).programming
+    with SocketLink.open(port, timeout=5) as link, refused(ErrorCode.BAD_FRAME):
+        link.write32(rm.CONTROL, 1)
+    with SocketLink.open(port, timeout=5) as link, refused(ErrorCode.BAD_FRAME):
+        link.request(framing.PROGRAM, 0, 0, 1, words(1))
+
+
+def test_an_image_for_another_map_is_refused_by_the_board_too(
+    start_board: StartBoard, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ours = rm.MAP_SHA256
+    monkeypatch.setattr(rm, "MAP_SHA256", "77" * 32)
+    content = image_bytes(image(MACHINE))
+    monkeypatch.setattr(rm, "MAP_SHA256", ours)
+    board = start_board()
+    with pytest.raises(ImageMismatchError, match=f"{'77' * 32}.*{ours}"):
+        program(board.endpoint, content)
+    # a loader that does not look
+    with SocketLink.open(parse_endpoint(board.endpoint).programming, timeout=5) as link:
+        payload = begin(content)
+        link.request(framing.PROGRAM, framing.BEGIN, 0, len(payload) // 4, payload)
+        padded = content + bytes(-len(content) % 4)
+        link.request(framing.PROGRAM, 0, 0, len(padded) // 4, padded)
+        with pytest.raises(AccessError, match=f"BAD_IMAGE.*{'77' * 32}.*{ours}"):
+            link.request(framing.PROGRAM, framing.END, len(content), 0)

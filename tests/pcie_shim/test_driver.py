@@ -1,0 +1,478 @@
+#   MiniCluster (this process) ══ 4 links ══ 4 board processes
+# What the boards give through registers is what the kernels give, to the bit; and every failure is said.
+import dataclasses
+import re
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from machines.bm1 import StopReason
+from machines.parameters import PriorMode
+from pcie_shim import register_map as rm
+from pcie_shim.driver import BoardResult, FrameInput, FrameOutput, MiniCluster
+from pcie_shim.errors import (
+    BoardGoneError,
+    BoardHeldError,
+    BoardLinkError,
+    BoardMismatchError,
+    BoardRefusedError,
+    BoardSilentError,
+    BoardStaleError,
+    BoardUnreachableError,
+    EndpointError,
+    FrameInputError,
+    ImageMismatchError,
+    PcieShimError,
+)
+from pcie_shim.loader import program
+from pcie_shim.misbehaviour import Misbehaviour, MisbehaviourKind, UnknownMisbehaviourError
+from tests.pcie_shim.boards import BoardProcess, expected, image, images, machine, never_stopping
+
+StartBoard = Callable[..., BoardProcess]
+LINES = (5, 4, 4, 4)
+PARTS = images(10, LINES, zeros=0.3)
+
+
+def outcome(output: FrameOutput) -> list[tuple[list[int], int, StopReason]]:
+    return [(board.counts.tolist(), board.cycles, board.reason) for board in output.boards]
+
+
+def frame(*addresses: int | None, **changed) -> FrameInput:
+    given = {"target_count": 100, "max_cycles": 3000, "bank": 0, "stop": "slices"} | changed
+    return FrameInput(addresses=addresses or (1, 2), **given)
+
+
+addresses = st.tuples(st.none() | st.integers(0, 7), st.none() | st.integers(0, 15))
+frames = st.builds(
+    FrameInput,
+    addresses=addresses,
+    target_count=st.integers(1, 255) | st.just(255),
+    max_cycles=st.integers(1, 600) | st.sampled_from([256, 257, 511, 512, 513, 4096]),
+    bank=st.integers(0, 15),
+    stop=st.sampled_from(["slices", "own"]),
+)
+
+
+# ---- to the bit ----
+
+
+@pytest.fixture(scope="module", params=["unix", "tcp"])
+def cluster(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[MiniCluster]:
+    """Four boards that misbehave in nothing, opened once for many frames."""
+    base = tmp_path_factory.mktemp("bm")
+    first = 20_000 + hash(str(base)) % 9_000 * 4
+    endpoints = [
+        f"unix:{base}/board{index}.sock"
+        if request.param == "unix"
+        else f"tcp://127.0.0.1:{first + 2 * index}"
+        for index in range(4)
+    ]
+    boards = [BoardProcess(endpoint, index=index) for index, endpoint in enumerate(endpoints)]
+    try:
+        with MiniCluster.open(endpoints, PARTS) as opened:
+            yield opened
+    finally:
+        for board in boards:
+            assert board.stop() == 0
+
+
+@settings(max_examples=80, deadline=None)
+@given(st.lists(frames, min_size=1, max_size=4))
+def test_frames_are_the_kernels_to_the_bit(cluster: MiniCluster, given_frames: list[FrameInput]) -> None:
+    for each in given_frames:
+        assert outcome(cluster.run(each)) == expected(PARTS, each)
+
+
+def test_slices_end_together(cluster: MiniCluster) -> None:
+    output = cluster.run(frame(None, None, target_count=255, max_cycles=2**17))
+    ends = {board.cycles for board in output.boards if board.reason is StopReason.SLICE}
+    stopped = [board.cycles for board in output.boards if board.reason is StopReason.OVERFLOW]
+    assert stopped
+    assert ends == {256 << output.slices - 1}
+    assert max(stopped) <= min(ends)
+
+
+def test_times_say_where_a_frame_went(cluster: MiniCluster) -> None:
+    output = cluster.run(frame(None, None, target_count=255))
+    assert output.register_writes_ns > 0
+    assert output.reads_ns > 0
+    assert 0 < output.boards_compute_ns < output.compute_ns + output.register_writes_ns
+    assert max(board.compute_ns for board in output.boards) <= output.boards_compute_ns
+    assert output.slices >= 1
+
+
+def test_results_are_the_callers_own(cluster: MiniCluster) -> None:
+    first = cluster.run(frame(None, None))
+    kept = outcome(first)
+    cluster.run(frame(3, 4))
+    assert outcome(first) == kept
+    assert first.boards[0].counts.dtype == np.uint32
+    assert first.boards[0].counts.flags.owndata
+
+
+@pytest.mark.parametrize(
+    ("bad", "sentence"),
+    [
+        ({"target_count": 0}, "target count is 0; this machine takes 1 to 255"),
+        ({"target_count": 256}, "target count is 256"),
+        ({"max_cycles": 0}, "most cycles is 0"),
+        ({"bank": 16}, "RNG bank is 16; this machine takes 0 to 15"),
+        ({"bank": -1}, "RNG bank is -1"),
+        ({"prior_address": 1}, "prior's address is 1; this machine takes 0 to 0"),
+        ({"prior_codes": np.zeros(17, np.uint16)}, "the machine's prior is a table"),
+        ({"stop": "line"}, "cannot stop by 'line': use slices or own"),
+        ({"addresses": (1,)}, "has 1 readings; this machine has 2 sensors"),
+        ({"addresses": (8, 0)}, "sensor column 1 is 8; this machine takes 0 to 6, or none"),
+        ({"addresses": (0, -1)}, "sensor column 2 is -1"),
+    ],
+)
+def test_a_frame_that_does_not_fit_is_refused(cluster: MiniCluster, bad: dict, sentence: str) -> None:
+    given_frame = {"addresses": (1, 1), "target_count": 5, "max_cycles": 10} | bad
+    with pytest.raises(FrameInputError, match=sentence) as caught:
+        cluster.run(FrameInput(**given_frame))
+    assert caught.value.exit_code == 2
+    assert outcome(cluster.run(frame())) == expected(PARTS, frame())
+
+
+@pytest.fixture
+def boards(start_board: StartBoard) -> list[BoardProcess]:
+    """Two blank boards."""
+    return [start_board(index=index) for index in range(2)]
+
+
+def endpoints_of(boards: list[BoardProcess]) -> list[str]:
+    return [board.endpoint for board in boards]
+
+
+def test_written_priors_are_split_over_the_boards(boards: list[BoardProcess]) -> None:
+    parts = images(20, (3, 2), prior_mode=PriorMode.WRITTEN, zeros=0)
+    random = np.random.default_rng(1)
+    with MiniCluster.open(endpoints_of(boards), parts) as cluster:
+        first = random.integers(1, 256, 5).astype(np.uint16)
+        second = random.integers(1, 256, 5).astype(np.uint16)
+        for codes in (None, first, first, second, None, first):
+            given_frame = frame(prior_codes=codes)
+            assert outcome(cluster.run(given_frame)) == expected(parts, given_frame)
+        with pytest.raises(FrameInputError, match=r"shape \(4,\) .* takes 5 codes from 0 to 255"):
+            cluster.run(frame(prior_codes=first[:4]))
+        with pytest.raises(FrameInputError, match="codes up to 256"):
+            cluster.run(frame(prior_codes=np.full(5, 256, np.uint16)))
+
+
+def test_what_did_not_change_is_not_written(
+    boards: list[BoardProcess], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    parts = images(30, (3, 2), prior_bits=2)
+    written: list[int] = []
+    with MiniCluster.open(endpoints_of(boards), parts) as cluster:
+        link = cluster._boards[0].link
+        good = link.posted_write
+        monkeypatch.setattr(
+            link, "posted_write", lambda address, words: written.append(address) or good(address, words)
+        )
+        for changed, first in (
+            ({}, rm.TARGET_COUNT),
+            ({}, rm.RUN_UNTIL),
+            ({"bank": 1}, rm.BANK),
+            ({"bank": 1, "prior_address": 3}, rm.PRIOR_SELECT),
+            ({"bank": 1, "prior_address": 3, "max_cycles": 99}, rm.TARGET_COUNT),
+            ({"bank": 1, "prior_address": 3, "max_cycles": 99, "target_count": 7}, rm.TARGET_COUNT),
+        ):
+            written.clear()
+            given_frame = frame(**{"stop": "own"} | changed)
+            assert outcome(cluster.run(given_frame)) == expected(parts, given_frame)
+            assert written == [rm.SENSORS, first]
+
+
+def test_a_machine_without_sensors_runs(start_board: StartBoard) -> None:
+    parts = images(40, (6,), sensor_bits=())
+    with MiniCluster.open([start_board().endpoint], parts) as cluster:
+        given_frame = FrameInput(addresses=(), target_count=9, max_cycles=500)
+        assert outcome(cluster.run(given_frame)) == expected(parts, given_frame)
+
+
+def test_all_boards_impossible(boards: list[BoardProcess]) -> None:
+    parts = images(50, (3, 2), zeros=1.0)
+    with MiniCluster.open(endpoints_of(boards), parts) as cluster:
+        output = cluster.run(frame())
+        assert outcome(output) == [([0] * 3, 0, StopReason.IMPOSSIBLE), ([0] * 2, 0, StopReason.IMPOSSIBLE)]
+        assert output.slices == 1
+
+
+# ---- opening ----
+
+
+def test_boards_are_programmed_once_and_found_again(boards: list[BoardProcess]) -> None:
+    parts = images(60, (3, 2))
+    for expected_number in range(3):
+        with MiniCluster.open(endpoints_of(boards), parts) as cluster:
+            assert cluster._boards[0].link.read32(rm.PROGRAMMED) == 1
+            # the link's own numbers go on where the last host's ended
+            assert cluster._boards[0].number == expected_number
+            assert outcome(cluster.run(frame(stop="own"))) == expected(parts, frame(stop="own"))
+
+
+def test_another_image_is_refused_with_both_hashes(boards: list[BoardProcess]) -> None:
+    parts, others = images(60, (3, 2)), images(61, (3, 2))
+    program(boards[1].endpoint, others[1])
+    with pytest.raises(BoardMismatchError) as caught:
+        MiniCluster.open(endpoints_of(boards), parts)
+    assert re.search(
+        rf"Board 1: .*holds image {others[1].image_hash}, the deployment's is {parts[1].image_hash}: program it",
+        str(caught.value),
+    )
+    assert caught.value.board == 1
+    assert caught.value.exit_code == 2
+    # the boards that were opened before it were let go
+    program(boards[1].endpoint, parts[1])
+    MiniCluster.open(endpoints_of(boards), parts).close()
+
+
+def test_a_held_board_is_refused(boards: list[BoardProcess]) -> None:
+    parts = images(60, (3, 2))
+    with MiniCluster.open(endpoints_of(boards), parts) as cluster:
+        with pytest.raises(BoardHeldError, match=r"Board 0: .* is held: another host has it") as caught:
+            MiniCluster.open(endpoints_of(boards), parts)
+        assert caught.value.exit_code == 5
+        assert outcome(cluster.run(frame())) == expected(parts, frame())
+
+
+def test_a_board_that_is_not_there_is_named(start_board: StartBoard, folder: Path) -> None:
+    endpoints = [start_board().endpoint, f"unix:{folder}/nobody.sock"]
+    with pytest.raises(BoardUnreachableError, match=r"Board 1: No board listens at .*nobody\.sock") as caught:
+        MiniCluster.open(endpoints, images(60, (3, 2)), timeout=0.1)
+    assert caught.value.board == 1
+
+
+@pytest.mark.parametrize(
+    ("parts", "sentence"),
+    [
+        ([], "0 endpoints for 0 images"),
+        (images(1, (3, 2))[:1], "1 endpoints for 1 images|part 0 of 2"),
+        (
+            images(1, (3, 2))[::-1],
+            "Image 0 is part 1 of 2 from line 3 on; part 0 of 2 from line 0 on is needed",
+        ),
+        ([images(1, (3, 2))[0], images(1, (4, 2))[1]], "from line 4 on; part 1 of 2 from line 3"),
+        ([image(machine(1), total=99)], "hold 8 lines, the model has 99"),
+    ],
+)
+def test_images_that_are_not_the_parts_of_one_model_are_refused(parts: list, sentence: str) -> None:
+    with pytest.raises(ImageMismatchError, match=sentence):
+        MiniCluster.open(["unix:/tmp/x.sock"] * len(parts), parts)
+
+
+def test_images_of_two_models_are_refused() -> None:
+    first, second = images(1, (3, 2))
+    other = dataclasses.replace(second, model_hash="cd" * 32)
+    with pytest.raises(ImageMismatchError, match=f"model {'cd' * 32}, image 0 to {'ab' * 32}"):
+        MiniCluster.open(["unix:/tmp/x.sock", "unix:/tmp/y.sock"], [first, other])
+    with pytest.raises(ImageMismatchError, match="1 endpoints for 2 images"):
+        MiniCluster.open(["unix:/tmp/x.sock"], [first, second])
+    with pytest.raises(EndpointError):
+        MiniCluster.open(["x", "y"], [first, second])
+
+
+# ---- boards that fail ----
+
+
+class Failing:
+    """A mini-cluster whose second board misbehaves from its second start on."""
+
+    def __init__(self, start_board: StartBoard, misbehave: str, **parameters) -> None:
+        self.boards = [start_board(index=0), start_board(index=1, misbehave=misbehave), start_board(index=2)]
+        self.parts = images(70, (3, 2, 2), **parameters)
+        self.cluster = MiniCluster.open(endpoints_of(self.boards), self.parts, timeout=2, slack=0.3)
+
+    def run(self, given_frame: FrameInput) -> None:
+        assert outcome(self.cluster.run(given_frame)) == expected(self.parts, given_frame)
+
+
+OWN = {"stop": "own"}
+
+
+@pytest.mark.parametrize(
+    ("kind", "error", "sentence"),
+    [
+        ("drop", BoardSilentError, r"did not say done after 3000 cycles within 0\.3\d* s"),
+        ("stall", BoardSilentError, r"did not say done after 3000 cycles within 0\.3\d* s"),
+        ("never-done", BoardSilentError, r"did not say done after 3000 cycles within 0\.3\d* s"),
+        ("endless", BoardSilentError, "a frame began and did not end"),
+        ("short-read", BoardLinkError, "said done with 1 results where 2 were due"),
+        ("wrong-sequence", BoardLinkError, "interrupt 3 came where interrupt 2 was due"),
+        ("wrong-crc", BoardLinkError, "is broken and closed: a frame's CRC-32 is wrong"),
+        ("all-ones", BoardGoneError, "read all ones: no device answers"),
+    ],
+)
+def test_a_misbehaving_board_fails_the_frame_and_comes_back(
+    start_board: StartBoard, kind: str, error: type[PcieShimError], sentence: str
+) -> None:
+    failing = Failing(start_board, f"{kind}:1:1")
+    cluster = failing.cluster
+    failing.run(frame(**OWN))
+    with pytest.raises(error, match=f"Board 1: .*{sentence}") as caught:
+        cluster.run(frame(**OWN))
+    assert caught.value.board == 1
+    assert caught.value.exit_code == 5
+    assert not cluster.is_open(1)
+    assert cluster.is_open(0)
+    with pytest.raises(BoardGoneError, match=r"Board 1 at unix:.* is not open \(.*\): open it again"):
+        cluster.run(frame(**OWN))
+    cluster.reopen(1, timeout=2)
+    for stop in ("own", "slices"):
+        failing.run(frame(stop=stop, bank=3))
+    cluster.close()
+
+
+@pytest.mark.parametrize(
+    ("kind", "error", "sentence"),
+    [
+        ("drop", BoardSilentError, "did not answer about 0x0000 within 0.3 s: the link is closed"),
+        ("stall", BoardSilentError, "did not answer about 0x0000 within 0.3 s"),
+        (
+            "endless",
+            BoardSilentError,
+            "0x0000 within 0.3 s: a frame began and did not end: the link is closed",
+        ),
+        ("short-read", BoardLinkError, "answered a read of 1 words at 0x0000 with 0"),
+        ("wrong-sequence", BoardLinkError, "answer 2 came where answer 1 was due"),
+        ("wrong-crc", BoardLinkError, "CRC-32 is wrong"),
+        ("all-ones", BoardGoneError, "The ID of the board at .* reads all ones"),
+        (
+            "wrong-map",
+            BoardMismatchError,
+            f"has register map [0-9a-f]{{64}}, this software has {rm.MAP_SHA256}",
+        ),
+    ],
+)
+def test_a_board_that_misbehaves_on_opening_is_refused(
+    start_board: StartBoard, kind: str, error: type[PcieShimError], sentence: str
+) -> None:
+    board = start_board(misbehave=kind)
+    with pytest.raises(error, match=f"Board 0: .*{sentence}"):
+        MiniCluster.open([board.endpoint], images(1, (3,)), timeout=0.3)
+
+
+def test_a_board_that_never_says_done_is_given_the_time_of_its_cycles(start_board: StartBoard) -> None:
+    failing = Failing(start_board, "never-done:0:0")
+    with pytest.raises(BoardSilentError, match=r"did not say done after 256 cycles within 0\.3\d* s"):
+        failing.cluster.run(frame(stop="slices"))
+
+
+def test_a_failure_in_a_later_slice(start_board: StartBoard) -> None:
+    failing = Failing(start_board, "drop:2:1", zeros=0.0, counter_bits=16)
+    slow = frame(target_count=60000, max_cycles=5000)
+    with pytest.raises(BoardSilentError, match=r"did not say done after 512 cycles"):
+        failing.cluster.run(slow)
+    failing.cluster.reopen(1)
+    failing.run(slow)
+
+
+def test_a_killed_board_is_gone_and_its_successor_is_programmed(boards: list[BoardProcess]) -> None:
+    parts = images(80, (3, 2))
+    with MiniCluster.open(endpoints_of(boards), parts, timeout=2) as cluster:
+        cluster.run(frame())
+        boards[0].kill()
+        with pytest.raises(BoardGoneError, match=r"Board 0: .* is gone: "):
+            cluster.run(frame())
+        with pytest.raises(BoardUnreachableError, match="Board 0: No board listens"):
+            cluster.reopen(0, timeout=0.05)
+        with pytest.raises(BoardGoneError, match=r"Board 0 at .* is not open \(No board listens"):
+            cluster.run(frame())
+        successor = BoardProcess(boards[0].endpoint)
+        cluster.reopen(0)
+        assert outcome(cluster.run(frame())) == expected(parts, frame())
+        successor.kill()
+
+
+def test_a_board_that_is_killed_while_it_computes(boards: list[BoardProcess]) -> None:
+    part = image(never_stopping(), total=8, count=2)
+    other = image(never_stopping(), total=8, count=2, index=1, offset=4)
+    with MiniCluster.open(endpoints_of(boards), [part, other]) as cluster:
+        killer = threading.Timer(0.3, boards[1].process.kill)
+        killer.start()
+        with pytest.raises(BoardGoneError, match=r"Board 1: .* is gone"):
+            cluster.run(FrameInput(addresses=(1,), target_count=2**32 - 1, max_cycles=2**45, stop="own"))
+        killer.join()
+        # the other board was computing: it was stopped, and is ready
+        assert cluster.is_open(0)
+        program(boards[0].endpoint, part)
+        with pytest.raises(BoardGoneError, match="Board 1 "):
+            cluster.run(FrameInput(addresses=(1,), target_count=1, max_cycles=5))
+
+
+def test_an_interrupted_frame_leaves_all_boards_usable(
+    boards: list[BoardProcess], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    parts = images(90, (3, 2))
+    with MiniCluster.open(endpoints_of(boards), parts) as cluster:
+
+        def interrupted(*_: object) -> None:
+            raise KeyboardInterrupt
+
+        with monkeypatch.context() as patch:
+            patch.setattr(cluster, "_collect", interrupted)
+            with pytest.raises(KeyboardInterrupt):
+                cluster.run(frame())
+        assert outcome(cluster.run(frame(bank=5))) == expected(parts, frame(bank=5))
+
+
+def test_a_refusing_board_fails_the_frame_and_stays_usable(
+    boards: list[BoardProcess], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    parts = images(100, (3, 2))
+    with MiniCluster.open(endpoints_of(boards), parts) as cluster:
+        with monkeypatch.context() as patch:
+            patch.setattr(cluster, "_words", lambda _: (bytes(20), bytes(8)))
+            with pytest.raises(
+                BoardRefusedError, match=r"Board [01]: .*refused access.*\(BAD_VALUE\): target_count"
+            ):
+                cluster.run(frame())
+        assert cluster.is_open(0)
+        assert cluster.is_open(1)
+        assert outcome(cluster.run(frame())) == expected(parts, frame())
+
+
+def test_a_board_programmed_behind_the_hosts_back_is_stale(boards: list[BoardProcess]) -> None:
+    parts = images(110, (3, 2))
+    with MiniCluster.open(endpoints_of(boards), parts) as cluster:
+        token = cluster._boards[1].link.greeting.token
+        program(boards[1].endpoint, parts[1], token=token)
+        with pytest.raises(BoardStaleError, match=r"Board 1: .* is stale: the board was programmed"):
+            cluster.run(frame())
+        assert not cluster.is_open(1)
+        cluster.reopen(1)
+        assert outcome(cluster.run(frame())) == expected(parts, frame())
+
+
+def test_a_closed_cluster_runs_nothing(boards: list[BoardProcess]) -> None:
+    cluster = MiniCluster.open(endpoints_of(boards), images(1, (3, 2)))
+    cluster.close()
+    cluster.close()
+    with pytest.raises(BoardGoneError, match=r"Board 0 .*\(the mini-cluster was closed\)"):
+        cluster.run(frame())
+
+
+# ---- misbehaviour's text ----
+
+
+def test_misbehaviours_are_parsed() -> None:
+    assert Misbehaviour.parse("drop") == Misbehaviour(MisbehaviourKind.DROP)
+    assert Misbehaviour.parse("never-done:3:1") == Misbehaviour(MisbehaviourKind.NEVER_DONE, 3, 1)
+    for text in ("", "no-such", "drop:x", "drop:1:2:3", "drop:-1"):
+        with pytest.raises(UnknownMisbehaviourError, match="use KIND") as caught:
+            Misbehaviour.parse(text)
+        assert caught.value.exit_code == 2
+
+
+def test_a_result_is_plain_data() -> None:
+    result = BoardResult(counts=np.zeros(1, np.uint32), cycles=0, reason=StopReason.NONE, compute_ns=0)
+    with pytest.raises(AttributeError):
+        result.cycles = 1

@@ -1,0 +1,87 @@
+# Endpoints: their text, their programming port, and sockets that are their owner's alone.
+import socket
+import stat
+from pathlib import Path
+
+import pytest
+
+from pcie_shim.endpoint import Endpoint, connect, listen, parse_endpoint, remove_listener
+from pcie_shim.errors import EndpointError, UnreachableError
+
+
+@pytest.mark.parametrize(
+    ("text", "programming"),
+    [
+        ("unix:/run/bm/board0.sock", "unix:/run/bm/board0.program.sock"),
+        ("unix:/run/board", "unix:/run/board.program"),
+        ("tcp://127.0.0.1:9000", "tcp://127.0.0.1:9001"),
+        ("tcp://board-3.local:65534", "tcp://board-3.local:65535"),
+        ("tcp://[::1]:9000", "tcp://[::1]:9001"),
+    ],
+)
+def test_endpoints_are_what_their_text_says(text: str, programming: str) -> None:
+    assert str(parse_endpoint(text)) == text
+    assert str(parse_endpoint(text).programming) == programming
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "", "/run/board0.sock", "unix:board0.sock", "unix:", "tcp://host", "tcp://host:0", "tcp://host:65535",
+        "tcp://host:x", "tcp://:9000", "udp://host:9000", "tcp://host:9000/x", "tcp://[::1:9000",
+    ],
+)  # fmt: skip
+def test_other_texts_are_refused(text: str) -> None:
+    with pytest.raises(EndpointError, match="is not understood") as caught:
+        parse_endpoint(text)
+    assert repr(text)[1:-1] in str(caught.value)
+
+
+def test_paths_that_no_socket_takes_are_refused() -> None:
+    assert parse_endpoint("unix:/" + "x" * 98).programming.path
+    with pytest.raises(EndpointError, match="with '.program' it has 108 bytes"):
+        parse_endpoint("unix:/" + "x" * 99)
+
+
+def test_a_unix_socket_is_its_owners_alone_and_goes_away(folder: Path) -> None:
+    endpoint = Endpoint(path=str(folder / "a.sock"))
+    server = listen(endpoint)
+    assert stat.S_IMODE((folder / "a.sock").stat().st_mode) == 0o600
+    with connect(endpoint, timeout=1):
+        pass
+    remove_listener(endpoint, server)
+    assert list(folder.iterdir()) == []
+
+
+def test_a_dead_processs_socket_is_replaced_and_a_served_one_is_not(folder: Path) -> None:
+    endpoint = Endpoint(path=str(folder / "a.sock"))
+    listen(endpoint).close()
+    server = listen(endpoint)
+    with pytest.raises(EndpointError, match="another process listens there"):
+        listen(endpoint)
+    connect(endpoint, timeout=1).close()
+    server.close()
+
+
+def test_a_taken_port_and_a_missing_folder_are_said(folder: Path) -> None:
+    server = socket.create_server(("127.0.0.1", 0))
+    port = server.getsockname()[1]
+    with server, pytest.raises(EndpointError, match=f"{port}: another process listens there"):
+        listen(Endpoint(host="127.0.0.1", port=port))
+    with pytest.raises(EndpointError, match="No such file"):
+        listen(Endpoint(path=str(folder / "no" / "a.sock")))
+
+
+def test_nothing_listening_is_said_in_time(folder: Path) -> None:
+    with pytest.raises(UnreachableError, match=r"No board listens at unix:.*No such file.* for 0\.05 s"):
+        connect(Endpoint(path=str(folder / "a.sock")), timeout=0.05)
+    (folder / "b.sock").touch()
+    with pytest.raises(UnreachableError, match="Connection refused"):
+        connect(Endpoint(path=str(folder / "b.sock")), timeout=0.05)
+
+
+def test_small_frames_are_sent_at_once_over_tcp() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        endpoint = Endpoint(host="127.0.0.1", port=server.getsockname()[1])
+        with connect(endpoint, timeout=1) as connection:
+            assert connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)

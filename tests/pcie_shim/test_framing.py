@@ -1,0 +1,144 @@
+# What goes in at one end of a stream comes out at the other, however it is cut; anything else is an error.
+import itertools
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pcie_shim import framing
+from pcie_shim.errors import CrcError, FramingError
+from pcie_shim.framing import FrameDecoder, Greeting, ProgramBegin, encode
+
+words32 = st.integers(0, 0xFFFFFFFF)
+payloads = st.binary(max_size=400).map(lambda data: data[: len(data) // 4 * 4])
+with_payload = st.tuples(
+    st.sampled_from(
+        [
+            (framing.READ, framing.REPLY),
+            (framing.WRITE, 0),
+            (framing.WRITE, framing.POSTED),
+            (framing.IRQ, 0),
+            (framing.ERROR, framing.REPLY),
+            (framing.PROGRAM, framing.BEGIN),
+        ]
+    ),
+    words32,
+    words32,
+    payloads,
+).map(lambda made: (*made[0], made[1], made[2], len(made[3]) // 4, made[3]))
+without_payload = st.tuples(
+    st.sampled_from([(framing.READ, 0), (framing.WRITE, framing.REPLY), (framing.PROGRAM, framing.REPLY)]),
+    words32,
+    words32,
+    st.integers(0, framing.MAX_PAYLOAD_WORDS),
+).map(lambda made: (*made[0], *made[1:], b""))
+frames = st.lists(with_payload | without_payload, max_size=8)
+
+
+def decode(stream: bytes, cuts: list[int]) -> list[tuple[object, ...]]:
+    """All frames in a stream that arrives in pieces."""
+    decoder = FrameDecoder()
+    found = []
+    edges = sorted({0, len(stream), *(cut % (len(stream) + 1) for cut in cuts)})
+    for start, end in itertools.pairwise(edges):
+        rest = stream[start:end]
+        while rest:
+            room = decoder.room()
+            piece, rest = rest[: len(room)], rest[len(room) :]
+            room[: len(piece)] = piece
+            decoder.received(len(piece))
+            while (frame := decoder.next_frame()) is not None:
+                found.append((*frame[:-1], bytes(frame.payload)))
+    return found
+
+
+@given(frames, st.lists(st.integers(0, 10_000), max_size=12))
+def test_frames_survive_any_split(sent: list[tuple[object, ...]], cuts: list[int]) -> None:
+    assert decode(b"".join(encode(*frame) for frame in sent), cuts) == sent
+
+
+def test_long_streams_do_not_outgrow_the_buffer() -> None:
+    longest = (framing.WRITE, 0, 1, 0, framing.MAX_PAYLOAD_WORDS, bytes(4 * framing.MAX_PAYLOAD_WORDS))
+    assert decode(encode(*longest) * 9, list(range(0, 300_000, 50_001))) == [longest] * 9
+
+
+@given(st.binary(max_size=3000), st.lists(st.integers(0, 3000), max_size=5))
+def test_any_bytes_give_frames_or_a_framing_error(stream: bytes, cuts: list[int]) -> None:
+    try:
+        found = decode(stream, cuts)
+    except FramingError:
+        return
+    assert found == [] or stream.startswith(b"BM")
+
+
+@given(with_payload, st.integers(0, 8 * 419), st.binary(max_size=40))
+def test_a_flipped_bit_is_never_taken_for_a_frame(
+    sent: tuple[object, ...], position: int, after: bytes
+) -> None:
+    stream = bytearray(encode(*sent))
+    position %= 8 * len(stream)
+    stream[position // 8] ^= 1 << position % 8
+    try:
+        assert decode(bytes(stream) + after, [])[:1] != [sent]
+    except FramingError:
+        return
+    # only a longer length can leave the decoder waiting for more
+    assert 12 * 8 <= position < 16 * 8
+
+
+def test_a_wrong_crc_and_a_boundless_length_are_told_apart() -> None:
+    stream = bytearray(encode(framing.WRITE, 0, 1, 0, 1, b"1234"))
+    stream[-1] ^= 1
+    with pytest.raises(CrcError, match="CRC-32"):
+        decode(bytes(stream), [])
+    with pytest.raises(FramingError, match="8193 words came; 8192 are the most"):
+        decode(encode(framing.READ, 0, 1, 0, framing.MAX_PAYLOAD_WORDS + 1), [])
+
+
+def test_the_wire_format_is_the_documented_one() -> None:
+    # a posted write of 7 to 0x0104 as request number 2: docs/boards.md shows the same bytes
+    assert encode(framing.WRITE, framing.POSTED, 2, 0x104, 1, b"\7\0\0\0").hex(" ", 4) == (
+        "424d0302 02000000 04010000 01000000 5e852fa0 07000000"
+    )
+
+
+def test_greeting_error_and_begin_come_back() -> None:
+    greeting = Greeting(
+        protocol_version=1,
+        bar_size=65536,
+        board=3,
+        map_hash="12" * 32,
+        image_hash="0" * 64,
+        token=b"tokentok",
+    )
+    (frame,) = _frames(framing.encode_greeting(greeting))
+    assert framing.decode_greeting(frame) == greeting
+    assert greeting.is_blank
+    (frame,) = _frames(framing.encode_error(9, 0x100, 5, "beschäftigt"))
+    assert (frame.sequence, frame.address, *framing.decode_error(frame)) == (9, 0x100, 5, "beschäftigt")
+    begin = ProgramBegin(size=5, sha256=b"s" * 32, token=b"t" * 8)
+    assert ProgramBegin.decode(memoryview(begin.encode())) == begin
+
+
+@pytest.mark.parametrize("payload", [b"", b"x" * 96])
+def test_other_frames_are_no_greeting(payload: bytes) -> None:
+    (frame,) = _frames(encode(framing.GREET, 0, 0, 0, len(payload) // 4, payload))
+    with pytest.raises(FramingError, match="greeting"):
+        framing.decode_greeting(frame)
+
+
+def test_short_payloads_are_refused() -> None:
+    (frame,) = _frames(encode(framing.ERROR, framing.REPLY, 1, 0, 0))
+    with pytest.raises(FramingError, match="without a code"):
+        framing.decode_error(frame)
+    with pytest.raises(FramingError, match="too short"):
+        ProgramBegin.decode(memoryview(b"123"))
+
+
+def _frames(stream: bytes) -> list[framing.Frame]:
+    decoder = FrameDecoder()
+    decoder.room()[: len(stream)] = stream
+    decoder.received(len(stream))
+    frame = decoder.next_frame()
+    assert frame is not None
+    return [frame]

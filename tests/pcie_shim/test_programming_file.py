@@ -1,0 +1,182 @@
+# A programming file is deterministic, comes back whole, and says which of its parts is damaged.
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from machines.parameters import PriorMode, RngKind, RngReset
+from pcie_shim import programming_file, register_map
+from pcie_shim.errors import DamagedImageError, ImageError, ImageMismatchError
+from pcie_shim.programming_file import (
+    Image,
+    build_date,
+    image_bytes,
+    image_from_bytes,
+    read_image,
+    write_image,
+)
+from tests.pcie_shim.boards import image, machine
+
+MACHINES = [
+    machine(1),
+    machine(2, lines=3, sensor_bits=(), prior_bits=2, rng=RngKind.IDEAL, ideal_seed=2**64 - 1),
+    machine(3, prob_bits=6, rng=RngKind.TABLE, rng_reset=RngReset.FREE, shared=False),
+    machine(4, prior_mode=PriorMode.WRITTEN, counter_bits=20, rng=RngKind.LFSR16, rng_banks=2),
+]
+
+
+def manifest_of(content: bytes) -> dict[str, object]:
+    length = int.from_bytes(content[8:12], "little")
+    found: dict[str, object] = json.loads(content[48 : 48 + length])
+    return found
+
+
+@pytest.mark.parametrize("of", MACHINES)
+def test_an_image_comes_back(of, tmp_path: Path) -> None:
+    path = tmp_path / "board0.bm"
+    written = image(of, index=1, count=3, offset=7, total=100)
+    write_image(path, written)
+    found = read_image(path)
+    for field in dataclasses.fields(Image):
+        assert getattr(found, field.name) == getattr(written, field.name)
+    assert found.image_hash == written.image_hash
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_the_same_image_gives_the_same_bytes() -> None:
+    assert image_bytes(image(machine(1))) == image_bytes(image(machine(1)))
+
+
+def test_the_image_hash_is_of_what_the_board_computes() -> None:
+    base = image(machine(1))
+    later = dataclasses.replace(base, build_date="2027-01-01T00:00:00Z", tool_version="9")
+    assert later.image_hash == base.image_hash
+    assert image_bytes(later) != image_bytes(base)
+    others = [
+        image(machine(2)),
+        image(machine(1, rng_banks=4)),
+        image(machine(1), total=9),
+        dataclasses.replace(base, interface_results=8),
+        dataclasses.replace(base, model_hash="cd"),
+    ]
+    assert len({each.image_hash for each in (base, *others)}) == 6
+
+
+def test_the_manifest_says_what_it_is() -> None:
+    content = image_bytes(image(machine(1)))
+    manifest = manifest_of(content)
+    identity = manifest["identity"]
+    assert manifest["emulated"] is True
+    assert manifest["build_date"] == "2026-01-02T03:04:05Z"
+    assert manifest["tool_version"] == "0"
+    assert manifest["image_hash"] == image(machine(1)).image_hash
+    assert identity["map_hash"] == register_map.MAP_SHA256
+    assert [section["name"] for section in identity["sections"]] == ["prior", "column 1", "column 2"]
+
+
+@given(st.data())
+def test_any_damage_is_found_and_named(data: st.DataObject) -> None:
+    content = bytearray(image_bytes(image(MACHINES[0])))
+    position = data.draw(st.integers(0, len(content) - 1))
+    content[position] ^= data.draw(st.integers(1, 255))
+    length = int.from_bytes(content[8:12], "little")
+    if 12 <= position < 16:
+        return  # padding of the header
+    with pytest.raises(ImageError, match=r"boards/board0\.bm") as caught:
+        image_from_bytes(bytes(content), "boards/board0.bm")
+    assert caught.value.exit_code == 2
+    if position >= 48 + length:
+        assert "sha256 of section '" in str(caught.value)
+    elif position >= 16:
+        assert "sha256 of its manifest is" in str(caught.value)
+
+
+@given(st.integers(0, 3000))
+def test_a_cut_file_is_damaged(length: int) -> None:
+    content = image_bytes(image(MACHINES[0]))
+    with pytest.raises(DamagedImageError):
+        image_from_bytes(content[: length % len(content)])
+
+
+def test_a_longer_file_is_damaged() -> None:
+    with pytest.raises(DamagedImageError, match="5 bytes follow"):
+        image_from_bytes(image_bytes(image(MACHINES[0])) + bytes(5))
+
+
+def test_a_file_that_agrees_with_itself_but_not_with_its_image_hash_is_damaged(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    good = programming_file._manifest
+    monkeypatch.setattr(
+        programming_file,
+        "_manifest",
+        lambda *given: good(*given).model_copy(update={"image_hash": "00" * 32}),
+    )
+    content = image_bytes(image(MACHINES[0]))
+    with pytest.raises(DamagedImageError, match=f"image hash is .*, its manifest says {'00' * 32}"):
+        image_from_bytes(content)
+
+
+def test_another_register_map_is_refused_with_both_hashes(monkeypatch: pytest.MonkeyPatch) -> None:
+    content = image_bytes(image(MACHINES[0]))
+    ours = register_map.MAP_SHA256
+    monkeypatch.setattr(register_map, "MAP_SHA256", "77" * 32)
+    with pytest.raises(ImageMismatchError, match=f"{ours}.*{'77' * 32}"):
+        image_from_bytes(content)
+
+
+def test_another_format_is_refused() -> None:
+    content = image_bytes(image(MACHINES[0]))
+    with pytest.raises(ImageMismatchError, match="has format 9, this software reads format 1"):
+        image_from_bytes(b"BMIMAGE\x09" + content[8:])
+    with pytest.raises(DamagedImageError, match="no programming file"):
+        image_from_bytes(b"hello" * 20)
+
+
+def test_files_that_cannot_be_read_or_written(tmp_path: Path) -> None:
+    with pytest.raises(ImageError, match=r"none\.bm cannot be read: No such file"):
+        read_image(tmp_path / "none.bm")
+    with pytest.raises(ImageError, match="cannot be written"):
+        write_image(tmp_path / "no" / "folder.bm", image(MACHINES[0]))
+
+
+def test_a_model_larger_than_the_interface_is_refused() -> None:
+    with pytest.raises(ImageError, match=r"2 sensors and 8 lines; the interface 1x1200 is smaller"):
+        dataclasses.replace(image(machine(1)), interface_sensors=1)
+    with pytest.raises(ImageError, match="use --interface 20x8, or more partitions"):
+        dataclasses.replace(image(machine(1)), interface_results=7)
+
+
+@pytest.mark.parametrize(("sensors", "results"), [(0, 10), (65, 10), (10, 0), (10, 4097)])
+def test_an_interface_larger_than_the_map_is_refused(sensors: int, results: int) -> None:
+    with pytest.raises(ImageError, match="room for 1x1 to 64x4096"):
+        dataclasses.replace(image(machine(1)), interface_sensors=sensors, interface_results=results)
+
+
+@pytest.mark.parametrize(
+    ("index", "count", "offset", "total"), [(1, 1, 0, 8), (-1, 1, 0, 8), (0, 1, 1, 8), (0, 1, -1, 8)]
+)
+def test_an_impossible_partition_is_refused(index: int, count: int, offset: int, total: int) -> None:
+    with pytest.raises(ImageError, match="cannot hold 8 lines"):
+        image(machine(1), index=index, count=count, offset=offset, total=total)
+
+
+def test_the_build_date_repeats_where_it_is_asked_to(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "86400")
+    assert build_date() == "1970-01-02T00:00:00Z"
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "yesterday")
+    with pytest.raises(ImageError, match="SOURCE_DATE_EPOCH is 'yesterday'"):
+        build_date()
+    monkeypatch.delenv("SOURCE_DATE_EPOCH")
+    assert build_date() > "2025"
+
+
+def test_tables_of_a_read_image_cannot_be_written() -> None:
+    found = image_from_bytes(image_bytes(image(MACHINES[0])))
+    with pytest.raises(ValueError, match="read-only"):
+        found.machine.prior[0, 0] = 1
+    assert found.machine.prior.dtype == np.uint16

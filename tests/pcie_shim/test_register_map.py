@@ -1,0 +1,77 @@
+# The committed constants and documentation are what the SystemRDL file makes of them.
+import dataclasses
+from pathlib import Path
+
+import pytest
+
+from machines.bm1 import StopReason
+from machines.parameters import RngKind
+from pcie_shim import map_generator, register_map
+from pcie_shim.framing import MAX_PAYLOAD_WORDS
+
+
+@pytest.fixture(scope="module")
+def generated() -> map_generator.RegisterMap:
+    return map_generator.read_map()
+
+
+def test_the_constants_module_is_up_to_date(generated: map_generator.RegisterMap) -> None:
+    assert map_generator.MODULE.read_text() == map_generator.module_text(generated), "run scripts/registers"
+
+
+def test_the_documentation_is_up_to_date(generated: map_generator.RegisterMap) -> None:
+    assert map_generator.DOCUMENT.read_text() == map_generator.document_text(generated), (
+        "run scripts/registers"
+    )
+
+
+def test_check_says_what_is_out_of_date(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "docs").mkdir()
+    monkeypatch.setattr(map_generator, "ROOT", tmp_path)
+    monkeypatch.setattr(map_generator, "MODULE", tmp_path / "register_map.py")
+    monkeypatch.setattr(map_generator, "DOCUMENT", tmp_path / "docs" / "registers.md")
+    with pytest.raises(SystemExit, match="1"):
+        map_generator.main(["--check"])
+    assert "register_map.py is out of date: run scripts/registers" in capsys.readouterr().err
+    with pytest.raises(SystemExit, match="0"):
+        map_generator.main([])
+    with pytest.raises(SystemExit, match="0"):
+        map_generator.main(["--check"])
+
+
+def test_the_hash_covers_the_definition_and_not_the_words(generated: map_generator.RegisterMap) -> None:
+    first, *rest = generated.blocks
+    reworded = dataclasses.replace(first, text="other words", title="another title")
+    moved = dataclasses.replace(first, address=first.address + 4)
+    field = dataclasses.replace(first.fields[0], reset=1)
+    assert dataclasses.replace(generated, blocks=(reworded, *rest)).hash == generated.hash
+    assert dataclasses.replace(generated, blocks=(moved, *rest)).hash != generated.hash
+    changed = dataclasses.replace(first, fields=(field,))
+    assert dataclasses.replace(generated, blocks=(changed, *rest)).hash != generated.hash
+
+
+def test_stop_reasons_and_rngs_are_the_machines() -> None:
+    assert {(each.name, each.value) for each in register_map.StopReason} == {
+        (each.name, each.value) for each in StopReason
+    }
+    assert {each.name for each in register_map.RngKind} - {"NONE"} == {each.name for each in RngKind}
+
+
+def test_blocks_neither_overlap_nor_outgrow_a_frame() -> None:
+    end = 0
+    for block in register_map.BLOCKS:
+        assert block.address >= end
+        assert block.words <= MAX_PAYLOAD_WORDS
+        end = block.address + 4 * block.words
+    assert end <= register_map.BAR_SIZE
+
+
+def test_what_is_written_in_one_burst_lies_side_by_side() -> None:
+    written = [
+        block
+        for block in register_map.BLOCKS
+        if register_map.TARGET_COUNT <= block.address <= register_map.RESUME
+    ]
+    assert sum(block.words for block in written) * 4 == register_map.RESUME + 4 - register_map.TARGET_COUNT
