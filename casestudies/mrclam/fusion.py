@@ -1,0 +1,62 @@
+"""Unquantised float64 fusion of raw readings: what the machine's posteriors are measured against.
+
+Gaussian densities at the cells' centres and the same outlier floor, no bins, no codes, no counts.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from casestudies.mrclam.landmarks import Landmark
+from casestudies.mrclam.model import BEARING_SIGMA, FLOOR, RANGE_SIGMA, X_LIMITS, Y_LIMITS
+from toolchain.fusion import fuse
+from toolchain.model import cell_centres, interval
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Reading:
+    """What was seen of one landmark: metres and radians (absolute, any turn); None where nothing was."""
+
+    range_m: float | None = None
+    bearing_rad: float | None = None
+
+
+def unquantised_posterior(
+    landmarks: Sequence[Landmark],
+    readings: Sequence[Reading],
+    *,
+    width: int = 32,
+    height: int = 32,
+    floor: float = FLOOR,
+) -> NDArray[np.float64]:
+    """Return the posterior over the cells, float64[width * height] with line = y * width + x.
+
+    Args:
+        landmarks: The landmarks.
+        readings: One per landmark, in the same order.
+        width: Cells along x in [-2, 7] m.
+        height: Cells along y in [-7, 7] m.
+        floor: What an outlier gets everywhere, relative to the density's peak.
+
+    Raises:
+        ValueError: Another number of readings than landmarks.
+        toolchain.errors.ModelError: Readings that are impossible on every line (only without a floor).
+    """
+    y, x = cell_centres(interval("y", *Y_LIMITS, cells=height), interval("x", *X_LIMITS, cells=width))
+    factors = []
+    for landmark, reading in zip(landmarks, readings, strict=True):
+        if reading.range_m is not None:
+            away = reading.range_m - np.hypot(landmark.x - x, landmark.y - y)
+            factors.append(_likelihood(away / RANGE_SIGMA, floor))
+        if reading.bearing_rad is not None:
+            away = reading.bearing_rad - np.arctan2(landmark.y - y, landmark.x - x)
+            away = (away + np.pi) % (2 * np.pi) - np.pi
+            factors.append(_likelihood(away / BEARING_SIGMA, floor))
+    return fuse(np.ones(width * height), factors)
+
+
+def _likelihood(z: NDArray[np.float64], floor: float) -> NDArray[np.float64]:
+    likelihood: NDArray[np.float64] = np.exp(-0.5 * z**2) + floor
+    return likelihood

@@ -1,0 +1,77 @@
+"""A robot among landmarks: P(range | cell) and P(bearing | cell) for each one, with an outlier floor.
+
+Column order range_6, bearing_6, range_7, bearing_7, ... for the landmarks of the file in its order; line = y *
+width + x from the lower left corner. A landmark that is not seen is a missing reading.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from casestudies.mrclam.landmarks import read_landmarks
+from toolchain.conditional import normal, wrapped_normal
+from toolchain.errors import ModelError
+from toolchain.model import Known, Model, cell_centres, interval
+
+X_LIMITS = (-2.0, 7.0)
+Y_LIMITS = (-7.0, 7.0)
+RANGE_SIGMA = 0.25
+BEARING_SIGMA = 0.12
+FLOOR = 0.05
+
+
+def model(
+    landmarks: Path,
+    width: int = 32,
+    height: int = 32,
+    floor: float = FLOOR,
+    range_step: float = 0.05,
+    range_values: int = 255,
+    bearing_values: int = 255,
+) -> Model:
+    """Return the model of a robot's position, in metres, from what it sees of landmarks.
+
+    Args:
+        landmarks: A CSV with the columns landmark, x_m, y_m; the data set's README says where to get it.
+        width: Cells along x in [-2, 7] m.
+        height: Cells along y in [-7, 7] m.
+        floor: What an outlier gets everywhere, relative to the peak of the bin likelihood. Codes of 8 bits
+            round 1e-3 to 0, and then one wild reading makes every line impossible.
+        range_step: Metres between the ranges told apart, from 0 on; longer ones than the last clamp.
+        range_values: How many ranges are told apart.
+        bearing_values: How many bearings are told apart in a turn; readings are radians, any turn.
+
+    Raises:
+        ModelError: A file that holds no landmarks, or a size that is not positive.
+    """
+    if bearing_values < 1:
+        message = f"bearing_values is {bearing_values}, expected how many bearings a turn has, from 1"
+        raise ModelError(message)
+    rows = interval("y", *Y_LIMITS, cells=height)
+    columns = interval("x", *X_LIMITS, cells=width)
+    y, x = cell_centres(rows, columns)
+    known: list[Known] = []
+    for landmark in read_landmarks(landmarks):
+        known.append(
+            normal(
+                f"range_{landmark.number}",
+                mean=np.hypot(landmark.x - x, landmark.y - y),
+                sigma=RANGE_SIGMA,
+                values=range_values,
+                step=range_step,
+                floor=floor,
+                on_missing="missing",
+            )
+        )
+        known.append(
+            wrapped_normal(
+                f"bearing_{landmark.number}",
+                mean=np.arctan2(landmark.y - y, landmark.x - x),
+                sigma=BEARING_SIGMA,
+                values=bearing_values,
+                step=2 * np.pi / bearing_values,
+                floor=floor,
+                on_missing="missing",
+            )
+        )
+    return Model(name="mrclam", searched=(rows, columns), known=tuple(known))
