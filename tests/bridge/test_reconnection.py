@@ -180,7 +180,8 @@ async def test_a_goodbye_of_the_server_is_told():
         await ros.wait_for_state(State.CONNECTED, 10)
 
 
-async def test_a_goodbye_without_hanging_up_is_not_waited_for():
+async def test_a_goodbye_without_hanging_up_is_not_waited_for(monkeypatch):
+    monkeypatch.setattr("bridge.websocket.CLOSE_TIMEOUT", 0.2)
     async with FakeRosbridge() as fake, connect(fake.uri) as ros:
         fake.freeze()
         (client,) = fake._clients
@@ -191,10 +192,8 @@ async def test_a_goodbye_without_hanging_up_is_not_waited_for():
 
 async def test_a_silent_peer_is_noticed():
     async with FakeRosbridge() as fake, connect(fake.uri, ping_interval=0.2, ping_timeout=0.2) as ros:
-        begun = time.monotonic()
         fake.freeze()
-        await ros.wait_for_state(State.RECONNECTING, 10)
-        assert 0.35 < time.monotonic() - begun < 5
+        await ros.wait_for_state(State.RECONNECTING, 5)
         assert "nothing was heard from the server for 0." in ros.last_error
         await ros.wait_for_state(State.CONNECTED, 10)
 
@@ -204,7 +203,7 @@ async def test_a_quiet_server_that_answers_pings_is_kept():
         FakeRosbridge(silent=True) as fake,
         connect(fake.uri, ping_interval=0.05, ping_timeout=0.3) as ros,
     ):
-        await asyncio.sleep(0.8)
+        await asyncio.sleep(0.5)
         assert (ros.state, ros.reconnections, fake.connections) == (State.CONNECTED, 0, 1)
 
 
@@ -214,7 +213,7 @@ async def test_a_sleep_of_this_process_is_not_the_servers_silence():
         while not ros._session._open_websocket()._pinged:
             await asyncio.sleep(0)
         fake.thaw()
-        time.sleep(1.0)  # noqa: ASYNC251  # the whole process stands still while the answer is on its way
+        time.sleep(0.9)  # noqa: ASYNC251  # the whole process stands still while the answer is on its way
         await asyncio.sleep(0.3)
         assert (ros.state, ros.reconnections) == (State.CONNECTED, 0)
         assert fake.connections == 1
@@ -303,7 +302,8 @@ async def test_a_callback_that_fails_breaks_nothing(caplog):
         assert "on_state failed" in caplog.text
 
 
-async def test_a_peer_that_does_not_say_goodbye_is_not_waited_for():
+async def test_a_peer_that_does_not_say_goodbye_is_not_waited_for(monkeypatch):
+    monkeypatch.setattr("bridge.websocket.CLOSE_TIMEOUT", 0.2)
     async with FakeRosbridge() as fake:
         ros = connect(fake.uri)
         await ros.__aenter__()
