@@ -21,6 +21,7 @@ Model = TypeVar("Model", bound=BaseModel)
 
 _HEADER = re.compile(r"^\s*(\[\[?)\s*([^\[\]]+?)\s*\]\]?\s*(?:#.*)?$")
 _PLACE = re.compile(r"\s*\(at (?:line (\d+), column \d+|end of document)\)$")
+_SHOWN = 60
 _MOST_BYTES = 4 << 20  # a deployment is a few kilobytes; this bounds what a wrong path can make us read
 
 
@@ -113,12 +114,15 @@ def _split(place: Sequence[str | int]) -> tuple[str, int | None, str]:
 def _sentence(model: type[BaseModel], detail: ErrorDetails, text: str, path: Path) -> str:
     place = detail["loc"]
     line = line_of(text, place)
-    if line is None and len(place) == 1:  # a whole table
+    whole_table = line is None and len(place) == 1
+    if whole_table:
         line = line_of(text, (*place, 0)) or line_of(text, (*place, ""))
     where = f"{path}, line {line}" if line is not None else str(path)
     table, index, key = _split(place)
     section = f" in [{table}]" if table and index is None else f" in [[{table}]] {(index or 0) + 1}"
     section = section if table else ""
+    value = repr(detail["input"])
+    value = value if len(value) <= _SHOWN else value[:_SHOWN] + "..."
     match detail["type"]:
         case "extra_forbidden":
             known = _keys(_model_at(model, place[:-1]))
@@ -128,13 +132,13 @@ def _sentence(model: type[BaseModel], detail: ErrorDetails, text: str, path: Pat
         case "literal_error" | "enum":
             expected = [word.strip("' ") for word in re.split(r",| or ", str(detail["ctx"]["expected"]))]
             nearest = _nearest(str(detail["input"]), expected)
-            return f"{where}: {key} = {detail['input']!r}{section} is not a value it can have; {nearest}"
+            return f"{where}: {key} = {value}{section} is not a value it can have; {nearest}"
         case "value_error":
-            subject = f"{key}{section}: " if key else f"{section.removeprefix(' ')}: " if section else ""
-            return f"{where}: {subject}{detail['ctx']['error']}"
+            subject = f"in [{key}]" if whole_table else f"{key}{section}".lstrip()
+            return ": ".join(part for part in (where, subject, str(detail["ctx"]["error"])) if part)
         case _:
             what = detail["msg"].removeprefix("Input should be ")
-            return f"{where}: {key or place} = {detail['input']!r}{section}: expected {what}"
+            return f"{where}: {key or place} = {value}{section}: expected {what}"
 
 
 def _nearest(word: str, known: Sequence[str]) -> str:

@@ -1,0 +1,399 @@
+"""deployment.toml: written and read back, guarded by its hash, and every mistake named with its line.
+
+build ──▶ deployment.toml ──▶ (a user edits it) ──▶ load_deployment ──▶ services
+          boards/*.bm                              └─ one sentence: file, line, nearest right name
+"""
+
+import string
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from machines.bm1 import BM1Machine
+from machines.parameters import BM1Parameters
+from pcie_shim.programming_file import Image, Partition, write_image
+from toolchain.deployment import (
+    Board,
+    Deployment,
+    Dimension,
+    MachineSection,
+    Output,
+    Queue,
+    Source,
+    Stop,
+    Variable,
+    deployment_hash,
+    deployment_text,
+    load_deployment,
+    write_deployment,
+)
+from toolchain.errors import DamagedDeploymentError, DeploymentError, DeploymentVersionError
+
+
+def deployment(**fields):
+    return Deployment(
+        **(
+            {
+                "name": "boat",
+                "sources": (Source(uri="ws://a:9090", topic="/boat/sensors", type="boat_msgs/Sensors"),),
+                "variables": (
+                    Variable(name="D1", bits=7, values=101, on_range="clamp"),
+                    Variable(name="B1", bits=9, values=360, period=360, path="bearings[0]"),
+                ),
+                "searched": (
+                    Dimension(label="y", size=4, offset=-3.0, step=2.0),
+                    Dimension(label="x", size=3),
+                ),
+                "machine": MachineSection(lines=12),
+                "boards": (
+                    Board(image="boards/board0.bm", image_hash="0" * 64, line_offset=0, lines=6),
+                    Board(image="boards/board1.bm", image_hash="1" * 64, line_offset=6, lines=6),
+                ),
+            }
+            | fields
+        )
+    )
+
+
+@pytest.fixture
+def folder(tmp_path):
+    write_deployment(tmp_path, deployment())
+    return tmp_path
+
+
+def edit(folder, old, new, *, count=1):
+    path = folder / "deployment.toml"
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, count))
+
+
+def refused(folder, error=DeploymentError):
+    with pytest.raises(error) as caught:
+        load_deployment(folder, images=False)
+    assert caught.value.exit_code == 2
+    sentence = str(caught.value)
+    assert "\n" not in sentence
+    assert str(folder / "deployment.toml") in sentence
+    return sentence.removeprefix(str(folder / "deployment.toml"))
+
+
+def test_what_is_written_is_read_back(folder):
+    written = load_deployment(folder, images=False)
+    assert written.directory == folder
+    assert written.image_path(1) == folder / "boards" / "board1.bm"
+    assert written.variables[1].period == 360
+    assert written.variables[0].period is None
+    assert written.outputs == (Output(),)
+    assert written.output_uri(written.outputs[0]) == "ws://a:9090"
+    assert written.machine.stop is Stop.SLICES
+    assert (written.machine.interface_sensors, written.machine.interface_results) == (20, 1200)
+    assert written == deployment(hash=deployment_hash(deployment()), directory=folder)
+    assert [written.searched[0].value(i) for i in (0, 3)] == [-3.0, 3.0]
+
+
+def test_tables_are_arrays_of_tables(folder):
+    text = (folder / "deployment.toml").read_text()
+    for header, count in (("[[source]]", 1), ("[[variable]]", 2), ("[machine]", 1), ("[[board]]", 2)):
+        assert text.count(f"\n{header}\n") == count
+
+
+NAMES = st.text(st.characters(codec="utf-8", exclude_categories=("Cs",)), min_size=1, max_size=20)
+FLOATS = st.floats(allow_nan=False, allow_infinity=False)
+
+
+@st.composite
+def deployments(draw):
+    sizes = draw(st.lists(st.integers(1, 5), min_size=1, max_size=3))
+    lines = int(np.prod(sizes))
+    cuts = sorted(draw(st.sets(st.integers(1, lines - 1), max_size=3))) if lines > 1 else []
+    starts = [0, *cuts]
+    names = draw(st.lists(NAMES, unique=True, max_size=4))
+    step = FLOATS.filter(bool)
+    return deployment(
+        name=draw(NAMES),
+        queue=draw(st.sampled_from(list(Queue))),
+        tolerance_s=draw(st.floats(0, 1e9)),
+        searched=tuple(
+            Dimension(label=string.ascii_letters[i], size=size, offset=draw(FLOATS), step=draw(step))
+            for i, size in enumerate(sizes)
+        ),
+        variables=tuple(
+            Variable(
+                name=name,
+                path=draw(st.text(max_size=10)),
+                bits=10,
+                values=draw(st.integers(1, 1023)),
+                period=draw(st.none() | st.integers(1, 1023)),
+                offset=draw(FLOATS),
+                step=draw(step),
+                on_missing=draw(st.sampled_from(["error", "missing"])),
+            )
+            for name in names
+        ),
+        machine=MachineSection(lines=lines, stop=draw(st.sampled_from(list(Stop)))),
+        boards=tuple(
+            Board(image=f"boards/{i}.bm", image_hash="a" * 64, line_offset=start, lines=end - start)
+            for i, (start, end) in enumerate(zip(starts, [*cuts, lines], strict=True))
+        ),
+    )
+
+
+@given(deployments())
+def test_any_deployment_survives_the_file(tmp_path_factory, deployment):
+    folder = tmp_path_factory.mktemp("deployment")
+    written = write_deployment(folder, deployment)
+    assert load_deployment(folder, images=False) == written
+    assert deployment_text(written) == (folder / "deployment.toml").read_text(encoding="utf-8")
+
+
+def test_uris_and_endpoints_may_be_edited(folder):
+    before = load_deployment(folder, images=False)
+    edit(folder, "ws://a:9090", "wss://robot.local:443/bridge")
+    edit(folder, 'endpoint = ""', 'endpoint = "tcp://board0:7000"')
+    edit(folder, 'uri = ""', 'uri = "ws://elsewhere:9090"')
+    after = load_deployment(folder, images=False)
+    assert after.hash == before.hash
+    assert after.sources[0].uri == "wss://robot.local:443/bridge"
+    assert after.boards[0].endpoint == "tcp://board0:7000"
+    assert after.output_uri(after.outputs[0]) == "ws://elsewhere:9090"
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ('name = "D1"', 'name = "D2"'),
+        ("offset = 0.0", "offset = 0.5"),
+        ("target_count = 255", "target_count = 254"),
+        ('topic = "/boat/sensors"', 'topic = "/boat/sensor"'),
+        ('on_range = "clamp"', 'on_range = "error"'),
+        ('image_hash = "0', 'image_hash = "1'),
+        ("lines = 6\n", "lines = 6\n\n# no change\n"),
+    ],
+)
+def test_any_other_edit_is_found(folder, old, new):
+    harmless = "no change" in new
+    edit(folder, old, new)
+    if harmless:
+        load_deployment(folder, images=False)
+        return
+    sentence = refused(folder, DamagedDeploymentError)
+    assert "is not as it was built: its hash is" in sentence
+    assert deployment_hash(deployment())[:16] in sentence
+
+
+def test_a_missing_hash_is_a_damaged_one(folder):
+    edit(folder, "hash = ", "# hash = ")
+    assert "it says nothing" in refused(folder, DamagedDeploymentError)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [("format = 1", "format = 2"), ("format = 1", 'format = "1"'), ("format = 1", "format = true")],
+)
+def test_another_format(folder, old, new):
+    edit(folder, old, new)
+    assert "and this version reads format 1" in refused(folder, DeploymentVersionError)
+
+
+def test_another_format_is_said_before_anything_else(folder):
+    edit(folder, "format = 1", "format = 7\nwarp = true")
+    assert "is of format 7" in refused(folder, DeploymentVersionError)
+
+
+def test_no_format(folder):
+    edit(folder, "format = 1\n", "")
+    assert "has no key 'format'" in refused(folder, DeploymentVersionError)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "sentence"),
+    [
+        ("on_range", "on_rnage", "unknown key 'on_rnage' in [[variable]] 1; did you mean 'on_range'?"),
+        ("\nname =", "\nnmae =", "unknown key 'nmae'; did you mean 'name'?"),
+        ("[machine]", "[mahcine]", "unknown key 'mahcine'; did you mean 'machine'?"),
+        ("[[source]]", "[[sources]]", "unknown key 'sources'; did you mean 'source'?"),
+        ("rng_banks", "banks", "unknown key 'banks' in [machine]; did you mean 'rng_banks'?"),
+        ("prob_bits", "zzzz", "unknown key 'zzzz' in [machine]; expected one of type, lines, interface"),
+        (
+            '"clamp"',
+            '"clmp"',
+            "on_range = 'clmp' in [[variable]] 1 is not a value it can have; did you mean 'clamp'?",
+        ),
+        (
+            '"slices"',
+            '"slice"',
+            "stop = 'slice' in [machine] is not a value it can have; did you mean 'slices'?",
+        ),
+        (
+            '"lfsr32"',
+            '"lfsr64"',
+            "rng = 'lfsr64' in [machine] is not a value it can have; did you mean 'lfsr",
+        ),
+        ("bits = 9", 'bits = "9"', "bits = '9' in [[variable]] 2: expected a valid integer"),
+        ("bits = 9", "bits = 9.0", "bits = 9.0 in [[variable]] 2: expected a valid integer"),
+        ("bits = 9", "bits = true", "bits = True in [[variable]] 2: expected a valid integer"),
+        ("bits = 9", "bits = 17", "bits = 17 in [[variable]] 2: expected less than or equal to 16"),
+        ("bits = 9\n", "", "the key 'bits' is missing in [[variable]] 2"),
+        ("values = 360", "values = 512", "[[variable]] 2: B1 serves 512 values, but 9 bits hold 511"),
+        ("ws://a:9090", "http://a:9090", "uri in [[source]] 1: 'http://a:9090' is no WebSocket URI"),
+        ("boat_msgs/Sensors", "Sensors", "type in [[source]] 1: 'Sensors' is no message type"),
+        ("step = 2.0", "step = 0.0", "step in [[searched]] 1: a step of 0"),
+        ("step = 2.0", "step = nan", "step = nan in [[searched]] 1: expected a finite number"),
+        (
+            "target_count = 255",
+            "target_count = 256",
+            "in [machine]: target_count = 256 does not fit counters of 8",
+        ),
+        ("20x1200", "20 by 1200", "interface in [machine]: '20 by 1200' is no interface"),
+        ("boards/board1.bm", "../board1.bm", "image in [[board]] 2: '../board1.bm' must be a path inside"),
+        (
+            "std_msgs/Float64MultiArray",
+            "std_msgs/Float64",
+            "type = 'std_msgs/Float64' in [[output]] 1 is not a value",
+        ),
+        ("[[variable]]", "[[variable", "Expected ']]'"),
+        ("tolerance_s = 0.05", "tolerance_s = -1", "tolerance_s = -1: expected greater than or equal to 0"),
+    ],
+)
+def test_a_wrong_key_or_value_has_its_line(folder, old, new, sentence):
+    text = (folder / "deployment.toml").read_text()
+    line = text[: text.index(old)].count("\n") + 1
+    line += old.startswith("\n")
+    edit(folder, old, new)
+    found = refused(folder)
+    assert sentence in found
+    if "is missing" in sentence or "512 values" in sentence:  # of a table as a whole: its header
+        line = text[: text.index("[[variable]]", text.index("[[variable]]") + 1)].count("\n") + 1
+    elif "does not fit counters" in sentence:
+        line = text[: text.index("[machine]")].count("\n") + 1
+    assert found.startswith(f", line {line}: ")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "sentence"),
+    [
+        ("source = 0", "source = 1", "variable D1 reads source 1, but the last one is 0"),
+        ("size = 3", "size = 2", "the searched variables have 8 cells, but the machine has 12 lines"),
+        ("line_offset = 6", "line_offset = 5", "board 1 starts at line 5, expected 6"),
+        ("line_offset = 6\nlines = 6", "line_offset = 6\nlines = 5", "the boards have 11 lines together"),
+        ('name = "B1"', 'name = "D1"', "[[variable]] has 'D1' twice"),
+    ],
+)
+def test_parts_that_disagree(folder, old, new, sentence):
+    edit(folder, old, new)
+    assert sentence in refused(folder)
+
+
+def test_no_deployment(tmp_path):
+    with pytest.raises(DeploymentError, match="holds no deployment: .*deployment.toml is not there"):
+        load_deployment(tmp_path / "nowhere")
+
+
+@pytest.mark.parametrize(
+    ("content", "word"),
+    [
+        (b"", "format"),
+        (b"\xff\xfe", "line 1: not UTF-8"),
+        (b"a = 1\n\nb = [", "line 3"),
+        (b"#" * (5 << 20), "larger"),
+    ],
+)
+def test_what_is_no_deployment_at_all(folder, content, word):
+    (folder / "deployment.toml").write_bytes(content)
+    assert word in refused(folder)
+
+
+@given(st.binary(max_size=200))
+def test_no_bytes_get_past(tmp_path_factory, content):
+    folder = tmp_path_factory.mktemp("garbage")
+    (folder / "deployment.toml").write_bytes(content)
+    with pytest.raises(DeploymentError):
+        load_deployment(folder, images=False)
+
+
+def test_a_folder_that_cannot_be_written(tmp_path):
+    with pytest.raises(DeploymentError, match="can't be written"):
+        write_deployment(tmp_path / "not" / "there", deployment())
+
+
+def test_objects_are_checked_like_files():
+    with pytest.raises(ValidationError, match="expected 0"):
+        deployment(boards=(Board(image="b.bm", image_hash="0" * 64, line_offset=1, lines=11),))
+
+
+def image(index=0, code=7):
+    table = np.full((4, 2), code, dtype=np.uint16)
+    table[-1] = 255
+    machine = BM1Machine(BM1Parameters(lines=2, sensor_bits=(2,)), np.full((1, 2), 255, np.uint16), (table,))
+    return Image(
+        machine=machine,
+        partition=Partition(index, 2, 2 * index, 4),
+        interface_sensors=20,
+        interface_results=1200,
+        model_hash="a" * 64,
+        build_date="2020-01-01T00:00:00Z",
+        tool_version="0",
+    )
+
+
+@pytest.fixture
+def with_images(tmp_path):
+    (tmp_path / "boards").mkdir()
+    images = [image(0), image(1)]
+    for index, one in enumerate(images):
+        write_image(tmp_path / "boards" / f"board{index}.bm", one)
+    write_deployment(
+        tmp_path,
+        deployment(
+            variables=(Variable(name="D1", bits=2, values=3),),
+            searched=(Dimension(label="x", size=4),),
+            machine=MachineSection(lines=4),
+            boards=tuple(
+                Board(image=f"boards/board{i}.bm", image_hash=one.image_hash, line_offset=2 * i, lines=2)
+                for i, one in enumerate(images)
+            ),
+        ),
+    )
+    return tmp_path
+
+
+def test_whole_images_are_accepted(with_images):
+    assert len(load_deployment(with_images).boards) == 2
+
+
+def test_a_damaged_image_is_named(with_images):
+    path = with_images / "boards" / "board1.bm"
+    content = bytearray(path.read_bytes())
+    content[-1] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(DamagedDeploymentError, match=r"board1\.bm is damaged"):
+        load_deployment(with_images)
+
+
+def test_a_swapped_image_is_named_with_both_hashes(with_images):
+    (with_images / "boards" / "board0.bm").write_bytes((with_images / "boards" / "board1.bm").read_bytes())
+    with pytest.raises(DamagedDeploymentError) as caught:
+        load_deployment(with_images)
+    assert "board0.bm" in str(caught.value)
+    assert image(0).image_hash[:16] in str(caught.value)
+    assert image(1).image_hash[:16] in str(caught.value)
+
+
+def test_an_absent_image_is_named(with_images):
+    (with_images / "boards" / "board1.bm").unlink()
+    with pytest.raises(DamagedDeploymentError, match=r"board1\.bm, the image of board 1, is not there"):
+        load_deployment(with_images)
+
+
+def test_a_subscriber_needs_no_numpy():
+    code = "import sys, toolchain.deployment, toolchain.address; print('numpy' in sys.modules)"
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60
+    )
+    assert done.stdout == "False\n"
