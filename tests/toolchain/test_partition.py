@@ -1,0 +1,31 @@
+"""Contiguous blocks of lines, the first M mod n one longer."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from toolchain.errors import BuildError
+from toolchain.partition import Block, partition_lines
+
+
+@given(st.data())
+def test_blocks_cover_all_lines_in_order(data):
+    lines = data.draw(st.integers(1, 5000))
+    count = data.draw(st.integers(1, min(lines, 50)))
+    blocks = partition_lines(lines, count)
+    assert [line for block in blocks for line in range(block.offset, block.end)] == list(range(lines))
+    sizes = [block.lines for block in blocks]
+    assert sizes == sorted(sizes, reverse=True)
+    assert sizes.count(lines // count + 1) == lines % count
+    assert len(blocks) == count
+
+
+def test_the_thesis_and_an_uneven_split():
+    assert partition_lines(1024, 4) == tuple(Block(256 * board, 256) for board in range(4))
+    assert partition_lines(11, 3) == (Block(0, 4), Block(4, 4), Block(8, 3))
+
+
+@pytest.mark.parametrize("count", [0, -1, 5])
+def test_what_cannot_be_split(count):
+    with pytest.raises(BuildError, match="expected 1 to 4 partitions"):
+        partition_lines(4, count)

@@ -1,0 +1,136 @@
+"""Codes and their loss, against loops that follow machines.md word for word."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from machines.encode import decode_code, encode_probability
+from machines.errors import ParameterError
+from toolchain.conditional import normal
+from toolchain.model import Known, Model, dimension
+from toolchain.options import Scale
+from toolchain.quantise import quantise, scaled
+
+
+def model_of(*tables, prior=None, **fields):
+    return Model(
+        name="m",
+        searched=(dimension("s", size=np.asarray(tables[0]).shape[1]),),
+        known=tuple(Known(name=f"K{i}", table=np.asarray(t, float), **fields) for i, t in enumerate(tables)),
+        prior=prior,
+    )
+
+
+@st.composite
+def models(draw):
+    random = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    lines, sharpness = draw(st.integers(1, 6)), draw(st.sampled_from([0.02, 0.3, 1.0]))
+    return Model(
+        name="random",
+        searched=(dimension("s", size=lines),),
+        known=tuple(
+            Known(
+                name=f"K{i}",
+                table=random.dirichlet(np.full(draw(st.integers(1, 6)), sharpness), size=lines).T,
+                bits=draw(st.sampled_from([0, 4])),
+            )
+            for i in range(draw(st.integers(0, 3)))
+        ),
+        prior=random.dirichlet(np.full(lines, sharpness)),
+    )
+
+
+@given(models(), st.integers(1, 16), st.sampled_from(list(Scale)))
+def test_every_address_by_its_scale_then_the_nearest_code(model, prob_bits, scale):
+    quantised = quantise(model, prob_bits=prob_bits, scale=scale)
+    ones = 2**prob_bits - 1
+    for known, codes in zip(model.known, quantised.tables, strict=True):
+        assert codes.shape == (2**known.bits, model.lines)
+        for address in range(2**known.bits - 1):
+            if address >= known.values:
+                assert not codes[address].any()
+                continue
+            largest = {
+                Scale.ADDRESS: known.table[address].max(),
+                Scale.COLUMN: known.table.max(),
+                Scale.NONE: 1.0,
+            }[scale]
+            expected = encode_probability(known.table[address] / (largest or 1.0), prob_bits)
+            assert codes[address].tolist() == expected.tolist()
+            if scale is Scale.ADDRESS and largest > 0:
+                assert codes[address].max() == ones
+        assert (codes[-1] == ones).all()
+
+
+@given(models(), st.sampled_from([2, 4, 8, 16]), st.sampled_from(list(Scale)))
+def test_the_loss_is_the_mass_of_vanished_cells_and_the_divergence_of_the_rest(model, prob_bits, scale):
+    quantised = quantise(model, prob_bits=prob_bits, scale=scale)
+    prior = model.prior_distribution
+    for known, codes, loss in zip(model.known, quantised.tables, quantised.losses[1:], strict=True):
+        mass, divergence, dead = 0.0, 0.0, 0
+        decoded = decode_code(codes, prob_bits)
+        for k in range(known.values):
+            exact = prior * known.table[k]
+            approximate = prior * decoded[k]
+            mass += exact[approximate == 0].sum()
+            if exact.sum() > 0 and approximate.sum() == 0:
+                dead += 1
+            elif exact.sum() > 0:
+                p, q = exact / exact.sum(), approximate / approximate.sum()
+                divergence += exact.sum() * sum(
+                    b * math.log2(b / a) for a, b in zip(p, q, strict=True) if b > 0
+                )
+        assert loss.mass == pytest.approx(mass, abs=1e-12)
+        assert loss.kl_bits == pytest.approx(max(0, divergence), abs=1e-9)
+        assert loss.dead_values == dead
+        assert any("code 0 on every line" in warning for warning in quantised.warnings) or not dead
+
+
+def test_the_prior_is_a_column_too():
+    prior = np.array([0.5, 0.499, 0.001])
+    quantised = quantise(model_of(np.full((2, 3), 0.5), prior=prior))
+    assert quantised.prior.tolist() == [[255, 255, 1]]
+    assert quantise(model_of(np.full((2, 3), 0.5), prior=prior), prob_bits=6).losses[0].mass == 0.001
+    assert quantised.losses[0].name == "prior"
+
+
+def test_more_bits_lose_less():
+    model = model_of(normal("D", mean=np.linspace(0, 20, 30), sigma=3.0, values=21).table)
+    losses = [quantise(model, prob_bits=bits).losses[1] for bits in (4, 8, 12, 16)]
+    assert [loss.mass for loss in losses] == sorted((loss.mass for loss in losses), reverse=True)
+    assert [loss.kl_bits for loss in losses] == sorted((loss.kl_bits for loss in losses), reverse=True)
+
+
+def with_floor(floor, prob_bits=8):
+    known = normal("D", mean=np.arange(40.0), sigma=1.0, values=40, floor=floor)
+    model = Model(name="m", searched=(dimension("s", size=40),), known=(known,))
+    return quantise(model, prob_bits=prob_bits)
+
+
+def test_a_floor_that_vanishes_is_said_and_how_to_keep_it():
+    (warning,) = with_floor(1e-3).warnings
+    assert "Variable D: its outlier floor of 0.001 vanishes at" in warning
+    assert "below 2^-9" in warning
+    needed = float(warning.split("a floor of about ")[1].split(" ")[0])
+    bits = int(warning.split("--prob-bits ")[1].rstrip("."))
+    assert not with_floor(1.1 * needed).warnings
+    assert not with_floor(1e-3, bits).warnings
+    assert with_floor(1e-3, bits - 1).warnings
+    assert not with_floor(0.05).warnings
+    assert not with_floor(0.0).warnings  # a Gaussian's tails vanish, and that is what tails do
+
+
+def test_scaling_never_exceeds_one_and_keeps_rows_of_zeros():
+    table = np.array([[0.2, 0.7], [0.0, 0.0], [0.8, 0.3]])
+    assert scaled(table, Scale.ADDRESS) == pytest.approx(np.array([[0.2 / 0.7, 1], [0, 0], [1, 0.375]]))
+    assert scaled(table, Scale.COLUMN) == pytest.approx(table / 0.8)
+    assert scaled(table, Scale.NONE) is table
+
+
+@pytest.mark.parametrize("prob_bits", [0, 17])
+def test_codes_that_no_machine_has(prob_bits):
+    with pytest.raises(ParameterError):
+        quantise(model_of(np.full((2, 3), 0.5)), prob_bits=prob_bits)
