@@ -42,7 +42,7 @@ DEFAULT_INTERFACE: Final = (20, 1200)
 
 REPORT_NAME: Final = "report.txt"
 
-_FLAGS: Final = {"uri": "--uri", "topic": "--topic", "type": "--type"}
+_FLAGS: Final = {"tolerance_s": "--tolerance"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -246,11 +246,10 @@ def _deployment(
     except ValidationError as reason:
         detail = reason.errors()[0]
         key = str(detail["loc"][0]) if detail["loc"] else ""
-        flag = _FLAGS.get(key, "--" + key.replace("_", "-") if key else "")
-        if reason.title == "Output":
-            flag = "--output"
+        flag = "--output" if reason.title == "Output" else _FLAGS.get(key, "--" + key.replace("_", "-"))
         if detail["type"] == "value_error":
-            raise BuildError(f"{flag}: {detail['ctx']['error']}".removeprefix(": ")) from None
+            sentence = str(detail["ctx"]["error"])
+            raise BuildError(f"{flag}: {sentence}" if key else sentence) from None
         what = detail["msg"].removeprefix("Input should be ")
         raise BuildError(f"{flag} is {detail['input']!r}, expected {what}") from None
 

@@ -1,0 +1,202 @@
+"""A model built into a deployment: the boards together are the machine, and the same input gives the same bytes."""
+
+import os
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from machines.parameters import RngKind, RngReset
+from pcie_shim.programming_file import read_image
+from toolchain.build import build_date, build_deployment
+from toolchain.conditional import normal, wrapped_normal
+from toolchain.deployment import Queue, Stop, load_deployment
+from toolchain.errors import BuildError, ToolchainError
+from toolchain.model import Known, Model, cell_centres, interval
+from toolchain.options import BuildOptions, Scale
+from toolchain.quantise import quantise
+
+OPTIONS = BuildOptions(uri="ws://robot:9090", topic="/readings", type="std_msgs/Float64MultiArray")
+
+
+def model(size=5, sensors=2):
+    y, x = interval("y", 0, 10, cells=size), interval("x", 0, 10, cells=size)
+    ys, xs = cell_centres(y, x)
+    known = [normal("D", mean=np.hypot(xs, ys), sigma=1.0, values=15, floor=0.05)]
+    known += [
+        wrapped_normal(f"B{i}", mean=np.arctan2(ys, xs), sigma=0.3, values=20, step=np.pi / 10)
+        for i in range(1, sensors)
+    ]
+    return Model(name="small", searched=(y, x), known=tuple(known))
+
+
+def contents(folder):
+    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+@pytest.mark.parametrize("partitions", [1, 3, 4, 25])
+def test_the_boards_together_are_the_machine(tmp_path, partitions):
+    built = build_deployment(model(), tmp_path, replace(OPTIONS, partitions=partitions, prob_bits=7))
+    deployment = load_deployment(tmp_path)
+    assert deployment == built.deployment
+    images = [read_image(deployment.image_path(i)) for i in range(partitions)]
+    expected = quantise(model(), prob_bits=7)
+    assert np.array_equal(np.hstack([image.machine.prior for image in images]), expected.prior)
+    for column, table in enumerate(expected.tables):
+        assert np.array_equal(np.hstack([image.machine.tables[column] for image in images]), table)
+    for index, (image, board) in enumerate(zip(images, deployment.boards, strict=True)):
+        assert image.partition.index == index
+        assert (image.partition.count, image.partition.total_lines) == (partitions, 25)
+        assert image.partition.line_offset == board.line_offset
+        assert image.machine.parameters.lines == board.lines
+        assert image.model_hash == images[0].model_hash
+    assert len({image.image_hash for image in images}) == partitions
+
+
+def test_the_same_input_gives_the_same_bytes_anywhere(tmp_path):
+    options = replace(OPTIONS, partitions=3, build_date="2020-02-02T02:02:02Z")
+    build_deployment(model(), tmp_path / "one", options)
+    build_deployment(model(), tmp_path / "another" / "one", options)
+    assert contents(tmp_path / "one") == contents(tmp_path / "another" / "one")
+    assert set(contents(tmp_path / "one")) == {
+        "deployment.toml",
+        "report.txt",
+        *(f"boards/board{i}.bm" for i in range(3)),
+    }
+
+
+def test_options_arrive_in_the_deployment_and_in_the_images(tmp_path):
+    options = replace(
+        OPTIONS,
+        output="/where",
+        scale=Scale.COLUMN,
+        prob_bits=5,
+        counter_bits=6,
+        target_count=17,
+        max_cycles=999,
+        stop=Stop.OWN,
+        rng=RngKind.LFSR16,
+        rng_banks=3,
+        rng_reset=RngReset.FREE,
+        queue=Queue.ALL,
+        tolerance_s=0.2,
+        interface=(4, 30),
+        build_date="2020-02-02T02:02:02Z",
+    )
+    deployment = build_deployment(model(), tmp_path, options).deployment
+    machine = deployment.machine
+    assert (machine.target_count, machine.max_cycles, machine.stop) == (17, 999, "own")
+    assert (machine.rng, machine.rng_banks, machine.rng_reset) == ("lfsr16", 3, "free")
+    assert (machine.prob_bits, machine.counter_bits, machine.steps_per_clock) == (5, 6, 8)
+    assert machine.interface == "4x30"
+    assert (deployment.queue, deployment.tolerance_s, deployment.outputs[0].topic) == ("all", 0.2, "/where")
+    image = read_image(deployment.image_path(0))
+    parameters = image.machine.parameters
+    assert (parameters.prob_bits, parameters.counter_bits, parameters.rng_banks) == (5, 6, 3)
+    assert (parameters.rng, parameters.rng_reset) == ("lfsr16", "free")
+    assert (image.interface_sensors, image.interface_results) == (4, 30)
+    assert image.build_date == "2020-02-02T02:02:02Z"
+    assert np.array_equal(
+        image.machine.tables[0], quantise(model(), prob_bits=5, scale=Scale.COLUMN).tables[0]
+    )
+
+
+def test_the_target_is_the_counters_largest_count(tmp_path):
+    assert build_deployment(model(), tmp_path, OPTIONS).deployment.machine.target_count == 255
+
+
+def test_the_interface_grows_with_the_model_and_says_so(tmp_path):
+    built = build_deployment(model(sensors=21), tmp_path, OPTIONS)
+    assert built.deployment.machine.interface == "21x1200"
+    assert "Interface: 21x1200, larger than the default 20x1200: a board needs 21 inputs and 25 results." in (
+        built.report
+    )
+    assert "Interface: 20x1200.\n" in build_deployment(model(), tmp_path, OPTIONS).report
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"partitions": 0}, "25 lines can't be split over 0 boards"),
+        ({"partitions": 26}, "expected 1 to 25 partitions"),
+        (
+            {"interface": (1, 1200)},
+            "the model is larger than the interface 1x1200: a board needs 2 inputs and 25",
+        ),
+        ({"interface": (20, 24)}, "use --interface 20x25 or leave it out, or --partitions 2"),
+        ({"interface": (65, 100)}, "larger than the register map's 64x4096"),
+        ({"prob_bits": 17}, "prob_bits is 17"),
+        ({"prob_bits": 8, "rng": RngKind.LFSR8}, "lfsr8 is too narrow"),
+        ({"rng": RngKind.TABLE}, "which this toolchain doesn't make"),
+        ({"target_count": 256}, "target_count = 256 does not fit counters of 8 bits; expected 1 to 255"),
+        ({"target_count": 0}, "--target-count is 0, expected greater than or equal to 1"),
+        ({"max_cycles": 0}, "--max-cycles is 0"),
+        ({"counter_bits": 0}, "counter_bits is 0"),
+        ({"rng_banks": 0}, "rng_banks is 0"),
+        ({"uri": "robot:9090"}, "--uri: 'robot:9090' is no WebSocket URI"),
+        ({"topic": ""}, "--topic: '' is no topic name"),
+        ({"type": "Float64"}, "--type: 'Float64' is no message type"),
+        ({"output": "/a b"}, "--output: '/a b' is no topic name"),
+        ({"tolerance_s": -1.0}, "--tolerance is -1.0"),
+    ],
+)
+def test_options_that_do_not_fit(tmp_path, changes, sentence):
+    with pytest.raises(BuildError) as caught:
+        build_deployment(model(), tmp_path / "new", replace(OPTIONS, **changes))
+    assert sentence in str(caught.value)
+    assert caught.value.exit_code == 2
+    assert not (tmp_path / "new").exists()  # nothing is written before all is known to fit
+
+
+def test_a_model_larger_than_the_register_map(tmp_path):
+    flat = Model(
+        name="long",
+        searched=(interval("x", 0, 1, cells=5000),),
+        known=(Known(name="K", table=np.ones((1, 5000))),),
+    )
+    with pytest.raises(BuildError, match="room for 64 and 4096: use --partitions 2 or more"):
+        build_deployment(flat, tmp_path, OPTIONS)
+    assert len(build_deployment(flat, tmp_path, replace(OPTIONS, partitions=2)).deployment.boards) == 2
+
+
+def test_a_folder_that_cannot_be_written(tmp_path):
+    (tmp_path / "file").write_text("")
+    for folder in (tmp_path / "file", tmp_path / "file" / "below"):
+        with pytest.raises(BuildError, match="can't be written: .*; choose another folder"):
+            build_deployment(model(), folder, OPTIONS)
+
+
+def test_a_build_over_another_leaves_nothing_of_it(tmp_path):
+    build_deployment(model(), tmp_path, replace(OPTIONS, partitions=4))
+    (tmp_path / "boards" / "notes.txt").write_text("mine")
+    build_deployment(model(), tmp_path, replace(OPTIONS, partitions=2))
+    assert sorted(p.name for p in (tmp_path / "boards").iterdir()) == ["board0.bm", "board1.bm", "notes.txt"]
+    load_deployment(tmp_path)
+
+
+def test_the_report_has_loss_and_warnings(tmp_path):
+    known = normal("D", mean=np.arange(40.0), sigma=1.0, values=40, floor=1e-3)
+    line = Model(name="line", searched=(interval("x", -0.5, 39.5, cells=40),), known=(known,))
+    built = build_deployment(line, tmp_path, OPTIONS)
+    assert built.report == (tmp_path / "report.txt").read_text()
+    assert "Model line: 40 lines (x 40), 1 known variables in the columns' order D." in built.report
+    assert "Warning: Variable D: its outlier floor of 0.001 vanishes" in built.report
+    assert f"{built.quantised.losses[1].mass:.2e}" in built.report
+    assert str(tmp_path) not in built.report
+
+
+@given(st.integers(0, 2**33))
+def test_the_build_date_is_source_date_epoch_or_the_files(tmp_path_factory, seconds):
+    path = tmp_path_factory.mktemp("date") / "model.py"
+    path.write_text("")
+    os.utime(path, (seconds, seconds))
+    from_file = build_date(path)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SOURCE_DATE_EPOCH", str(seconds))
+        os.utime(path, (0, 0))
+        assert build_date(path) == from_file
+        patch.setenv("SOURCE_DATE_EPOCH", "yesterday")
+        with pytest.raises(ToolchainError, match="SOURCE_DATE_EPOCH is 'yesterday'"):
+            build_date(path)

@@ -1,0 +1,127 @@
+"""The toolchain command: the report on stdout, all else on stderr, one sentence and exit code 2 for a mistake."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from toolchain.command import app
+from toolchain.deployment import load_deployment
+
+MODEL = """
+import numpy as np
+from toolchain.model import Known, Model, dimension
+
+def model(size: int = 4):
+    return Model(name="tiny", searched=(dimension("s", size=size),),
+                 known=(Known(name="K", table=np.full((2, size), 0.5)),))
+"""
+TARGET = ["--uri", "ws://robot:9090", "--topic", "/readings", "--type", "std_msgs/msg/Float64"]
+
+
+@pytest.fixture
+def case(tmp_path):
+    folder = tmp_path / "case"
+    folder.mkdir()
+    (folder / "model.py").write_text(MODEL)
+    return folder
+
+
+def build(case, *arguments, target=TARGET):
+    return CliRunner().invoke(app, ["build", str(case), "-o", str(case.parent / "out"), *target, *arguments])
+
+
+def test_a_build(case):
+    result = build(case, "--partitions", "2", "--set", "size=6", "--queue", "all", "--interface", "1x3")
+    assert result.exit_code == 0, result.stderr
+    out = case.parent / "out"
+    assert result.stdout == (out / "report.txt").read_text()
+    assert f"Reading {case / 'model.py'}" in result.stderr
+    assert f"Wrote {out / 'deployment.toml'}" in result.stderr
+    deployment = load_deployment(out)
+    assert [board.lines for board in deployment.boards] == [3, 3]
+    assert (deployment.machine.interface, deployment.queue) == ("1x3", "all")
+    assert deployment.sources[0].type == "std_msgs/msg/Float64"
+
+
+def test_same_input_same_bytes_though_time_passes(case):
+    os.utime(case / "model.py", (1_000_000_000, 1_000_000_000))
+    build(case)
+    out = case.parent / "out"
+    first = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+    assert b"2001-09-09T01:46:40Z" in first[out / "boards" / "board0.bm"]
+    shutil.rmtree(out)
+    build(case)
+    assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == first
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (
+            ["--set", "sze=3"],
+            "error: {case}/model.py: the model has no parameter 'sze'; did you mean 'size'?\n",
+        ),
+        (["--set", "size"], "error: --set size: expected KEY=VALUE, such as --set width=64\n"),
+        (["--set", "=3"], "error: --set =3: expected KEY=VALUE"),
+        (["--set", "size=3", "--set", "size=4"], "error: --set size is given twice\n"),
+        (["--partitions", "5"], "error: 4 lines can't be split over 5 boards: expected 1 to 4 partitions\n"),
+        (["--interface", "20"], "error: --interface: '20' is no interface; expected inputs x results"),
+        (["--interface", "1x3"], "error: the model is larger than the interface 1x3"),
+        (["--prob-bits", "99"], "error: prob_bits is 99"),
+    ],
+)
+def test_mistakes(case, arguments, sentence):
+    result = build(case, *arguments)
+    assert result.exit_code == 2
+    assert sentence.format(case=case) in result.stderr
+    assert result.stderr.splitlines()[-1].startswith("error: ")
+    assert result.stdout == ""
+    assert "Traceback" not in result.stderr
+    assert not (case.parent / "out").exists()
+
+
+def test_a_folder_without_a_model(tmp_path):
+    result = build(tmp_path / "nowhere")
+    assert result.exit_code == 2
+    assert "is no folder; expected a case study's folder" in result.stderr
+
+
+@pytest.mark.parametrize("missing", ["--uri", "--topic", "--type"])
+def test_what_must_be_given(case, missing):
+    at = TARGET.index(missing)
+    result = build(case, target=TARGET[:at] + TARGET[at + 2 :])
+    assert result.exit_code == 2
+    assert missing in result.stderr
+
+
+def test_a_folder_that_cannot_be_written(case):
+    (case.parent / "out").write_text("a file in its place")
+    result = build(case)
+    assert result.exit_code == 2
+    assert f"error: {case.parent / 'out'} can't be written: " in result.stderr
+
+
+def test_the_installed_command_has_help_with_an_example():
+    command = Path(sys.executable).parent / "toolchain"
+    done = subprocess.run(
+        [command, "build", "--help"],
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=60,
+        env={"COLUMNS": "200"},
+    )
+    assert "toolchain build casestudies/boat -o build/boat --partitions 4" in done.stdout
+
+
+def test_help_loads_no_numpy():
+    code = "import sys, toolchain.command; print('numpy' in sys.modules)"
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60
+    )
+    assert done.stdout == "False\n"
