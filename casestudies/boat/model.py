@@ -15,6 +15,7 @@ from casestudies.boat.geometry import (
     LONGEST_DISTANCE,
     MAP_HIGH,
     MAP_LOW,
+    SENSOR_NAMES,
     distance_sigma,
 )
 from toolchain.conditional import normal, wrapped_normal
@@ -26,7 +27,13 @@ BEARING_BITS = 9
 TURN = 360
 
 
-def model(width: int = 32, height: int = 32, distance_step: int = 1, bearing_step: int = 1) -> Model:
+def model(
+    width: int = 32,
+    height: int = 32,
+    distance_step: int = 1,
+    bearing_step: int = 1,
+    array: bool = False,
+) -> Model:
     """Return the boat's model; a cell's likelihood is that of its centre.
 
     Args:
@@ -35,6 +42,8 @@ def model(width: int = 32, height: int = 32, distance_step: int = 1, bearing_ste
         distance_step: Map units between the distances told apart; readings are whole numbers 0..100, those
             beyond clamp and the end bins hold the tails.
         bearing_step: Degrees between the bearings told apart; must divide a turn.
+        array: Whether the readings come as six numbers in a std_msgs/Float64MultiArray, in the columns' order,
+            instead of fields with the sensors' names: for servers that know installed message types only.
 
     Raises:
         ModelError: A grid without cells, or a step that does not fit.
@@ -48,6 +57,7 @@ def model(width: int = 32, height: int = 32, distance_step: int = 1, bearing_ste
     rows = interval("y", MAP_LOW, MAP_HIGH, cells=height)
     columns = interval("x", MAP_LOW, MAP_HIGH, cells=width)
     y, x = cell_centres(rows, columns)
+    path = {name: f"data[{place}]" if array else "" for place, name in enumerate(SENSOR_NAMES)}
     known: list[Known] = []
     for name, (beacon_x, beacon_y) in zip(DISTANCE_NAMES, BEACONS, strict=True):
         true_distance = np.hypot(x - beacon_x, y - beacon_y)
@@ -59,6 +69,7 @@ def model(width: int = 32, height: int = 32, distance_step: int = 1, bearing_ste
                 values=math.floor(LONGEST_DISTANCE / distance_step) + 1,
                 step=distance_step,
                 bits=DISTANCE_BITS,
+                path=path[name],
             )
         )
     for name, (beacon_x, beacon_y) in zip(BEARING_NAMES, BEACONS, strict=True):
@@ -70,6 +81,7 @@ def model(width: int = 32, height: int = 32, distance_step: int = 1, bearing_ste
                 values=TURN // bearing_step,
                 step=bearing_step,
                 bits=BEARING_BITS,
+                path=path[name],
             )
         )
     return Model(name="boat", searched=(rows, columns), known=tuple(known))

@@ -1,0 +1,135 @@
+"""The boat's tables against its formulas written out for single cells (boat.md, thesis 2.1.2.1)."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from casestudies.boat.geometry import BEACONS, SENSOR_NAMES, bearing, distance, distance_sigma, map_grid
+from casestudies.boat.model import model
+from machines.parameters import BM1Parameters
+from toolchain.address import to_address
+from toolchain.errors import ModelError
+from toolchain.fusion import exact_posterior
+from toolchain.quantise import quantise
+
+BOAT = model()
+GRID = map_grid()
+LINES = st.integers(0, GRID.cells - 1)
+
+
+def phi(z):
+    return 0.5 * math.erfc(-z / math.sqrt(2))
+
+
+def test_shape_order_and_widths():
+    assert tuple(known.name for known in BOAT.known) == SENSOR_NAMES
+    assert [known.table.shape for known in BOAT.known] == [(101, 1024)] * 3 + [(360, 1024)] * 3
+    assert [known.bits for known in BOAT.known] == [7] * 3 + [9] * 3
+    assert [known.on_missing for known in BOAT.known] == ["error"] * 6
+    assert [(d.label, d.size) for d in BOAT.searched] == [("y", 32), ("x", 32)]
+    assert BOAT.prior_distribution == pytest.approx(np.full(1024, 1 / 1024))
+
+
+@given(LINES)
+def test_lines_are_the_grids_cells(line):
+    row, column = divmod(line, 32)
+    y, x = BOAT.searched
+    assert (x.value(column), y.value(row)) == pytest.approx(GRID.centre(line))
+    assert (x.value(-0.5), y.value(31.5)) == pytest.approx((-50, 50))
+
+
+@given(LINES, st.integers(0, 2), st.integers(0, 100))
+def test_a_distance_is_the_gaussian_over_its_bin_with_tails_at_the_ends(line, beacon, reading):
+    mean = distance(*GRID.centre(line), BEACONS[beacon])
+    sigma = mean / 10 + 5
+    assert distance_sigma(mean) == sigma
+    low = -math.inf if reading == 0 else reading - 0.5
+    high = math.inf if reading == 100 else reading + 0.5
+    expected = phi((high - mean) / sigma) - phi((low - mean) / sigma)
+    assert BOAT.known[beacon].table[reading, line] == pytest.approx(expected, abs=1e-12)
+
+
+@given(LINES, st.integers(0, 2), st.integers(0, 359))
+def test_a_bearing_is_the_wrapped_gaussian_over_its_degree(line, beacon, reading):
+    mean = bearing(*GRID.centre(line), BEACONS[beacon])
+    expected = sum(
+        phi((reading + 0.5 + turn - mean) / 10) - phi((reading - 0.5 + turn - mean) / 10)
+        for turn in (-360, 0, 360)
+    )
+    assert BOAT.known[3 + beacon].table[reading, line] == pytest.approx(expected, abs=1e-12)
+
+
+def test_every_line_is_a_distribution():
+    for known in BOAT.known:
+        assert known.table.sum(axis=0) == pytest.approx(np.ones(1024), abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("width", "height", "distance_step", "bearing_step"), [(64, 64, 1, 1), (8, 4, 7, 45), (1, 1, 100, 360)]
+)
+def test_other_sizes(width, height, distance_step, bearing_step):
+    other = model(width, height, distance_step, bearing_step)
+    assert other.lines == width * height
+    assert [d.size for d in other.searched] == [height, width]
+    assert other.known[0].values == 100 // distance_step + 1
+    assert (other.known[5].values, other.known[5].period) == (360 // bearing_step, 360 // bearing_step)
+    assert [known.bits for known in other.known] == [7] * 3 + [9] * 3
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"width": 0},
+        {"height": -1},
+        {"distance_step": 0},
+        {"distance_step": 101},
+        {"bearing_step": 7},
+        {"bearing_step": 0},
+    ],
+)
+def test_sizes_that_do_not_fit(wrong):
+    with pytest.raises(ModelError):
+        model(**wrong)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "address"),
+    [("D1", 100, 100), ("D1", 141.4, 100), ("D1", -3, 0), ("B1", 359, 359), ("B1", 360, 0), ("B1", -90, 270)],
+)
+def test_readings_clamp_and_wrap(name, value, address):
+    variable = BOAT.known[SENSOR_NAMES.index(name)].as_variable()
+    assert to_address(variable, value) == address
+
+
+def test_an_array_of_readings_has_paths_and_the_same_tables():
+    array = model(4, 4, array=True)
+    assert [known.as_variable().path for known in array.known] == [f"data[{place}]" for place in range(6)]
+    assert [known.as_variable().path for known in model(4, 4).known] == [""] * 6
+    assert np.array_equal(array.known[0].table, model(4, 4).known[0].table)
+
+
+@given(LINES)
+def test_exact_readings_point_at_their_cell(line):
+    x, y = GRID.centre(line)
+    readings = [to_address(BOAT.known[i].as_variable(), distance(x, y, BEACONS[i])) for i in range(3)]
+    readings += [to_address(BOAT.known[3 + i].as_variable(), bearing(x, y, BEACONS[i])) for i in range(3)]
+    posterior = exact_posterior(BOAT, readings)
+    mean = posterior @ np.array([GRID.centre(each) for each in range(GRID.cells)])
+    if max(distance(x, y, beacon) for beacon in BEACONS) <= 100:
+        assert math.dist(mean, (x, y)) < 10
+
+
+def test_codes_keep_the_missing_address_and_lose_little():
+    quantised = quantise(BOAT)
+    parameters = BM1Parameters(lines=1024, sensor_bits=tuple(known.bits for known in BOAT.known))
+    for column, table in enumerate(quantised.tables, start=1):
+        assert (table[parameters.missing_address(column)] == 255).all()
+        served = BOAT.known[column - 1].values
+        assert (table[:served].max(axis=1) == 255).all()
+        assert not table[served:-1].any()
+    assert not quantised.warnings
+    assert max(loss.mass for loss in quantised.losses) < 1e-3
+    assert max(loss.kl_bits for loss in quantised.losses) < 1e-2

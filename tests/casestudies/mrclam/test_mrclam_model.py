@@ -1,0 +1,191 @@
+"""The landmarks' model against unquantised fusion, on sightings made here: the data set does not ship."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from casestudies.mrclam.fusion import Reading, unquantised_posterior
+from casestudies.mrclam.landmarks import Landmark, read_landmarks
+from casestudies.mrclam.model import model
+from casestudies.mrclam.recording import area_grid
+from machines.encode import decode_code
+from toolchain.address import to_address
+from toolchain.case_study import load_model
+from toolchain.errors import ModelError
+from toolchain.fusion import exact_posterior, fuse
+from toolchain.quantise import quantise
+
+LANDMARKS = (Landmark(6, 5.7, 5.0), Landmark(9, 2.3, 3.4), Landmark(17, 0.0, -2.8), Landmark(20, 2.1, -3.9))
+CSV = "landmark,x_m,y_m\n" + "".join(f"{each.number},{each.x},{each.y}\n" for each in LANDMARKS)
+GRID = area_grid()
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory):
+    file = tmp_path_factory.mktemp("data") / "landmarks.csv"
+    file.write_text(CSV)
+    return file
+
+
+@pytest.fixture(scope="module")
+def robot(path):
+    return model(path)
+
+
+@pytest.fixture(scope="module")
+def codes(robot):
+    return [decode_code(table, 8) for table in quantise(robot).tables]
+
+
+def sight(random, x, y, *, outlier=None):
+    """What a robot at (x, y) sees with the model's noise; one range may be wild, every third landmark hidden."""
+    readings = []
+    for place, landmark in enumerate(LANDMARKS):
+        if place == random.integers(0, 6):
+            readings.append(Reading())
+            continue
+        range_m = math.dist((x, y), (landmark.x, landmark.y)) + random.normal(0, 0.25)
+        bearing = math.atan2(landmark.y - y, landmark.x - x) + random.normal(0, 0.12)
+        readings.append(
+            Reading(range_m=abs(range_m) + (5.0 if place == outlier else 0.0), bearing_rad=bearing)
+        )
+    return readings
+
+
+def addresses(robot, readings):
+    values = [value for each in readings for value in (each.range_m, each.bearing_rad)]
+    return [to_address(known.as_variable(), value) for known, value in zip(robot.known, values, strict=True)]
+
+
+def test_columns_alternate_and_may_all_be_missing(robot):
+    names = [f"{what}_{each.number}" for each in LANDMARKS for what in ("range", "bearing")]
+    assert [known.name for known in robot.known] == names
+    assert {known.on_missing for known in robot.known} == {"missing"}
+    assert [(d.label, d.size) for d in robot.searched] == [("y", 32), ("x", 32)]
+    nothing = exact_posterior(robot, [None] * len(robot.known))
+    assert nothing == pytest.approx(np.full(1024, 1 / 1024))
+    for line in (0, 31, 500, 1023):
+        x, y = robot.searched[1].value(line % 32), robot.searched[0].value(line // 32)
+        assert (x, y) == pytest.approx(GRID.centre(line))
+
+
+@pytest.mark.parametrize("outlier", [None, 1])
+def test_bins_and_codes_are_as_accurate_as_raw_float64(robot, codes, outlier):
+    random = np.random.default_rng(7)
+    cells = np.array([GRID.centre(line) for line in range(GRID.cells)])
+    raw, binned, coded = [], [], []
+    for _ in range(60):
+        truth = random.uniform((-1, -6), (6, 6))
+        readings = sight(random, *truth, outlier=outlier)
+        places = addresses(robot, readings)
+        codes_here = [table[place] for table, place in zip(codes, places, strict=True) if place is not None]
+        posteriors = (
+            unquantised_posterior(LANDMARKS, readings),
+            exact_posterior(robot, places),
+            fuse(np.ones(GRID.cells), codes_here),
+        )
+        for errors, posterior in zip((raw, binned, coded), posteriors, strict=True):
+            errors.append(math.dist(posterior @ cells, truth))
+    assert np.median(raw) < 0.4  # a cell is 0.28 m x 0.44 m
+    assert np.median(binned) < 1.1 * np.median(raw)
+    assert np.median(coded) < 1.15 * np.median(raw)
+
+
+def test_one_wild_reading_leaves_no_line_impossible(robot, codes):
+    for known, table in zip(robot.known, codes, strict=True):
+        assert (table[: known.values] > 0).all()
+    assert not quantise(robot).warnings
+
+
+def test_a_floor_that_codes_cannot_hold_is_said(path):
+    warnings = quantise(model(path, floor=1e-3)).warnings
+    assert len(warnings) == 2 * len(LANDMARKS)
+    assert "range_6: its outlier floor of 0.001 vanishes" in warnings[0]
+
+
+@settings(max_examples=25)
+@given(
+    st.floats(-1.5, 6.5),
+    st.floats(-6.5, 6.5),
+    st.floats(0, 12) | st.none(),
+    st.floats(-10, 10) | st.none(),
+    st.sampled_from([0.0, 0.05]),
+)
+def test_unquantised_fusion_is_density_and_floor_at_the_centres(x, y, range_m, bearing_rad, floor):
+    landmark = Landmark(1, x, y)
+    found = unquantised_posterior(
+        [landmark], [Reading(range_m=range_m, bearing_rad=bearing_rad)], width=5, height=4, floor=floor
+    )
+    expected = []
+    for line in range(20):
+        cx, cy = area_grid(5, 4).centre(line)
+        product = 1.0
+        if range_m is not None:
+            product *= math.exp(-0.5 * ((range_m - math.dist((cx, cy), (x, y))) / 0.25) ** 2) + floor
+        if bearing_rad is not None:
+            off = math.remainder(bearing_rad - math.atan2(y - cy, x - cx), math.tau)
+            product *= math.exp(-0.5 * (off / 0.12) ** 2) + floor
+        expected.append(product)
+    if sum(expected) > 1e-200:
+        assert found == pytest.approx(np.array(expected) / sum(expected), rel=1e-6, abs=1e-12)
+
+
+def test_bearings_of_any_turn_and_ranges_beyond_the_last(robot):
+    bearing = robot.known[1].as_variable()
+    assert to_address(bearing, -math.pi) == to_address(bearing, math.pi)
+    assert to_address(bearing, 0.5) == to_address(bearing, 0.5 + 4 * math.pi)
+    distance = robot.known[0].as_variable()
+    assert to_address(distance, 40.0) == robot.known[0].values - 1
+    assert to_address(distance, None) is None
+    assert to_address(distance, math.nan) is None
+
+
+def test_the_command_lines_settings_reach_it(path):
+    from casestudies import mrclam
+
+    folder = mrclam.__path__[0]
+    few = load_model(folder, {"landmarks": str(path), "width": "4", "height": "3", "bearing_values": "20"})
+    assert (few.lines, few.known[1].values) == (12, 20)
+    with pytest.raises(ModelError, match="the model needs landmarks: add --set landmarks=VALUE"):
+        load_model(folder, {})
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"width": 0}, {"bearing_values": 0}, {"range_values": 0}, {"range_step": 0.0}, {"floor": -1.0}]
+)
+def test_sizes_that_do_not_fit(path, wrong):
+    with pytest.raises(ModelError):
+        model(path, **wrong)
+
+
+def test_landmarks_are_read_in_the_files_order(path):
+    assert read_landmarks(path) == LANDMARKS
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("", "holds no landmarks"),
+        ("landmark,x_m,y_m\n", "holds no landmarks"),
+        ("number,x_m,y_m\n1,2,3\n", "line 2: there is no column 'landmark'"),
+        ("landmark,x_m,y_m\n1,2,3\n1,4,5\n", "line 3: landmark 1 is there twice"),
+        ("landmark,x_m,y_m\n1,2,north\n", "line 2 is no landmark: could not convert"),
+        ("landmark,x_m,y_m\n1,2\n", "line 2 is no landmark"),
+        ("landmark,x_m,y_m\n1,2,nan\n", "line 2 is no landmark: expected a number from 0 and a finite"),
+        ("landmark,x_m,y_m\n-1,2,3\n", "line 2 is no landmark"),
+        ("landmark,x_m,y_m\n1,\xff,3\n", "is no CSV of landmarks"),
+    ],
+)
+def test_files_that_hold_no_landmarks(tmp_path, text, sentence):
+    file = tmp_path / "landmarks.csv"
+    file.write_bytes(text.encode("latin-1"))
+    with pytest.raises(ModelError, match=sentence):
+        read_landmarks(file)
+
+
+def test_a_file_that_is_not_there(tmp_path):
+    with pytest.raises(ModelError, match="the landmarks' file .*nowhere.csv can't be read: No such file"):
+        read_landmarks(tmp_path / "nowhere.csv")
