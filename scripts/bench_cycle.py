@@ -23,9 +23,10 @@ from rich.console import Console
 from rich.table import Table
 
 from bridge.client import Publication, Ros, Subscription, connect
-from bridge.stamps import header
+from bridge.stamps import header, header_stamp_ns
 
 STAGES = (
+    "wire_in",
     "rosbridge_in",
     "local_hops",
     "waited",
@@ -34,6 +35,7 @@ STAGES = (
     "reads",
     "boards_compute",
     "rosbridge_out",
+    "wire_out",
 )
 _TICKS = os.sysconf("SC_CLK_TCK")
 WINDOW = 4
@@ -125,12 +127,32 @@ def processes_of(master: int) -> dict[str, list[int]]:
     return found
 
 
-async def collect_stages(ros: Ros, measured: Measured) -> None:
-    """Keep the stage times of every frame."""
-    async for each in ros.subscribe("/bm/frame", "diagnostic_msgs/DiagnosticArray"):
-        values = {pair["key"]: pair["value"] for pair in each.msg["status"][0]["values"]}
+async def collect_stages(
+    ros: Ros, publication: Publication, some: list[dict[str, int]], measured: Measured
+) -> None:
+    """The stages of some frames, apart from the timed turns: hearing /bm/frame too is work for hub and client.
+
+    The wire's stages are seen from this client, whose clock the host shares: from the reading's stamp to its
+    receipt by the subscriber, and from the publisher's beginning to publish to the result's arrival here.
+    """
+    frames = ros.subscribe("/bm/frame", "diagnostic_msgs/DiagnosticArray")
+    results = ros.subscribe("/BMresults", "std_msgs/Float64MultiArray")
+    await asyncio.sleep(0.2)
+    for reading in some:
+        sent = message(reading)
+        await publication.publish(sent)
+        frame = await frames.next(timeout=10)
+        result = await results.next(timeout=10)
+        values = {pair["key"]: pair["value"] for pair in frame.msg["status"][0]["values"]}
         for name in STAGES:
-            measured.stages[name].append(float(values[f"{name}_us"]))
+            if f"{name}_us" in values:
+                measured.stages[name].append(float(values[f"{name}_us"]))
+        stamp = header_stamp_ns(frame.msg) or 0
+        measured.stages["wire_in"].append((int(values["received_ns"]) - stamp) / 1e3)
+        out = result.received_ns - int(values["sent_ns"])
+        measured.stages["wire_out"].append(out / 1e3 - measured.stages["rosbridge_out"][-1])
+    await frames.close()
+    await results.close()
 
 
 def quantile(values: list[float], share: float) -> float:
@@ -175,11 +197,7 @@ async def bench(arguments: argparse.Namespace) -> int:
                     name: (sum(map(cpu_seconds, all_)) - before[name]) / len(some) * 1e6
                     for name, all_ in pids.items()
                 }
-                # apart from the timed turns: hearing /bm/frame too is work for hub and client
-                stages = asyncio.create_task(collect_stages(ros, measured))
-                await asyncio.sleep(0.1)
-                await one_by_one(to_stack, results, some[: max(50, len(some) // 4)], [])
-                stages.cancel()
+                await collect_stages(ros, to_stack, some[: max(50, len(some) // 4)], measured)
                 rates = {
                     "floor": await per_second(to_echo, echoes, some),
                     "stack": await per_second(to_stack, results, some),
