@@ -1,0 +1,80 @@
+"""Codes: the nearest of what a cell can make, ties up."""
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from machines.encode import decode_code, encode_probability
+from machines.errors import ParameterError
+
+
+@pytest.mark.parametrize(
+    ("p", "prob_bits", "code"),
+    [
+        (0, 8, 0),
+        (1, 8, 255),
+        (0.5, 8, 128),
+        (1 / 512, 8, 1),
+        (np.nextafter(1 / 512, 0), 8, 0),
+        (254 / 256, 8, 254),
+        (255 / 256, 8, 255),
+        (np.nextafter(255 / 256, 0), 8, 254),
+        (0.49, 1, 0),
+        (0.5, 1, 1),
+        (0.125, 2, 1),
+        (0.74, 2, 2),
+        (0.75, 2, 3),
+        (65534.5 / 65536, 16, 65534),
+        (65535 / 65536, 16, 65535),
+    ],
+)
+def test_examples(p, prob_bits, code):
+    assert encode_probability(p, prob_bits) == code
+
+
+@settings(deadline=None)
+@given(st.floats(0, 1), st.integers(1, 16))
+def test_no_other_code_is_nearer_and_ties_go_up(p, prob_bits):
+    ones = 2**prob_bits - 1
+    below = int(p * 2**prob_bits)
+    values = {code: Fraction(code, 2**prob_bits) for code in range(below - 1, below + 3) if 0 <= code < ones}
+    values[ones] = Fraction(1)
+    nearest = min(values, key=lambda code: (abs(values[code] - Fraction(p)), -code))
+    assert int(encode_probability(p, prob_bits)) == nearest
+
+
+@given(st.integers(1, 16))
+def test_every_code_is_the_nearest_to_what_it_makes(prob_bits):
+    codes = np.arange(2**prob_bits)
+    made = decode_code(codes, prob_bits)
+    assert made[-1] == 1
+    assert (encode_probability(made, prob_bits) == codes).all()
+
+
+def test_shapes_stay():
+    assert encode_probability(np.zeros((2, 3)), 8).shape == (2, 3)
+    assert encode_probability([0.1, 0.2], 8).dtype == np.uint16
+    assert decode_code(np.zeros((2, 3), dtype=np.uint16), 8).shape == (2, 3)
+    assert decode_code([0, 255], 8).tolist() == [0.0, 1.0]
+
+
+@pytest.mark.parametrize("p", [-0.01, 1.01, np.nan, np.inf])
+def test_what_is_no_probability_is_refused(p):
+    with pytest.raises(ParameterError, match="not a number from 0 to 1"):
+        encode_probability([0.5, p], 8)
+
+
+@pytest.mark.parametrize("codes", [[256], [-1], [0.5]])
+def test_what_is_no_code_is_refused(codes):
+    with pytest.raises(ParameterError, match="no integer from 0 to 255"):
+        decode_code(codes, 8)
+
+
+@pytest.mark.parametrize("prob_bits", [0, 17])
+def test_there_are_no_codes_of_so_many_bits(prob_bits):
+    for function in (encode_probability, decode_code):
+        with pytest.raises(ParameterError, match=f"prob_bits is {prob_bits}"):
+            function([0], prob_bits)

@@ -1,0 +1,46 @@
+"""Which kernel a machine gets, and what is loaded for it."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from machines.bm1 import BM1Machine, Start, StopReason
+from machines.fast import FastBM1
+from machines.kernel import make_kernel, warm_up
+from machines.parameters import BM1Parameters, RngKind
+from machines.reference import ReferenceBM1
+
+
+@pytest.mark.parametrize("kind", RngKind)
+@pytest.mark.parametrize("shared", [True, False])
+def test_the_fast_one_where_it_can(kind, shared):
+    parameters = BM1Parameters(lines=2, sensor_bits=(1,), prob_bits=7, rng=kind, shared=shared)
+    rng_table = np.random.default_rng(1).integers(0, 2**32, 1000, dtype=np.uint32)
+    machine = BM1Machine(
+        parameters,
+        np.full((1, 2), 100),
+        (np.full((2, 2), 127),),
+        rng_table if kind is RngKind.TABLE else None,
+    )
+    kernel = make_kernel(machine)
+    assert type(kernel) is (FastBM1 if shared and kind in (*RngKind,)[:4] else ReferenceBM1)
+    assert kernel.start(Start(addresses=(0,), target_count=20, max_cycles=1000)) is StopReason.OVERFLOW
+    assert kernel.counts.max() == 20
+
+
+def test_warming_up_twice_is_no_harm():
+    warm_up()
+    warm_up()
+
+
+@pytest.mark.parametrize("module", ["parameters", "bm1", "encode", "posterior", "kernel", "reference", "rng"])
+def test_numba_is_not_loaded_before_it_is_needed(module):
+    code = f"import sys, machines.{module}; sys.exit('numba' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False, timeout=60).returncode == 0
+
+
+def test_parameters_do_without_numpy():
+    code = "import sys, machines.parameters; sys.exit('numpy' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False, timeout=60).returncode == 0

@@ -1,0 +1,121 @@
+"""Posteriors from counts, over boards, and in one call."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from machines.bm1 import BM1Machine
+from machines.encode import decode_code
+from machines.errors import MachineError, NoPosteriorError, StartError
+from machines.parameters import BM1Parameters, PriorMode
+from machines.posterior import joint_posterior, posterior
+
+
+def counts(*boards):
+    return [np.array(board, dtype=np.uint32) for board in boards]
+
+
+def test_one_board_is_its_counts_normalised():
+    assert joint_posterior(counts([1, 3, 0]), [100]).tolist() == [0.25, 0.75, 0]
+
+
+def test_a_board_that_ran_longer_weighs_less():
+    # Rates of 0.1 and 0.3 on the first board, of 0.1 on the second: not one half for each board.
+    joint = joint_posterior(counts([10, 30], [10, 0]), [100, 100])
+    assert joint == pytest.approx([0.2, 0.6, 0.2, 0])
+    joint = joint_posterior(counts([10, 30], [100, 0]), [100, 1000])
+    assert joint == pytest.approx([0.2, 0.6, 0.2, 0])
+
+
+def test_a_board_that_did_not_run_has_no_weight():
+    assert joint_posterior(counts([0, 0], [2, 2]), [0, 64]).tolist() == [0, 0, 0.5, 0.5]
+
+
+@pytest.mark.parametrize(("boards", "cycles"), [(([0, 0], [0]), (0, 64)), (([0],), (0,)), ((), ())])
+def test_without_counts_there_is_none(boards, cycles):
+    assert joint_posterior(counts(*boards), cycles) is None
+
+
+def test_boards_and_cycles_must_belong_together():
+    with pytest.raises(MachineError, match="counts of 2 boards and cycles of 1"):
+        joint_posterior(counts([1], [1]), [3])
+    with pytest.raises(MachineError, match="Board 1 has counts, but ran 0 cycles"):
+        joint_posterior(counts([1], [1]), [3, 0])
+
+
+@given(
+    st.lists(st.lists(st.integers(0, 255), min_size=1, max_size=20), min_size=1, max_size=5),
+    st.integers(1, 2**40),
+)
+def test_partitions_that_stop_together_are_the_whole(boards, cycles):
+    joint = joint_posterior(counts(*boards), [cycles] * len(boards))
+    whole = joint_posterior(counts([count for board in boards for count in board]), [cycles])
+    if joint is None:
+        assert whole is None
+    else:
+        assert joint == pytest.approx(whole, abs=1e-15)
+        assert joint.sum() == pytest.approx(1)
+
+
+@pytest.fixture
+def machine():
+    """Three lines, two sensors of three values."""
+    return BM1Machine(
+        BM1Parameters(lines=3, sensor_bits=(2, 2)),
+        np.array([[255, 128, 64]]),
+        (
+            np.array([[255, 128, 32], [0, 0, 0], [16, 0, 0], [255, 255, 255]]),
+            np.array([[64, 128, 255], [255, 10, 0], [0, 200, 100], [255, 255, 255]]),
+        ),
+    )
+
+
+@pytest.mark.parametrize("readings", [(0, 0), (None, None), (None, 0), (0, None), (0, 1), (2, 1)])
+def test_readings_give_the_product(machine, readings):
+    exact = decode_code(machine.prior[0], 8)
+    for table, reading in zip(machine.tables, readings, strict=True):
+        exact = exact * decode_code(table[-1 if reading is None else reading], 8)
+    exact /= exact.sum()
+    # 16 banks of 255 counts at the best line: 1.6 % of it, of which three times that is far.
+    mean = np.mean([posterior(machine, readings, bank=bank) for bank in range(16)], axis=0)
+    assert mean == pytest.approx(exact, abs=0.03)
+    assert mean[exact == 0].tolist() == [0] * int((exact == 0).sum())
+
+
+def test_readings_that_no_line_allows_have_no_posterior(machine):
+    with pytest.raises(NoPosteriorError, match="every line has a code 0") as none:
+        posterior(machine, [1, 0])
+    assert none.value.exit_code == 4
+
+
+def test_too_few_cycles_have_no_posterior(machine):
+    with pytest.raises(NoPosteriorError, match="no line counted in 1 cycles"):
+        posterior(machine, [2, 1], max_cycles=1)
+
+
+@pytest.mark.parametrize(
+    ("readings", "options", "sentence"),
+    [
+        ([0], {}, "There are 1 readings; this machine has 2"),
+        ([0, 3], {}, "The reading of column 2 is 3, the address that stands for a missing one"),
+        ([0, 4], {}, "The address of column 2 is 4"),
+        ([0, 0], {"target_count": 256}, "target_count is 256"),
+        ([0, 0], {"bank": 16}, "bank is 16"),
+    ],
+)
+def test_what_the_machine_can_not_take_is_refused(machine, readings, options, sentence):
+    with pytest.raises(StartError) as refusal:
+        posterior(machine, readings, **options)
+    assert sentence in str(refusal.value)
+
+
+def test_a_posterior_can_become_the_next_prior(machine):
+    written = BM1Machine(
+        BM1Parameters(lines=3, sensor_bits=(2, 2), prior_mode=PriorMode.WRITTEN),
+        machine.prior,
+        machine.tables,
+    )
+    codes = np.array([0, 255, 0], dtype=np.uint16)
+    assert posterior(written, [0, 0], prior_codes=codes).tolist() == [0, 1, 0]
+    assert posterior(written, [0, 0]).tolist() == posterior(machine, [0, 0]).tolist()

@@ -1,0 +1,117 @@
+"""What streams of random bits promise (thesis 2.1.1): the mean is the product, the spread is equation 2.1.
+
+Seeds are fixed, so that nothing here is left to chance: a test that passes, passes always.
+"""
+
+import numpy as np
+import pytest
+
+from machines.bm1 import BM1Machine, Start
+from machines.encode import decode_code
+from machines.kernel import make_kernel
+from machines.parameters import BM1Parameters, RngKind
+
+EVER = 2**32 - 1
+
+
+def machine_of(codes, **parameters):
+    """A machine whose columns (the first one the prior's) hold these codes, one row per column."""
+    codes = np.asarray(codes)
+    columns, lines = codes.shape
+    parameters = BM1Parameters(
+        **{
+            "lines": lines,
+            "sensor_bits": (1,) * (columns - 1),
+            "counter_bits": 32,
+            "rng_banks": 400,
+            **parameters,
+        }
+    )
+    tables = tuple(np.stack([row, np.full(lines, parameters.ones_code)]) for row in codes[1:])
+    return BM1Machine(parameters, codes[:1], tables)
+
+
+def counts_of(machine, cycles, banks):
+    """uint32[banks, lines]: counts after so many cycles from each bank."""
+    kernel = make_kernel(machine)
+    counts = []
+    for bank in range(banks):
+        addresses = (0,) * machine.parameters.sensors
+        kernel.start(Start(addresses=addresses, target_count=EVER, max_cycles=cycles, bank=bank))
+        counts.append(kernel.counts)
+    return np.array(counts)
+
+
+def exact(machine):
+    """The probability of each line's bit."""
+    rows = [machine.prior[0], *(table[0] for table in machine.tables)]
+    return np.prod([decode_code(row, machine.parameters.prob_bits) for row in rows], axis=0)
+
+
+@pytest.mark.parametrize("kind", [RngKind.LFSR24, RngKind.LFSR32])
+@pytest.mark.parametrize("columns", [2, 3, 4, 5, 7, 17, 21])
+def test_the_and_of_columns_is_the_product_within_its_standard_error(kind, columns):
+    """Numbers of columns that divide the period are the ones that evenly spaced seeds would fail at."""
+    shares = np.linspace(0.3, 0.9, 12) ** (2 / columns)
+    codes = np.clip(np.rint(shares * 256), 1, 254).astype(int) * np.ones((columns, 1), dtype=int)
+    machine = machine_of(codes, rng=kind)
+    cycles, banks = 2**15, 16
+    mean = counts_of(machine, cycles, banks).sum(axis=0) / (cycles * banks)
+    p = exact(machine)
+    assert (np.abs(mean - p) < 4 * np.sqrt(p * (1 - p) / (cycles * banks))).all()
+
+
+@pytest.mark.parametrize(
+    ("parameters", "banks"),
+    [
+        ({"rng": RngKind.LFSR32}, 400),
+        ({"rng": RngKind.LFSR24}, 400),
+        ({"rng": RngKind.LFSR32, "prob_bits": 16}, 400),
+        ({"rng": RngKind.IDEAL}, 200),
+        ({"rng": RngKind.IDEAL, "shared": False}, 100),
+        ({"rng": RngKind.LFSR32, "shared": False}, 50),
+    ],
+)
+def test_counts_spread_as_equation_2_1_says(parameters, banks):
+    ones = 2 ** parameters.get("prob_bits", 8)
+    codes = np.rint(np.array([[0.2, 0.5, 0.9, 0.7], [0.9, 0.5, 0.9, 0.1]]) * ones).astype(int)
+    machine = machine_of(codes, **parameters)
+    cycles = 200
+    rates = counts_of(machine, cycles, banks) / cycles
+    p = exact(machine)
+    limit = np.sqrt(p * (1 - p) / cycles)
+    assert (np.abs(rates.mean(axis=0) - p) < 4 * limit / np.sqrt(banks)).all()
+    # What so many draws spread is known to 1 in sqrt(2 banks).
+    assert rates.std(axis=0) == pytest.approx(limit, rel=3.5 / np.sqrt(2 * banks))
+
+
+def test_one_step_a_clock_keeps_the_mean_and_widens_the_spread():
+    """The thesis's generators step once a cycle; neighbouring cycles share bits then."""
+    codes = np.array([[60, 40, 90], [250, 220, 230]])
+    spreads = {}
+    for steps_per_clock in (1, 8):
+        machine = machine_of(codes, steps_per_clock=steps_per_clock)
+        rates = counts_of(machine, 1000, 400) / 1000
+        p = exact(machine)
+        spreads[steps_per_clock] = rates.var(axis=0) / (p * (1 - p) / 1000)
+        assert rates.mean(axis=0) == pytest.approx(p, abs=0.004)
+    assert spreads[8] == pytest.approx(1, abs=0.25)
+    assert (spreads[1] > 1.3).all()
+    assert (spreads[1] < 3).all()
+
+
+def test_lines_of_equal_codes_count_alike_where_generators_are_shared():
+    codes = np.array([[100, 100], [200, 200]])
+    shared = counts_of(machine_of(codes), 500, 4)
+    assert (shared[:, 0] == shared[:, 1]).all()
+    unshared = counts_of(machine_of(codes, shared=False), 500, 4)
+    assert (unshared[:, 0] != unshared[:, 1]).any()
+
+
+def test_a_played_table_is_as_good_as_what_is_in_it():
+    numbers = np.random.default_rng(5).integers(0, 2**32, 20_000, dtype=np.uint32)
+    parameters = BM1Parameters(lines=2, sensor_bits=(1,), counter_bits=32, rng=RngKind.TABLE)
+    machine = BM1Machine(parameters, np.array([[128, 200]]), (np.array([[100, 50], [255, 255]]),), numbers)
+    rates = counts_of(machine, 20_000, 1)[0] / 20_000
+    p = exact(machine)
+    assert (np.abs(rates - p) < 4 * np.sqrt(p * (1 - p) / 20_000)).all()
