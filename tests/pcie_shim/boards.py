@@ -4,6 +4,7 @@ import multiprocessing
 import os
 import select
 import signal
+import socket
 import struct
 from collections.abc import Sequence
 
@@ -145,6 +146,18 @@ def expected(parts: Sequence[Image], frame: FrameInput) -> list[tuple[list[int],
         for kernel in going:
             kernel.resume(end if end < frame.max_cycles else 0)
     return [(kernel.counts.tolist(), kernel.cycles, kernel.reason) for kernel in kernels]
+
+
+def tcp_endpoint() -> str:
+    """An endpoint whose port is free, and so is the next one, for programming."""
+    while True:
+        with socket.create_server(("127.0.0.1", 0)) as first:
+            port = first.getsockname()[1]
+            try:
+                socket.create_server(("127.0.0.1", port + 1)).close()
+            except OSError:
+                continue
+            return f"tcp://127.0.0.1:{port}"
 
 
 def words(*values: int) -> bytes:

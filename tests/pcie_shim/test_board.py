@@ -2,7 +2,6 @@
 #        └────────socket──── its programming port
 # What one host, a second one, one that vanishes, one that talks nonsense, and loaders get.
 import hashlib
-import socket
 import struct
 import time
 from collections.abc import Callable
@@ -15,7 +14,7 @@ from machines.kernel import make_kernel
 from pcie_shim import board as board_module
 from pcie_shim import framing
 from pcie_shim import register_map as rm
-from pcie_shim.endpoint import connect, parse_endpoint
+from pcie_shim.endpoint import connect, listen, parse_endpoint
 from pcie_shim.errors import (
     AccessError,
     EndpointError,
@@ -29,7 +28,7 @@ from pcie_shim.link import SocketLink
 from pcie_shim.loader import program
 from pcie_shim.programming_file import image_bytes
 from pcie_shim.register_map import BoardState, ErrorCode
-from tests.pcie_shim.boards import BoardProcess, image, machine, never_stopping, words
+from tests.pcie_shim.boards import BoardProcess, image, machine, never_stopping, tcp_endpoint, words
 
 ENABLE = rm.CONTROL_INTERRUPT_ENABLE_MASK
 StartBoard = Callable[..., BoardProcess]
@@ -58,7 +57,7 @@ def run_for_minutes(link: SocketLink) -> None:
 
 @pytest.mark.parametrize("kind", ["unix", "tcp"])
 def test_a_frame_over_a_link(start_board: StartBoard, kind: str) -> None:
-    board = start_board("" if kind == "unix" else f"tcp://127.0.0.1:{free_ports()}", index=3)
+    board = start_board("" if kind == "unix" else tcp_endpoint(), index=3)
     program(board.endpoint, image(MACHINE))
     kernel = make_kernel(MACHINE)
     kernel.start(Start(addresses=(2, 5), target_count=50, max_cycles=4000, bank=1, run_until=30))
@@ -84,18 +83,6 @@ def test_a_frame_over_a_link(start_board: StartBoard, kind: str) -> None:
         kernel.resume(0)
         assert (done.reason, done.cycles) == (kernel.reason, kernel.cycles)
         assert bytes(done.results) == kernel.counts.tobytes()
-
-
-def free_ports() -> int:
-    """A port that is free, and so is the next one."""
-    while True:
-        with socket.create_server(("127.0.0.1", 0)) as first:
-            port = first.getsockname()[1]
-            try:
-                socket.create_server(("127.0.0.1", port + 1)).close()
-            except OSError:
-                continue
-            return port
 
 
 def test_without_interrupts_the_host_reads_done(start_board: StartBoard) -> None:
@@ -179,6 +166,26 @@ def test_a_host_that_vanishes_leaves_the_board_well(start_board: StartBoard) -> 
         assert link.read32(rm.DONE) == 0
     with pytest.raises(LinkClosedError, match="it was closed"):
         link.read32(rm.ID)
+
+
+def test_a_host_that_has_just_left_does_not_hold_the_board(folder: Path) -> None:
+    endpoint, port = (parse_endpoint(f"unix:{folder}/{name}.sock") for name in ("registers", "programming"))
+    stop = board_module.StopSignal()
+    server = board_module._Server(listen(endpoint), listen(port), 0, stop, None)
+    for where, accept in ((endpoint, server._accept_host), (port, server._accept_loader)):
+        first = connect(where, timeout=1)
+        accept()
+        # a request that was not yet answered, and the end: both come before the next connection is looked at
+        first.sendall(framing.encode(framing.READ, 0, 1, 0, 1))
+        first.close()
+        with connect(where, timeout=1) as second:
+            accept()
+            decoder = framing.FrameDecoder()
+            decoder.received(second.recv_into(decoder.room()))
+            assert decoder.next_frame().operation == framing.GREET
+    server._drop_host()
+    server._drop_loader()
+    stop.close()
 
 
 @pytest.mark.parametrize(
