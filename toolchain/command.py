@@ -1,6 +1,8 @@
 """The `toolchain` command: `toolchain build` makes a deployment of a case study's model (thesis 3.4)."""
 
+import signal
 from pathlib import Path
+from types import FrameType
 from typing import Annotated
 
 import typer
@@ -11,7 +13,12 @@ from toolchain.deployment import Queue, Stop, parse_interface
 from toolchain.errors import BuildError, ToolchainError
 from toolchain.options import BuildOptions, Scale
 
-app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode="markdown")
+app = typer.Typer(
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="markdown",
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
 
 
 @app.callback()
@@ -101,8 +108,15 @@ def build(
 
 
 def main() -> None:
-    """Entry point of the `toolchain` command."""
+    """Entry point of the `toolchain` command; SIGINT ends it with 130 and SIGTERM with 143."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, _end)
     app()
+
+
+def _end(number: int, _frame: FrameType | None) -> None:
+    typer.echo(f"error: ended by {signal.Signals(number).name}; the deployment is not complete", err=True)
+    raise SystemExit(128 + number)
 
 
 def _build(case: Path, directory: Path, settings: dict[str, str], options: BuildOptions) -> None:

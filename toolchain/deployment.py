@@ -12,6 +12,7 @@ import json
 import math
 import re
 from collections import Counter
+from contextlib import suppress
 from enum import StrEnum
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Any, Final, Literal, Self, TypeVar
@@ -385,6 +386,8 @@ def write_deployment(directory: Path, deployment: DeploymentFile) -> Deployment:
         partial.write_text(deployment_text(written), encoding="utf-8")
         partial.replace(written.path)
     except OSError as reason:
+        with suppress(OSError):
+            partial.unlink(missing_ok=True)
         message = f"{written.path} can't be written: {reason.strerror or reason}"
         raise DeploymentError(message) from None
     return written

@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -104,6 +105,24 @@ def test_a_folder_that_cannot_be_written(case):
     result = build(case)
     assert result.exit_code == 2
     assert f"error: {case.parent / 'out'} can't be written: " in result.stderr
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_signals_end_it_with_their_code(case, number, code):
+    (case / "model.py").write_text(
+        "import time\n\ndef model():\n    print('here', flush=True)\n    time.sleep(60)\n"
+    )
+    command = [Path(sys.executable).parent / "toolchain", "build", case, "-o", case.parent / "out", *TARGET]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    try:
+        assert process.stdout.readline() == "here\n"
+        process.send_signal(number)
+        _, sentences = process.communicate(timeout=30)
+    finally:
+        process.kill()
+    assert process.returncode == code
+    assert f"error: ended by {number.name}; the deployment is not complete" in sentences
+    assert "Traceback" not in sentences
 
 
 def test_the_installed_command_has_help_with_an_example():
