@@ -17,7 +17,7 @@ from bridge.hub.limits import HubLimits
 from bridge.hub.server import serve_hub
 
 #: No wait in these tests may take longer; none should take a tenth of it.
-PATIENCE = 20.0
+PATIENCE = 60.0
 
 
 class Ears:

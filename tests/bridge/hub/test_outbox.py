@@ -105,6 +105,15 @@ def test_what_is_held_counts_towards_the_bytes_and_makes_room() -> None:
     assert outbox.deadline == inf
 
 
+def test_a_late_release_does_not_turn_the_order() -> None:
+    outbox, lane = Outbox(1000), _lane(throttle=1.0, queue_length=9)
+    for index in range(3):
+        outbox.offer(lane, b"%d" % index, index * 0.9)  # the second waits until 1, and nobody releases it
+    assert _drain(outbox) == [b"0"]
+    outbox.release(1.8)
+    assert _drain(outbox) == [b"1"]
+
+
 def test_lifting_a_throttle_queues_what_it_held() -> None:
     outbox, lane = Outbox(1000), _lane(throttle=1.0, queue_length=5)
     for index in range(4):
@@ -237,6 +246,7 @@ _STEPS = st.lists(
         st.tuples(st.just("put"), st.just(0), st.integers(1, 12)),
         st.tuples(st.just("pop"), st.just(0), st.just(0)),
         st.tuples(st.just("wait"), st.just(0), st.integers(0, 3)),
+        st.tuples(st.just("be late"), st.just(0), st.integers(0, 3)),
     ),
     max_size=120,
 )
@@ -266,6 +276,8 @@ def test_the_outbox_is_its_model(
             model.put(payload)
         elif step == "pop":
             assert outbox.pop() == (model.waiting.pop(0)[0] if model.waiting else None)
+        elif step == "be late":
+            now += amount / 2
         else:
             now += amount / 2
             outbox.release(now)
