@@ -48,12 +48,6 @@ class OtherPeerError(ServiceError):
     """The process at the other end of a local socket is not the one that belongs there."""
 
 
-class NoDataError(ServiceError):
-    """A topic stayed silent longer than it may."""
-
-    exit_code = ExitCode.ROSBRIDGE
-
-
 class RosbridgeLostError(ServiceError):
     """The rosbridge server went away in a run that does not wait for it."""
 

@@ -16,10 +16,9 @@ import typer
 from bridge.client import Message, Ros, State, connect
 from bridge.errors import BridgeError, NoMessageError
 from bridge.fields import Field
-from bridge.names import same_type
 from services import options
 from services.command_line import ends_well, make_app, run_async
-from services.errors import NoDataError, RosbridgeLostError, SettingsError, VariableError, exit_code_of
+from services.errors import RosbridgeLostError, SettingsError, VariableError, exit_code_of
 from services.frames import CompleteReading, FrameAssembler
 from services.local_socket import MAX_RECORD
 from services.logs import get_logger, say
@@ -33,21 +32,6 @@ ROLE = "subscriber"
 _RECEIVED_QUEUE = 64
 _BACKLOG_LIMIT = min(1 << 18, MAX_RECORD)
 """Bytes that may wait for the master; beyond, readings are passed over (queue = latest) and counted."""
-
-
-async def why_silent(ros: Ros, source: Source, waited: float) -> str:
-    """One sentence about a topic that stayed silent, with what the server says of it where it has rosapi."""
-    sentence = f"no message came on {source.topic} ({source.type}) from {source.uri} within {waited:g} s"
-    try:
-        known = await ros.call("/rosapi/publishers", {"topic": source.topic}, timeout=2)
-        if not known.get("publishers"):
-            return f"{sentence}; the server knows of nobody who publishes it: start its publisher, or check the name"
-        found = (await ros.call("/rosapi/topic_type", {"topic": source.topic}, timeout=2)).get("type", "")
-    except BridgeError:
-        return f"{sentence}; is its publisher running, and is that its type?"
-    if found and not same_type(found, source.type):
-        return f"{sentence}; it is published there as {found}: build the deployment with that type"
-    return f"{sentence}; it has a publisher there, which says nothing"
 
 
 class Subscriber:
@@ -114,7 +98,7 @@ class Subscriber:
                     error = error.exceptions[0]
                 await self._fail(error)
                 raise error from None
-            except (BridgeError, NoDataError) as error:
+            except BridgeError as error:
                 await self._fail(error)
                 raise
         return 0
@@ -143,11 +127,9 @@ class Subscriber:
             try:
                 message = await subscription.next(timeout=timeout)
             except NoMessageError as error:
-                source = source.model_copy(update={"uri": self._settings.uri or source.uri})
-                sentence = await why_silent(ros, source, timeout)
                 if first and ros.state is State.CONNECTED:
-                    raise NoDataError(sentence) from error
-                self._link.notice("warning", sentence)
+                    raise
+                self._link.notice("warning", str(error))
                 continue
             first = False
             self._passed_over += subscription.lost - lost_before
@@ -188,7 +170,7 @@ async def print_readings(settings: Settings, source: Source, names: list[str], c
     """Alone, without a deployment: print the named variables of each message, one JSON object a line.
 
     Raises:
-        NoDataError: no message in time.
+        NoMessageError: no message in time.
         BridgeError: a variable is not there, or the server is not.
     """
     fields = [Field(name) for name in names]
@@ -199,10 +181,7 @@ async def print_readings(settings: Settings, source: Source, names: list[str], c
         printed = 0
         timeout: float = settings.first_data_timeout
         while count is None or printed < count:
-            try:
-                message = await subscription.next(timeout=timeout)
-            except NoMessageError as error:
-                raise NoDataError(await why_silent(ros, source, timeout)) from error
+            message = await subscription.next(timeout=timeout)
             values: dict[str, Any] = {}
             for field in fields:
                 present, value = field.value(message.msg)
@@ -218,7 +197,7 @@ async def print_addresses(settings: Settings, deployment: Deployment, count: int
     """Alone, with a deployment: print each complete reading as `pcie-app` reads it, one JSON object a line.
 
     Raises:
-        NoDataError: no message in time.
+        NoMessageError: no message in time.
         VariableError: a variable is missing or unusable.
     """
     if len({settings.uri or source.uri for source in deployment.sources}) > 1:
@@ -230,27 +209,24 @@ async def print_addresses(settings: Settings, deployment: Deployment, count: int
     async with connect(
         uri, connect_timeout=settings.connect_timeout, ros_version=settings.ros_version
     ) as ros:
-        queue: asyncio.Queue[tuple[int, Message]] = asyncio.Queue(_RECEIVED_QUEUE)
 
         async def follow(at: int, source: Source) -> None:
+            nonlocal printed
             subscription = ros.subscribe(source.topic, source.type, queue_size=_RECEIVED_QUEUE)
-            async for message in subscription:
-                await queue.put((at, message))
+            while count is None or printed < count:
+                message = await subscription.next(timeout=settings.first_data_timeout)
+                reading = assembler.take(at, message.msg, message.received_ns, message.received_monotonic_ns)
+                if reading is not None and (count is None or printed < count):
+                    printed += 1
+                    _print({"stamp_ns": reading.stamp_ns, "addresses": reading.addresses})
 
         followers = [
             asyncio.ensure_future(follow(at, source)) for at, source in enumerate(deployment.sources)
         ]
         try:
-            while count is None or printed < count:
-                try:
-                    at, message = await asyncio.wait_for(queue.get(), settings.first_data_timeout)
-                except TimeoutError as error:
-                    source = deployment.sources[0].model_copy(update={"uri": uri})
-                    raise NoDataError(await why_silent(ros, source, settings.first_data_timeout)) from error
-                reading = assembler.take(at, message.msg, message.received_ns, message.received_monotonic_ns)
-                if reading is not None:
-                    _print({"stamp_ns": reading.stamp_ns, "addresses": reading.addresses})
-                    printed += 1
+            ended, _ = await asyncio.wait(followers, return_when=asyncio.FIRST_COMPLETED)
+            for each in ended:
+                each.result()
         finally:
             for follower in followers:
                 follower.cancel()

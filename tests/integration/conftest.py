@@ -204,19 +204,25 @@ def stage(tmp_path_factory):
     made.end_all()
 
 
-def build_boat(directory: Path, *options: str, cells: int = 8) -> Path:
-    """A small boat deployment, built by the command as a user builds it."""
+def build(model: Path, directory: Path, *options: str) -> Path:
+    """A deployment for four boards, built by the command as a user builds it."""
     subprocess.run(
         [
-            *(str(BIN / "toolchain"), "build", str(ROOT / "casestudies/boat"), "-o", str(directory)),
-            *("--partitions", "4", "--uri", "ws://127.0.0.1:9090", "--topic", "/boat/sensors"),
-            *("--type", "boat_msgs/Sensors", "--set", f"width={cells}", "--set", f"height={cells}", *options),
+            *(str(BIN / "toolchain"), "build", str(model), "-o", str(directory), "--partitions", "4"),
+            *("--uri", "ws://127.0.0.1:9090", "--topic", "/boat/sensors", "--type", "boat_msgs/Sensors"),
+            *options,
         ],
         check=True,
         capture_output=True,
         timeout=60,
     )
     return directory
+
+
+def build_boat(directory: Path, *options: str, cells: int = 8) -> Path:
+    """The boat on a square map of few cells."""
+    size = ("--set", f"width={cells}", "--set", f"height={cells}")
+    return build(ROOT / "casestudies/boat", directory, *size, *options)
 
 
 @pytest.fixture(scope="session")

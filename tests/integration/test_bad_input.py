@@ -6,7 +6,7 @@ import socket
 
 import pytest
 
-from tests.integration.conftest import READING, Robot, build_boat
+from tests.integration.conftest import READING, Robot, build, build_boat
 
 
 def only_sentence(running) -> str:
@@ -105,9 +105,23 @@ async def test_a_variable_that_cannot_be_used(stage, boat, server, reading, matc
         assert each in sentence
 
 
-async def test_a_bearing_out_of_range(stage, server, tmp_path):
-    """Bearings wrap and distances clamp in the boat's model; a deployment that refuses names the range."""
-    deployment = build_boat(tmp_path / "strict", "--set", "on_range=error")
+STRICT = """
+from dataclasses import replace
+
+from casestudies.boat.model import model as boat
+
+
+def model():
+    whole = boat(width=8, height=8)
+    return replace(whole, known=tuple(replace(each, on_range="error") for each in whole.known))
+"""
+
+
+async def test_a_value_out_of_range_names_the_range(stage, server, tmp_path):
+    """Bearings wrap and distances clamp in the boat's model; this one refuses."""
+    (tmp_path / "strict").mkdir()
+    (tmp_path / "strict/model.py").write_text(STRICT)
+    deployment = build(tmp_path / "strict", tmp_path / "deployment")
     uri, robot = server
     await robot.keep_publishing(**READING | {"D2": 5000})
     code, sentence = await once(stage, deployment, uri)
