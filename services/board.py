@@ -141,7 +141,7 @@ app = make_app(
 )
 
 
-@app.command()
+@app.command(help=app.info.help)
 @ends_well
 def board(
     listen: options.Listen = None,
@@ -164,6 +164,9 @@ def board(
         msg = "give either --listen ENDPOINT for one board, or --boards N --directory DIR for several"
         raise SettingsError(msg)
     if boards is not None:
+        if misbehave:
+            msg = "--misbehave belongs to a single board: start it with --listen ENDPOINT"
+            raise SettingsError(msg)
         if directory is None or not directory.is_dir():
             msg = f"--directory {directory or ''} is no folder; name one for the boards' sockets"
             raise SettingsError(msg)

@@ -19,7 +19,7 @@ app = make_app(
 )
 
 
-@app.command()
+@app.command(help=app.info.help)
 @ends_well
 def hub(
     host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",

@@ -22,7 +22,7 @@ app = make_app(
 )
 
 
-@app.command()
+@app.command(help=app.info.help)
 @ends_well
 def loader(
     image: Annotated[Path, typer.Argument(help="Programming file (boards/*.bm of a deployment).")],

@@ -160,7 +160,7 @@ class Master:
                 boards = [str(endpoint_in(directory, f"board{at}")) for at in range(len(endpoints))]
                 command = [*own_command("board"), "--boards", str(len(boards)), "--directory", str(directory)]
                 command += ["--restarts", "0" if self._once else str(RESTARTS)]
-                self._boards = Child("boards", command, directory=directory)
+                self._boards = Child("the boards' process", command, directory=directory)
         arguments = {
             "subscriber": [
                 *common,
@@ -234,9 +234,9 @@ class Master:
                 self._fail(failure)
                 return
             if self._once or not boards.may_restart():
-                self._fail(BoardFailedError(f"the boards' process ended: {failure}"))
+                self._fail(BoardFailedError(str(failure)))
                 return
-            self._log.warning("the boards' process ended; restarting it", why=str(failure))
+            self._log.warning(f"{failure}; restarting it")
             boards.start()
 
     async def _keep(self, peer: Peer) -> None:
@@ -537,7 +537,7 @@ app = make_app(
 )
 
 
-@app.command()
+@app.command(help=app.info.help)
 @ends_well
 def master(
     once: Annotated[bool, typer.Option("--once", help="Compute the first complete frame, then end.")] = False,

@@ -30,7 +30,7 @@ from services.errors import (
     exit_code_of,
 )
 from services.local_socket import BlockingRecordSocket, check_hello, own_hello
-from services.logs import get_logger, say
+from services.logs import say
 from services.records import BoardOutcome, Frame, FrameFailed, FrameResult, Notice, Ready, Record, Trouble
 from services.results import REASON_WORDS, counts_of
 from services.serving import deployment_for, endpoint_from
@@ -68,7 +68,8 @@ class Boards:
             timeout=self._settings.peer_timeout,
             slack=self._settings.board_timeout,
         )
-        return f"{len(self._endpoints)} boards programmed and open"
+        count = len(self._endpoints)
+        return f"{count} {'board' if count == 1 else 'boards'} programmed and open"
 
     def run(self, frame: Frame) -> FrameOutput:
         """Compute one frame.
@@ -92,9 +93,21 @@ class Boards:
                 )
             )
         except BoardError as error:
-            if not self._cluster.is_open(error.board):
-                self.gone[error.board] = str(error)
+            self._look(error)
             raise
+
+    def _look(self, error: BoardError) -> None:
+        """After a failure: find all boards that are gone, so that several deaths at once fail one frame."""
+        if self._cluster is None:
+            return
+        if not self._cluster.is_open(error.board):
+            self.gone[error.board] = str(error)
+        for board in range(len(self._endpoints)):
+            if board != error.board and board not in self.gone:
+                try:
+                    self._cluster.reopen(board, timeout=_TICK)
+                except BoardError as other:
+                    self.gone[board] = str(other)
 
     def mend(self) -> list[int]:
         """Try once to open the boards that are gone; the numbers of those that are back.
@@ -150,7 +163,6 @@ class PcieApp:
         self._greeted = False
         self._ready: Ready | None = None
         self._selector = selectors.DefaultSelector()
-        self._log = get_logger(ROLE)
 
     def serve(self) -> int:
         """Serve until a signal raises in this thread.
@@ -238,7 +250,6 @@ class PcieApp:
         try:
             output = self._boards.run(frame)
         except BoardError as error:
-            self._log.warning(str(error), frame=frame.number)
             self._send(FrameFailed(frame.number, error.board, exit_code_of(error), str(error)))
         else:
             self._send(result_record(frame.number, output))
@@ -259,7 +270,8 @@ def compute_lines(boards: Boards, banks: int) -> int:
     try:
         for number, line in enumerate(sys.stdin.buffer, 1):
             try:
-                addresses = orjson.loads(line)["addresses"]
+                reading = orjson.loads(line)
+                addresses = reading["addresses"]
                 frame = Frame(
                     number, [None if each is None else int(each) for each in addresses], number % banks
                 )
@@ -271,6 +283,7 @@ def compute_lines(boards: Boards, banks: int) -> int:
             result = result_record(number, boards.run(frame))
             printed = {
                 "number": number,
+                "stamp_ns": reading.get("stamp_ns"),
                 "boards": [
                     {
                         "counts": counts.tolist(),
@@ -296,7 +309,7 @@ def board_endpoints(settings: Settings, deployment: Deployment) -> list[Endpoint
     """
     texts = settings.boards or tuple(board.endpoint for board in deployment.boards)
     if len(texts) != len(deployment.boards):
-        msg = f"--boards names {len(texts)} boards, the deployment has {len(deployment.boards)} partitions; name one each"
+        msg = f"--boards names {len(texts)} of the deployment's {len(deployment.boards)} boards; name each once, in the order of the partitions"
         raise SettingsError(msg)
     if not all(texts):
         msg = "the deployment names no endpoints of boards; give --boards ENDPOINT,... (start some with: board --boards 4 --directory DIR)"
@@ -312,7 +325,7 @@ app = make_app(
 )
 
 
-@app.command()
+@app.command(help=app.info.help)
 @ends_well
 def pcie_app(
     deployment: options.Deployment = None,

@@ -216,8 +216,8 @@ async def _lines() -> AsyncIterator[bytes]:
         yield line
 
 
-def result_from_line(line: bytes, number: int, lines: int) -> FrameResult | list[float]:
-    """What one line of standard input says: `pcie-app`'s result, or an array of probabilities.
+def result_from_line(line: bytes, number: int, lines: int) -> tuple[FrameResult, int | None] | list[float]:
+    """What one line of standard input says: `pcie-app`'s result with its reading's stamp, or an array of probabilities.
 
     Raises:
         InputLineError: neither; says which line.
@@ -235,7 +235,10 @@ def result_from_line(line: bytes, number: int, lines: int) -> FrameResult | list
             for board in value["boards"]
         ]
         if sum(len(board.counts) for board in boards) == 4 * lines:
-            return FrameResult(int(value["number"]), boards, 0, 0, 0, 0)
+            stamp_ns = value.get("stamp_ns")
+            return FrameResult(int(value["number"]), boards, 0, 0, 0, 0), None if stamp_ns is None else int(
+                stamp_ns
+            )
     except (ValueError, TypeError, KeyError, OverflowError):
         pass
     msg = f"line {number} of standard input is neither a result of pcie-app nor an array of {lines} probabilities"
@@ -251,9 +254,10 @@ async def publish_lines(settings: Settings, deployment: Deployment) -> int:
         async for line in _lines():
             number += 1
             result = result_from_line(line, number, deployment.machine.lines)
-            if isinstance(result, FrameResult):
+            if isinstance(result, tuple):
                 now, tick = time.time_ns(), time.monotonic_ns()
-                await topics.publish(Publish(result, now, now, tick, tick, 0), look=False)
+                counted, stamp_ns = result
+                await topics.publish(Publish(counted, stamp_ns or now, now, tick, tick, 0), look=False)
             else:
                 await topics.publish_array(result)
     say(f"{number} published")
@@ -268,7 +272,7 @@ app = make_app(
 )
 
 
-@app.command()
+@app.command(help=app.info.help)
 @ends_well
 def publisher(
     deployment: options.Deployment = None,

@@ -12,6 +12,7 @@ from typing import Annotated, Any
 
 import orjson
 import typer
+from pydantic import ValidationError
 
 from bridge.client import Message, Ros, State, connect
 from bridge.errors import BridgeError, NoMessageError
@@ -247,7 +248,7 @@ app = make_app(
 )
 
 
-@app.command()
+@app.command(help=app.info.help)
 @ends_well
 def subscriber(
     deployment: options.Deployment = None,
@@ -281,9 +282,14 @@ def subscriber(
     if settings.uri is None or topic is None or type_ is None:
         msg = "give --uri, --topic and --type, or --deployment DIR (subscriber --help shows examples)"
         raise SettingsError(msg)
-    say(f"listening on {topic} at {settings.uri}")
     names = [name.strip() for name in variables.split(",") if name.strip()]
-    source = Source(uri=settings.uri, topic=topic, type=type_)
+    try:
+        source = Source(uri=settings.uri, topic=topic, type=type_)
+    except ValidationError as error:
+        first = error.errors()[0]
+        msg = f"--{first['loc'][0]}: {str(first['msg']).removeprefix('Value error, ')}"
+        raise SettingsError(msg) from error
+    say(f"listening on {topic} at {settings.uri}")
     return run_async(print_readings(settings, source, names, count))
 
 

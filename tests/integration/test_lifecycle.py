@@ -144,6 +144,14 @@ async def test_loop_survives_a_killed_service(stage, boat, victim):
     await robot.have(before + 5)
 
 
+async def test_loop_survives_all_boards_dying_at_once(stage, boat):
+    _, _, robot, master = await looping(stage, boat)
+    min(stage.processes()["board"], key=lambda each: each.pid).kill()  # the others were forked from it
+    await master.says("the boards' process was killed by SIGKILL; restarting it")
+    await robot.have(len(robot.results) + 5)
+    assert master.process.poll() is None
+
+
 async def test_loop_survives_a_killed_board_and_gives_up_on_the_fourth(stage, boat):
     _, _, robot, master = await looping(stage, boat)
     for time_ in range(1, 4):
