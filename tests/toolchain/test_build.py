@@ -13,7 +13,7 @@ from pcie_shim.programming_file import read_image
 from toolchain.build import build_date, build_deployment
 from toolchain.conditional import normal, wrapped_normal
 from toolchain.deployment import Queue, Stop, load_deployment
-from toolchain.errors import BuildError, ToolchainError
+from toolchain.errors import BuildError, DeploymentError, ToolchainError
 from toolchain.model import Known, Model, cell_centres, interval
 from toolchain.options import BuildOptions, Scale
 from toolchain.quantise import quantise
@@ -174,6 +174,16 @@ def test_a_build_over_another_leaves_nothing_of_it(tmp_path):
     build_deployment(model(), tmp_path, replace(OPTIONS, partitions=2))
     assert sorted(p.name for p in (tmp_path / "boards").iterdir()) == ["board0.bm", "board1.bm", "notes.txt"]
     load_deployment(tmp_path)
+
+
+def test_a_build_that_fails_half_way_leaves_no_deployment(tmp_path):
+    build_deployment(model(), tmp_path, replace(OPTIONS, partitions=2))
+    (tmp_path / "boards" / "board1.bm").unlink()
+    (tmp_path / "boards" / "board1.bm" / "in the way").mkdir(parents=True)
+    with pytest.raises(BuildError, match="can't be written"):
+        build_deployment(model(), tmp_path, replace(OPTIONS, partitions=2))
+    with pytest.raises(DeploymentError, match="holds no deployment"):
+        load_deployment(tmp_path)
 
 
 def test_the_report_has_loss_and_warnings(tmp_path):
