@@ -38,6 +38,7 @@ _TAGS = (
     *("--only-binary", ":all:", "--python-version", "3.11", "--implementation", "cp", "--abi", "cp311"),
     *("--platform", "manylinux_2_35_x86_64", "--platform", "manylinux_2_28_x86_64"),
 )
+_ROS_VARIABLES = ("AMENT_", "CYCLONEDDS_", "FASTDDS_", "FASTRTPS_", "RCUTILS_", "RMW_", "ROS_")
 _SIOCGIFFLAGS, _SIOCSIFFLAGS, _IFF_UP = 0x8913, 0x8914, 0x1
 
 
@@ -210,12 +211,13 @@ def serve(port: int) -> None:
     if not network_is_alone():
         msg = "the real server runs only in a network with nothing but loopback: start it with `scripts/real-rosbridge alone ...`"
         raise RealServerError(msg)
-    environment = dict(os.environ) | {
+    # what a user of ROS has set is for another ROS than this
+    theirs = {name: value for name, value in os.environ.items() if not name.startswith(_ROS_VARIABLES)}
+    environment = theirs | {
         "LD_LIBRARY_PATH": str(prefix / "lib"),
         "AMENT_PREFIX_PATH": str(prefix),
         "ROS_DISTRO": "jazzy",
         "ROS_VERSION": "2",
-        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
         "ROS_LOG_DIR": str(Path(tempfile.gettempdir(), "rosbayes-ros2-log")),
         # shared memory would leave files behind when the server is killed
         "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4",
