@@ -77,7 +77,7 @@ class EmulatedBoard:
         self._latched: dict[int, bytes] = {}
         self._error = ErrorCode.NONE
         # of the start or resume that runs, or ran last
-        self._speed = 0.0
+        self._chunk = self._first_chunk = _SHORTEST_CHUNK
         self._max_cycles = 0
         self._run_until = 0
         self._compute_ns = 0
@@ -139,8 +139,9 @@ class EmulatedBoard:
         self.programmed += 1
         self._power_up()
         self._describe(image)
-        self._speed = _measure_speed(kernel)
-        self._put(rm.CAP_SPEED, min(int(self._speed), 0xFFFFFFFF))
+        speed = _measure_speed(kernel)
+        self._first_chunk = max(int(speed * CHUNK_S), _SHORTEST_CHUNK)
+        self._put(rm.CAP_SPEED, min(int(speed), 0xFFFFFFFF))
         self.reset()
 
     def _describe(self, image: Image) -> None:
@@ -315,8 +316,7 @@ class EmulatedBoard:
             self._run(kernel, None, self._chunk_end(kernel.cycles))
         else:
             self._max_cycles = max_cycles
-            # The last frame's speed may be that of few live lines; the next one's first chunk assumes all.
-            (self._speed,) = _WORD.unpack_from(self._memory, rm.CAP_SPEED)
+            self._chunk = self._first_chunk
             end = self._chunk_end(0)
             start = Start(
                 addresses=self._sensors.unpack_from(self._memory, rm.SENSORS),
@@ -353,15 +353,16 @@ class EmulatedBoard:
             self.running = True
             self._publish(BoardState.RUNNING, StopReason.NONE, 0)
             return
-        before = 0 if start is not None else kernel.cycles
         began = time.perf_counter_ns()
         reason = kernel.resume(end) if start is None else kernel.start(start)
         elapsed = time.perf_counter_ns() - began
         self._compute_ns += elapsed
         cycles = kernel.cycles
-        if elapsed > CHUNK_S * 2e8:
-            # long enough to be a measurement; short runs are mostly the call itself
-            self._speed = (cycles - before) * 1e9 / elapsed
+        # Frames differ in speed (lines that cannot count cost nothing), and so does what else the core does.
+        if elapsed < CHUNK_S * 0.5e9:
+            self._chunk *= 2
+        elif elapsed > CHUNK_S * 1.5e9:
+            self._chunk = max(int(self._chunk * CHUNK_S * 1e9 / elapsed), _SHORTEST_CHUNK)
         self._results[:] = kernel.counts
         self.running = reason is StopReason.SLICE and cycles != self._run_until
         if self.running:
@@ -372,7 +373,7 @@ class EmulatedBoard:
 
     def _chunk_end(self, cycles: int) -> int:
         """Cycle at which the next chunk ends: the slice's end, if that is near enough; 0 for no end."""
-        end = cycles + max(int(self._speed * CHUNK_S), _SHORTEST_CHUNK)
+        end = cycles + self._chunk
         if end - cycles > _ALIGNMENT:
             end -= end % _ALIGNMENT
         run_until = self._run_until
@@ -410,7 +411,10 @@ _DATA: Final = (
 
 
 def _measure_speed(kernel: BM1Kernel) -> float:
-    """Machine cycles per second where every line counts (all readings missing): the slowest that it gets."""
+    """Machine cycles per second where every line counts (all readings missing): the slowest that it gets.
+
+    It is the thread's own time that counts: what else the core does must not make a board look slow for good.
+    """
     parameters = kernel.machine.parameters
     start = Start(
         addresses=tuple(parameters.missing_address(column + 1) for column in range(parameters.sensors)),
@@ -419,10 +423,10 @@ def _measure_speed(kernel: BM1Kernel) -> float:
         run_until=1,
     )
     kernel.start(start)  # what a kernel does at its first start only is not its speed
-    began = time.perf_counter_ns()
+    began = time.thread_time_ns()
     reason = kernel.start(start)
     while reason is StopReason.SLICE and kernel.cycles < _ALIGNMENT:
-        if time.perf_counter_ns() - began > CHUNK_S * 1e8:
+        if time.thread_time_ns() - began > CHUNK_S * 1e8:
             break
         reason = kernel.resume(2 * kernel.cycles)
-    return kernel.cycles * 1e9 / (time.perf_counter_ns() - began)
+    return kernel.cycles * 1e9 / max(time.thread_time_ns() - began, 1)
