@@ -24,7 +24,7 @@ from numba.extending import intrinsic
 from machines.bm1 import BM1Machine, Start, StopReason, addressed_codes, check_resume, check_start
 from machines.errors import MachineError
 from machines.parameters import BM1Parameters, PriorMode, RngKind, RngReset
-from machines.rng import LFSR, LFSRNumbers, Words, apply_map, jump_tables, map_tables
+from machines.rng import LFSR, LFSRNumbers, Words, apply_map, jump_tables
 
 KEPT_BYTES: Final = 64 * 2**20
 """Most memory for kept words, in bytes for each machine. It is taken as it is filled."""
@@ -33,21 +33,27 @@ KEPT_CYCLES: Final = 2**17
 """Words of later cycles than this are never kept."""
 
 _WORD_BITS: Final = 64
-_WORD_JUMP: Final = 6  # 2**6 clocks are a word
 _BLOCK_WORDS: Final = 8  # one register of AVX-512, two of AVX2, four of NEON
 _BLOCK_CYCLES: Final = _WORD_BITS * _BLOCK_WORDS
 _NO_ROW: Final = -1
 
 cgutils: Any = untyped_cgutils
 _Function = TypeVar("_Function", bound=Callable[..., Any])
-_jit = cast("Callable[[_Function], _Function]", njit(cache=True, nogil=True))
+
+
+def _jit(function: _Function) -> _Function:
+    """Machine code for a function, cached on disk where there is a place that can be written to."""
+    try:
+        return cast("_Function", njit(cache=True, nogil=True)(function))
+    except RuntimeError:  # no such place: every process compiles for itself
+        return cast("_Function", njit(nogil=True)(function))
 
 
 class _Generators(NamedTuple):
     """What the LFSRs of all columns do, as linear maps of a state."""
 
     jumps: Words  # [bits, bits / 8, 256]: 2**i clocks on
-    bits: Words  # [prob_bits, bits / 8, 256]: the next 64 cycles of bit b of what is shown, as a word
+    bits: Words  # [prob_bits, bits / 4, 16, _BLOCK_WORDS]: the next block of each bit shown
 
 
 class _Store(NamedTuple):
@@ -304,15 +310,25 @@ def _frame(parameters: BM1Parameters, rows: int) -> _Frame:
 
 @cache
 def _bit_tables(kind: RngKind, steps_per_clock: int, prob_bits: int) -> Words:
-    """The maps from a state to the next 64 cycles of each bit shown: uint64[prob_bits, bits / 8, 256]."""
+    """The map from a state to a block of each bit shown: uint64[prob_bits, bits / 4, 16, _BLOCK_WORDS].
+
+    Like `machines.rng.map_tables`, but with a table per 4 bits of the state, so that all of them stay in the
+    processor's nearest caches.
+    """
     clock = jump_tables(kind, steps_per_clock)[0]
-    states = np.uint64(1) << np.arange(LFSR(kind).bits, dtype=np.uint64)
-    images = np.zeros((prob_bits, len(states)), dtype=np.uint64)
+    bits = LFSR(kind).bits
+    states = np.uint64(1) << np.arange(bits, dtype=np.uint64)
     shifts = np.arange(prob_bits, dtype=np.uint64)[:, np.newaxis]
-    for cycle in range(_WORD_BITS):
-        images |= ((states >> shifts) & np.uint64(1)) << np.uint64(cycle)
+    images = np.zeros((prob_bits, bits, _BLOCK_WORDS), dtype=np.uint64)
+    for cycle in range(_BLOCK_CYCLES):
+        word, place = divmod(cycle, _WORD_BITS)
+        images[:, :, word] |= ((states >> shifts) & np.uint64(1)) << np.uint64(place)
         states = apply_map(clock, states)
-    return np.stack([map_tables(image) for image in images])
+    tables = np.zeros((prob_bits, bits // 4, 16, _BLOCK_WORDS), dtype=np.uint64)
+    for j in range(bits):
+        table, half = tables[:, j // 4], 1 << (j % 4)
+        table[:, half : 2 * half] = table[:, :half] ^ images[:, j, np.newaxis]
+    return tables
 
 
 # What follows is machine code. Types are the same for every machine (contiguous arrays, int64 and uint64), so it
@@ -321,7 +337,9 @@ def _bit_tables(kind: RngKind, steps_per_clock: int, prob_bits: int) -> Words:
 
 _0: Final = np.uint64(0)
 _1: Final = np.uint64(1)
+_4: Final = np.uint64(4)
 _8: Final = np.uint64(8)
+_DIGIT: Final = np.uint64(15)
 _BYTE: Final = np.uint64(255)
 _ALL: Final = np.uint64(2**64 - 1)
 
@@ -410,11 +428,11 @@ _popcount = cast("Callable[[np.uint64], int]", intrinsic(_popcount_code))
 
 
 @_jit
-def _image(tables: Words, state: np.uint64) -> np.uint64:
-    """The image of a state under a linear map."""
+def _image(maps: Words, which: int, state: np.uint64) -> np.uint64:
+    """The image of a state under one of some linear maps."""
     image = _0
-    for byte in range(tables.shape[0]):
-        image ^= tables[byte, state & _BYTE]
+    for byte in range(maps.shape[1]):
+        image ^= maps[which, byte, state & _BYTE]
         state >>= _8
     return image
 
@@ -426,7 +444,7 @@ def _jump(jumps: Words, states: Words, clocks: int, later: Words) -> None:
         state = states[column]
         for bit in range(jumps.shape[0]):
             if (clocks >> bit) & 1:
-                state = _image(jumps[bit], state)
+                state = _image(jumps, bit, state)
         later[column] = state
 
 
@@ -475,12 +493,16 @@ def _select(
 def _show(generators: _Generators, frame: _Frame, clocks: int) -> None:
     """Make a block's words of all bits that the generators show, inverted, from so many clocks on."""
     _jump(generators.jumps, frame.starts, clocks, frame.states)
-    for column in range(frame.states.shape[0]):
-        state = frame.states[column]
-        for word in range(_BLOCK_WORDS):
-            for bit in range(generators.bits.shape[0]):
-                frame.inverted[column, bit, word] = ~_image(generators.bits[bit], state)
-            state = _image(generators.jumps[_WORD_JUMP], state)
+    for column in range(frame.inverted.shape[0]):
+        for bit in range(frame.inverted.shape[1]):
+            state = frame.states[column]
+            for word in range(_BLOCK_WORDS):
+                frame.inverted[column, bit, word] = _ALL
+            for digit in range(generators.bits.shape[1]):
+                value = state & _DIGIT
+                for word in range(_BLOCK_WORDS):
+                    frame.inverted[column, bit, word] ^= generators.bits[bit, digit, value, word]
+                state >>= _4
 
 
 @_jit
@@ -542,7 +564,7 @@ def _run(
         shown = False
         for i in range(used):
             row = frame.used[i]
-            if keep and filled[row]:
+            if filled[row]:
                 continue
             if not shown:
                 _show(generators, frame, (block * _BLOCK_CYCLES) % period)

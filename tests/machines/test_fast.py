@@ -166,3 +166,13 @@ def test_a_forked_process_has_the_kernel_loaded():
     child.start()
     assert answers.get(timeout=30) == (compiled, kernel.cycles, kernel.counts.tolist())
     child.join(10)
+
+
+def test_where_nothing_can_be_cached_it_is_compiled_all_the_same(monkeypatch):
+    def njit(*, cache=False, nogil=False):
+        if cache:
+            raise RuntimeError("cannot cache function: no locator available")
+        return lambda function: (function, nogil)
+
+    monkeypatch.setattr(fast, "njit", njit)
+    assert fast._jit(abs) == (abs, True)
