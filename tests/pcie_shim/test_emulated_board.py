@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from machines.bm1 import CYCLES_MAX, Start, StopReason
+from machines.bm1 import CYCLES_MAX, BM1Kernel, Start, StopReason
 from machines.kernel import make_kernel
 from machines.parameters import PriorMode, RngKind, RngReset
 from pcie_shim import emulated_board
@@ -230,45 +230,47 @@ def test_chunks_and_slices_do_not_change_a_bit(data: st.DataObject) -> None:
         rng_reset=data.draw(st.sampled_from(RngReset)),
         prior_bits=data.draw(st.integers(0, 1)),
     )
-    parameters = of.parameters
-    board = EmulatedBoard()
-    board.load(image_bytes(image(of)))
-    kernel = make_kernel(of)
-    for _ in range(2):
-        addresses = [data.draw(st.integers(0, (1 << bits) - 1)) for bits in parameters.sensor_bits]
-        target = data.draw(st.integers(1, 255))
-        max_cycles = data.draw(st.integers(1, 1500))
-        bank = data.draw(st.integers(0, 15))
-        prior = data.draw(st.integers(0, parameters.prior_addresses - 1))
-        ends = sorted(data.draw(st.sets(st.integers(1, 1500), max_size=3)))
-        kernel.start(
-            Start(
-                addresses=tuple(addresses),
-                target_count=target,
-                max_cycles=max_cycles,
-                bank=bank,
-                prior_address=prior,
-            )
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(emulated_board, "CHUNK_S", 1e-12)  # as short as chunks can be
+        board = EmulatedBoard()
+        board.load(image_bytes(image(of)))
+        kernel = make_kernel(of)
+        for _ in range(2):
+            compare_a_frame(data, board, kernel)
+
+
+def compare_a_frame(data: st.DataObject, board: EmulatedBoard, kernel: BM1Kernel) -> None:
+    parameters = kernel.machine.parameters
+    addresses = [data.draw(st.integers(0, (1 << bits) - 1)) for bits in parameters.sensor_bits]
+    target = data.draw(st.integers(1, 255))
+    max_cycles = data.draw(st.integers(1, 1500))
+    bank = data.draw(st.integers(0, 15))
+    prior = data.draw(st.integers(0, parameters.prior_addresses - 1))
+    ends = sorted(data.draw(st.sets(st.integers(1, 1500), max_size=3)))
+    kernel.start(
+        Start(
+            addresses=tuple(addresses),
+            target_count=target,
+            max_cycles=max_cycles,
+            bank=bank,
+            prior_address=prior,
         )
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(emulated_board, "CHUNK_S", 1e-12)  # as short as chunks can be
-            if addresses:
-                board.write(rm.SENSORS, words(*addresses))
-            configure(
-                board, target=target, max_cycles=max_cycles, bank=bank, prior=prior, until=(ends or [0])[0]
-            )
-            board.write(rm.START, words(following(board.done)))
-            rounds = finish(board)
-            for end in [*ends[1:], 0]:
-                if status(board)[1] is not StopReason.SLICE:
-                    break
-                board.write(rm.RUN_UNTIL, struct.pack("<QII", end, 0, following(board.done)))
-                rounds += finish(board)
-        assert board.read(rm.RESULTS, parameters.lines) == kernel.counts.tobytes()
-        assert read64(board, rm.CYCLES) == kernel.cycles
-        assert status(board)[1] is kernel.reason
-        assert np.array_equal(board._kernel.rng_state, kernel.rng_state)
-        assert rounds >= kernel.cycles // 64 - len(ends) - 1
+    )
+    if addresses:
+        board.write(rm.SENSORS, words(*addresses))
+    configure(board, target=target, max_cycles=max_cycles, bank=bank, prior=prior, until=(ends or [0])[0])
+    board.write(rm.START, words(following(board.done)))
+    rounds = finish(board)
+    for end in [*ends[1:], 0]:
+        if status(board)[1] is not StopReason.SLICE:
+            break
+        board.write(rm.RUN_UNTIL, struct.pack("<QII", end, 0, following(board.done)))
+        rounds += finish(board)
+    assert board.read(rm.RESULTS, parameters.lines) == kernel.counts.tobytes()
+    assert read64(board, rm.CYCLES) == kernel.cycles
+    assert status(board)[1] is kernel.reason
+    assert np.array_equal(board._kernel.rng_state, kernel.rng_state)
+    assert rounds >= kernel.cycles // 64 - len(ends) - 1
 
 
 def finish(board: EmulatedBoard) -> int:
