@@ -2,6 +2,7 @@
 #        └────────socket──── its programming port
 # What one host, a second one, one that vanishes, one that talks nonsense, and loaders get.
 import hashlib
+import socket
 import struct
 import time
 from collections.abc import Callable
@@ -186,6 +187,16 @@ def test_a_host_that_has_just_left_does_not_hold_the_board(folder: Path) -> None
     server._drop_host()
     server._drop_loader()
     stop.close()
+
+
+def test_a_host_whose_machine_is_gone_does_not_hold_the_board_for_ever() -> None:
+    endpoint = parse_endpoint(tcp_endpoint())
+    with listen(endpoint) as server, connect(endpoint, timeout=1):
+        connection = board_module._Connection(server.accept()[0]).socket
+        assert connection.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE)
+        assert connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE) == board_module.KEEPALIVE_S
+        assert connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
+        connection.close()
 
 
 @pytest.mark.parametrize(
