@@ -34,6 +34,8 @@ _LOG: Final = logging.getLogger(__name__)
 
 SEND_S: Final = 5.0
 """Seconds that a host may leave what the board sends unread, before it loses its link."""
+KEEPALIVE_S: Final = 5
+"""Seconds between questions to a silent TCP host whether its machine is still there; three without answer end it."""
 PROGRAMMING_SILENCE_S: Final = 10.0
 """Seconds that a loader may say nothing, before another may program the board."""
 
@@ -110,6 +112,12 @@ class _Connection:
 
     def __init__(self, connection: socket.socket) -> None:
         no_delay(connection)
+        if connection.family != socket.AF_UNIX:
+            # a host whose machine or cable failed says nothing any more: it must not hold the board for ever
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, KEEPALIVE_S)
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, KEEPALIVE_S)
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT, 3)
         # the loop reads only what epoll announced; what it sends may take SEND_S
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, struct.pack("@ll", int(SEND_S), 0))
         self.socket = connection
