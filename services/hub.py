@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import logging
+import sys
 from typing import Annotated
 
 import typer
@@ -33,6 +35,9 @@ def hub(
     if host not in {"127.0.0.1", "::1", "localhost"} and not insecure:
         msg = f"--host {host} lets everybody on that network publish to your robot, and the hub knows no passwords; add --insecure if that is meant"
         raise SettingsError(msg)
+
+    # a refusal gets no word to its client (as at the reference server): the log is where it is seen
+    logging.basicConfig(level=logging.WARNING, stream=sys.stderr, format="hub: %(message)s")
 
     def ready(at: int) -> None:
         shown = f"[{host}]" if ":" in host else host
