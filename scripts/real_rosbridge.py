@@ -248,6 +248,9 @@ def main(arguments: list[str]) -> int:
     except RealServerError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        print("interrupted (Ctrl-C)", file=sys.stderr)
+        return 130
     return 0
 
 

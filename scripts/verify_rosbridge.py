@@ -141,9 +141,11 @@ class PlainClient:
                     self._news.clear()
                     await self._news.wait()
         except TimeoutError:
-            why = f"; the server said: {self.refused[-1]}" if self.refused else ""
+            numbers = [values_of(heard.msg)["number"] for heard in self.heard if heard.topic == FRAME_TOPIC]
             raise CheckError(
-                f"{self.count(RESULT_TOPIC)} of {count} results came on {RESULT_TOPIC} within {limit:g} s{why}"
+                f"{self.count(RESULT_TOPIC)} of {count} results came on {RESULT_TOPIC} within {limit:g} s; "
+                f"frames on {FRAME_TOPIC}: {', '.join(numbers) or 'none'}"
+                + (f"; the server said: {self.refused[-1]}" if self.refused else "")
             ) from None
 
     def count(self, topic: str) -> int:
@@ -607,6 +609,9 @@ def main() -> int:
         except real_rosbridge.RealServerError as error:
             print(f"error: {error}", file=sys.stderr)
             return 2
+        except KeyboardInterrupt:
+            print("interrupted (Ctrl-C)", file=sys.stderr)
+            return 130
     return run_script(lambda: verify(kinds), LIMIT)
 
 
