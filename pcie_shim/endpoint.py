@@ -69,6 +69,7 @@ def parse_endpoint(text: str) -> Endpoint:
     try:
         parts = urlsplit(text)
         host, port = parts.hostname, parts.port
+        (host or "").encode("idna")  # what the resolver will do, and fail with a UnicodeError (a ValueError)
     except ValueError:
         host, port = None, None
     if text.startswith("tcp://") and host and port and port < 65535 and text.count("/") == 2:

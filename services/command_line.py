@@ -14,7 +14,7 @@ from typing import Any, NoReturn, ParamSpec
 import typer
 import uvloop
 
-from services.errors import ExitCode, StoppedError, exit_code_of
+from services.errors import ExitCode, ReportedError, StoppedError, exit_code_of
 from services.logs import say
 from services.supervision import PARENT_VARIABLE
 
@@ -46,6 +46,7 @@ def ends_well(command: Callable[Parameters, int | None]) -> Callable[Parameters,
 
     @functools.wraps(command)
     def run(*args: Parameters.args, **kwargs: Parameters.kwargs) -> None:
+        _open_standard_streams()
         try:
             code = _outcome(functools.partial(command, *args, **kwargs))
         except StoppedError as stopped:  # a signal came while another end was being told
@@ -53,6 +54,19 @@ def ends_well(command: Callable[Parameters, int | None]) -> Callable[Parameters,
         raise typer.Exit(code)
 
     return run
+
+
+def _open_standard_streams() -> None:
+    """Put /dev/null where a standard stream was closed (`>&-`): an event loop would take its number."""
+    for number, (name, mode) in enumerate((("stdin", "r"), ("stdout", "w"), ("stderr", "w"))):
+        try:
+            os.fstat(number)
+        except OSError:
+            null = os.open(os.devnull, os.O_RDWR)
+            if null != number:
+                os.dup2(null, number)
+                os.close(null)
+            setattr(sys, name, os.fdopen(number, mode, closefd=False))
 
 
 def _outcome(command: Callable[[], int | None]) -> int:
@@ -68,7 +82,7 @@ def _outcome(command: Callable[[], int | None]) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except Exception as error:
         code = exit_code_of(error)
-        if code == ExitCode.BUG:
+        if code == ExitCode.BUG and not isinstance(error, ReportedError):
             say(traceback.format_exc().rstrip())
             say("error: this is a bug in rosbayes; please report it with the lines above")
         elif not isinstance(error, StoppedError):

@@ -21,6 +21,7 @@ from services.errors import (
     BoardFailedError,
     ChildDiedError,
     ExitCode,
+    OtherPeerError,
     ReportedError,
     RosbridgeLostError,
     ServiceError,
@@ -44,7 +45,7 @@ from services.records import (
     Trouble,
     Unusable,
 )
-from services.serving import deployment_for, endpoint_from
+from services.serving import board_endpoints, deployment_for, endpoint_from
 from services.settings import Settings, endpoint_in, load_settings
 from services.supervision import (
     RESTARTS,
@@ -64,6 +65,9 @@ RESULTS_UNDER_WAY = 8
 _CONNECT_EVERY = 0.01
 _RECONNECT_PATIENCE = 60.0
 _PROGRESS_EVERY = 1.0
+_ANSWER_TIME = 60.0
+"""Seconds that pcie-app or the publisher may take beyond their own limits, before they count as stuck."""
+_GRACE = 2.0
 
 
 class Peer:
@@ -78,6 +82,7 @@ class Peer:
         self.ready = False
         self.closed = asyncio.Event()
         self.reason: Exception | None = None
+        self.since = 0.0
 
 
 class Master:
@@ -102,6 +107,9 @@ class Master:
         self._failures: deque[float] = deque(maxlen=RESTARTS + 1)
         self._end: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self._began = False
+        self._heard = False
+        self._expecting: asyncio.Task[None] | None = None
+        self._published_at = 0.0
         self._directory: Path | None = None
         self._boards: Child | None = None
         self._peers: dict[str, Peer] = {}
@@ -128,7 +136,7 @@ class Master:
                 tasks.append(asyncio.ensure_future(self._show_progress()))
             await self._end
         finally:
-            for task in tasks:
+            for task in (*tasks, *([self._expecting] if self._expecting else [])):
                 task.cancel()
             await self._finish()
         return ExitCode.DONE
@@ -145,6 +153,8 @@ class Master:
         if not all(given.values()):
             self._directory = make_private_directory()
         directory = self._directory
+        if settings.boards or any(board.endpoint for board in deployment.boards):
+            board_endpoints(settings, deployment)  # a wrong list is told before anything starts
         common = ["--deployment", str(settings.deployment)]
         rosbridge = [*(["--uri", settings.uri] if settings.uri else [])]
         rosbridge += [
@@ -227,6 +237,12 @@ class Master:
     # --- processes -----------------------------------------------------------------------------
 
     async def _keep_boards(self, boards: Child) -> None:
+        try:
+            await self._restart_boards(boards)
+        except Exception as error:
+            self._fail(error)
+
+    async def _restart_boards(self, boards: Child) -> None:
         while True:
             await boards.ended()
             failure = boards.failure()
@@ -249,12 +265,49 @@ class Master:
                 while not closing.done():
                     if peer.child is not None:
                         peer.child.relay()
+                    self._check_stuck(peer)
                     await asyncio.wait([closing], timeout=0.05)
                 peer.protocol, peer.ready = None, False
                 self._lost(peer)
                 await self._again(peer)
-        except ServiceError as error:
+        except Exception as error:
             self._fail(error)
+
+    def _check_stuck(self, peer: Peer) -> None:
+        """A peer that is there but does not answer is treated as dead."""
+        settings = self._settings
+        now = time.monotonic()
+        what = ""
+        if not peer.greeted:
+            limit, since, what = settings.peer_timeout, peer.since, "greet"
+        elif not peer.ready:
+            limit = settings.connect_timeout + len(self._deployment.boards) * settings.peer_timeout
+            since, what = peer.since, "get ready"
+        elif peer.role == "pcie-app" and self._computing is not None:
+            limit, since = settings.board_timeout + _ANSWER_TIME, self._computing[3] / 1e9
+            what = f"answer frame {self._computing[0].number}"
+        elif peer.role == "publisher" and self._under_way:
+            limit, since, what = settings.seen_timeout + _ANSWER_TIME, self._published_at, "publish"
+        if not what or now - since <= limit:
+            return
+        sentence = f"{peer.role} at {peer.endpoint} did not {what} within {limit:g} s"
+        if self._once or peer.child is None:
+            self._fail(ChildDiedError(sentence))
+        else:
+            self._log.warning(f"{sentence}; ending it")
+        if peer.child is not None:
+            peer.child.kill()
+        elif peer.protocol is not None:
+            peer.protocol.close()
+        peer.since = now
+
+    async def _expect_data(self) -> None:
+        """The first reading, or a message that holds none, comes in time; the subscriber usually says so first."""
+        limit = self._settings.first_data_timeout
+        await asyncio.sleep(limit + _GRACE)
+        if not self._heard:
+            topics = ", ".join(source.topic for source in self._deployment.sources)
+            self._fail(RosbridgeLostError(f"no reading came from {topics} within {limit:g} s"))
 
     async def _connect(self, peer: Peer, patience: float) -> None:
         deadline = time.monotonic() + patience
@@ -268,6 +321,7 @@ class Master:
             )
 
         peer.greeted = False
+        peer.since = time.monotonic()
         peer.reason = None
         peer.closed.clear()
         while True:
@@ -284,6 +338,7 @@ class Master:
                     raise ChildDiedError(msg) from error
                 await asyncio.sleep(_CONNECT_EVERY)
             else:
+                peer.since = time.monotonic()
                 return
 
     def _lost(self, peer: Peer) -> None:
@@ -330,6 +385,14 @@ class Master:
             peer.closed.set()
 
     def _take(self, peer: Peer, protocol: RecordProtocol, record: AnyRecord) -> None:
+        try:
+            self._handle(peer, protocol, record)
+        except OtherPeerError:
+            raise
+        except Exception as error:  # a closed standard output, or a bug: neither may pass for a lost peer
+            self._fail(error)
+
+    def _handle(self, peer: Peer, protocol: RecordProtocol, record: AnyRecord) -> None:
         if isinstance(record, Trouble):
             self._fail(ReportedError(record.exit_code, f"{peer.role}: {record.sentence}"))
             return
@@ -364,6 +427,7 @@ class Master:
         # the publisher advertises before the subscriber subscribes: no result without a topic
         if not self._began and all(each.ready for each in self._peers.values()):
             self._began = True
+            self._expecting = asyncio.ensure_future(self._expect_data())
             for each in self._peers.values():
                 if each.role != "pcie-app" and each.protocol is not None:
                     each.protocol.send(Begin(self._once))
@@ -379,6 +443,7 @@ class Master:
             self._log.info(record.sentence)
 
     def _read(self, reading: Reading) -> None:
+        self._heard = True
         if self._once and self._number:
             return
         self._losses["passed over"] += reading.passed_over
@@ -390,6 +455,7 @@ class Master:
         self._next()
 
     def _unusable(self, record: Unusable) -> None:
+        self._heard = True
         if self._once:
             self._fail(VariableError(record.sentence))
             return
@@ -429,6 +495,8 @@ class Master:
             waited_ns=sent - arrived,
         )
         if publisher is not None and publisher.send(record):
+            if not self._under_way:
+                self._published_at = time.monotonic()
             self._under_way += 1
         else:
             self._losses["lost with the publisher"] += 1
@@ -456,6 +524,7 @@ class Master:
 
     def _was_published(self, record: Published) -> None:
         self._under_way = max(0, self._under_way - 1)
+        self._published_at = time.monotonic()
         if record.outcome == "published":
             self._published += 1
             self._print(record)
@@ -493,8 +562,14 @@ class Master:
                     "seen": record.seen,
                 }
             )
-            sys.stdout.buffer.write(line + b"\n")
-            sys.stdout.buffer.flush()
+            try:
+                sys.stdout.buffer.write(line + b"\n")
+                sys.stdout.buffer.flush()
+            except BrokenPipeError:
+                raise
+            except OSError as error:
+                msg = f"standard output can't be written: {error.strerror or error}"
+                raise ServiceError(msg) from error
         elif self._once:
             where = ", ".join(f"{label} = {value:g}" for label, value in cell.items())
             print(

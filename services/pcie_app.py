@@ -33,7 +33,7 @@ from services.local_socket import BlockingRecordSocket, check_hello, own_hello
 from services.logs import say
 from services.records import BoardOutcome, Frame, FrameFailed, FrameResult, Notice, Ready, Record, Trouble
 from services.results import REASON_WORDS, counts_of
-from services.serving import deployment_for, endpoint_from
+from services.serving import board_endpoints, deployment_for, endpoint_from
 from services.settings import Settings, load_settings
 from services.supervision import end_with_parent, leave_private_directory
 from toolchain.deployment import Deployment
@@ -299,22 +299,6 @@ def compute_lines(boards: Boards, banks: int) -> int:
     finally:
         boards.close()
     return 0
-
-
-def board_endpoints(settings: Settings, deployment: Deployment) -> list[Endpoint]:
-    """Where the boards are: the settings' list, else the deployment's own endpoints.
-
-    Raises:
-        SettingsError: a board has no endpoint, or there are too few or too many.
-    """
-    texts = settings.boards or tuple(board.endpoint for board in deployment.boards)
-    if len(texts) != len(deployment.boards):
-        msg = f"--boards names {len(texts)} of the deployment's {len(deployment.boards)} boards; name each once, in the order of the partitions"
-        raise SettingsError(msg)
-    if not all(texts):
-        msg = "the deployment names no endpoints of boards; give --boards ENDPOINT,... (start some with: board --boards 4 --directory DIR)"
-        raise SettingsError(msg)
-    return [endpoint_from(text, "--boards") for text in texts]
 
 
 app = make_app(

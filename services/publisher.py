@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import os
+import stat
 import sys
 import time
 from collections.abc import AsyncIterator
@@ -14,6 +16,7 @@ import typer
 
 from bridge.client import Publication, Ros, State, Subscription, connect
 from bridge.errors import BridgeError, NoMessageError
+from machines.bm1 import StopReason
 from services import options
 from services.command_line import ends_well, make_app, run_async
 from services.errors import InputLineError, SettingsError, exit_code_of
@@ -36,6 +39,10 @@ from toolchain.deployment import Deployment
 ROLE = "publisher"
 RESULTS_DEPTH = 64
 """Results that may wait for the rosbridge server; the master keeps fewer than that under way."""
+
+
+LINE_LIMIT = 1 << 24
+"""Bytes of the longest line on standard input."""
 
 
 class ResultTopics:
@@ -204,15 +211,22 @@ async def _lines() -> AsyncIterator[bytes]:
 
     A pipe or a terminal; regular files are read at once.
     """
-    loop = asyncio.get_running_loop()
-    reader = asyncio.StreamReader(limit=1 << 24)
-    try:
-        await loop.connect_read_pipe(lambda: asyncio.StreamReaderProtocol(reader), sys.stdin)
-    except (ValueError, OSError):
-        for line in sys.stdin.buffer:
+    kind = os.fstat(sys.stdin.fileno()).st_mode
+    if not (stat.S_ISFIFO(kind) or stat.S_ISSOCK(kind)):
+        while line := await asyncio.to_thread(sys.stdin.buffer.readline):
             yield line
         return
-    while line := await reader.readline():
+    loop = asyncio.get_running_loop()
+    reader = asyncio.StreamReader(limit=LINE_LIMIT)
+    await loop.connect_read_pipe(lambda: asyncio.StreamReaderProtocol(reader), sys.stdin)
+    while True:
+        try:
+            line = await reader.readline()
+        except ValueError as error:
+            msg = f"a line of standard input is longer than {LINE_LIMIT} bytes; expected one result a line"
+            raise InputLineError(msg) from error
+        if not line:
+            return
         yield line
 
 
@@ -230,7 +244,7 @@ def result_from_line(line: bytes, number: int, lines: int) -> tuple[FrameResult,
             BoardOutcome(
                 b"".join(int(count).to_bytes(4, "little") for count in board["counts"]),
                 int(board["cycles"]),
-                int(board["reason"]),
+                StopReason(int(board["reason"])),
             )
             for board in value["boards"]
         ]

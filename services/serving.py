@@ -17,6 +17,9 @@ from services.settings import Settings
 from services.supervision import leave_private_directory
 from toolchain.deployment import Deployment, load_deployment
 
+GREETING_TIME = 5.0
+"""Seconds that who connects has to greet, before the place is free for another."""
+
 
 class MasterLink:
     """Listens for a master, greets it, and passes its records on.
@@ -66,15 +69,20 @@ class MasterLink:
 
     def _open(self, protocol: RecordProtocol) -> None:
         if self._master is not None:
-            protocol.send(Trouble(2, f"the {self._role} at {self._endpoint} serves another master already"))
-            protocol.close()
-            return
+            return  # it is told so when it greets: what is sent before might never be read
         self._master = protocol
         self._greeted = False
         protocol.send(own_hello(self._role, self._hash))
+        asyncio.get_running_loop().call_later(GREETING_TIME, self._check_greeted, protocol)
+
+    def _check_greeted(self, protocol: RecordProtocol) -> None:
+        if protocol is self._master and not self._greeted:
+            protocol.close()
 
     def _take(self, protocol: RecordProtocol, record: AnyRecord) -> None:
         if protocol is not self._master:
+            protocol.send(Trouble(2, f"the {self._role} at {self._endpoint} serves another master already"))
+            protocol.close()
             return
         if not self._greeted:
             try:
@@ -92,6 +100,11 @@ class MasterLink:
     def _closed(self, protocol: RecordProtocol, _: Exception | None) -> None:
         if protocol is self._master:
             self._master = None
+
+    @property
+    def has_master(self) -> bool:
+        """Whether a master is connected and has greeted."""
+        return self._master is not None and self._greeted
 
     @property
     def backlog(self) -> int:
@@ -136,3 +149,23 @@ def deployment_for(settings: Settings, *, images: bool = False) -> Deployment:
         msg = "no deployment was given: use --deployment DIR (or BM_DEPLOYMENT), with a folder that `toolchain build` wrote"
         raise SettingsError(msg)
     return load_deployment(settings.deployment, images=images)
+
+
+def board_endpoints(settings: Settings, deployment: Deployment) -> list[Endpoint]:
+    """Where the boards are: the settings' list, else the deployment's own endpoints.
+
+    Raises:
+        SettingsError: a board has no endpoint, or there are too few or too many.
+    """
+    texts = settings.boards or tuple(board.endpoint for board in deployment.boards)
+    if len(texts) != len(deployment.boards):
+        msg = f"--boards names {len(texts)} of the deployment's {len(deployment.boards)} boards; name each once, in the order of the partitions"
+        raise SettingsError(msg)
+    if not all(texts) and any(texts):
+        msg = f"{deployment.path} names endpoints of some boards only; name all of them, or none (then the master starts emulated ones)"
+        raise SettingsError(msg)
+    if not all(texts):
+        msg = "the deployment names no endpoints of boards; give --boards ENDPOINT,... (start some with: board --boards 4 --directory DIR)"
+        raise SettingsError(msg)
+    where = "--boards" if settings.boards else f"{deployment.path}, [[board]] endpoint"
+    return [endpoint_from(text, where) for text in texts]

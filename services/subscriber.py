@@ -59,7 +59,7 @@ class Subscriber:
     def _state_changed(self, uri: str, state: State, reason: str) -> None:
         if state is State.RECONNECTING:
             self._link.notice("warning", f"rosbridge at {uri} is gone ({reason}); waiting for it")
-            if self._once and self._lost is not None and not self._lost.done():
+            if self._once and self._link.has_master and self._lost is not None and not self._lost.done():
                 self._lost.set_exception(
                     RosbridgeLostError(f"rosbridge at {uri} went away before a reading came ({reason})")
                 )
@@ -154,6 +154,9 @@ class Subscriber:
             return
         if self._link.send(_reading_record(reading, self._passed_over)):
             self._passed_over = 0
+            self._once = (
+                False  # its frame is on its way; what comes later must not end a service that goes on
+            )
 
 
 def _reading_record(reading: CompleteReading, passed_over: int) -> Reading:

@@ -49,6 +49,11 @@ def ask_for_end_with_parent() -> None:
     ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
 
 
+def _end_early(_number: int, _frame: object) -> None:
+    leave_private_directory()
+    os._exit(ExitCode.TERMINATED)
+
+
 def end_with_parent() -> None:
     """In a child: have the kernel send SIGTERM when the parent ends, even by SIGKILL.
 
@@ -57,10 +62,12 @@ def end_with_parent() -> None:
     parent = os.environ.get(PARENT_VARIABLE)
     if parent is None or not parent.isdigit():
         return
+    # until the command has its own handlers, an early end still takes the run's directory away
+    signal.signal(signal.SIGTERM, _end_early)
     ask_for_end_with_parent()
     # the parent may have ended before the kernel was told
     if os.getppid() != int(parent):
-        raise SystemExit(ExitCode.TERMINATED)
+        _end_early(signal.SIGTERM, None)
 
 
 def leave_private_directory() -> None:
@@ -82,7 +89,10 @@ def own_command(name: str) -> list[str]:
 def how_it_ended(code: int | None) -> str:
     """A process's exit code in words: the signal that killed it, or the code itself."""
     if code is not None and code < 0:
-        return f"was killed by {signal.Signals(-code).name}"
+        try:
+            return f"was killed by {signal.Signals(-code).name}"
+        except ValueError:  # real-time signals have no names
+            return f"was killed by signal {-code}"
     return f"ended by itself with exit code {code}"
 
 

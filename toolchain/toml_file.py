@@ -53,7 +53,7 @@ def parse_toml(text: str, path: Path, error: type[ToolchainError]) -> dict[str, 
     """
     try:
         return tomllib.loads(text)
-    except tomllib.TOMLDecodeError as reason:
+    except (tomllib.TOMLDecodeError, RecursionError) as reason:
         sentence = str(reason)
         place = _PLACE.search(sentence)
         line = (place and place[1]) or str(text.count("\n") + 1)
