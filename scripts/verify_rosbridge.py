@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import asyncio
 import contextlib
+import fcntl
 import hashlib
 import json
 import math
@@ -18,7 +19,7 @@ import signal
 import socket
 import sys
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -569,30 +570,48 @@ async def run_checks(stand: Stand, tally: Tally) -> None:
         await stand.stop_server()
 
 
+@contextlib.contextmanager
+def only_one() -> Iterator[None]:
+    """Hold what no second verification in this folder may hold: they would overwrite each other's deployments.
+
+    Raises:
+        ServiceError: another one runs.
+    """
+    OUT.parent.mkdir(exist_ok=True)
+    with OUT.with_suffix(".lock").open("w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            msg = f"another scripts/verify runs, and writes to {OUT}: wait for its end"
+            raise ServiceError(msg) from None
+        yield
+
+
 async def verify(kinds: list[str]) -> int:
     """Build the deployments once, then run all checks on each server with them."""
-    shutil.rmtree(OUT, ignore_errors=True)
-    OUT.mkdir(parents=True)
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    deployments = {form: OUT / f"deployment-{form}" for form in ARRAY_TYPES}
-    for form, folder in deployments.items():
-        await build(
-            "boat", folder, f"ws://127.0.0.1:{port}", BOAT_TOPIC, ARRAY_TYPES[form], "--set", "array=true"
+    with only_one():
+        shutil.rmtree(OUT, ignore_errors=True)
+        OUT.mkdir()
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            port = free.getsockname()[1]
+        deployments = {form: OUT / f"deployment-{form}" for form in ARRAY_TYPES}
+        for form, folder in deployments.items():
+            await build(
+                "boat", folder, f"ws://127.0.0.1:{port}", BOAT_TOPIC, ARRAY_TYPES[form], "--set", "array=true"
+            )
+        before = bytes_of(deployments)
+        tally = Tally()
+        for kind in kinds:
+            folder = OUT / kind
+            folder.mkdir()
+            await run_checks(Stand(KINDS[kind], port, folder, deployments), tally)
+        changed = None if bytes_of(deployments) == before else "a run changed a file of a deployment"
+        tally.tell(
+            f"the deployments are as built, byte for byte ({' and '.join(kinds)})", time.monotonic(), changed
         )
-    before = bytes_of(deployments)
-    tally = Tally()
-    for kind in kinds:
-        folder = OUT / kind
-        folder.mkdir()
-        await run_checks(Stand(KINDS[kind], port, folder, deployments), tally)
-    changed = None if bytes_of(deployments) == before else "a run changed a file of a deployment"
-    tally.tell(
-        f"the deployments are as built, byte for byte ({' and '.join(kinds)})", time.monotonic(), changed
-    )
-    print(f"{tally.passed} passed, {tally.failed} failed")
-    return 1 if tally.failed else 0
+        print(f"{tally.passed} passed, {tally.failed} failed")
+        return 1 if tally.failed else 0
 
 
 def main() -> int:
