@@ -234,7 +234,7 @@ class FastBM1:
 
 
 def warm_up() -> None:
-    """Compile, or load from the cache, all that runs in machine code: about 10 s the first time, then 0.1 s."""
+    """Compile, or load from the cache, all that runs in machine code: some 5 s the first time, then 0.2 s."""
     parameters = BM1Parameters(lines=1, sensor_bits=(), rng=RngKind.LFSR16)
     kernel = FastBM1(BM1Machine(parameters, np.full((1, 1), 128, dtype=np.uint16), ()))
     kernel.start(Start(addresses=(), target_count=1, max_cycles=1))
