@@ -1,15 +1,17 @@
 """Beginnings and ends: whatever happens to a run, its processes end, and one sentence says what happened."""
 
 import asyncio
+import json
 import os
 import pty
 import re
 import signal
+import socket
 import time
 
 import pytest
 
-from tests.integration.conftest import BIN, READING, Robot
+from tests.integration.conftest import BIN, MARK, READING, Robot
 
 LOOP = ("master", "--loop", "--connect-timeout", "3")
 
@@ -224,3 +226,54 @@ async def test_the_subscriber_alone_prints_what_it_finds(stage, boat):
         )
         assert await alone.end() == 0, alone.err
         assert alone.out == f'{{"D1":{READING["D1"]},"header.frame_id":"map"}}\n' * 2
+
+
+async def shell(stage, command: str, timeout: float = 30) -> tuple[int, str, str]:
+    """A command as a shell runs it, with the test's marks: exit code, standard output, standard error."""
+    process = await asyncio.create_subprocess_shell(
+        f"set -o pipefail; cd {stage.where}; {command}",
+        executable="/bin/bash",
+        env=dict(os.environ) | {MARK: stage.run, "TMPDIR": str(stage.where), "PATH": f"{BIN}:/usr/bin:/bin"},
+        stdout=asyncio.subprocess.PIPE,
+        stderr=asyncio.subprocess.PIPE,
+    )
+    out, err = await asyncio.wait_for(process.communicate(), timeout)
+    return process.returncode, out.decode(), err.decode()
+
+
+@pytest.mark.parametrize(
+    ("redirection", "code"), [("--json | head -1", 0), (">&-", 143), ("2>&-", 143), ("--json >/dev/full", 2)]
+)
+async def test_closed_and_full_streams_leave_no_run_behind(stage, boat, redirection, code):
+    _, uri = await stage.hub()
+    async with Robot(uri) as robot:
+        await robot.keep_publishing()
+        limit = "timeout 8 " if code == 143 else ""
+        command = f"{limit}master --loop -d {boat} --uri {uri} {redirection}"
+        ended, _, err = await shell(stage, f"{command}; exit $?")
+        assert ended in {code, 124 if limit else code}, err
+        assert "Traceback" not in err
+        await robot.have(1)
+        await stage.nothing_left("hub")
+
+
+async def test_a_peer_that_says_nothing_is_given_up(stage, boat):
+    _, uri = await stage.hub()
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        endpoint = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
+        master = stage.start(
+            *("master", "--once", "-d", str(boat), "--uri", uri, "--peer-timeout", "4"),
+            environment={"BM_SUBSCRIBER": endpoint},
+        )
+        assert await master.end(20) == 6, master.err
+    assert f"subscriber at {endpoint} did not greet within 4 s" in master.err
+    await stage.nothing_left("hub")
+
+
+async def test_results_from_a_file_are_published(stage, boat):
+    _, uri = await stage.hub()
+    async with Robot(uri) as robot:
+        (stage.where / "results").write_text(json.dumps([1 / 64] * 64) + "\n")
+        code, _, err = await shell(stage, f"publisher -d {boat} --uri {uri} < results")
+        assert code == 0, err
+        await robot.have(1)
