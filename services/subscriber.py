@@ -14,7 +14,7 @@ import orjson
 import typer
 from pydantic import ValidationError
 
-from bridge.client import Message, Ros, State, connect
+from bridge.client import Message, Ros, State, Subscription, connect
 from bridge.errors import BridgeError, NoMessageError
 from bridge.fields import Field
 from services import options
@@ -31,8 +31,26 @@ from toolchain.deployment import Deployment, Source
 
 ROLE = "subscriber"
 _RECEIVED_QUEUE = 64
+_BURST_PAUSE = 0.02
+"""Seconds of silence after which what a server kept from before the subscription is through."""
+_BURST_LIMIT = 0.1
 _BACKLOG_LIMIT = min(1 << 18, MAX_RECORD)
 """Bytes that may wait for the master; beyond, readings are passed over (queue = latest) and counted."""
+
+
+async def newest_now(subscription: Subscription, message: Message) -> tuple[Message, int]:
+    """The newest of a subscription's first messages, and how many older ones came with it.
+
+    ROS 2 servers begin with what was published before the subscription, the oldest first, in one burst.
+    """
+    older = 0
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(_BURST_LIMIT):
+            while True:
+                async with asyncio.timeout(_BURST_PAUSE):
+                    message = await anext(subscription)
+                older += 1
+    return message, older
 
 
 class Subscriber:
@@ -123,6 +141,7 @@ class Subscriber:
         )
         timeout = self._settings.first_data_timeout
         first = True
+        connection: int | None = None
         lost_before = 0
         while True:
             try:
@@ -133,6 +152,10 @@ class Subscriber:
                 self._link.notice("warning", str(error))
                 continue
             first = False
+            if connection != ros.reconnections and not self._queue_all:
+                connection = ros.reconnections
+                message, older = await newest_now(subscription, message)
+                self._passed_over += older
             self._passed_over += subscription.lost - lost_before
             lost_before = subscription.lost
             self._forward(at, message)
