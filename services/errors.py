@@ -48,6 +48,12 @@ class OtherPeerError(ServiceError):
     """The process at the other end of a local socket is not the one that belongs there."""
 
 
+class NoDataError(ServiceError):
+    """No reading came within the time that the first one may take."""
+
+    exit_code = ExitCode.ROSBRIDGE
+
+
 class RosbridgeLostError(ServiceError):
     """The rosbridge server went away in a run that does not wait for it."""
 

@@ -21,6 +21,7 @@ from services.errors import (
     BoardFailedError,
     ChildDiedError,
     ExitCode,
+    NoDataError,
     OtherPeerError,
     ReportedError,
     RosbridgeLostError,
@@ -307,7 +308,7 @@ class Master:
         await asyncio.sleep(limit + _GRACE)
         if not self._heard:
             topics = ", ".join(source.topic for source in self._deployment.sources)
-            self._fail(RosbridgeLostError(f"no reading came from {topics} within {limit:g} s"))
+            self._fail(NoDataError(f"no reading came from {topics} within {limit:g} s"))
 
     async def _connect(self, peer: Peer, patience: float) -> None:
         deadline = time.monotonic() + patience

@@ -6,7 +6,6 @@ import asyncio
 import contextlib
 import sys
 import time
-from collections import Counter
 from functools import partial
 from typing import Annotated, Any
 
@@ -22,7 +21,7 @@ from services.command_line import ends_well, make_app, run_async
 from services.errors import RosbridgeLostError, SettingsError, VariableError, exit_code_of
 from services.frames import CompleteReading, FrameAssembler
 from services.local_socket import MAX_RECORD
-from services.logs import get_logger, say
+from services.logs import say
 from services.records import AnyRecord, Begin, Reading, Ready, Trouble, Unusable
 from services.serving import MasterLink, deployment_for, endpoint_from
 from services.settings import Settings, load_settings
@@ -64,9 +63,7 @@ class Subscriber:
         self._begun = asyncio.Event()
         self._once = False
         self._passed_over = 0
-        self._causes: Counter[str] = Counter()
         self._link = MasterLink(endpoint_from(listen, "--listen"), ROLE, deployment.hash, self._take)
-        self._log = get_logger(ROLE)
         self._lost: asyncio.Future[None] | None = None
 
     def _take(self, record: AnyRecord) -> None:
@@ -167,7 +164,6 @@ class Subscriber:
             )
         except VariableError as error:
             cause = f"{type(error.__cause__).__name__} {at}"
-            self._causes[cause] += 1
             self._link.send(Unusable(cause, str(error)))
             return
         if reading is None:
