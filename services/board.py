@@ -20,7 +20,8 @@ from services.command_line import ends_well, make_app, raise_on_signals
 from services.errors import BoardFailedError, SettingsError, exit_code_of
 from services.logs import say
 from services.serving import endpoint_from
-from services.settings import endpoint_in
+from services.settings import endpoint_in, load_settings
+from services.status_socket import BoardStatus, ProcessStatus, status_thread
 from services.supervision import (
     PARENT_VARIABLE,
     RESTARTS,
@@ -28,11 +29,22 @@ from services.supervision import (
     end_with_parent,
     how_it_ended,
     leave_private_directory,
+    remove_dead_sockets,
 )
 
 
-def serve_one(endpoint: Endpoint, index: int, misbehave: Misbehaviour | None) -> int:
-    """Serve one board in this process until a signal; gives the signal's exit code."""
+def serve_one(
+    endpoint: Endpoint, index: int, misbehave: Misbehaviour | None, directory: Path | None, restarts: int = 0
+) -> int:
+    """Serve one board in this process until a signal; gives the signal's exit code.
+
+    Args:
+        endpoint: where its registers are.
+        index: the board's number.
+        misbehave: what it does wrong, for tests.
+        directory: where its status socket goes, if anywhere.
+        restarts: how often it was started again before.
+    """
     stop = StopSignal()
     ended_by: list[int] = []
 
@@ -42,17 +54,33 @@ def serve_one(endpoint: Endpoint, index: int, misbehave: Misbehaviour | None) ->
 
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, end)
-    serve_board(endpoint, index=index, stop=stop, misbehave=misbehave)
+    listening: list[str] = []
+
+    def tell() -> ProcessStatus:
+        state = "listening" if listening else "starting"
+        board = BoardStatus(index=index, endpoint=str(endpoint), state=state, restarts=restarts)
+        return ProcessStatus(ready=bool(listening), why=f"{state} at {endpoint}", boards=[board])
+
+    with status_thread(directory, f"board{index}", tell):
+        serve_board(
+            endpoint,
+            index=index,
+            stop=stop,
+            misbehave=misbehave,
+            on_ready=lambda: listening.append(str(endpoint)),
+        )
     return ended_by[0] if ended_by else 0
 
 
 class BoardProcesses:
     """Boards 0 to n-1, each a process forked from this one."""
 
-    def __init__(self, directory: Path, count: int, restarts: int) -> None:
+    def __init__(self, directory: Path, count: int, restarts: int, run_directory: Path | None) -> None:
         self._endpoints = [endpoint_in(directory, f"board{at}") for at in range(count)]
         self._restarts = restarts
+        self._run_directory = run_directory
         self._started: dict[int, int] = {}
+        self._starts = [0] * count
         self._ends: list[float] = []
 
     def run(self) -> NoReturn:
@@ -79,6 +107,7 @@ class BoardProcesses:
 
     def _fork(self, at: int) -> None:
         parent = os.getpid()
+        self._starts[at] += 1
         pid = os.fork()
         if pid:
             self._started[pid] = at
@@ -87,7 +116,9 @@ class BoardProcesses:
         try:
             os.environ[PARENT_VARIABLE] = str(parent)
             end_with_parent()
-            code = serve_one(self._endpoints[at], at, None)
+            code = serve_one(
+                self._endpoints[at], at, None, self._run_directory, restarts=self._starts[at] - 1
+            )
         except BaseException as error:  # the fork must never run on in its parent's code
             code = exit_code_of(error)
             say(f"error: board {at}: {error}")
@@ -126,6 +157,8 @@ class BoardProcesses:
                 os.kill(pid, signal.SIGKILL)
         for at in range(len(self._endpoints)):
             self._forget(self._endpoints[at])
+        if self._run_directory is not None:
+            remove_dead_sockets(self._run_directory)
 
     def _forget(self, endpoint: Endpoint) -> None:
         # a board that was killed could not take its sockets away
@@ -160,6 +193,7 @@ def board(
     """Emulate boards of the mini-cluster."""
     end_with_parent()
     raise_on_signals()
+    run_directory = load_settings().run_directory
     if (listen is None) == (boards is None):
         msg = "give either --listen ENDPOINT for one board, or --boards N --directory DIR for several"
         raise SettingsError(msg)
@@ -170,12 +204,12 @@ def board(
         if directory is None or not directory.is_dir():
             msg = f"--directory {directory or ''} is no folder; name one for the boards' sockets"
             raise SettingsError(msg)
-        BoardProcesses(directory, boards, restarts).run()
+        BoardProcesses(directory, boards, restarts, run_directory).run()
     wrong = Misbehaviour.parse(misbehave) if misbehave else None
     from machines.kernel import warm_up
 
     warm_up()
-    return serve_one(endpoint_from(listen or "", "--listen"), index, wrong)
+    return serve_one(endpoint_from(listen or "", "--listen"), index, wrong, run_directory)
 
 
 def main() -> None:

@@ -13,6 +13,8 @@ from bridge.hub.server import serve_hub
 from services.command_line import ends_well, make_app, run_async
 from services.errors import SettingsError
 from services.logs import say
+from services.settings import load_settings
+from services.status_socket import ProcessStatus, status_served
 from services.supervision import end_with_parent
 
 app = make_app(
@@ -39,12 +41,19 @@ def hub(
     # a refusal gets no word to its client (as at the reference server): the log is where it is seen
     logging.basicConfig(level=logging.WARNING, stream=sys.stderr, format="hub: %(message)s")
 
+    listening: list[str] = []
+
     def ready(at: int) -> None:
         shown = f"[{host}]" if ":" in host else host
-        say(f"hub: listening on ws://{shown}:{at}")
+        listening.append(f"listening on ws://{shown}:{at}")
+        say(f"hub: {listening[0]}")
+
+    def tell() -> ProcessStatus:
+        return ProcessStatus(ready=bool(listening), why=listening[0] if listening else "not listening yet")
 
     async def serve() -> int:
-        await serve_hub(host, port, on_ready=ready, stop=asyncio.Event())
+        async with status_served(load_settings().run_directory, "hub", tell):
+            await serve_hub(host, port, on_ready=ready, stop=asyncio.Event())
         return 0
 
     return run_async(serve())

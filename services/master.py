@@ -48,6 +48,14 @@ from services.records import (
 )
 from services.serving import board_endpoints, deployment_for, endpoint_from
 from services.settings import Settings, endpoint_in, load_settings
+from services.status_socket import (
+    FrameCounts,
+    PeerStatus,
+    ProcessStatus,
+    reasons,
+    seconds_since,
+    status_served,
+)
 from services.supervision import (
     RESTARTS,
     RESTARTS_WITHIN,
@@ -102,7 +110,9 @@ class Master:
         self._computing: tuple[Frame, Reading, int, int] | None = None
         self._under_way = 0
         self._number = 0
+        self._received = 0
         self._published = 0
+        self._last = (0, 0)
         self._losses: Counter[str] = Counter()
         self._told: set[str] = set()
         self._failures: deque[float] = deque(maxlen=RESTARTS + 1)
@@ -124,8 +134,11 @@ class Master:
             ServiceError: what ended the run, with its exit code.
         """
         tasks: list[asyncio.Task[None]] = []
+        status = contextlib.AsyncExitStack()
         try:
             self._prepare()
+            run_directory = self._settings.run_directory or self._directory
+            await status.enter_async_context(status_served(run_directory, ROLE, self.status))
             if self._boards is not None:
                 self._boards.start()
                 tasks.append(asyncio.ensure_future(self._keep_boards(self._boards)))
@@ -139,6 +152,7 @@ class Master:
         finally:
             for task in (*tasks, *([self._expecting] if self._expecting else [])):
                 task.cancel()
+            await status.aclose()
             await self._finish()
         return ExitCode.DONE
 
@@ -218,6 +232,45 @@ class Master:
             shutil.rmtree(self._directory, ignore_errors=True)
         if not self._once:
             say(self._summary())
+
+    def status(self) -> ProcessStatus:
+        """What this process knows: the run as a whole."""
+        number, tick = self._last
+        age = seconds_since(tick)
+        waiting = [peer.role for peer in self._peers.values() if not peer.ready]
+        if waiting:
+            why = f"waiting for {' and '.join(waiting)}"
+        elif age is None:
+            why = "no result yet: waiting for a complete reading"
+        elif age > self._settings.ready_timeout:
+            why = f"no result for {age:.0f} s"
+        else:
+            why = ""
+        peers = [
+            PeerStatus(
+                name=peer.role,
+                endpoint=str(peer.endpoint),
+                pid=peer.child.pid if peer.child else 0,
+                restarts=peer.child.restarts if peer.child else 0,
+                ready=peer.ready,
+            )
+            for peer in self._peers.values()
+        ]
+        lost = Counter(self._losses)
+        lost["passed over"] += self._waiting.passed_over
+        return ProcessStatus(
+            ready=not why,
+            why=why or "results flow",
+            deployment=self._deployment.hash,
+            peers=peers,
+            frames=FrameCounts(
+                received=self._received,
+                completed=self._published,
+                lost=reasons(lost),
+                last_number=number,
+                last_age_s=age,
+            ),
+        )
 
     def _summary(self) -> str:
         elapsed = time.monotonic() - self._started
@@ -447,6 +500,7 @@ class Master:
         self._heard = True
         if self._once and self._number:
             return
+        self._received += 1
         self._losses["passed over"] += reading.passed_over
         try:
             self._waiting.put((reading, time.monotonic_ns()))
@@ -528,6 +582,7 @@ class Master:
         self._published_at = time.monotonic()
         if record.outcome == "published":
             self._published += 1
+            self._last = (record.number, time.monotonic_ns())
             self._print(record)
             if record.seen is False:
                 say(

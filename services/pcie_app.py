@@ -35,6 +35,14 @@ from services.records import BoardOutcome, Frame, FrameFailed, FrameResult, Noti
 from services.results import REASON_WORDS, counts_of
 from services.serving import board_endpoints, deployment_for, endpoint_from
 from services.settings import Settings, load_settings
+from services.status_socket import (
+    BoardStatus,
+    FrameCounts,
+    ProcessStatus,
+    reasons,
+    seconds_since,
+    status_thread,
+)
 from services.supervision import end_with_parent, leave_private_directory
 from toolchain.deployment import Deployment
 
@@ -55,6 +63,7 @@ class Boards:
         self._endpoints = list(endpoints)
         self._cluster: MiniCluster | None = None
         self.gone: dict[int, str] = {}
+        self._times_gone = [0] * len(self._endpoints)
 
     def open(self) -> str:
         """Open all boards, programming blank ones; gives a sentence.
@@ -70,6 +79,22 @@ class Boards:
         )
         count = len(self._endpoints)
         return f"{count} {'board' if count == 1 else 'boards'} programmed and open"
+
+    def status(self, output: FrameOutput | None) -> list[BoardStatus]:
+        """What is known of each board, with its part of the last output; may be called by another thread."""
+        gone = dict(self.gone)
+        return [
+            BoardStatus(
+                index=at,
+                endpoint=str(endpoint),
+                state="not opened yet" if self._cluster is None else "gone" if at in gone else "programmed",
+                image=image.image_hash,
+                restarts=self._times_gone[at],
+                last_cycles=None if output is None else output.boards[at].cycles,
+                why=gone.get(at, ""),
+            )
+            for at, (endpoint, image) in enumerate(zip(self._endpoints, self._images, strict=True))
+        ]
 
     def run(self, frame: Frame) -> FrameOutput:
         """Compute one frame.
@@ -101,13 +126,17 @@ class Boards:
         if self._cluster is None:
             return
         if not self._cluster.is_open(error.board):
-            self.gone[error.board] = str(error)
+            self._is_gone(error.board, error)
         for board in range(len(self._endpoints)):
             if board != error.board and board not in self.gone:
                 try:
                     self._cluster.reopen(board, timeout=_TICK)
                 except BoardError as other:
-                    self.gone[board] = str(other)
+                    self._is_gone(board, other)
+
+    def _is_gone(self, board: int, error: BoardError) -> None:
+        self.gone[board] = str(error)
+        self._times_gone[board] += 1
 
     def mend(self) -> list[int]:
         """Try once to open the boards that are gone; the numbers of those that are back.
@@ -162,6 +191,8 @@ class PcieApp:
         self._master: BlockingRecordSocket | None = None
         self._greeted = False
         self._ready: Ready | None = None
+        self._asked = self._computed = self._failed = 0
+        self._last: tuple[int, int, FrameOutput] | None = None
         self._selector = selectors.DefaultSelector()
 
     def serve(self) -> int:
@@ -246,13 +277,41 @@ class PcieApp:
             master.send(Trouble(error.exit_code, str(error)))
             self._drop()
 
+    def status(self) -> ProcessStatus:
+        """What this process knows; called by the status socket's thread."""
+        number, tick, output = self._last or (0, 0, None)
+        gone = next(iter(dict(self._boards.gone).items()), None)
+        if self._ready is None:
+            why = "waiting for the boards to be opened and programmed"
+        elif gone is not None:
+            why = f"board {gone[0]} is gone ({gone[1]})"
+        else:
+            why = self._ready.sentence
+        return ProcessStatus(
+            ready=self._ready is not None and gone is None,
+            why=why,
+            deployment=self._hash,
+            boards=self._boards.status(output),
+            frames=FrameCounts(
+                received=self._asked,
+                completed=self._computed,
+                lost=reasons({"failed on a board": self._failed}),
+                last_number=number,
+                last_age_s=seconds_since(tick),
+            ),
+        )
+
     def _compute(self, frame: Frame) -> None:
+        self._asked += 1
         try:
             output = self._boards.run(frame)
         except BoardError as error:
+            self._failed += 1
             self._send(FrameFailed(frame.number, error.board, exit_code_of(error), str(error)))
         else:
             self._send(result_record(frame.number, output))
+            self._computed += 1
+            self._last = (frame.number, time.monotonic_ns(), output)
 
     def _mend_boards(self) -> None:
         for board in self._boards.mend():
@@ -332,7 +391,9 @@ def pcie_app(
     loaded = deployment_for(settings, images=True)
     opened = Boards(settings, loaded, board_endpoints(settings, loaded))
     if listen_at is not None:
-        return PcieApp(opened, loaded.hash, endpoint_from(listen_at, "--listen")).serve()
+        pcie = PcieApp(opened, loaded.hash, endpoint_from(listen_at, "--listen"))
+        with status_thread(settings.run_directory, ROLE, pcie.status):
+            return pcie.serve()
     if sys.stdin.isatty():
         msg = "pcie-app reads readings from standard input, which is a terminal: pipe them in, or use --listen (pcie-app --help)"
         raise SettingsError(msg)

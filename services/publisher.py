@@ -9,6 +9,7 @@ import os
 import stat
 import sys
 import time
+from collections import Counter
 from collections.abc import AsyncIterator
 from typing import Annotated, Any, Literal
 
@@ -34,6 +35,15 @@ from services.results import (
 )
 from services.serving import MasterLink, deployment_for, endpoint_from
 from services.settings import Settings, load_settings
+from services.status_socket import (
+    FrameCounts,
+    ProcessStatus,
+    connections,
+    reasons,
+    seconds_since,
+    status_served,
+    why_not_connected,
+)
 from services.supervision import end_with_parent
 from toolchain.deployment import Deployment
 
@@ -70,6 +80,7 @@ class ResultTopics:
         self._watched: Subscription | None = None
         self._ros_version: Literal[1, 2] = 2
         self._previous_out_ns = 0
+        self.rosbridges: dict[str, Ros] = {}
 
     @contextlib.asynccontextmanager
     async def opened(self, on_state: Any = None) -> AsyncIterator[str]:
@@ -80,7 +91,7 @@ class ResultTopics:
         """
         settings, deployment = self._settings, self._deployment
         async with contextlib.AsyncExitStack() as stack:
-            by_uri: dict[str, Ros] = {}
+            by_uri = self.rosbridges
             for output in deployment.outputs:
                 uri = settings.uri or deployment.output_uri(output)
                 if uri not in by_uri:
@@ -185,6 +196,32 @@ class Publisher:
         self._begun = asyncio.Event()
         self._once = False
         self._link = MasterLink(endpoint_from(listen, "--listen"), ROLE, deployment.hash, self._take)
+        self._deployment = deployment
+        self._run_directory = settings.run_directory
+        self._where = ""
+        self._outcomes: Counter[str] = Counter()
+        self._last = (0, 0)
+
+    def status(self) -> ProcessStatus:
+        """What this process knows."""
+        why = why_not_connected(self._topics.rosbridges)
+        if not why and not self._where:
+            why = "waiting for its topics to be advertised"
+        number, tick = self._last
+        outcomes = self._outcomes
+        return ProcessStatus(
+            ready=not why,
+            why=why or self._where,
+            deployment=self._deployment.hash,
+            connections=connections(self._topics.rosbridges),
+            frames=FrameCounts(
+                received=outcomes.total() + self._waiting.qsize(),
+                completed=outcomes["published"],
+                lost=reasons({reason: count for reason, count in outcomes.items() if reason != "published"}),
+                last_number=number,
+                last_age_s=seconds_since(tick),
+            ),
+        )
 
     def _take(self, record: AnyRecord) -> None:
         if isinstance(record, Begin):
@@ -196,6 +233,7 @@ class Publisher:
             try:
                 self._waiting.put_nowait(record)
             except asyncio.QueueFull:
+                self._outcomes["rosbridge away"] += 1
                 self._link.send(Published(record.result.number, "rosbridge away", None, -1, 0.0, 0, 0))
 
     def _state_changed(self, state: State, reason: str) -> None:
@@ -204,13 +242,18 @@ class Publisher:
 
     async def run(self) -> int:
         """Serve until a signal; raises what ends it."""
-        async with self._link:
+        async with self._link, status_served(self._run_directory, ROLE, self.status):
             try:
                 async with self._topics.opened(self._state_changed) as where:
+                    self._where = where
                     self._link.keep(Ready(where))
                     while True:
                         publish = await self._waiting.get()
-                        self._link.send(await self._topics.publish(publish, look=self._once))
+                        published = await self._topics.publish(publish, look=self._once)
+                        self._link.send(published)
+                        self._outcomes[published.outcome] += 1
+                        if published.outcome == "published":
+                            self._last = (published.number, time.monotonic_ns())
             except BridgeError as error:
                 for _ in range(100):
                     if self._link.send(Trouble(exit_code_of(error), str(error))):

@@ -47,6 +47,19 @@ class Settings(BaseSettings):
     stop_timeout: Seconds = Field(default=5, description="seconds a process has to end")
     seen_timeout: Seconds = Field(default=2, description="seconds until a result is seen on the wire")
 
+    run_directory: Path | None = Field(default=None, description="folder of the processes' status sockets")
+    ready_timeout: Seconds = Field(
+        default=10, description="seconds without a frame after which a process is not ready"
+    )
+    log_level: Literal["debug", "info", "warning"] = Field(
+        default="info", description="what is logged; debug has a line for every frame"
+    )
+
+    @field_validator("run_directory", mode="before")
+    @classmethod
+    def _no_directory(cls, value: object) -> object:
+        return value or None  # an empty variable means none, not the folder that one happens to stand in
+
     @field_validator("boards", mode="before")
     @classmethod
     def _split(cls, value: object) -> object:

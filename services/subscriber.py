@@ -25,6 +25,15 @@ from services.logs import say
 from services.records import AnyRecord, Begin, Reading, Ready, Trouble, Unusable
 from services.serving import MasterLink, deployment_for, endpoint_from
 from services.settings import Settings, load_settings
+from services.status_socket import (
+    FrameCounts,
+    ProcessStatus,
+    connections,
+    reasons,
+    seconds_since,
+    status_served,
+    why_not_connected,
+)
 from services.supervision import end_with_parent
 from toolchain.deployment import Deployment, Source
 
@@ -65,11 +74,44 @@ class Subscriber:
         self._passed_over = 0
         self._link = MasterLink(endpoint_from(listen, "--listen"), ROLE, deployment.hash, self._take)
         self._lost: asyncio.Future[None] | None = None
+        self._rosbridges: dict[str, Ros] = {}
+        self._received = self._completed = self._unusable = self._passed_over_before = 0
+        self._last_tick = 0
 
     def _take(self, record: AnyRecord) -> None:
         if isinstance(record, Begin):
             self._once = record.once
             self._begun.set()
+
+    def status(self) -> ProcessStatus:
+        """What this process knows."""
+        why = why_not_connected(self._rosbridges)
+        age = seconds_since(self._last_tick)
+        limit = self._settings.ready_timeout
+        # before a run there is nothing to hear: what starts the master may wait for us
+        if not why and self._begun.is_set() and self._link.has_master and (age is None or age > limit):
+            topics = " and ".join(source.topic for source in self._deployment.sources)
+            since = "yet" if age is None else f"for {age:.0f} s"
+            why = f"no complete reading {since}: waiting for messages on {topics}"
+        return ProcessStatus(
+            ready=not why,
+            why=why or f"connected to {', '.join(self._rosbridges)}",
+            deployment=self._deployment.hash,
+            connections=connections(self._rosbridges),
+            frames=FrameCounts(
+                received=self._received,
+                completed=self._completed,
+                lost=reasons(
+                    {
+                        "passed over": self._passed_over + self._passed_over_before,
+                        "with an unusable variable": self._unusable,
+                        "unpaired": self._assembler.unpaired,
+                    }
+                ),
+                last_number=self._completed,
+                last_age_s=age,
+            ),
+        )
 
     def _state_changed(self, uri: str, state: State, reason: str) -> None:
         if state is State.RECONNECTING:
@@ -86,9 +128,10 @@ class Subscriber:
         settings = self._settings
         sources = self._deployment.sources
         self._lost = asyncio.get_running_loop().create_future()
-        async with self._link, contextlib.AsyncExitStack() as stack:
+        status = status_served(settings.run_directory, ROLE, self.status)
+        async with self._link, status, contextlib.AsyncExitStack() as stack:
             try:
-                by_uri: dict[str, Ros] = {}
+                by_uri = self._rosbridges
                 for uri in {settings.uri or source.uri: None for source in sources}:
                     by_uri[uri] = await stack.enter_async_context(
                         connect(
@@ -149,6 +192,7 @@ class Subscriber:
                 self._link.notice("warning", str(error))
                 continue
             first = False
+            self._received += 1
             if connection != ros.reconnections and not self._queue_all:
                 connection = ros.reconnections
                 message, older = await newest_now(subscription, message)
@@ -163,15 +207,19 @@ class Subscriber:
                 at, message.msg, message.received_ns, message.received_monotonic_ns
             )
         except VariableError as error:
+            self._unusable += 1
             cause = f"{type(error.__cause__).__name__} {at}"
             self._link.send(Unusable(cause, str(error)))
             return
         if reading is None:
             return
+        self._last_tick = reading.received_tick
         if self._link.backlog > _BACKLOG_LIMIT and not self._queue_all:
             self._passed_over += 1
             return
         if self._link.send(_reading_record(reading, self._passed_over)):
+            self._completed += 1
+            self._passed_over_before += self._passed_over
             self._passed_over = 0
             self._once = (
                 False  # its frame is on its way; what comes later must not end a service that goes on

@@ -8,6 +8,7 @@ import ctypes
 import os
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
@@ -24,6 +25,9 @@ PARENT_VARIABLE = "ROSBAYES_PARENT"
 
 DIRECTORY_VARIABLE = "ROSBAYES_DIRECTORY"
 """The run's private directory, which whoever ends last takes away."""
+
+RUN_DIRECTORY_VARIABLE = "BM_RUN_DIRECTORY"
+"""Where status sockets go (the setting `run_directory`); a run of the user's own choice, else the private one."""
 
 RESTARTS = 3
 RESTARTS_WITHIN = 60.0
@@ -74,8 +78,20 @@ def leave_private_directory() -> None:
     """In a child that ends: take the run's directory away if it is empty and the parent did not."""
     directory = os.environ.get(DIRECTORY_VARIABLE)
     if directory:
+        remove_dead_sockets(Path(directory))
         with contextlib.suppress(OSError):
             Path(directory).rmdir()
+
+
+def remove_dead_sockets(directory: Path) -> None:
+    """Take the status sockets away that processes left which were killed."""
+    for path in directory.glob("*.status.sock"):
+        with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX) as probe:
+            probe.settimeout(0.2)
+            try:
+                probe.connect(str(path))
+            except ConnectionRefusedError:
+                path.unlink()
 
 
 def own_command(name: str) -> list[str]:
@@ -107,6 +123,7 @@ class Child:
         self._process: subprocess.Popen[bytes] | None = None
         self._restarts: deque[float] = deque(maxlen=RESTARTS + 1)
         self._pending = b""
+        self.restarts = 0
 
     def start(self) -> None:
         """Start it, in a session of its own so that a terminal's Ctrl-C reaches the parent alone.
@@ -117,6 +134,8 @@ class Child:
         environment = dict(os.environ) | {PARENT_VARIABLE: str(os.getpid()), "PYTHONUNBUFFERED": "1"}
         if self._directory is not None:
             environment[DIRECTORY_VARIABLE] = str(self._directory)
+            if not environment.get(RUN_DIRECTORY_VARIABLE):
+                environment[RUN_DIRECTORY_VARIABLE] = str(self._directory)
         self._errors.clear()
         self._pending = b""
         try:
@@ -183,6 +202,7 @@ class Child:
     def may_restart(self) -> bool:
         """Count a restart; False when there were too many within the last minute."""
         now = time.monotonic()
+        self.restarts += 1
         self._restarts.append(now)
         return sum(1 for at in self._restarts if now - at <= RESTARTS_WITHIN) <= RESTARTS
 
