@@ -1,0 +1,237 @@
+"""CBOR: typed arrays both ways, and nothing but what a ROS message holds."""
+
+import math
+import struct
+import subprocess
+import sys
+
+import cbor2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bridge.cbor_codec import TYPED_ARRAYS, decode, encode, typed_array
+from bridge.errors import DecodeError, EncodeError
+
+FORMATS = {69: "H", 70: "I", 71: "Q", 72: "b", 77: "h", 78: "i", 79: "q", 85: "f", 86: "d"}
+
+
+def written(value: object) -> bytes:
+    return cbor2.dumps({"data": value})
+
+
+def packed(tag: int, *values: float) -> bytes:
+    return written(cbor2.CBORTag(tag, struct.pack(f"<{len(values)}{FORMATS[tag]}", *values)))
+
+
+@pytest.mark.parametrize("tag", FORMATS)
+def test_a_typed_array_as_list_and_as_array(tag):
+    values = [1, 2, 100] if FORMATS[tag] in "HIQ" else [-1, 0, 100]
+    data = packed(tag, *values)
+    numbers = decode(data)["data"]
+    assert numbers == values
+    assert {type(number) for number in numbers} == {float if tag in {85, 86} else int}
+    found = decode(data, arrays="numpy")["data"]
+    assert isinstance(found, np.ndarray)
+    assert found.dtype == np.dtype(TYPED_ARRAYS[tag][0])
+    assert found.tolist() == values
+    assert not found.flags.writeable
+    assert decode(packed(tag))["data"] == []
+
+
+def test_bytes_of_uint8():
+    for data in (written(b"\x01\xff"), written(cbor2.CBORTag(64, b"\x01\xff"))):
+        assert decode(data)["data"] == b"\x01\xff"
+        found = decode(data, arrays="numpy")["data"]
+        assert (found.dtype, found.tolist()) == (np.uint8, [1, 255])
+
+
+def test_everything_else_as_in_json():
+    message = {
+        "op": "publish",
+        "msg": {"a": [1, "two", None, True, {"b": [-(2**63), 2**64 - 1]}], "x": 1.5, "\u00e4": ""},
+    }
+    for arrays in ("list", "numpy"):
+        assert decode(cbor2.dumps(message), arrays=arrays) == message
+
+
+def test_nan_and_infinity_are_numbers():
+    low, high, odd = decode(packed(86, -math.inf, math.inf, math.nan))["data"]
+    assert (low, high) == (-math.inf, math.inf)
+    assert math.isnan(odd)
+
+
+@pytest.mark.parametrize("value", [1, "a", b"abc", [1, 2], {"a": 1}])
+def test_no_other_tag_is_taken(value):
+    """Some would cost hours (a bigfloat's power), memory, or make an object that holds itself."""
+    tags = [tag for tag in [*range(300), 1004, 43000, 55799, 65536, 2**63] if tag not in TYPED_ARRAYS]
+    for tag in tags:
+        with pytest.raises(DecodeError, match=f"tag {tag} "):
+            decode(written(cbor2.CBORTag(tag, value)))
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        b"\xff",
+        b"\x01",
+        b"\x80",
+        b"\xa0\x00",
+        b"\xa1\x01\x02",
+        b"\xa1\x41a\x02",
+        b"\xa1\xa0\x02",
+        b"\xa1\x80\x02",
+        b"\xa1\x61a",
+        b"\xa1\x61\xff\x01",
+        b'{"op":"publish"}',
+        bytes.fromhex("a161619b0000ffffffffffff"),
+        bytes.fromhex("a161615b0000ffffffffffff"),
+        bytes.fromhex("bb0000ffffffffffff"),
+        written(cbor2.undefined),
+        written([cbor2.undefined]),
+        written(cbor2.CBORSimpleValue(7)),
+        written([1, cbor2.CBORSimpleValue(99)]),
+        written(cbor2.CBORTag(86, b"123")),
+        written(cbor2.CBORTag(86, "12345678")),
+        written(cbor2.CBORTag(86, 8)),
+        written(cbor2.CBORTag(64, 8)),
+        bytes.fromhex("a16161d81c81d81d00"),
+        bytes.fromhex("a16161c4821a7fffffff03"),
+        b"\xc6" * 100_000,
+        b"\xa1\x61a" + b"\x81" * 100_000,
+    ],
+)
+@pytest.mark.parametrize("arrays", ["list", "numpy"])
+def test_what_is_no_message(data, arrays):
+    with pytest.raises(DecodeError) as caught:
+        decode(data, arrays=arrays)
+    assert len(str(caught.value)) < 300
+    assert "\n" not in str(caught.value)
+
+
+def test_limits_of_size_and_depth():
+    message: dict[str, object] = {"a": 1}
+    for _ in range(9):
+        message = {"a": message}
+    assert decode(cbor2.dumps(message), max_depth=10) == message
+    assert encode(message, max_depth=10) == cbor2.dumps(message)
+    with pytest.raises(DecodeError):
+        decode(cbor2.dumps(message), max_depth=9)
+    with pytest.raises(EncodeError, match="deeply"):
+        encode(message, max_depth=9)
+    size = len(cbor2.dumps(message))
+    assert decode(cbor2.dumps(message), max_size=size)
+    with pytest.raises(DecodeError, match=f"at most {size - 1}"):
+        decode(cbor2.dumps(message), max_size=size - 1)
+    with pytest.raises(EncodeError, match=f"at most {size - 1}"):
+        encode(message, max_size=size - 1)
+
+
+plain = st.recursive(
+    st.none() | st.booleans() | st.integers(-(2**63), 2**64 - 1) | st.floats(allow_nan=False) | st.text(),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(), inner, max_size=4),
+    max_leaves=20,
+)
+
+
+@given(st.dictionaries(st.text(), plain, max_size=5))
+def test_what_is_written_is_read_again(message):
+    assert decode(encode(message)) == message
+    assert decode(encode(message), arrays="numpy") == message
+
+
+def only_of_messages(value: object) -> bool:
+    if isinstance(value, dict):
+        return all(type(key) is str and only_of_messages(part) for key, part in value.items())
+    if isinstance(value, list):
+        return all(map(only_of_messages, value))
+    return value is None or type(value) in {str, int, float, bool, bytes, np.ndarray}
+
+
+@settings(max_examples=500)
+@given(st.binary(max_size=80), st.sampled_from([b"", b"\xa1\x61a", b"\xa2\x61a\xd8", b"\xbf\x61a"]))
+def test_any_bytes_are_a_message_or_refused(data, start):
+    for arrays in ("list", "numpy"):
+        try:
+            message = decode(start + data, arrays=arrays)
+        except DecodeError:
+            continue
+        assert type(message) is dict
+        assert only_of_messages(message)
+
+
+@pytest.mark.parametrize("name", ["u1", "u2", "u4", "u8", "i1", "i2", "i4", "i8", "f4", "f8"])
+@pytest.mark.parametrize("order", "<>")
+def test_numpy_arrays_leave_as_typed_arrays(name, order):
+    values = np.array([[1, 2], [3, 100]], order + name)
+    found = decode(encode({"data": values}), arrays="numpy")["data"]
+    assert found.dtype == np.dtype("<" + name)
+    assert found.tolist() == [1, 2, 3, 100]
+    assert decode(encode({"data": values[:, 1]}), arrays="numpy")["data"].tolist() == [2, 100]
+
+
+def test_other_numpy_values():
+    message = {
+        "a": np.float32(1.5),
+        "b": np.int64(7),
+        "c": np.bool_(True),
+        "d": np.array([True, False]),
+        "e": np.array([1.5], np.float16),
+        "f": np.array(3.0),
+    }
+    assert decode(encode(message)) == {"a": 1.5, "b": 7, "c": True, "d": [True, False], "e": [1.5], "f": 3.0}
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        object(),
+        {1, 2},
+        1j,
+        np.array([1j]),
+        np.array(["2020-01-01"], "M8[s]"),
+        np.array([object()], dtype=object),
+        {1: 2},
+        {"a": {b"b": 1}},
+    ],
+)
+def test_what_no_message_holds_is_refused(value):
+    with pytest.raises(EncodeError) as caught:
+        encode({"a": value})
+    assert "\n" not in str(caught.value)
+
+
+def test_lists_of_floats_are_packed_where_asked():
+    message = {
+        "floats": [1.5, 2, None],
+        "ints": [1, 2],
+        "mixed": [1.5, "a"],
+        "empty": [],
+        "nested": [[1.5], [2.5]],
+    }
+    read = cbor2.loads(encode(message, pack_floats=True))
+    assert read["floats"].tag == 86
+    one, two, nothing = struct.unpack("<3d", read["floats"].value)
+    assert (one, two) == (1.5, 2.0)
+    assert math.isnan(nothing)
+    assert [read[name] for name in ("ints", "mixed", "empty")] == [[1, 2], [1.5, "a"], []]
+    assert [tag.tag for tag in read["nested"]] == [86, 86]
+    assert cbor2.loads(encode(message)) == message
+
+
+def test_typed_arrays_of_anything():
+    assert decode(encode({"a": typed_array([1, 2], "i4")}), arrays="numpy")["a"].dtype == np.int32
+    assert decode(encode({"a": typed_array(range(3), "u1")}))["a"] == b"\x00\x01\x02"
+    for values, elements in [([1], "f2"), ([300], "u1"), (["a"], "f8"), ([1.5], "i4"), (5, "f8")]:
+        with pytest.raises(EncodeError):
+            typed_array(values, elements)
+
+
+def test_numpy_is_not_imported_until_it_is_wanted():
+    code = (
+        "import sys; from bridge.cbor_codec import *; decode(encode({'a': typed_array([1.5], 'f8')}));"
+        "assert 'numpy' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)

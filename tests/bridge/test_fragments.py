@@ -1,0 +1,217 @@
+"""Fragments: what servers send, in any order and as odd as they do, and what must not make a client grow."""
+
+import json
+import math
+import random
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bridge.errors import DecodeError
+from bridge.fragments import MAX_FRAGMENTS, Reassembler, split
+
+
+def fragment(num: object, data: str, total: object, key: object = "a") -> dict[str, object]:
+    return {"op": "fragment", "id": key, "data": data, "num": num, "total": total}
+
+
+def pieces_of(message: str, size: int, key: object = "a") -> list[dict[str, object]]:
+    return [json.loads(piece) for piece in split(message.encode(), size, key)]
+
+
+def take_all(box: Reassembler, fragments: list[dict[str, object]], now: float = 0.0) -> list[str]:
+    return [whole for each in fragments if (whole := box.take(each, now)) is not None]
+
+
+def test_a_message_that_fits_stays_whole():
+    assert list(split(b'{"op":"x"}', 10, "a")) == [b'{"op":"x"}']
+
+
+def test_a_message_is_cut_by_characters_not_bytes():
+    pieces = pieces_of('"\u00e4\U0001f600\u00e4\u00e4"', 2)
+    assert [piece["data"] for piece in pieces] == ['"\u00e4', "\U0001f600\u00e4", '\u00e4"']
+    assert [(piece["num"], piece["total"], piece["id"]) for piece in pieces] == [
+        (0, 3, "a"),
+        (1, 3, "a"),
+        (2, 3, "a"),
+    ]
+
+
+@given(st.text(min_size=1), st.integers(1, 40), st.randoms(use_true_random=False))
+def test_whatever_the_order_the_message_comes_back(text, size, order):
+    message = json.dumps({"op": "publish", "msg": text}, ensure_ascii=False)
+    try:
+        message.encode()
+    except UnicodeEncodeError:
+        return  # half a character is no message
+    pieces = pieces_of(message, size)
+    if len(pieces) == 1:
+        return
+    order.shuffle(pieces)
+    box = Reassembler()
+    assert [box.take(piece, 0.0) for piece in pieces[:-1]] == [None] * (len(pieces) - 1)
+    assert box.take(pieces[-1], 0.0) == message
+    assert (len(box), box.waiting_bytes, box.given_up) == (0, 0, 0)
+
+
+@pytest.mark.parametrize("length", [101, 150, 199, 200, 201, 236])
+def test_the_reference_server_forgets_to_round_the_total(length):
+    text = "x" * length
+    total = (length - 1) / 100 + 1
+    parts = [text[at : at + 100] for at in range(0, length, 100)]
+    assert take_all(Reassembler(), [fragment(n, part, total) for n, part in enumerate(parts)]) == [text]
+
+
+@pytest.mark.parametrize("first", [0, 1])
+@pytest.mark.parametrize("write", [int, float, str, lambda n: f"{n}.0"])
+def test_numbers_from_0_or_1_of_any_kind(first, write):
+    fragments = [fragment(write(first + n), part, write(3)) for n, part in enumerate("abc")]
+    random.Random(1).shuffle(fragments)
+    assert take_all(Reassembler(), fragments) == ["abc"]
+
+
+def test_one_fragment_is_a_message():
+    assert Reassembler().take(fragment(0, "abc", 1), 0.0) == "abc"
+    assert Reassembler().take(fragment(1, "abc", 1.0), 0.0) == "abc"
+
+
+def test_what_comes_twice_counts_once():
+    box = Reassembler()
+    assert take_all(box, [fragment(0, "a", 2), fragment(0, "a", 2), fragment(1, "b", 2)]) == ["ab"]
+    assert box.given_up == 0
+
+
+def test_an_id_that_is_used_again_begins_another_message():
+    box = Reassembler()
+    assert take_all(box, [fragment(0, "old", 2), fragment(0, "new", 2), fragment(1, "er", 2)]) == ["newer"]
+    assert box.given_up == 1
+    assert take_all(box, [fragment(0, "a", 3), fragment(0, "a", 2), fragment(1, "b", 2)]) == ["ab"]
+    assert box.given_up == 2
+
+
+def test_messages_whose_fragments_mix():
+    box = Reassembler()
+    mixed = [fragment(n, f"{key}{n}", 2, key) for n in (0, 1) for key in ("a", 7, "7")]
+    assert take_all(box, mixed) == ["a0a1", "7071", "7071"]
+
+
+def test_numbers_with_a_hole_make_no_message():
+    box = Reassembler()
+    box.take(fragment(0, "a", 2), 0.0)
+    with pytest.raises(DecodeError, match="numbered from 0 or 1 to 2"):
+        box.take(fragment(2, "c", 2), 0.0)
+    assert (len(box), box.waiting_bytes, box.given_up) == (0, 0, 1)
+
+
+@pytest.mark.parametrize(
+    "broken",
+    [
+        {},
+        fragment(0, "a", 2, None),
+        fragment(0, "a", 2, True),
+        fragment(0, "a", 2, 1.5),
+        fragment(0, "a", 2, "x" * 2000),
+        fragment(0, "a", 2, 10**2000),
+        fragment(0, None, 2),
+        fragment(0, 5, 2),
+        fragment(0, "a", 0),
+        fragment(0, "a", -1),
+        fragment(0, "a", None),
+        fragment(0, "a", True),
+        fragment(0, "a", "two"),
+        fragment(0, "a", "9" * 5000),
+        fragment(0, "a", math.inf),
+        fragment(0, "a", math.nan),
+        fragment(0, "a", 1e300),
+        fragment(0, "a", MAX_FRAGMENTS + 1),
+        fragment(-1, "a", 2),
+        fragment(3, "a", 2),
+        fragment(0.5, "a", 2),
+        fragment("", "a", 2),
+        fragment("-1", "a", 2),
+        fragment([0], "a", 2),
+    ],
+)
+def test_what_is_no_fragment(broken):
+    box = Reassembler()
+    with pytest.raises(DecodeError) as caught:
+        box.take(broken, 0.0)
+    assert len(str(caught.value)) < 200
+    assert len(box) == 0
+
+
+def test_a_message_that_is_too_large_is_given_up():
+    box = Reassembler(max_size=10)
+    box.take(fragment(0, "x" * 6, 3), 0.0)
+    with pytest.raises(DecodeError, match="more than 10 characters"):
+        box.take(fragment(1, "x" * 6, 3), 0.0)
+    with pytest.raises(DecodeError, match="more than 10 characters"):
+        box.take(fragment(0, "x" * 11, 1), 0.0)
+    assert (len(box), box.waiting_bytes, box.given_up) == (0, 0, 1)
+
+
+def test_messages_that_never_end_are_bounded_in_number():
+    box = Reassembler(max_sets=4)
+    for key in range(100):
+        assert box.take(fragment(0, "a", 2, key), 0.0) is None
+    assert (len(box), box.given_up) == (4, 96)
+    assert box.take(fragment(1, "b", 2, 99), 0.0) == "ab"
+
+
+def test_messages_that_never_end_are_bounded_in_bytes():
+    box = Reassembler(max_size=1000, max_sets=100)
+    for key in range(100):
+        box.take(fragment(0, "x" * 900, 2, key), 0.0)
+        assert box.waiting_bytes <= 4 * 1128
+    assert len(box) == 4
+
+
+def test_fragments_without_content_are_bounded_too():
+    box = Reassembler(max_size=1000)
+    for number in range(35):
+        box.take(fragment(number, "", 60000), 0.0)
+    with pytest.raises(DecodeError, match="too many small fragments"):
+        box.take(fragment(35, "", 60000), 0.0)
+    assert (len(box), box.waiting_bytes) == (0, 0)
+
+
+def test_messages_that_never_end_are_bounded_in_time():
+    box = Reassembler(max_age=10)
+    box.take(fragment(0, "a", 3), 0.0)
+    box.take(fragment(1, "b", 3), 9.0)
+    box.take(fragment(0, "z", 3, "other"), 18.0)
+    assert len(box) == 2, "a fragment gives its message more time"
+    box.take(fragment(1, "z", 3, "other"), 20.0)
+    assert (len(box), box.given_up) == (1, 1)
+    box.clear()
+    assert (len(box), box.waiting_bytes) == (0, 0)
+
+
+values = st.one_of(
+    st.none(),
+    st.booleans(),
+    st.integers(-2, 6),
+    st.floats(),
+    st.text(max_size=3),
+    st.sampled_from(["0", "1", "2.0"]),
+)
+
+
+@settings(max_examples=300)
+@given(
+    st.lists(
+        st.fixed_dictionaries({"id": values, "data": values, "num": values, "total": values}), max_size=60
+    )
+)
+def test_nothing_makes_it_grow_or_fail_otherwise(fragments):
+    box = Reassembler(max_size=8, max_sets=3, max_age=5)
+    for now, each in enumerate(fragments):
+        try:
+            whole = box.take(each, float(now))
+        except DecodeError:
+            whole = None
+        assert whole is None or len(whole) <= 8
+        assert len(box) <= 3
+        assert 0 <= box.waiting_bytes <= 4 * (8 + 128)
+        assert (len(box) == 0) == (box.waiting_bytes == 0)
