@@ -482,9 +482,9 @@ class ClientCore:
         subscribed = self._subscribed.get(topic) or self._subscribed.get(absolute(topic))
         if subscribed is None:
             return None
-        subscribed.heard = True
-        if self.seen_version is None:
-            self.seen_version = ros_version_of_message(msg)
+        if not subscribed.heard:
+            subscribed.heard = True
+            self.seen_version = self.seen_version or ros_version_of_message(msg)
         receivers = subscribed.receivers(now)
         return MessageReceived(topic, msg, receivers) if receivers else None
 

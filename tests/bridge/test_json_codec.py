@@ -2,6 +2,7 @@ import json
 import math
 import subprocess
 import sys
+from typing import Any
 
 import numpy as np
 import pytest
@@ -138,7 +139,36 @@ def test_many_brackets_side_by_side_are_not_deep():
     assert decode(json.dumps({"a": "[" * 1000})) == {"a": "[" * 1000}
 
 
+@pytest.mark.parametrize("text", [False, True])
+@pytest.mark.parametrize("filling", [0, 3000])
+def test_the_limit_of_depth_is_exact_whatever_the_size(filling, text):
+    head = '{"x":[' + ",".join(["0.12345"] * (filling // 8)) + "],"  # two levels, and two brackets
+    for levels in (1, 2, 62, 63, 64, 65, 200):
+        message = head + '"a":' + "[" * levels + "]" * levels + "}"
+        if levels < MAX_DEPTH:
+            assert depth(decode(message if text else message.encode()), 1000) == max(levels, 1) + 1
+        else:
+            with pytest.raises(DecodeError, match="deeper than 64"):
+                decode(message if text else message.encode())
+        value: Any = {"x": [0.12345] * (filling // 8), "a": []}
+        for _ in range(levels - 1):
+            value["a"] = [value["a"]]
+        if levels < MAX_DEPTH:
+            assert encode(value)
+        else:
+            with pytest.raises(EncodeError, match="deeper than 64"):
+                encode(value)
+
+
 # Outbound
+
+
+@pytest.mark.parametrize("before", ["", "n" * 2000, "an" * 700, "x" * 2000])
+def test_a_nan_is_found_wherever_it_is(before):
+    for message in ({"a": before, "b": math.nan}, {"b": [math.inf], "a": before}):
+        with pytest.raises(EncodeError, match="b.* is NaN or infinite"):
+            encode(message, nonfinite="refuse")
+    assert encode({"a": before, "b": 1.5, "c": "null", "d": None}, nonfinite="refuse")
 
 
 @given(objects)

@@ -242,8 +242,9 @@ def test_a_topic_of_unknown_type_is_asked_for_until_it_brings_something():
 def test_stamps_show_the_version(header, version):
     core = connected()
     core.subscribe("/a")
+    core.subscribe("/b")
     tell(core, op="publish", topic="/a", msg={"no": "header"})
-    tell(core, op="publish", topic="/a", msg={"header": header})
+    tell(core, op="publish", topic="/b", msg={"header": header})
     assert core.seen_version == version
 
 
