@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import sys
 from typing import Any, TextIO
@@ -36,11 +37,12 @@ def say(text: str) -> None:
     stream.flush()
 
 
-def get_logger(role: str) -> FilteringBoundLogger:
+def get_logger(role: str, level: str = "info") -> FilteringBoundLogger:
     """The logger of a process; every line says which process, and the frame where there is one.
 
     Args:
         role: the process's name, for example "subscriber".
+        level: the least that is written: debug, info or warning. The first call in a process decides.
     """
     # what the libraries log, our own records say in words; only their errors are news
     logging.basicConfig(level=logging.ERROR, stream=sys.stderr, format="%(name)s: %(message)s")
@@ -50,7 +52,7 @@ def get_logger(role: str) -> FilteringBoundLogger:
             structlog.processors.TimeStamper(fmt="%H:%M:%S.%f", utc=False),
             _one_line,
         ],
-        wrapper_class=structlog.make_filtering_bound_logger(20),
+        wrapper_class=structlog.make_filtering_bound_logger(logging.getLevelNamesMapping()[level.upper()]),
         logger_factory=structlog.PrintLoggerFactory(file=_SurvivingStream(sys.stderr)),  # type: ignore[arg-type]  # only write and flush are used
         cache_logger_on_first_use=True,
     )
@@ -59,9 +61,19 @@ def get_logger(role: str) -> FilteringBoundLogger:
 
 
 def _one_line(_: Any, level: str, event: structlog.typing.EventDict) -> str:
-    """`12:00:00.123 master: the event (frame=7)`; the level stands there when it is no mere information."""
+    """`12:00:00.123 master: warning: frame=7 the event cycles=512`: no level where it is mere information.
+
+    The frame comes before the sentence, so that a space follows it: `grep 'frame=7 '` finds no frame 70.
+    """
     time, process, sentence = str(event.pop("timestamp"))[:12], event.pop("process"), event.pop("event")
     event.pop("level", None)
-    rest = f" ({', '.join(f'{key}={value}' for key, value in event.items())})" if event else ""
+    frame = f"frame={event.pop('frame')} " if "frame" in event else ""
+    rest = "".join(f" {key}={_value(value)}" for key, value in event.items())
     urgency = "" if level == "info" else f"{level}: "
-    return f"{time} {process}: {urgency}{sentence}{rest}"
+    return f"{time} {process}: {urgency}{frame}{sentence}{rest}"
+
+
+def _value(value: Any) -> str:
+    """A value as logfmt has it: in quotation marks where it has spaces."""
+    text = str(value)
+    return json.dumps(text) if not text or set(text) & set(' ="') else text

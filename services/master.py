@@ -105,7 +105,8 @@ class Master:
         self._once = once
         self._count = 1 if once else count
         self._json = json
-        self._log = get_logger(ROLE)
+        self._log = get_logger(ROLE, settings.log_level)
+        self._follows = settings.log_level == "debug"
         self._waiting: WaitingFrames[tuple[Reading, int]] = WaitingFrames(settings.queue or deployment.queue)
         self._computing: tuple[Frame, Reading, int, int] | None = None
         self._under_way = 0
@@ -170,7 +171,7 @@ class Master:
         directory = self._directory
         if settings.boards or any(board.endpoint for board in deployment.boards):
             board_endpoints(settings, deployment)  # a wrong list is told before anything starts
-        common = ["--deployment", str(settings.deployment)]
+        common = ["--deployment", str(settings.deployment), "--log-level", settings.log_level]
         rosbridge = [*(["--uri", settings.uri] if settings.uri else [])]
         rosbridge += [
             "--ros-version",
@@ -533,6 +534,25 @@ class Master:
         frame = Frame(self._number, reading.addresses, self._number % self._deployment.machine.rng_banks)
         self._computing = (frame, reading, arrived, time.monotonic_ns())
         app.protocol.send(frame)
+        if self._follows:
+            self._follow(frame, reading, arrived)
+
+    def _follow(self, frame: Frame, reading: Reading, arrived: int) -> None:
+        """Log a frame that was handed on, and tell its number to the subscriber, which could not know it before."""
+        now = time.monotonic_ns()
+        self._log.debug(
+            "handed on to pcie-app", frame=frame.number, bank=frame.bank, waited_us=(now - arrived) // 1000
+        )
+        subscriber = self._peers["subscriber"].protocol
+        if subscriber is not None:
+            taken = (reading.sent_tick - reading.received_tick) // 1000
+            subscriber.send(
+                Notice(
+                    "debug",
+                    f"frame={frame.number} complete stamp_ns={reading.stamp_ns} received_ns={reading.received_ns} "
+                    f"taken_us={taken}",
+                )
+            )
 
     def _computed(self, result: FrameResult) -> None:
         computing = self._computing
@@ -691,6 +711,7 @@ def master(
     peer_timeout: options.PeerTimeout = None,
     board_timeout: options.BoardTimeout = None,
     stop_timeout: options.StopTimeout = None,
+    log_level: options.LogLevel = None,
     json: Annotated[bool, typer.Option("--json", help="Print one JSON object per result.")] = False,
     print_config: Annotated[
         bool, typer.Option("--print-config", help="Print all settings as they are in force, and end.")
@@ -714,6 +735,7 @@ def master(
         peer_timeout=peer_timeout,
         board_timeout=board_timeout,
         stop_timeout=stop_timeout,
+        log_level=log_level,
         **connected,
     )
     if print_config:

@@ -59,4 +59,8 @@ BoardTimeout = Annotated[
 StopTimeout = Annotated[
     float | None, typer.Option("--stop-timeout", help="Seconds a process has to end (5).")
 ]
+LogLevel = Annotated[
+    str | None,
+    typer.Option("--log-level", help="What is logged: info, warning, or debug (a line for every frame)."),
+]
 Count = Annotated[int | None, typer.Option("--count", "-n", min=1, help="End after this many.")]

@@ -30,7 +30,7 @@ from services.errors import (
     exit_code_of,
 )
 from services.local_socket import BlockingRecordSocket, check_hello, own_hello
-from services.logs import say
+from services.logs import get_logger, say
 from services.records import BoardOutcome, Frame, FrameFailed, FrameResult, Notice, Ready, Record, Trouble
 from services.results import REASON_WORDS, counts_of
 from services.serving import board_endpoints, deployment_for, endpoint_from
@@ -183,7 +183,9 @@ def result_record(number: int, output: FrameOutput) -> FrameResult:
 class PcieApp:
     """Serves one master at a time over a local socket."""
 
-    def __init__(self, boards: Boards, deployment_hash: str, endpoint: Endpoint) -> None:
+    def __init__(
+        self, boards: Boards, deployment_hash: str, endpoint: Endpoint, log_level: str = "info"
+    ) -> None:
         self._boards = boards
         self._hash = deployment_hash
         self._endpoint = endpoint
@@ -191,6 +193,8 @@ class PcieApp:
         self._master: BlockingRecordSocket | None = None
         self._greeted = False
         self._ready: Ready | None = None
+        self._follows = log_level == "debug"
+        self._log = get_logger(ROLE, log_level)
         self._asked = self._computed = self._failed = 0
         self._last: tuple[int, int, FrameOutput] | None = None
         self._selector = selectors.DefaultSelector()
@@ -312,6 +316,13 @@ class PcieApp:
             self._send(result_record(frame.number, output))
             self._computed += 1
             self._last = (frame.number, time.monotonic_ns(), output)
+            if self._follows:
+                self._log.debug(
+                    "computed",
+                    frame=frame.number,
+                    cycles=max(board.cycles for board in output.boards),
+                    compute_us=output.compute_ns // 1000,
+                )
 
     def _mend_boards(self) -> None:
         for board in self._boards.mend():
@@ -377,6 +388,7 @@ def pcie_app(
     stop: options.Stop = None,
     peer_timeout: options.PeerTimeout = None,
     board_timeout: options.BoardTimeout = None,
+    log_level: options.LogLevel = None,
 ) -> int:
     """Drive the boards of a mini-cluster."""
     end_with_parent()
@@ -387,11 +399,12 @@ def pcie_app(
         stop=stop,
         peer_timeout=peer_timeout,
         board_timeout=board_timeout,
+        log_level=log_level,
     )
     loaded = deployment_for(settings, images=True)
     opened = Boards(settings, loaded, board_endpoints(settings, loaded))
     if listen_at is not None:
-        pcie = PcieApp(opened, loaded.hash, endpoint_from(listen_at, "--listen"))
+        pcie = PcieApp(opened, loaded.hash, endpoint_from(listen_at, "--listen"), settings.log_level)
         with status_thread(settings.run_directory, ROLE, pcie.status):
             return pcie.serve()
     if sys.stdin.isatty():

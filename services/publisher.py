@@ -197,6 +197,8 @@ class Publisher:
         self._once = False
         self._link = MasterLink(endpoint_from(listen, "--listen"), ROLE, deployment.hash, self._take)
         self._deployment = deployment
+        self._follows = settings.log_level == "debug"
+        self._log = get_logger(ROLE, settings.log_level)
         self._run_directory = settings.run_directory
         self._where = ""
         self._outcomes: Counter[str] = Counter()
@@ -254,6 +256,13 @@ class Publisher:
                         self._outcomes[published.outcome] += 1
                         if published.outcome == "published":
                             self._last = (published.number, time.monotonic_ns())
+                        if self._follows:
+                            self._log.debug(
+                                published.outcome,
+                                frame=published.number,
+                                probability=f"{published.best_probability:.3g}",
+                                ms=f"{published.total_ns / 1e6:.2f}",
+                            )
             except BridgeError as error:
                 for _ in range(100):
                     if self._link.send(Trouble(exit_code_of(error), str(error))):
@@ -353,6 +362,7 @@ def publisher(
     seen_timeout: Annotated[
         float | None, typer.Option(help="Seconds until a result is seen on the wire (2).")
     ] = None,
+    log_level: options.LogLevel = None,
 ) -> int:
     """Publish posteriors over rosbridge."""
     end_with_parent()
@@ -362,6 +372,7 @@ def publisher(
         ros_version=ros_version,
         connect_timeout=connect_timeout,
         seen_timeout=seen_timeout,
+        log_level=log_level,
     )
     loaded = deployment_for(settings)
     if listen is not None:

@@ -18,17 +18,20 @@ import time
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from pathlib import Path
-from typing import cast
+from typing import TYPE_CHECKING, cast
 
 import msgspec
 
-from bridge.client import Ros, State
 from pcie_shim.endpoint import Endpoint, listen, remove_listener
 from pcie_shim.errors import PcieShimError
 from services.errors import SettingsError
 from services.logs import say
 from services.supervision import leave_private_directory
 from services.version import VERSION
+
+if TYPE_CHECKING:
+    # boards and pcie-app start without the bridge
+    from bridge.client import Ros
 
 SUFFIX = ".status.sock"
 STATUS_LIMIT = 1 << 20
@@ -132,7 +135,7 @@ def why_not_connected(rosbridges: Mapping[str, Ros]) -> str:
     if not rosbridges:
         return "waiting for the rosbridge server"
     for uri, ros in rosbridges.items():
-        if ros.state is not State.CONNECTED:
+        if ros.state != "connected":
             reason = f" ({ros.last_error})" if ros.last_error else ""
             return f"waiting for the rosbridge server at {uri}{reason}"
     return ""

@@ -21,8 +21,8 @@ from services.command_line import ends_well, make_app, run_async
 from services.errors import RosbridgeLostError, SettingsError, VariableError, exit_code_of
 from services.frames import CompleteReading, FrameAssembler
 from services.local_socket import MAX_RECORD
-from services.logs import say
-from services.records import AnyRecord, Begin, Reading, Ready, Trouble, Unusable
+from services.logs import get_logger, say
+from services.records import AnyRecord, Begin, Notice, Reading, Ready, Trouble, Unusable
 from services.serving import MasterLink, deployment_for, endpoint_from
 from services.settings import Settings, load_settings
 from services.status_socket import (
@@ -71,6 +71,8 @@ class Subscriber:
         self._queue_all = (settings.queue or deployment.queue) == "all"
         self._begun = asyncio.Event()
         self._once = False
+        self._follows = settings.log_level == "debug"
+        self._log = get_logger(ROLE, settings.log_level)
         self._passed_over = 0
         self._link = MasterLink(endpoint_from(listen, "--listen"), ROLE, deployment.hash, self._take)
         self._lost: asyncio.Future[None] | None = None
@@ -82,6 +84,9 @@ class Subscriber:
         if isinstance(record, Begin):
             self._once = record.once
             self._begun.set()
+        elif isinstance(record, Notice) and self._follows:
+            # a frame has its number from the master, once it is neither passed over nor unusable
+            self._log.debug(record.sentence)
 
     def status(self) -> ProcessStatus:
         """What this process knows."""
@@ -334,6 +339,7 @@ def subscriber(
     ros_version: options.RosVersion = None,
     connect_timeout: options.ConnectTimeout = None,
     first_data_timeout: options.FirstDataTimeout = None,
+    log_level: options.LogLevel = None,
 ) -> int:
     """Take variables out of a ROS topic over rosbridge."""
     end_with_parent()
@@ -344,6 +350,7 @@ def subscriber(
         ros_version=ros_version,
         connect_timeout=connect_timeout,
         first_data_timeout=first_data_timeout,
+        log_level=log_level,
     )
     if listen is not None:
         return run_async(Subscriber(settings, deployment_for(settings), listen).run())
