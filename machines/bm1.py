@@ -180,7 +180,9 @@ def check_start(machine: BM1Machine, start: Start) -> None:
     for column, (address, bits) in enumerate(
         zip(start.addresses, parameters.sensor_bits, strict=True), start=1
     ):
-        _check(f"The address of column {column}", address, 0, (1 << bits) - 1)
+        # said in full only of what is refused: this is done for every frame
+        if type(address) is not int or not 0 <= address < 1 << bits:
+            _check(f"The address of column {column}", address, 0, (1 << bits) - 1)
     _check("prior_address", start.prior_address, 0, parameters.prior_addresses - 1)
     _check("target_count", start.target_count, 1, parameters.target_count_max)
     _check("max_cycles", start.max_cycles, 1, CYCLES_MAX)

@@ -36,6 +36,9 @@ _WORD_BITS: Final = 64
 _BLOCK_WORDS: Final = 8  # one register of AVX-512, two of AVX2, four of NEON
 _BLOCK_CYCLES: Final = _WORD_BITS * _BLOCK_WORDS
 _NO_ROW: Final = -1
+_NO_CYCLE: Final = cast(
+    "int", np.int64(0)
+)  # a plain 0 is a type of its own to numba: it would compile `_run` twice
 
 cgutils: Any = untyped_cgutils
 _Function = TypeVar("_Function", bound=Callable[..., Any])
@@ -182,13 +185,21 @@ class FastBM1:
             # There may be more codes than could have rows for good: rows are the frame's own.
             last_codes = self._store.row_column[: self._used], self._store.row_code[: self._used]
             self._store.row_of_code[last_codes] = _NO_ROW
-        self._live, self._used = _select(
-            codes, parameters.ones_code, self._store, self._frame, self._frames, self._kept_blocks == 0
+        # One call for both: passing a machine's arrays costs as much as a block of its cycles.
+        self._live, self._used, self._cycles, overflow = _begin(
+            codes,
+            parameters.ones_code,
+            self._generators,
+            self._store,
+            self._frame,
+            self._frames,
+            self._limit(int(start.run_until)),
+            self._target_count,
+            self._first_slot,
+            self._kept_blocks,
+            self._period,
         )
-        if self._live == 0:
-            self._reason = StopReason.IMPOSSIBLE
-        else:
-            self._run(int(start.run_until))
+        self._reason = StopReason.IMPOSSIBLE if self._live == 0 else self._why_stopped(overflow)
         return self._reason
 
     def resume(self, run_until: int) -> StopReason:
@@ -199,7 +210,20 @@ class FastBM1:
                 changed then.
         """
         check_resume(self._reason, self._cycles, run_until)
-        self._run(int(run_until))
+        self._cycles, overflow = _run(
+            self._generators,
+            self._store,
+            self._frame,
+            self._live,
+            self._used,
+            self._cycles,
+            self._limit(int(run_until)),
+            self._target_count,
+            self._first_slot,
+            self._kept_blocks,
+            self._period,
+        )
+        self._reason = self._why_stopped(overflow)
         return self._reason
 
     def _restart(self, bank: int) -> None:
@@ -210,34 +234,22 @@ class FastBM1:
         self._frame.starts[:] = starts
         self._first_slot = bank * self._kept_blocks
 
-    def _run(self, run_until: int) -> None:
-        limit = min(run_until, self._max_cycles) if run_until else self._max_cycles
-        self._cycles, overflow = _run(
-            self._generators,
-            self._store,
-            self._frame,
-            self._live,
-            self._used,
-            self._cycles,
-            limit,
-            self._target_count,
-            self._first_slot,
-            self._kept_blocks,
-            self._period,
-        )
+    def _limit(self, run_until: int) -> int:
+        """The cycle at which a slice ends."""
+        return min(run_until, self._max_cycles) if run_until else self._max_cycles
+
+    def _why_stopped(self, overflow: bool) -> StopReason:
         if overflow:
-            self._reason = StopReason.OVERFLOW
-        elif self._cycles == self._max_cycles:
-            self._reason = StopReason.MAX_CYCLES
-        else:
-            self._reason = StopReason.SLICE
+            return StopReason.OVERFLOW
+        return StopReason.MAX_CYCLES if self._cycles == self._max_cycles else StopReason.SLICE
 
 
 def warm_up() -> None:
     """Compile, or load from the cache, all that runs in machine code: some 5 s the first time, then 0.2 s."""
     parameters = BM1Parameters(lines=1, sensor_bits=(), rng=RngKind.LFSR16)
     kernel = FastBM1(BM1Machine(parameters, np.full((1, 1), 128, dtype=np.uint16), ()))
-    kernel.start(Start(addresses=(), target_count=1, max_cycles=1))
+    kernel.start(Start(addresses=(), target_count=2, max_cycles=2, run_until=1))
+    kernel.resume(0)
     _ = kernel.rng_state
 
 
@@ -591,3 +603,30 @@ def _run(
             frame.counts[i] += frame.added[i]
         cycles = block * _BLOCK_CYCLES + end
     return cycles, overflow
+
+
+@_jit
+def _begin(
+    codes: npt.NDArray[np.uint16],
+    ones: int,
+    generators: _Generators,
+    store: _Store,
+    frame: _Frame,
+    frame_number: int,
+    limit: int,
+    target_count: int,
+    first_slot: int,
+    kept_blocks: int,
+    period: int,
+) -> tuple[int, int, int, bool]:
+    """Select a frame's lines and run its first cycles: what `_select` and `_run` return, one after the other.
+
+    A frame in which no line can count runs no cycle.
+    """
+    live, used = _select(codes, ones, store, frame, frame_number, kept_blocks == 0)
+    if live == 0:
+        return live, used, _NO_CYCLE, False
+    cycles, overflow = _run(
+        generators, store, frame, live, used, _NO_CYCLE, limit, target_count, first_slot, kept_blocks, period
+    )
+    return live, used, cycles, overflow

@@ -61,8 +61,8 @@ if TYPE_CHECKING:
     from pcie_shim.endpoint import Endpoint
     from pcie_shim.programming_file import Image
 
-FIRST_SLICE: Final = 256
-"""Cycle at which the first slice ends; the next ones end at twice the last one's end."""
+SHORTEST_SLICE: Final = 256
+"""Cycle at which the first slice ends at the earliest; the next ones end at twice the last one's end."""
 SLACK_S: Final = 5.0
 """Seconds that a board may take beyond what its cycles need at its measured speed."""
 PROGRAMMING_S: Final = 30.0
@@ -421,7 +421,9 @@ class MiniCluster:
     ) -> FrameOutput:
         boards = self._boards
         sliced = frame.stop == "slices"
-        end = FIRST_SLICE if sliced and frame.max_cycles > FIRST_SLICE else 0
+        end = first_slice(frame.target_count) if sliced else 0
+        if end >= frame.max_cycles:
+            end = 0  # one slice, which ends where the frame does
         writes = waits = computing = rounds = begun = 0
         clock = time.perf_counter_ns
         started = clock()
@@ -573,6 +575,18 @@ class MiniCluster:
         return [
             codes[offset : offset + board.lines] for offset, board in zip(offsets, self._boards, strict=True)
         ]
+
+
+def first_slice(target_count: int) -> int:
+    """The cycle at which the first of a frame's slices ends: 256 * 2^k, the first that is twice the target or more.
+
+    No counter can reach the target earlier than in as many cycles, and even a line whose every other cycle counts takes
+    twice as many: a slice that ended before would cost every board a doorbell and an answer for nothing.
+    """
+    end = SHORTEST_SLICE
+    while end < 2 * target_count:
+        end *= 2
+    return end
 
 
 def _check_images(boards: int, images: Sequence[Image]) -> None:

@@ -56,7 +56,7 @@ def reference_frame(deployment, readings, number):
     boards = [ReferenceBM1(read_image(loaded.image_path(at)).machine) for at in range(len(loaded.boards))]
     from machines.bm1 import Start, StopReason
 
-    end = 256
+    end = 512  # the first that is at least twice the target of 255
     for board in boards:
         board.start(
             Start(

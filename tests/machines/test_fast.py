@@ -143,7 +143,7 @@ def test_nothing_is_compiled_twice():
         Start(addresses=(1, 2, 3), target_count=70, max_cycles=900, run_until=3),
         kept_bytes=0,
     )
-    for function in (fast._select, fast._run, fast._jump):
+    for function in (fast._begin, fast._run, fast._jump):
         assert len(function.signatures) == 1
 
 

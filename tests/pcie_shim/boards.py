@@ -120,6 +120,8 @@ def expected(parts: Sequence[Image], frame: FrameInput) -> list[tuple[list[int],
     kernels = [make_kernel(part.machine) for part in parts]
     sliced = frame.stop == "slices"
     end = 256 if sliced else 0
+    while sliced and end < 2 * frame.target_count:
+        end *= 2
     for kernel, part in zip(kernels, parts, strict=True):
         parameters = part.machine.parameters
         offset = part.partition.line_offset
