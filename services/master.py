@@ -268,7 +268,7 @@ class Master:
                 received=self._received,
                 completed=self._published,
                 lost=reasons(lost),
-                last_number=number,
+                last_number=number or None,
                 last_age_s=age,
             ),
         )

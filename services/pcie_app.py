@@ -300,7 +300,7 @@ class PcieApp:
                 received=self._asked,
                 completed=self._computed,
                 lost=reasons({"failed on a board": self._failed}),
-                last_number=number,
+                last_number=number or None,
                 last_age_s=seconds_since(tick),
             ),
         )

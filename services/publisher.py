@@ -220,7 +220,7 @@ class Publisher:
                 received=outcomes.total() + self._waiting.qsize(),
                 completed=outcomes["published"],
                 lost=reasons({reason: count for reason, count in outcomes.items() if reason != "published"}),
-                last_number=number,
+                last_number=number or None,
                 last_age_s=seconds_since(tick),
             ),
         )

@@ -57,14 +57,15 @@ class FrameCounts(msgspec.Struct, frozen=True, kw_only=True):
 
     `received` and `completed` are messages and complete readings (subscriber), frames asked for and computed
     (pcie-app), results asked for and published (publisher), readings and published results (master). `lost` says
-    what became of the others, by reason. `last_number` is that of the last completed one (0: none yet; the
-    subscriber counts its own), `last_age_s` the seconds since. `rate` is completed ones a second, lately.
+    what became of the others, by reason. `last_number` is that of the last completed one (None: none yet, or the
+    subscriber, which knows no numbers), `last_age_s` the seconds since. `rate` is completed ones a second, lately.
+    All of it begins anew when a process is restarted.
     """
 
     received: int
     completed: int
     lost: dict[str, int]
-    last_number: int
+    last_number: int | None
     last_age_s: float | None
     rate: float = 0.0
 

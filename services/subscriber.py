@@ -113,7 +113,7 @@ class Subscriber:
                         "unpaired": self._assembler.unpaired,
                     }
                 ),
-                last_number=self._completed,
+                last_number=None,
                 last_age_s=age,
             ),
         )
