@@ -1,0 +1,69 @@
+"""Quality of service of a ROS 2 topic, as servers take it in ``advertise`` and ``subscribe`` (field ``qos``).
+
+Newer servers of ROS 2 read it; those of ROS 1 and older ones pass over it without a word. What is left out is left
+to the server, which for a subscription looks at what the publishers offer.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any, Final, Literal
+
+from bridge.errors import OptionError
+
+_CHOICES: Final = {
+    "history": ("keep_last", "keep_all"),
+    "reliability": ("reliable", "best_effort", "best_available"),
+    "durability": ("volatile", "transient_local", "best_available"),
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Qos:
+    """What is wanted of a topic's transport between ROS nodes.
+
+    Attributes:
+        history: whether the last ``depth`` messages are kept for a slow reader, or all.
+        depth: how many messages are kept.
+        reliability: whether lost messages are sent again.
+        durability: whether a late subscriber gets what was published before (``transient_local``).
+        deadline: seconds within which the next message is expected; infinity for none.
+        lifespan: seconds after which a message is not delivered any more; infinity for none.
+    """
+
+    history: Literal["keep_last", "keep_all"] | None = None
+    depth: int | None = None
+    reliability: Literal["reliable", "best_effort", "best_available"] | None = None
+    durability: Literal["volatile", "transient_local", "best_available"] | None = None
+    deadline: float | None = None
+    lifespan: float | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse what servers would refuse, most of them without a word."""
+        for name, choices in _CHOICES.items():
+            value = getattr(self, name)
+            if value is not None and value not in choices:
+                raise OptionError(f"qos {name} must be one of {', '.join(choices)}, not {value!r}")
+        if self.depth is not None and (type(self.depth) is not int or self.depth < 0):
+            raise OptionError(f"qos depth must be a whole number from 0 up, not {self.depth!r}")
+        for name in ("deadline", "lifespan"):
+            value = getattr(self, name)
+            if value is not None and (isinstance(value, bool) or not value >= 0):
+                raise OptionError(f"qos {name} must be seconds from 0 up, not {value!r}")
+
+    def as_operation(self) -> dict[str, Any]:
+        """The value of the field ``qos`` of an operation."""
+        wanted: dict[str, Any] = {
+            name: value
+            for name in ("history", "depth", "reliability", "durability")
+            if (value := getattr(self, name)) is not None
+        }
+        for name in ("deadline", "lifespan"):
+            seconds = getattr(self, name)
+            if seconds is not None:
+                wanted[name] = "infinite" if math.isinf(seconds) else _duration(seconds)
+        return wanted
+
+
+def _duration(seconds: float) -> dict[str, int]:
+    whole, part = divmod(round(seconds * 1_000_000_000), 1_000_000_000)
+    return {"secs": whole, "nsecs": part}
