@@ -13,13 +13,13 @@ RUN set -- --require-hashes --no-deps --only-binary :all: -r wheels/requirements
     if ls wheels/*.whl >/dev/null 2>&1; then set -- --no-index --find-links wheels "$@"; fi; \
     python -m pip --python /opt/rosbayes/bin/python install --quiet "$@"
 COPY . .
-ENV PATH=/opt/rosbayes/bin:$PATH
 # setuptools is there to install the project, and for nothing else
 RUN python -m pip --python /opt/rosbayes/bin/python install --quiet --no-deps --no-build-isolation . && \
     python -m pip --python /opt/rosbayes/bin/python uninstall --quiet --yes setuptools && \
     install scripts/with-kernels /opt/rosbayes/bin/
 # in a folder without sources: what is compiled is what is installed
 WORKDIR /
+ENV PATH=/opt/rosbayes/bin:$PATH
 RUN with-kernels --compile && \
     toolchain build /build/casestudies/boat -o /deployment --partitions 4 \
     --uri ws://hub:9090 --topic /boat/sensors --type boat_msgs/Sensors

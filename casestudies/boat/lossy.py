@@ -16,8 +16,8 @@ class LossyPublication:
         self._publication = publication
         self._away = False
 
-    async def publish(self, message: Mapping[str, Any]) -> None:
-        """Publish the message, or drop it where nobody takes it."""
+    async def publish(self, message: Mapping[str, Any]) -> bool:
+        """Publish the message, or drop it where nobody takes it; whether it was published."""
         try:
             await self._publication.publish(message)
         except (DisconnectedError, SlowPeerError) as error:
@@ -28,3 +28,4 @@ class LossyPublication:
             if self._away:
                 say(f"{self._publication.topic} is published again")
             self._away = False
+        return not self._away

@@ -50,9 +50,11 @@ async def serve(uri: str, *, raw_topic: str, sensors_topic: str, array: bool) ->
     """
     from bridge.client import connect
     from casestudies.boat.lossy import LossyPublication
+    from casestudies.readiness import Readiness, readiness_told
 
     said: set[str] = set()
-    async with connect(uri) as ros:
+    readiness = Readiness("a reading was normalised")
+    async with readiness_told("boat-normaliser", readiness), connect(uri) as ros:
         sensors = LossyPublication(await ros.advertise(sensors_topic, ARRAY_TYPE if array else SENSORS_TYPE))
         raw = ros.subscribe(raw_topic, ARRAY_TYPE if array else RAW_TYPE)
         async for message in raw:
@@ -63,7 +65,8 @@ async def serve(uri: str, *, raw_topic: str, sensors_topic: str, array: bool) ->
                     say(f"warning: a message on {raw_topic} is dropped: {error}")
                     said.add(str(error))
                 continue
-            await sensors.publish(readings_message(normalise(values), head, array=array))
+            if await sensors.publish(readings_message(normalise(values), head, array=array)):
+                readiness.did()
 
 
 app = make_app()

@@ -112,8 +112,10 @@ async def simulate(
     from bridge.client import connect
     from bridge.stamps import header
     from casestudies.boat.lossy import LossyPublication
+    from casestudies.readiness import Readiness, readiness_told
 
-    async with connect(uri) as ros:
+    readiness = Readiness("a reading was published")
+    async with readiness_told("boat-simulator", readiness), connect(uri) as ros:
         ros_version = await ros.detect_ros_version()
         poses = LossyPublication(await ros.advertise(TRUE_POSE_TOPIC, TRUE_POSE_TYPE))
         readings = LossyPublication(await ros.advertise(topic, ARRAY_TYPE if array else RAW_TYPE))
@@ -122,7 +124,8 @@ async def simulate(
         while count is None or step < count:
             head = header(time.time_ns(), MAP_FRAME, ros_version)
             await poses.publish(true_pose(boat.x, boat.y, head))
-            await readings.publish(readings_message(boat.measure(), head, array=array))
+            if await readings.publish(readings_message(boat.measure(), head, array=array)):
+                readiness.did()
             step += 1
             boat.sail(1 / rate)
             await asyncio.sleep(begin + step / rate - time.monotonic())

@@ -4,6 +4,7 @@ import json
 import math
 import signal
 import sys
+from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
@@ -25,6 +26,8 @@ POSITIONS_PICTURE: Final = "figure-4.4.png"
 SHARES_PICTURE: Final = "figure-4.5.png"
 _WORTH_DRAWING: Final = (NoResultError.exit_code, 128 + signal.SIGINT)
 """Exit codes after which the pictures of what has come are drawn all the same."""
+KEPT: Final = 2000
+"""Frames kept for pictures and numbers by a viewer that runs without end: a robot's may run for weeks."""
 HEADING: Final = "frame     true cell  estimated mean  distance     cycles   time (ms)"
 
 
@@ -86,19 +89,24 @@ def line_of(instance: "Instance") -> Line:
 
 
 class Viewer:
-    """Collects frames, says a line of each, and draws the pictures at the end."""
+    """Collects frames, says a line of each, and draws the pictures at the end.
+
+    Attributes:
+        instances: the frames, the newest last: all of them, or without an end to wait for the last `KEPT`.
+        lines: what was said of each.
+        frames: how many there were.
+        results: how many of them had a posterior.
+    """
 
     def __init__(self, count: int | None) -> None:
         """Be done after so many results; None: never."""
         self.count = count
-        self.instances: list[Instance] = []
+        kept = KEPT if count is None else None
+        self.instances: deque[Instance] = deque(maxlen=kept)
         self.route: tuple[Truth, ...] = ()
-        self.lines: list[Line] = []
-
-    @property
-    def results(self) -> int:
-        """How many results have come; a frame without a posterior is none."""
-        return sum(line.mean is not None for line in self.lines)
+        self.lines: deque[Line] = deque(maxlen=kept)
+        self.frames = 0
+        self.results = 0
 
     @property
     def done(self) -> bool:
@@ -110,6 +118,8 @@ class Viewer:
         line = line_of(instance)
         self.instances.append(instance)
         self.lines.append(line)
+        self.frames += 1
+        self.results += line.mean is not None
         return line
 
     async def watch(
@@ -130,8 +140,11 @@ class Viewer:
         """
         from bridge.client import connect
         from casestudies.listening import listen
+        from casestudies.readiness import Readiness, readiness_told
 
+        readiness = Readiness("a result was shown")
         async with (
+            readiness_told("boat-viewer", readiness),
             connect(uri) as ros,
             listen(ros, truth_topic=truth_topic, truth_tolerance_s=truth_tolerance_s) as listener,
         ):
@@ -142,6 +155,7 @@ class Viewer:
                     while not self.done:
                         line = self.add(await listener.next(limit_s if self.lines else first_limit_s))
                         shown.line(str(line))
+                        readiness.did()
                         shown.count(self.results)
                 except NoResultError as error:
                     if not self.lines:
@@ -184,7 +198,7 @@ class Viewer:
         times = [line.time_ms for line in self.lines if line.time_ms is not None]
         numbers = {
             "results": self.results,
-            "frames_without_posterior": len(self.lines) - self.results,
+            "frames_without_posterior": self.frames - self.results,
             "median_distance_cells": median(distances) if distances else None,
             "median_time_ms": median(times) if times else None,
             "stages": [_stage_numbers(stage) for stage in stage_shares(self.instances)],
@@ -274,7 +288,11 @@ app = make_app()
 def boat_viewer(
     uri: Annotated[str, typer.Option(envvar="BM_URI", help="The rosbridge server.")] = "ws://127.0.0.1:9090",
     count: Annotated[
-        int | None, typer.Option(min=1, help="End after so many results; by default at Ctrl-C.")
+        int | None,
+        typer.Option(
+            min=1,
+            help=f"End after so many results; by default at Ctrl-C, with the last {KEPT} in pictures and numbers.",
+        ),
     ] = None,
     out: Annotated[
         Path | None,
@@ -332,7 +350,7 @@ def _finish(viewer: Viewer, out: Path | None, numbers: Path | None) -> None:
     distances = [line.distance for line in viewer.lines if line.distance is not None]
     times = [line.time_ms for line in viewer.lines if line.time_ms is not None]
     summary = [_results(viewer.results)]
-    if without := len(viewer.lines) - viewer.results:
+    if without := viewer.frames - viewer.results:
         summary.append(f"{without} frames without a posterior")
     if distances:
         summary.append(f"median distance {median(distances):.2f} cells")
