@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from typing import Any, Final, Literal, Self
 
 from bridge.errors import OptionError
+from bridge.events import StatusReceived
 from bridge.handles import (
     PUBLISH_QUEUE_SIZE,
     QUEUE_SIZE,
@@ -24,7 +25,7 @@ from bridge.handles import (
 )
 from bridge.json_codec import MAX_SIZE
 from bridge.names import ros_version_of_type
-from bridge.protocol import ClientCore, RosVersion, StatusReceived
+from bridge.protocol import ClientCore, RosVersion
 from bridge.session import Limits, Message, Session, State, StateCallback
 
 __all__ = ["Message", "Publication", "Ros", "Service", "State", "Subscription", "connect"]

@@ -16,8 +16,8 @@ from bridge.errors import (
     ServiceError,
     SlowPeerError,
 )
+from bridge.events import ServiceRequested
 from bridge.names import absolute, same_type
-from bridge.protocol import ServiceRequested
 from bridge.session import Message, Session, State
 
 #: Messages that wait in a subscription for their reader, unless it says otherwise.

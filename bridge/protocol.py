@@ -18,6 +18,14 @@ from itertools import count
 from typing import Any, Final, Literal
 
 from bridge.errors import BridgeError, DecodeError, EncodeError, OptionError, SlowPeerError, TypeConflictError
+from bridge.events import (
+    CallAnswered,
+    Event,
+    MessageReceived,
+    ServiceRequested,
+    StatusReceived,
+    Unusable,
+)
 from bridge.json_codec import MAX_DEPTH, MAX_SIZE, decode, encode, excerpt
 from bridge.names import Kind, absolute, check_name, ros1_type, ros2_type, same_type, split_type
 from bridge.stamps import ros_version_of_message
@@ -28,51 +36,6 @@ RosVersion = Literal[1, 2]
 MAX_CALLS: Final = 1000
 #: Requests to services of this client that may wait for their answers at once; more are refused.
 MAX_REQUESTS: Final = 64
-
-
-@dataclass(frozen=True, slots=True)
-class MessageReceived:
-    """A message of a subscribed topic: for which of this client's subscriptions."""
-
-    topic: str
-    msg: dict[str, Any]
-    subscriptions: tuple[int, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class CallAnswered:
-    """A service answered: its values, or the text with which it refused."""
-
-    call: str
-    ok: bool
-    values: Any
-
-
-@dataclass(frozen=True, slots=True)
-class ServiceRequested:
-    """Someone calls a service of this client; `ClientCore.answer` takes the ticket back."""
-
-    service: str
-    args: dict[str, Any]
-    ticket: int
-
-
-@dataclass(frozen=True, slots=True)
-class StatusReceived:
-    """The server says something about an operation (few servers do)."""
-
-    level: str
-    text: str
-
-
-@dataclass(frozen=True, slots=True)
-class Unusable:
-    """Something arrived that no client can use: one sentence says what."""
-
-    reason: str
-
-
-Event = MessageReceived | CallAnswered | ServiceRequested | StatusReceived | Unusable
 
 
 @dataclass(slots=True)

@@ -19,15 +19,8 @@ from bridge.errors import (
     SlowPeerError,
     StateTimeoutError,
 )
-from bridge.protocol import (
-    CallAnswered,
-    ClientCore,
-    Event,
-    MessageReceived,
-    ServiceRequested,
-    StatusReceived,
-    Unusable,
-)
+from bridge.events import CallAnswered, Event, MessageReceived, ServiceRequested, StatusReceived, Unusable
+from bridge.protocol import ClientCore
 from bridge.websocket import WebSocket, check_uri, open_websocket
 
 #: Seconds before the first attempt to reconnect, and at most before any.

@@ -22,17 +22,9 @@ from bridge.errors import (
     SlowPeerError,
     TypeConflictError,
 )
+from bridge.events import CallAnswered, MessageReceived, ServiceRequested, StatusReceived, Unusable
 from bridge.json_codec import MAX_DEPTH
-from bridge.protocol import (
-    MAX_CALLS,
-    MAX_REQUESTS,
-    CallAnswered,
-    ClientCore,
-    MessageReceived,
-    ServiceRequested,
-    StatusReceived,
-    Unusable,
-)
+from bridge.protocol import MAX_CALLS, MAX_REQUESTS, ClientCore
 
 
 def connected(**options: Any) -> ClientCore:
