@@ -24,7 +24,8 @@ def to_address(variable: Variable, value: object) -> int | None:
         variable: Offset, step, period, number of served addresses, and what to do with a reading out of
             range or missing.
         value: What stood in the message. `None` stands for null and for a field that was absent; NaN and an
-            empty array are missing too. Booleans are 0 and 1. Strings are never numbers.
+            empty array are missing too. Booleans are 0 and 1. Strings are never numbers; one that is the name of
+            a state is that state.
 
     Returns:
         The address, 0 to `variable.values - 1`, or `None` for a missing reading.
@@ -37,6 +38,8 @@ def to_address(variable: Variable, value: object) -> int | None:
     """
     if value is None:
         return _missing(variable, "is absent or null")
+    if isinstance(value, str) and value in variable.states:
+        return variable.states.index(value)
     if not isinstance(value, int | float):  # bool is an int: False is 0, True is 1
         if isinstance(value, list | tuple) and not value:
             return _missing(variable, "is an empty array")

@@ -16,7 +16,7 @@ from pydantic import ValidationError
 
 from machines.bm1 import BM1Machine
 from machines.errors import MachineError
-from machines.parameters import BM1Parameters, RngKind
+from machines.parameters import BM1Parameters, PriorMode, RngKind
 from pcie_shim import register_map
 from pcie_shim.errors import PcieShimError
 from pcie_shim.programming_file import Image, Partition, tool_version, write_image
@@ -27,6 +27,7 @@ from toolchain.deployment import (
     MachineSection,
     Output,
     Source,
+    WrittenPrior,
     write_deployment,
 )
 from toolchain.errors import BuildError
@@ -42,7 +43,7 @@ DEFAULT_INTERFACE: Final = (20, 1200)
 
 REPORT_NAME: Final = "report.txt"
 
-_FLAGS: Final = {"tolerance_s": "--tolerance"}
+_FLAGS: Final = {"tolerance_s": "--tolerance", "path": "--prior-path"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -68,13 +69,17 @@ def build_deployment(model: Model, directory: Path, options: BuildOptions) -> Bu
         BuildError: Options that don't fit each other, the model or the register map, or a folder that can't be
             written.
     """
+    check_options(options)
     blocks = partition_lines(model.lines, options.partitions)
+    _check_prior(model, options)
     interface, interface_reason = _interface(model, blocks, options.interface)
     try:
         parameters = BM1Parameters(
             lines=model.lines,
             sensor_bits=tuple(known.bits for known in model.known),
             prob_bits=options.prob_bits,
+            prior_bits=0 if model.prior_select is None else model.prior_select.bits,
+            prior_mode=options.prior_mode,
             counter_bits=options.counter_bits,
             rng=options.rng,
             rng_banks=options.rng_banks,
@@ -161,7 +166,7 @@ def model_hash(model: Model, quantised: Quantised, parameters: BM1Parameters) ->
     words = {
         "name": model.name,
         "searched": [dimension.model_dump(mode="json") for dimension in model.searched],
-        "known": [known.as_variable().model_dump(mode="json") for known in model.known],
+        "known": [variable.model_dump(mode="json") for variable in model.variables],
         "prob_bits": parameters.prob_bits,
     }
     digest = hashlib.sha256(json.dumps(words, sort_keys=True, separators=(",", ":")).encode())
@@ -216,12 +221,14 @@ def _deployment(
             queue=options.queue,
             tolerance_s=options.tolerance_s,
             sources=(Source(uri=options.uri, topic=options.topic, type=options.type),),
-            variables=tuple(known.as_variable() for known in model.known),
+            variables=model.variables,
             searched=model.searched,
             machine=MachineSection(
                 lines=model.lines,
                 interface=f"{interface[0]}x{interface[1]}",
                 prob_bits=parameters.prob_bits,
+                prior_bits=parameters.prior_bits,
+                prior_mode=parameters.prior_mode,
                 counter_bits=parameters.counter_bits,
                 rng=parameters.rng,
                 rng_banks=parameters.rng_banks,
@@ -232,6 +239,7 @@ def _deployment(
                 max_cycles=options.max_cycles,
                 stop=options.stop,
             ),
+            prior=None if options.prior_path is None else WrittenPrior(path=options.prior_path),
             boards=tuple(
                 Board(
                     image=f"boards/board{index}.bm",
@@ -244,14 +252,45 @@ def _deployment(
             outputs=(Output(topic=options.output),),
         )
     except ValidationError as reason:
-        detail = reason.errors()[0]
-        key = str(detail["loc"][0]) if detail["loc"] else ""
-        flag = "--output" if reason.title == "Output" else _FLAGS.get(key, "--" + key.replace("_", "-"))
-        if detail["type"] == "value_error":
-            sentence = str(detail["ctx"]["error"])
-            raise BuildError(f"{flag}: {sentence}" if key else sentence) from None
-        what = detail["msg"].removeprefix("Input should be ")
-        raise BuildError(f"{flag} is {detail['input']!r}, expected {what}") from None
+        raise _refused_option(reason) from None
+
+
+def check_options(options: BuildOptions) -> None:
+    """Refuse a URI, topic or type that is none, before anything is computed.
+
+    Raises:
+        BuildError: Names the option and what it is to be.
+    """
+    try:
+        Source(uri=options.uri, topic=options.topic, type=options.type)
+        Output(topic=options.output)
+    except ValidationError as reason:
+        raise _refused_option(reason) from None
+
+
+def _check_prior(model: Model, options: BuildOptions) -> None:
+    if options.prior_mode is PriorMode.TABLE:
+        if options.prior_path is not None:
+            message = "--prior-path says where a written prior comes from: add --prior-mode written"
+            raise BuildError(message)
+    elif model.prior_select is not None:
+        message = (
+            f"the prior is selected by {model.prior_select.name}, so it can't be written too: leave "
+            "--prior-mode written out, or the selection"
+        )
+        raise BuildError(message)
+
+
+def _refused_option(reason: ValidationError) -> BuildError:
+    """Return a refusal by pydantic as a sentence about the option it came from."""
+    detail = reason.errors()[0]
+    key = str(detail["loc"][0]) if detail["loc"] else ""
+    flag = "--output" if reason.title == "Output" else _FLAGS.get(key, "--" + key.replace("_", "-"))
+    if detail["type"] == "value_error":
+        sentence = str(detail["ctx"]["error"])
+        return BuildError(f"{flag}: {sentence}" if key else sentence)
+    what = detail["msg"].removeprefix("Input should be ")
+    return BuildError(f"{flag} is {detail['input']!r}, expected {what}")
 
 
 def _write(directory: Path, deployment: Deployment, images: tuple[Image, ...]) -> Deployment:
@@ -293,6 +332,8 @@ def _report(
     paragraphs = [
         f"Model {model.name}: {model.lines} lines ({grid}), {len(model.known)} known variables"
         + (f" in the columns' order {names}." if names else "."),
+        *_state_paragraph(model),
+        *_prior_paragraph(model, deployment),
         machine_sentence,
         f"Interface: {machine.interface}{interface_reason}.",
         f"Boards: {len(deployment.boards)}.\n"
@@ -310,6 +351,31 @@ def _report(
         f"{deployment.outputs[0].topic}. Deployment {deployment.hash[:16]}."
     )
     return "\n\n".join(paragraphs) + "\n"
+
+
+def _state_paragraph(model: Model) -> list[str]:
+    """Say which number, or word, is which state, where values have names."""
+    named = [
+        f"  {name}: " + ", ".join(f"{offset + at * step:g} {state}" for at, state in enumerate(states))
+        for name, offset, step, states in (
+            *((each.label, each.offset, each.step, each.states) for each in model.searched),
+            *((each.name, each.offset, each.step, each.states) for each in model.variables),
+        )
+        if states
+    ]
+    return ["States, as numbers; a reading may be either:\n" + "\n".join(named)] if named else []
+
+
+def _prior_paragraph(model: Model, deployment: Deployment) -> list[str]:
+    if (select := model.prior_select) is not None:
+        return [
+            f"Prior: selected by {select.name}, one of {select.values} rows; a missing reading takes the prior without it."
+        ]
+    if deployment.machine.prior_mode is not PriorMode.WRITTEN:
+        return []
+    if deployment.prior is None:
+        return ["Prior: written by the host; the model's own until it is."]
+    return [f"Prior: written every frame, from {deployment.prior.path} of the message."]
 
 
 def _loss_table(quantised: Quantised) -> str:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final, Literal
 import numpy as np
 
 from toolchain.errors import ModelError
-from toolchain.model import Known
+from toolchain.model import Known, Normal
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
@@ -33,6 +33,7 @@ def normal(
     step: float = 1.0,
     bits: int = 0,
     floor: float = 0.0,
+    outliers: float = 0.0,
     on_range: Literal["error", "clamp", "missing"] = "clamp",
     on_missing: Literal["error", "missing"] = "error",
     path: str = "",
@@ -48,22 +49,19 @@ def normal(
         step: The width of a bin.
         bits: Address bits; 0 for as few as will do.
         floor: What an outlier's bin gets everywhere, relative to the bin likelihood's peak.
+        outliers: Share of readings that have nothing to do with S: it is spread over all bins.
         on_range: What a reading beyond the end bins is.
         on_missing: Whether a reading may be missing.
         path: Where in the message it is.
 
     Raises:
-        ModelError: A sigma, step, floor or number of values that is not positive.
+        ModelError: A sigma, step, floor, share or number of values that is not positive.
     """
-    mean, sigma = _checked(name, mean, sigma, values, step, floor)
-    inner = offset + (np.arange(1, values) - 0.5) * step
-    edges = np.concatenate(([-np.inf], inner, [np.inf]))[:, np.newaxis]
-    z = (edges - mean) / sigma
-    tails = _upper_tail(np.abs(z))
-    table = _mass(z[:-1], z[1:], tails[:-1], tails[1:])
+    shape = Normal(mean=mean, sigma=sigma, floor=floor, outliers=outliers)
+    table = normal_table(name, shape, values=values, offset=offset, step=step)
     return Known(
         name=name,
-        table=_with_floor(table, floor, step / sigma),
+        table=table,
         bits=bits,
         offset=offset,
         step=step,
@@ -71,6 +69,7 @@ def normal(
         on_missing=on_missing,
         path=path,
         floor=floor,
+        normal=shape,
     )
 
 
@@ -84,6 +83,7 @@ def wrapped_normal(
     step: float = 1.0,
     bits: int = 0,
     floor: float = 0.0,
+    outliers: float = 0.0,
     on_missing: Literal["error", "missing"] = "error",
     path: str = "",
 ) -> Known:
@@ -98,13 +98,53 @@ def wrapped_normal(
         step: The width of a bin.
         bits: Address bits; 0 for as few as will do.
         floor: What an outlier's bin gets everywhere, relative to the bin likelihood's peak.
+        outliers: Share of readings that have nothing to do with S: it is spread over all bins.
         on_missing: Whether a reading may be missing.
         path: Where in the message it is.
 
     Raises:
-        ModelError: A sigma, step, floor or number of values that is not positive.
+        ModelError: A sigma, step, floor, share or number of values that is not positive.
     """
-    mean, sigma = _checked(name, mean, sigma, values, step, floor)
+    shape = Normal(mean=mean, sigma=sigma, floor=floor, outliers=outliers)
+    table = wrapped_normal_table(name, shape, values=values, offset=offset, step=step)
+    return Known(
+        name=name,
+        table=table,
+        bits=bits,
+        offset=offset,
+        step=step,
+        period=values,
+        on_missing=on_missing,
+        path=path,
+        floor=floor,
+        normal=shape,
+    )
+
+
+def normal_table(name: str, shape: Normal, *, values: int, offset: float, step: float) -> NDArray[np.float64]:
+    """Return P(K | S) of a normal over bins, float64[values, lines]; the end bins hold the tails.
+
+    Raises:
+        ModelError: A sigma, step, floor, share or number of values that is not positive.
+    """
+    mean, sigma = _checked(name, shape, values, step)
+    inner = offset + (np.arange(1, values) - 0.5) * step
+    edges = np.concatenate(([-np.inf], inner, [np.inf]))[:, np.newaxis]
+    z = (edges - mean) / sigma
+    tails = _upper_tail(np.abs(z))
+    table = _mass(z[:-1], z[1:], tails[:-1], tails[1:])
+    return _with_outliers(table, shape, step / sigma)
+
+
+def wrapped_normal_table(
+    name: str, shape: Normal, *, values: int, offset: float, step: float
+) -> NDArray[np.float64]:
+    """Return P(K | S) of a wrapped normal over a turn of `values` bins, float64[values, lines].
+
+    Raises:
+        ModelError: A sigma, step, floor, share or number of values that is not positive.
+    """
+    mean, sigma = _checked(name, shape, values, step)
     turn = values * step
     sigma = np.minimum(sigma, _UNIFORM * turn)
     lower = offset + (np.arange(values) - 0.5)[:, np.newaxis] * step - mean
@@ -120,27 +160,17 @@ def wrapped_normal(
         tails_upper = np.roll(tails_lower, -1, axis=0)
         tails_upper[over] = _upper_tail(np.abs(z_upper[over]))
         table += _mass(z_lower, z_upper, tails_lower, tails_upper)
-    return Known(
-        name=name,
-        table=_with_floor(table, floor, step / sigma),
-        bits=bits,
-        offset=offset,
-        step=step,
-        period=values,
-        on_missing=on_missing,
-        path=path,
-        floor=floor,
-    )
+    return _with_outliers(table, shape, step / sigma)
 
 
 def _checked(
-    name: str, mean: NDArray[np.float64], sigma: ArrayLike, values: int, step: float, floor: float
+    name: str, shape: Normal, values: int, step: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    mean = np.asarray(mean, dtype=np.float64)
+    mean = np.asarray(shape.mean, dtype=np.float64)
     if mean.ndim != 1 or not np.all(np.isfinite(mean)):
         message = f"variable {name!r}: its mean must be one finite number for every line"
         raise ModelError(message)
-    spread = np.asarray(sigma, dtype=np.float64)
+    spread = np.asarray(shape.sigma, dtype=np.float64)
     if spread.shape not in {(), mean.shape}:
         message = f"variable {name!r}: sigma has shape {spread.shape}, expected one number or {mean.shape}"
         raise ModelError(message)
@@ -150,8 +180,11 @@ def _checked(
     if values < 1 or not step > 0 or not math.isfinite(step):
         message = f"variable {name!r}: {values} bins of width {step:g}; both must be positive"
         raise ModelError(message)
-    if not 0 <= floor < math.inf:
-        message = f"variable {name!r}: a floor of {floor:g}, expected a share of the peak from 0"
+    if not 0 <= shape.floor < math.inf:
+        message = f"variable {name!r}: a floor of {shape.floor:g}, expected a share of the peak from 0"
+        raise ModelError(message)
+    if not 0 <= shape.outliers <= 1:
+        message = f"variable {name!r}: {shape.outliers:g} of its readings are outliers, expected 0 to 1"
         raise ModelError(message)
     return mean, np.broadcast_to(spread, mean.shape)
 
@@ -173,12 +206,17 @@ def _mass(
     return np.where((lower < 0) & (upper > 0), 1 - tails_lower - tails_upper, same_side)
 
 
-def _with_floor(
-    table: NDArray[np.float64], floor: float, bin_in_sigmas: NDArray[np.float64]
+def _with_outliers(
+    table: NDArray[np.float64], shape: Normal, bin_in_sigmas: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Add the floor, a share of a bin's mass where the mean is at its middle, and normalise every line."""
-    if floor:
+    """Spread the outliers' share over all bins, add the floor, and normalise every line.
+
+    The floor is a share of a bin's mass where the mean is at its middle.
+    """
+    if shape.outliers:
+        table = (1 - shape.outliers) * table + shape.outliers / len(table)
+    if shape.floor:
         peak = 1 - 2 * _upper_tail(bin_in_sigmas / 2)
-        table = table + floor * peak
+        table = table + shape.floor * peak
     normalised: NDArray[np.float64] = table / table.sum(axis=0)
     return normalised

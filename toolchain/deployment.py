@@ -15,7 +15,7 @@ from collections import Counter
 from contextlib import suppress
 from enum import StrEnum
 from pathlib import Path, PurePosixPath
-from typing import Annotated, Any, Final, Literal, Self, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Self, TypeVar
 
 import tomli_w
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
@@ -23,6 +23,9 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validat
 from machines.parameters import PriorMode, RngKind, RngReset
 from toolchain.errors import DamagedDeploymentError, DeploymentError, DeploymentVersionError
 from toolchain.toml_file import parse_toml, read_text, validate
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
 
 FORMAT: Final = 1
 FILE_NAME: Final = "deployment.toml"
@@ -85,6 +88,8 @@ Item = TypeVar("Item")
 # TOML has arrays and strings, we keep tuples and enums; what is inside them stays strict.
 Sequence = Annotated[tuple[Item, ...], Field(strict=False)]
 Choice = Annotated[Item, Field(strict=False)]
+# What says nothing is left out of the file and of its hash.
+States = Annotated[tuple[Name, ...], Field(strict=False, exclude_if=lambda states: not states)]
 
 
 class Stop(StrEnum):
@@ -122,12 +127,16 @@ class Source(_Section):
 
 
 class Variable(_Section):
-    """`[[variable]]`: a known variable, one column of the machine, and how its readings become addresses."""
+    """`[[variable]]`: a known variable, and how its readings become addresses.
+
+    Of kind `sensor` it is a column of the machine; of kind `prior_select` it chooses the row of the prior's table
+    (thesis 2.1.2), whose top row is the prior without it: what a missing reading chooses.
+    """
 
     name: Name
     source: int = Field(default=0, ge=0)
     path: str = ""
-    kind: Literal["sensor"] = "sensor"
+    kind: Literal["sensor", "prior_select"] = "sensor"
     bits: int = Field(ge=1, le=16)
     offset: float = 0.0
     step: Step = 1.0
@@ -135,6 +144,7 @@ class Variable(_Section):
     values: int = Field(ge=1)
     on_range: Literal["error", "clamp", "missing"] = "error"
     on_missing: Literal["error", "missing"] = "error"
+    states: States = ()
 
     @model_validator(mode="after")
     def _addresses_fit(self) -> Self:
@@ -144,6 +154,7 @@ class Variable(_Section):
                 "beside the address of a missing reading"
             )
             raise ValueError(message)
+        _states_fit(self.name, self.states, self.values)
         return self
 
 
@@ -154,6 +165,12 @@ class Dimension(_Section):
     size: int = Field(ge=1)
     offset: float = 0.0
     step: Step = 1.0
+    states: States = ()
+
+    @model_validator(mode="after")
+    def _every_cell_has_a_name(self) -> Self:
+        _states_fit(self.label, self.states, self.size)
+        return self
 
     def value(self, index: float) -> float:
         """Return the variable's value at an index: a cell's centre where the index is whole."""
@@ -206,6 +223,18 @@ class MachineSection(_Section):
         return parse_interface(self.interface)[1]
 
 
+class WrittenPrior(_Section):
+    """`[prior]`: where a written prior comes from: one number for each line, of which ratios count.
+
+    Without this section a machine with `prior_mode = written` keeps the prior of its images until a host writes
+    another.
+    """
+
+    source: int = Field(default=0, ge=0)
+    path: str = Field(min_length=1)
+    on_missing: Literal["error", "model"] = "error"
+
+
 class Board(_Section):
     """`[[board]]`: one board of the mini-cluster, its image and its lines of the machine."""
 
@@ -250,6 +279,7 @@ class DeploymentFile(_Section):
     variables: Sequence[Variable] = Field(default=(), validation_alias="variable")
     searched: Sequence[Dimension] = Field(min_length=1)
     machine: MachineSection
+    prior: WrittenPrior | None = Field(default=None, exclude_if=lambda prior: prior is None)
     boards: Sequence[Board] = Field(validation_alias="board", min_length=1)
     outputs: Sequence[Output] = Field(default=(Output(),), validation_alias="output")
 
@@ -265,6 +295,7 @@ class DeploymentFile(_Section):
                     f"{len(self.sources) - 1}"
                 )
                 raise ValueError(message)
+        self._prior_agrees()
         cells = math.prod(dimension.size for dimension in self.searched)
         if cells != self.machine.lines:
             message = (
@@ -282,11 +313,60 @@ class DeploymentFile(_Section):
             raise ValueError(message)
         return self
 
+    def _prior_agrees(self) -> None:
+        selects = [variable for variable in self.variables if variable.kind == "prior_select"]
+        if len(selects) > 1:
+            message = f"{selects[0].name} and {selects[1].name} both select the prior; one can"
+            raise ValueError(message)
+        bits = selects[0].bits if selects else 0
+        if bits != self.machine.prior_bits:
+            who = f"{selects[0].name} selects it with {bits}" if selects else "no variable selects it"
+            message = f"the prior has {self.machine.prior_bits} address bits (prior_bits), but {who}"
+            raise ValueError(message)
+        if self.prior is None:
+            return
+        if self.machine.prior_mode is not PriorMode.WRITTEN:
+            message = (
+                "[prior] says where a written prior comes from, but the machine's is a table (prior_mode)"
+            )
+            raise ValueError(message)
+        if self.prior.source >= len(self.sources):
+            message = f"the prior comes from source {self.prior.source}, but the last one is {len(self.sources) - 1}"
+            raise ValueError(message)
+
 
 class Deployment(DeploymentFile):
     """A deployment in its folder, ready for the services."""
 
     directory: Path = Field(default=Path(), exclude=True)
+
+    @property
+    def sensors(self) -> tuple[Variable, ...]:
+        """The variables that are columns of the machine, in the columns' order."""
+        return tuple(variable for variable in self.variables if variable.kind == "sensor")
+
+    @property
+    def prior_select(self) -> Variable | None:
+        """The variable that selects the prior, or None where the prior is one row."""
+        return next((variable for variable in self.variables if variable.kind == "prior_select"), None)
+
+    def machine_addresses(self, addresses: Iterable[int | None]) -> tuple[tuple[int | None, ...], int]:
+        """Return the sensors' addresses in the columns' order, and the row of the prior's table.
+
+        Args:
+            addresses: One per variable, in the order of `variables`; None for a missing reading.
+
+        Raises:
+            ValueError: Another number of addresses than variables.
+        """
+        sensors: list[int | None] = []
+        row = 0
+        for variable, address in zip(self.variables, addresses, strict=True):
+            if variable.kind == "sensor":
+                sensors.append(address)
+            else:
+                row = 2**variable.bits - 1 if address is None else address
+        return tuple(sensors), row
 
     @property
     def path(self) -> Path:
@@ -432,6 +512,12 @@ def _check_images(deployment: Deployment) -> None:
                 f"{deployment.path} says {board.image_hash[:16]}"
             )
             raise DamagedDeploymentError(message)
+
+
+def _states_fit(name: str, states: tuple[str, ...], size: int) -> None:
+    if states and len(states) != size:
+        message = f"{name} has {size} values, but {len(states)} states are named"
+        raise ValueError(message)
 
 
 def _names_differ(kind: str, names: list[str]) -> None:

@@ -16,12 +16,15 @@ if TYPE_CHECKING:
     from toolchain.model import Model
 
 
-def exact_posterior(model: Model, addresses: Sequence[int | None]) -> NDArray[np.float64]:
+def exact_posterior(
+    model: Model, addresses: Sequence[int | None], *, prior_address: int | None = None
+) -> NDArray[np.float64]:
     """Return P(S | readings) of the unquantised model.
 
     Args:
         model: The model.
         addresses: One per known variable, in the columns' order; None for a missing reading.
+        prior_address: Which row of the selected prior; None for the prior without a selection.
 
     Returns:
         float64[lines], summing to 1.
@@ -41,7 +44,13 @@ def exact_posterior(model: Model, addresses: Sequence[int | None]) -> NDArray[np
             message = f"variable {known.name}: address {address} is not one of its {known.values}"
             raise ModelError(message)
         factors.append(known.table[address])
-    return fuse(model.prior_distribution, factors)
+    if prior_address is None:
+        return fuse(model.prior_distribution, factors)
+    rows = None if model.prior_select is None else model.prior_select.table
+    if rows is None or not 0 <= prior_address < len(rows):
+        message = f"model {model.name!r} has no prior of address {prior_address}"
+        raise ModelError(message)
+    return fuse(rows[prior_address], factors)
 
 
 def fuse(prior: NDArray[np.float64], likelihoods: Iterable[NDArray[np.float64]]) -> NDArray[np.float64]:

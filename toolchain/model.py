@@ -18,9 +18,26 @@ from toolchain.deployment import Dimension, Variable
 from toolchain.errors import ModelError
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
+    from numpy.typing import ArrayLike, NDArray
 
 _SUM_TOLERANCE: Final = 1e-6
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Normal:
+    """What a table of normals was made of; learning replaces the parts that recordings tell (`toolchain fit`).
+
+    Attributes:
+        mean: float64[lines], in the reading's unit.
+        sigma: Standard deviation, one or float64[lines], in the reading's unit.
+        floor: What an outlier's bin gets everywhere, relative to the bin likelihood's peak.
+        outliers: Share of readings that have nothing to do with S.
+    """
+
+    mean: NDArray[np.float64]
+    sigma: ArrayLike
+    floor: float = 0.0
+    outliers: float = 0.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -39,6 +56,8 @@ class Known:
         path: Where in the message it is; empty to search the message for the name.
         floor: The least probability of an outlier that the table was made with, relative to the peak of the
             likelihood; 0 for none. Quantising says when codes are too coarse to hold it.
+        states: Its values' names, or none; a reading may be a name.
+        normal: What the table was made of, where it is one of normals.
     """
 
     name: str
@@ -51,6 +70,8 @@ class Known:
     on_missing: Literal["error", "missing"] = "error"
     path: str = ""
     floor: float = 0.0
+    states: tuple[str, ...] = ()
+    normal: Normal | None = None
 
     def __post_init__(self) -> None:
         """Check the table by itself.
@@ -79,21 +100,67 @@ class Known:
         Raises:
             ModelError: The name is empty, the addresses don't fit the bits, or the step is 0.
         """
-        try:
-            return Variable(
-                name=self.name,
-                path=self.path,
-                bits=self.bits,
-                offset=self.offset,
-                step=self.step,
-                period=self.period,
-                values=self.values,
-                on_range=self.on_range,
-                on_missing=self.on_missing,
-            )
-        except ValidationError as reason:
-            message = f"variable {self.name!r}: {_first(reason)}"
-            raise ModelError(message) from None
+        return _variable(self, "sensor")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PriorSelect:
+    """A known variable A that selects the prior: P(S | A), one row of the prior's table for each value (thesis 2.1.2).
+
+    Attributes:
+        name: The variable's name: the field in the message, unless `path` says where it is.
+        table: P(S | A), float64[values, lines]; row a is address a, and every row sums to 1.
+        bits: Address bits of the prior's table; 0 takes as few as hold all values and the top row, which is the
+            prior without a selection.
+        offset: The reading that is address 0, in the variable's unit.
+        step: From one address to the next, in the variable's unit.
+        period: After how many addresses the readings begin again, or None.
+        on_range: What a reading out of range is: an error, the nearest end, or a missing reading.
+        on_missing: Whether a reading may be missing.
+        path: Where in the message it is; empty to search the message for the name.
+        states: Its values' names, or none; a reading may be a name.
+    """
+
+    name: str
+    table: NDArray[np.float64]
+    bits: int = 0
+    offset: float = 0.0
+    step: float = 1.0
+    period: int | None = None
+    on_range: Literal["error", "clamp", "missing"] = "error"
+    on_missing: Literal["error", "missing"] = "error"
+    path: str = ""
+    states: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Check the table by itself.
+
+        Raises:
+            ModelError: A row is no distribution, or the addresses don't fit.
+        """
+        table = np.array(self.table, dtype=np.float64)
+        if table.ndim != 2 or 0 in table.shape:
+            message = f"P(S | {self.name}) has shape {table.shape}, expected (values, lines)"
+            raise ModelError(message)
+        for address, row in enumerate(table):
+            _check_distribution(f"P(S | {self.name}) of address {address}", row)
+        table.flags.writeable = False
+        object.__setattr__(self, "table", table)
+        object.__setattr__(self, "bits", self.bits or len(table).bit_length())
+        self.as_variable()
+
+    @property
+    def values(self) -> int:
+        """How many rows it chooses from."""
+        return len(self.table)
+
+    def as_variable(self) -> Variable:
+        """Return how its readings become rows of the prior's table, as `deployment.toml` says it.
+
+        Raises:
+            ModelError: The name is empty, the addresses don't fit the bits, or the step is 0.
+        """
+        return _variable(self, "prior_select")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -104,13 +171,16 @@ class Model:
         name: What the deployment is called.
         searched: The searched variable's dimensions, the slowest first; line = y * width + x for (y, x).
         known: The known variables in the order of the machine's columns 1..N.
-        prior: P(S), float64[lines] summing to 1; None for a uniform one.
+        prior: P(S), float64[lines] summing to 1; None for a uniform one, or with a `prior_select` for the mean of
+            its rows.
+        prior_select: What selects the prior; then `prior` is the one without a selection.
     """
 
     name: str
     searched: tuple[Dimension, ...]
     known: tuple[Known, ...]
     prior: NDArray[np.float64] | None = None
+    prior_select: PriorSelect | None = None
 
     def __post_init__(self) -> None:
         """Check that the parts belong together.
@@ -122,7 +192,7 @@ class Model:
             message = f"model {self.name!r} searches nothing: it needs at least one searched dimension"
             raise ModelError(message)
         for kind, names in (
-            ("known variable", [known.name for known in self.known]),
+            ("known variable", [known.name for known in self._all_known()]),
             ("searched dimension", [dimension.label for dimension in self.searched]),
         ):
             twice = [name for name, count in Counter(names).items() if count > 1]
@@ -136,13 +206,36 @@ class Model:
                     f"({' x '.join(str(d.size) for d in self.searched)}) have {self.lines} cells"
                 )
                 raise ModelError(message)
-        prior = np.full(self.lines, 1 / self.lines) if self.prior is None else np.array(self.prior, float)
+        prior = self._default_prior() if self.prior is None else np.array(self.prior, float)
         if prior.shape != (self.lines,):
             message = f"the prior P(S) has shape {prior.shape}, expected ({self.lines},)"
             raise ModelError(message)
         _check_distribution("the prior P(S)", prior)
+        if self.prior_select is not None:
+            self._default_prior()  # checks that its rows have this model's lines
         prior.flags.writeable = False
         object.__setattr__(self, "prior", prior)
+
+    def _all_known(self) -> tuple[Known | PriorSelect, ...]:
+        return self.known if self.prior_select is None else (*self.known, self.prior_select)
+
+    def _default_prior(self) -> NDArray[np.float64]:
+        if self.prior_select is None:
+            return np.full(self.lines, 1 / self.lines)
+        rows = self.prior_select.table
+        if rows.shape[1] != self.lines:
+            message = (
+                f"P(S | {self.prior_select.name}) has {rows.shape[1]} lines, but the searched dimensions have "
+                f"{self.lines} cells"
+            )
+            raise ModelError(message)
+        mean: NDArray[np.float64] = rows.mean(axis=0)
+        return mean
+
+    @property
+    def variables(self) -> tuple[Variable, ...]:
+        """All known variables as `deployment.toml` has them: the columns', then what selects the prior."""
+        return tuple(known.as_variable() for known in self._all_known())
 
     @property
     def lines(self) -> int:
@@ -157,14 +250,18 @@ class Model:
         return self.prior
 
 
-def dimension(label: str, *, size: int, offset: float = 0.0, step: float = 1.0) -> Dimension:
+def dimension(
+    label: str, *, size: int, offset: float = 0.0, step: float = 1.0, states: tuple[str, ...] = ()
+) -> Dimension:
     """Return a searched dimension: `size` cells, the first centred at `offset`, the next a `step` further.
 
+    `states` names the cells, where they have names.
+
     Raises:
-        ModelError: No cells, no name, or a step of 0.
+        ModelError: No cells, no name, another number of states than cells, or a step of 0.
     """
     try:
-        return Dimension(label=label, size=size, offset=offset, step=step)
+        return Dimension(label=label, size=size, offset=offset, step=step, states=states)
     except ValidationError as reason:
         message = f"searched dimension {label!r}: {_first(reason)}"
         raise ModelError(message) from None
@@ -187,6 +284,26 @@ def cell_centres(*searched: Dimension) -> tuple[NDArray[np.float64], ...]:
     """Return each dimension's value at the centre of every line's cell: float64[lines] per dimension."""
     axes = [d.offset + np.arange(d.size) * d.step for d in searched]
     return tuple(axis.ravel() for axis in np.meshgrid(*axes, indexing="ij"))
+
+
+def _variable(known: Known | PriorSelect, kind: Literal["sensor", "prior_select"]) -> Variable:
+    try:
+        return Variable(
+            name=known.name,
+            path=known.path,
+            kind=kind,
+            bits=known.bits,
+            offset=known.offset,
+            step=known.step,
+            period=known.period,
+            values=known.values,
+            on_range=known.on_range,
+            on_missing=known.on_missing,
+            states=known.states,
+        )
+    except ValidationError as reason:
+        message = f"variable {known.name!r}: {_first(reason)}"
+        raise ModelError(message) from None
 
 
 def _check_distribution(what: str, table: NDArray[np.float64]) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import StrEnum
 
-from machines.parameters import RngKind, RngReset
+from machines.parameters import PriorMode, RngKind, RngReset
 from toolchain.deployment import Queue, Stop
 
 
@@ -34,6 +34,9 @@ class BuildOptions:
             size where that is larger.
         scale: What is divided by its maximum before quantising.
         prob_bits: Bits of a code (W).
+        prior_mode: Whether the prior is the images' table, or written by the host.
+        prior_path: Where in the message a written prior is, one number for each line; None where it comes from
+            elsewhere.
         counter_bits: Bits of a line's counter.
         target_count: The count that stops a machine; None for the counters' largest.
         max_cycles: The cycles after which a machine stops anyway.
@@ -54,6 +57,8 @@ class BuildOptions:
     interface: tuple[int, int] | None = None
     scale: Scale = Scale.ADDRESS
     prob_bits: int = 8
+    prior_mode: PriorMode = PriorMode.TABLE
+    prior_path: str | None = None
     counter_bits: int = 8
     target_count: int | None = None
     max_cycles: int = 2**17

@@ -14,10 +14,11 @@ import numpy as np
 
 from machines.encode import decode_code, encode_probability
 from machines.parameters import PROB_BITS_MAX
+from toolchain.errors import ReadingError
 from toolchain.options import Scale
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
+    from numpy.typing import ArrayLike, NDArray
 
     from toolchain.model import Known, Model
 
@@ -50,7 +51,8 @@ class Quantised:
     """A model's codes for all lines, before they are split over boards.
 
     Attributes:
-        prior: uint16[1, lines].
+        prior: uint16[rows, lines]: one row, or one for each address that selects a prior; then the top one is the
+            prior without a selection, and unserved ones hold 0.
         tables: uint16[2**bits, lines] per known variable; addresses beyond the served ones hold 0, the top one,
             a missing reading's, all ones.
         losses: The prior's and one per known variable.
@@ -75,8 +77,8 @@ def quantise(model: Model, *, prob_bits: int = 8, scale: Scale = Scale.ADDRESS) 
         machines.errors.ParameterError: `prob_bits` is not 1 to 16.
     """
     prior = model.prior_distribution
-    prior_codes = encode_probability(scaled(prior[np.newaxis], scale), prob_bits)
-    losses = [_loss("prior", 0, prior[np.newaxis], decode_code(prior_codes, prob_bits))]
+    prior_codes, prior_loss = _quantised_prior(model, prob_bits, scale)
+    losses = [prior_loss]
     warnings: list[str] = []
     tables = []
     for known in model.known:
@@ -98,6 +100,48 @@ def quantise(model: Model, *, prob_bits: int = 8, scale: Scale = Scale.ADDRESS) 
                 "--prob-bits."
             )
     return Quantised(prior=prior_codes, tables=tuple(tables), losses=tuple(losses), warnings=tuple(warnings))
+
+
+def written_prior(prior: ArrayLike, *, lines: int, prob_bits: int) -> NDArray[np.uint16]:
+    """Return a written prior's codes, uint16[lines]: of the numbers only ratios count.
+
+    Args:
+        prior: One number for each line of the machine, such as a posterior of an earlier frame.
+        lines: Lines of the machine, over all boards.
+        prob_bits: Bits of a code (W), 1 to 16.
+
+    Raises:
+        ReadingError: Another number of numbers, one that is no probability, or all of them 0.
+    """
+    try:
+        numbers = np.asarray(prior, dtype=np.float64)
+    except (TypeError, ValueError):
+        message = "the prior to write is not an array of numbers"
+        raise ReadingError(message) from None
+    if numbers.shape != (lines,):
+        message = (
+            f"the prior to write has shape {numbers.shape}, expected one number for each of {lines} lines"
+        )
+        raise ReadingError(message)
+    if not np.all(np.isfinite(numbers)) or np.any(numbers < 0) or not numbers.max() > 0:
+        message = "the prior to write is no distribution: it holds a negative, infinite or NaN number, or only zeros"
+        raise ReadingError(message)
+    return encode_probability(numbers / numbers.max(), prob_bits)
+
+
+def _quantised_prior(model: Model, prob_bits: int, scale: Scale) -> tuple[NDArray[np.uint16], ColumnLoss]:
+    plain = model.prior_distribution[np.newaxis]
+    select = model.prior_select
+    if select is None:
+        codes = encode_probability(scaled(plain, scale), prob_bits)
+        return codes, _loss("prior", 0, plain, decode_code(codes, prob_bits))
+    served = encode_probability(scaled(np.vstack([select.table, plain]), scale), prob_bits)
+    codes = np.zeros((1 << select.bits, model.lines), dtype=np.uint16)
+    codes[: select.values] = served[:-1]
+    codes[-1] = served[-1]
+    # How often each row is selected is not known here: all weigh the same.
+    loss = _loss("prior", select.bits, select.table / select.values, decode_code(served[:-1], prob_bits))
+    return codes, loss
 
 
 def scaled(table: NDArray[np.float64], scale: Scale) -> NDArray[np.float64]:

@@ -30,7 +30,8 @@ def sections():
         models = [each for each in inner if isinstance(each, type) and issubclass(each, BaseModel)]
         key = str(field.validation_alias or name)
         if models:
-            header = f"`[{key}]`" if inner[0] is models[0] else f"`[[{key}]]`"
+            single = inner[0] is models[0] or type(None) in inner
+            header = f"`[{key}]`" if single else f"`[[{key}]]`"
             yield pytest.param(header, list(models[0].model_fields), id=key)
         else:
             plain.append(key)

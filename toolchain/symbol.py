@@ -1,0 +1,222 @@
+"""Symbols: the variables of a joint distribution, each with the type that says which values it has (as in ProBT)."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import TYPE_CHECKING, Final, Literal, TypeAlias
+
+import numpy as np
+
+from toolchain.errors import ModelError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+_NUMBER: Final = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d{1,3})?")
+_NO_AND_YES: Final = ({"false", "true"}, {"no", "yes"}, {"off", "on"})
+_YES: Final = {"true", "yes", "on"}
+
+
+@dataclass(frozen=True, slots=True)
+class IntegerType:
+    """The whole numbers `low` to `high`; with `wraps` they lie on a circle, and `high` is beside `low`."""
+
+    low: int
+    high: int
+    wraps: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuse an empty range.
+
+        Raises:
+            ModelError: `high` is below `low`.
+        """
+        if self.high < self.low:
+            message = f"an integer type from {self.low} to {self.high} has no values"
+            raise ModelError(message)
+
+    @property
+    def size(self) -> int:
+        """How many values it has."""
+        return self.high - self.low + 1
+
+    @property
+    def offset(self) -> float:
+        """The first value."""
+        return float(self.low)
+
+    @property
+    def step(self) -> float:
+        """From one value to the next."""
+        return 1.0
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Its values' names: none."""
+        return ()
+
+
+@dataclass(frozen=True, slots=True)
+class IntervalType:
+    """The real numbers from `low` to `high`, cut into equal intervals, each of which is one value: its middle.
+
+    With `wraps` they lie on a circle: `high` is `low` again, as for a bearing from 0 to 360.
+    """
+
+    low: float
+    high: float
+    intervals: int
+    wraps: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuse what can't be cut.
+
+        Raises:
+            ModelError: No intervals, or `high` is not above `low`.
+        """
+        if self.intervals < 1 or not (math.isfinite(self.low) and self.low < self.high < math.inf):
+            message = f"[{self.low:g}, {self.high:g}] can't be cut into {self.intervals} intervals"
+            raise ModelError(message)
+
+    @property
+    def size(self) -> int:
+        """How many values it has."""
+        return self.intervals
+
+    @property
+    def offset(self) -> float:
+        """The first interval's middle."""
+        return self.low + self.step / 2
+
+    @property
+    def step(self) -> float:
+        """The width of an interval."""
+        return (self.high - self.low) / self.intervals
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Its values' names: none."""
+        return ()
+
+
+@dataclass(frozen=True, slots=True, init=False)
+class LabelType:
+    """Named values. As numbers they count from 0 in their order, but for two cases.
+
+    Names that are equally spaced numbers (`10`, `20`, `30`) are these numbers. Of `false` and `true`, `no` and `yes`, `off`
+    and `on` the former is 0 and the latter 1, whichever comes first: a ROS bool means what it says.
+    """
+
+    labels: tuple[str, ...]
+
+    def __init__(self, *labels: str) -> None:
+        """Take the names in their order.
+
+        Raises:
+            ModelError: None, an empty one, or one twice.
+        """
+        if not labels or not all(labels) or len(set(labels)) < len(labels):
+            message = f"a label type needs names that differ, not {', '.join(map(repr, labels)) or 'none'}"
+            raise ModelError(message)
+        object.__setattr__(self, "labels", labels)
+
+    @property
+    def size(self) -> int:
+        """How many values it has."""
+        return len(self.labels)
+
+    @property
+    def wraps(self) -> bool:
+        """Whether its values lie on a circle: no."""
+        return False
+
+    @property
+    def offset(self) -> float:
+        """The first name's number."""
+        return self._numbers()[0]
+
+    @property
+    def step(self) -> float:
+        """From one name's number to the next."""
+        return self._numbers()[1]
+
+    def _numbers(self) -> tuple[float, float]:
+        if {label.lower() for label in self.labels} in _NO_AND_YES:
+            return (1.0, -1.0) if self.labels[0].lower() in _YES else (0.0, 1.0)
+        if len(self.labels) > 1 and all(_NUMBER.fullmatch(label) for label in self.labels):
+            values = [float(label) for label in self.labels]
+            step = values[1] - values[0]
+            slack = 1e-9 * max(map(abs, values))
+            if step and all(abs(after - before - step) <= slack for before, after in pairwise(values)):
+                return values[0], step
+        return 0.0, 1.0
+
+
+Type: TypeAlias = IntegerType | IntervalType | LabelType
+
+
+@dataclass(frozen=True, slots=True)
+class Symbol:
+    """A variable: its name, its type, and where its readings come from when a question knows it.
+
+    Attributes:
+        name: Its name; also the field in the message, unless `path` says where it is.
+        type: Which values it has.
+        path: Where in the message it is; empty to search the message for the name.
+        bits: Address bits of its column; 0 takes as few as will do.
+        on_range: What a reading that is none of its values is: an error, the nearest end, or a missing reading.
+        on_missing: Whether a reading may be missing.
+    """
+
+    name: str
+    type: Type
+    path: str = ""
+    bits: int = 0
+    on_range: Literal["error", "clamp", "missing"] = "error"
+    on_missing: Literal["error", "missing"] = "error"
+
+    def __post_init__(self) -> None:
+        """Refuse a symbol without a name.
+
+        Raises:
+            ModelError: The name is empty.
+        """
+        if not self.name:
+            message = "a symbol needs a name"
+            raise ModelError(message)
+
+    @property
+    def size(self) -> int:
+        """How many values it has."""
+        return self.type.size
+
+    @property
+    def period(self) -> int | None:
+        """After how many values they begin again; None where they don't."""
+        return self.type.size if self.type.wraps else None
+
+    def values(self) -> NDArray[np.float64]:
+        """Return its values as numbers, float64[size]."""
+        values: NDArray[np.float64] = self.type.offset + np.arange(self.size) * np.float64(self.type.step)
+        return values
+
+    def index(self, label: str) -> int:
+        """Return which value a user means by a word: a label, or a number.
+
+        Raises:
+            ModelError: It is none of the symbol's values; lists them.
+        """
+        if label in self.type.labels:
+            return self.type.labels.index(label)
+        if not self.type.labels and _NUMBER.fullmatch(label):
+            place = (float(label) - self.type.offset) / self.type.step
+            at = math.floor(place + 0.5)
+            if 0 <= at < self.size:
+                return at
+        last = self.type.offset + (self.size - 1) * self.type.step
+        expected = ", ".join(self.type.labels[:20]) or f"{self.type.offset:g} to {last:g}"
+        message = f"{self.name} is never {label!r}; expected {expected}"
+        raise ModelError(message)
