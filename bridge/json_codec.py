@@ -30,7 +30,7 @@ MAX_DEPTH: Final = 64
 _OPTIONS: Final = orjson.OPT_SERIALIZE_NUMPY
 _SHOWN: Final = 60
 # Bytes up to which counting brackets is faster than looking for each.
-_COUNTED: Final = 1024
+_COUNTED: Final = 4096
 # Characters that are looked for one by one before a whole word is searched.
 _HOPS: Final = 64
 
