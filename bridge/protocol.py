@@ -9,33 +9,82 @@ Several advertisements, or several subscriptions, of one topic share one on the 
 deliver a first message twice, or not at all, to a client that subscribes twice.
 
 Source: the rosbridge protocol, version 2 (https://github.com/RobotWebTools/rosbridge_suite), and what its
-servers really do (``docs/bridge.md``).
+servers really do (``docs/rosbridge-differences.md``).
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import count
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, get_args
 
+from bridge import cbor_codec, png
+from bridge.arrays import with_arrays, with_lists
+from bridge.cbor_codec import Arrays
 from bridge.errors import BridgeError, DecodeError, EncodeError, OptionError, SlowPeerError, TypeConflictError
 from bridge.events import (
     CallAnswered,
     Event,
+    GoalEnded,
+    GoalFeedback,
+    GoalStatus,
     MessageReceived,
     ServiceRequested,
     StatusReceived,
     Unusable,
 )
+from bridge.fragments import Reassembler, split
 from bridge.json_codec import MAX_DEPTH, MAX_SIZE, decode, encode, excerpt
 from bridge.names import Kind, absolute, check_name, ros1_type, ros2_type, same_type, split_type
+from bridge.qos import Qos
 from bridge.stamps import ros_version_of_message
 
 RosVersion = Literal[1, 2]
+Compression = Literal["none", "png", "cbor", "cbor-raw"]
 
 #: Calls that may wait for their answers at once.
 MAX_CALLS: Final = 1000
 #: Requests to services of this client that may wait for their answers at once; more are refused.
 MAX_REQUESTS: Final = 64
+#: Goals of actions that may be under way at once.
+MAX_GOALS: Final = 100
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Delivery:
+    """How the messages of a topic are to come; all subscriptions of one topic by one client have it in common.
+
+    Attributes:
+        compression: ``cbor`` for long arrays, ``cbor-raw`` for the serialised bytes alone, ``png`` for servers of
+            ROS 1 on thin lines. Many servers pass over what they do not know, and send JSON.
+        arrays: what arrays of numbers become, whatever the server sends.
+        fragment_size: characters of a message in one fragment at most; None for whole messages. Servers keep
+            the last one that a client asked for and use it for all they send to it.
+        qos: what the server is to ask of ROS 2.
+    """
+
+    compression: Compression = "none"
+    arrays: Arrays = "list"
+    fragment_size: int | None = None
+    qos: Qos | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse what servers would pass over without a word."""
+        for name, choices in (("compression", get_args(Compression)), ("arrays", get_args(Arrays))):
+            if getattr(self, name) not in choices:
+                raise OptionError(f"{name} must be one of {', '.join(choices)}, not {getattr(self, name)!r}")
+        check_fragment_size(self.fragment_size)
+        if self.compression == "cbor-raw" and self.arrays == "numpy":
+            raise OptionError("cbor-raw brings bytes, no arrays: leave arrays out")
+
+
+def check_fragment_size(size: int | None) -> None:
+    """Refuse what is no size of a fragment.
+
+    Raises:
+        OptionError: it is neither None nor a whole number from 1 up.
+    """
+    if size is not None and (type(size) is not int or size < 1):
+        raise OptionError(f"fragment_size must be a whole number from 1 up, or None, not {size!r}")
 
 
 @dataclass(slots=True)
@@ -46,6 +95,7 @@ class _Advertised:
     type: str
     latch: bool
     queue_size: int
+    qos: Qos | None
     wire_id: str
     holders: set[int] = field(default_factory=set)
     latched: bytes | None = None  # the last message, said again after a reconnection
@@ -66,6 +116,7 @@ class _Subscribed:
 
     topic: str
     type: str | None
+    delivery: Delivery
     wire_id: str
     wanted: dict[int, _Wanted] = field(default_factory=dict)
     throttle_rate: int = 0
@@ -107,6 +158,7 @@ class ClientCore:
             on the wire: if unknown, they leave in the form of ROS 1, which ROS 2 servers take too.
         seen_version: what the header stamps of received messages say about it.
         connected: between `restore` and `lost`.
+        fragment_size: characters of a message beyond which `pieces` cuts it, None for never.
     """
 
     def __init__(
@@ -115,8 +167,11 @@ class ClientCore:
         ros_version: RosVersion | None = None,
         max_size: int = MAX_SIZE,
         max_depth: int = MAX_DEPTH,
+        fragment_size: int | None = None,
     ) -> None:
         """Begin with no connection and nothing wanted."""
+        check_fragment_size(fragment_size)
+        self.fragment_size = fragment_size
         self.ros_version: RosVersion | None = ros_version
         self.seen_version: RosVersion | None = None
         self.connected = False
@@ -131,6 +186,10 @@ class ClientCore:
         self._services: dict[str, str] = {}
         self._calls: set[str] = set()
         self._requests: dict[int, tuple[str, Any]] = {}
+        self._goals: dict[str, str] = {}
+        self._fragments = Reassembler(max_size=max_size)
+        self._binary = False  # some topic is to come as CBOR
+        self._numpy = False  # some topic's arrays are wanted as NumPy's
 
     # The connection
 
@@ -154,6 +213,8 @@ class ClientCore:
         self._outbox.clear()
         self._calls.clear()
         self._requests.clear()
+        self._goals.clear()
+        self._fragments.clear()
 
     def data_to_send(self) -> list[bytes]:
         """Empty the outbox: whole messages, in order."""
@@ -164,12 +225,27 @@ class ClientCore:
         if self.connected:
             self._outbox.append(encode(operation, max_size=self._max_size, max_depth=self._max_depth))
 
+    def pieces(self, data: bytes) -> Iterator[bytes]:
+        """A whole message as it goes onto the wire: itself, or its fragments if it is larger than one may be."""
+        if self.fragment_size is None or len(data) <= self.fragment_size:
+            yield data
+        else:
+            yield from split(data, self.fragment_size, f"fragment:{next(self._numbers)}")
+
     def _wire_type(self, name: str, kind: Kind = "msg") -> str:
         return ros2_type(name, kind) if self.ros_version == 2 else ros1_type(name)
 
     # Publishing
 
-    def advertise(self, topic: str, type_name: str, *, latch: bool = False, queue_size: int = 100) -> int:
+    def advertise(
+        self,
+        topic: str,
+        type_name: str,
+        *,
+        latch: bool = False,
+        queue_size: int = 100,
+        qos: Qos | None = None,
+    ) -> int:
         """Want to publish on a topic.
 
         Args:
@@ -177,6 +253,7 @@ class ClientCore:
             type_name: in the form of ROS 1 or of ROS 2.
             latch: the server keeps the last message for those who subscribe later.
             queue_size: messages that the server holds for ROS's transport.
+            qos: what the server is to ask of ROS 2.
 
         Returns:
             The advertisement's number, for `publish` and `unadvertise`.
@@ -191,19 +268,20 @@ class ClientCore:
         key = absolute(topic)
         advertised = self._advertised.get(key)
         if advertised is None:
-            advertised = _Advertised(topic, type_name, latch, queue_size, f"advertise:{topic}:{number}")
+            advertised = _Advertised(topic, type_name, latch, queue_size, qos, f"advertise:{topic}:{number}")
             self._advertised[key] = advertised
             self._send_advertise(advertised)
-        elif not same_type(advertised.type, type_name) or advertised.latch != latch:
+        elif not same_type(advertised.type, type_name) or advertised.latch != latch or advertised.qos != qos:
             raise TypeConflictError(
-                f"topic {topic} is already advertised as {advertised.type}, latch={advertised.latch}; "
-                f"it cannot be advertised as {type_name}, latch={latch} too"
+                f"topic {topic} is already advertised as {advertised.type}, latch={advertised.latch}, "
+                f"qos={advertised.qos}; it cannot be advertised as {type_name}, latch={latch}, qos={qos} too"
             )
         advertised.holders.add(number)
         self._advertisements[number] = advertised
         return number
 
     def _send_advertise(self, advertised: _Advertised) -> None:
+        qos = {} if advertised.qos is None else {"qos": advertised.qos.as_operation()}
         self._send(
             op="advertise",
             id=advertised.wire_id,
@@ -211,6 +289,7 @@ class ClientCore:
             type=self._wire_type(advertised.type),
             latch=advertised.latch,
             queue_size=advertised.queue_size,
+            **qos,
         )
 
     def publish(self, advertisement: int, msg: Mapping[str, Any]) -> bytes:
@@ -246,7 +325,13 @@ class ClientCore:
     # Subscribing
 
     def subscribe(
-        self, topic: str, type_name: str | None = None, *, throttle_rate: int = 0, queue_length: int = 0
+        self,
+        topic: str,
+        type_name: str | None = None,
+        *,
+        throttle_rate: int = 0,
+        queue_length: int = 0,
+        delivery: Delivery | None = None,
     ) -> int:
         """Want the messages of a topic.
 
@@ -258,13 +343,14 @@ class ClientCore:
             type_name: in the form of ROS 1 or of ROS 2; None leaves it to the server (see `ask_again`).
             throttle_rate: milliseconds between two messages at least.
             queue_length: messages that the server keeps while the throttle holds them back; 0 drops them.
+            delivery: how they are to come; None is as usual.
 
         Returns:
             The subscription's number.
 
         Raises:
             NameFormError: of topic or type.
-            TypeConflictError: this client subscribes to the topic already, as another type.
+            TypeConflictError: this client subscribes to the topic already, as another type or in another form.
             OptionError: a rate or length that is no whole number from 0 up (servers drop a subscription
                 with a float here without a word).
         """
@@ -278,17 +364,27 @@ class ClientCore:
         key = absolute(topic)
         subscribed = self._subscribed.get(key)
         new = subscribed is None
+        delivery = delivery or Delivery()
         if subscribed is None:
-            subscribed = _Subscribed(topic, type_name, f"subscribe:{topic}:{number}")
+            subscribed = _Subscribed(topic, type_name, delivery, f"subscribe:{topic}:{number}")
             self._subscribed[key] = subscribed
-        elif type_name is not None:
-            if subscribed.type is None:
-                subscribed.type = type_name
-                new = True
-            elif not same_type(subscribed.type, type_name):
-                raise TypeConflictError(
-                    f"topic {topic} is already subscribed to as {subscribed.type}, not as {type_name}"
-                )
+            self._note_deliveries()
+        elif (
+            type_name is not None
+            and subscribed.type is not None
+            and not same_type(subscribed.type, type_name)
+        ):
+            raise TypeConflictError(
+                f"topic {topic} is already subscribed to as {subscribed.type}, not as {type_name}"
+            )
+        elif subscribed.delivery != delivery:
+            raise TypeConflictError(
+                f"topic {topic} is already subscribed to with {subscribed.delivery}, not with {delivery}: "
+                "all subscriptions of a topic by one client share one on the wire"
+            )
+        elif type_name is not None and subscribed.type is None:
+            subscribed.type = type_name
+            new = True
         subscribed.wanted[number] = _Wanted(throttle_rate, queue_length)
         self._subscriptions[number] = subscribed
         if subscribed.settle() or new:
@@ -299,7 +395,19 @@ class ClientCore:
         operation: dict[str, Any] = {"op": "subscribe", "id": subscribed.wire_id, "topic": subscribed.topic}
         if subscribed.type is not None:
             operation["type"] = self._wire_type(subscribed.type)
+        delivery = subscribed.delivery
+        if delivery.compression != "none":
+            operation["compression"] = delivery.compression
+        if delivery.fragment_size is not None:
+            operation["fragment_size"] = delivery.fragment_size
+        if delivery.qos is not None:
+            operation["qos"] = delivery.qos.as_operation()
         self._send(**operation, throttle_rate=subscribed.throttle_rate, queue_length=subscribed.queue_length)
+
+    def _note_deliveries(self) -> None:
+        deliveries = [subscribed.delivery for subscribed in self._subscribed.values()]
+        self._binary = any(delivery.compression in {"cbor", "cbor-raw"} for delivery in deliveries)
+        self._numpy = any(delivery.arrays == "numpy" for delivery in deliveries)
 
     def unsubscribe(self, subscription: int) -> None:
         """Stop wanting messages; the last subscription of a topic takes it off the wire."""
@@ -310,6 +418,7 @@ class ClientCore:
                 self._send_subscribe(subscribed)
         else:
             del self._subscribed[absolute(subscribed.topic)]
+            self._note_deliveries()
             self._send(op="unsubscribe", id=subscribed.wire_id, topic=subscribed.topic)
 
     def ask_again(self) -> bool:
@@ -358,6 +467,57 @@ class ClientCore:
     def forget_call(self, call: str) -> None:
         """Wait no longer for an answer; one that comes all the same is passed over."""
         self._calls.discard(call)
+
+    # Goals of actions
+
+    def send_goal(self, action: str, type_name: str, goal: Mapping[str, Any], *, feedback: bool) -> str:
+        """Send a goal to an action of ROS 2.
+
+        Args:
+            action: its name.
+            type_name: its type, in any form.
+            goal: the goal's fields.
+            feedback: whether to be told how far it is.
+
+        Returns:
+            The goal's identity, which its events bear.
+
+        Raises:
+            NameFormError: of action or type.
+            EncodeError: the goal cannot leave as JSON.
+            SlowPeerError: `MAX_GOALS` goals are under way already.
+        """
+        check_name(action)
+        if len(self._goals) >= MAX_GOALS:
+            raise SlowPeerError(f"{MAX_GOALS} goals are under way already, {action} gets none")
+        identity = f"send_action_goal:{action}:{next(self._numbers)}"
+        data = encode(
+            {
+                "op": "send_action_goal",
+                "id": identity,
+                "action": action,
+                "action_type": ros2_type(type_name, "action"),
+                "args": goal,
+                "feedback": feedback,
+            },
+            nonfinite="refuse",
+            max_size=self._max_size,
+            max_depth=self._max_depth,
+        )
+        self._goals[identity] = action
+        if self.connected:
+            self._outbox.append(data)
+        return identity
+
+    def cancel_goal(self, goal: str) -> None:
+        """Ask for a goal to be given up; its end tells whether it was. Nothing happens if it is over."""
+        action = self._goals.get(goal)
+        if action is not None:
+            self._send(op="cancel_action_goal", id=goal, action=action)
+
+    def forget_goal(self, goal: str) -> None:
+        """Be told no more of a goal."""
+        self._goals.pop(goal, None)
 
     # Serving services
 
@@ -420,6 +580,10 @@ class ClientCore:
             What it means; None for what was answered here, or comes too late to mean anything (a topic or a
             call given up).
         """
+        if (
+            self._binary and type(data) is bytes and data[:1] >= b"\x80"
+        ):  # no JSON begins so, a map of CBOR does
+            return self._receive_cbor(data, now)
         try:
             operation = decode(data, max_size=self._max_size, max_depth=self._max_depth)
         except DecodeError as error:
@@ -427,17 +591,67 @@ class ClientCore:
         op = operation.get("op")
         if op == "publish":
             return self._receive_publish(operation, now, data)
-        if op == "service_response":
-            return self._receive_answer(operation, data)
-        if op == "call_service":
-            return self._receive_request(operation, data)
-        if op == "status":
-            return StatusReceived(_text(operation.get("level")) or "error", _text(operation.get("msg")))
-        if not isinstance(op, str):
-            return Unusable(f"a message without an op arrived: {excerpt(data)}")
-        return Unusable(f"a message with an op that was not asked for arrived: {excerpt(data)}")
+        if op in ("fragment", "png"):
+            return self._receive_wrapped(operation, now, data)
+        return self._receive_other(operation, data)
 
-    def _receive_publish(self, operation: dict[str, Any], now: float, data: bytes | str) -> Event | None:
+    def _receive_cbor(self, data: bytes, now: float) -> Event | None:
+        try:
+            operation = cbor_codec.decode(
+                data,
+                max_size=self._max_size,
+                max_depth=self._max_depth,
+                arrays="numpy" if self._numpy else "list",
+            )
+        except DecodeError as error:
+            return Unusable(str(error))
+        if operation.get("op") == "publish":
+            return self._receive_publish(operation, now, data, from_cbor=True)
+        return Unusable(f"a message in CBOR arrived that is none of a topic: {excerpt(data)}")
+
+    def _receive_wrapped(self, operation: dict[str, Any], now: float, data: bytes | str) -> Event | None:
+        """Take a fragment or a picture: the message is in it, perhaps one in the other."""
+        wrapped = ["fragment", "png"]
+        try:
+            while (op := operation.get("op")) in wrapped:
+                wrapped.remove(op)  # each once
+                whole = self._unwrapped(operation, now)
+                if whole is None:
+                    return None
+                operation = decode(whole, max_size=self._max_size, max_depth=self._max_depth)
+                data = whole
+        except DecodeError as error:
+            return Unusable(str(error))
+        if op == "publish":
+            return self._receive_publish(operation, now, data)
+        return self._receive_other(operation, data)
+
+    def _unwrapped(self, operation: dict[str, Any], now: float) -> bytes | str | None:
+        if operation["op"] == "fragment":
+            return self._fragments.take(operation, now)
+        picture = operation.get("data")
+        if not isinstance(picture, str):
+            raise DecodeError("a png without data arrived")
+        return png.decode(picture, max_size=self._max_size)
+
+    def _receive_other(self, operation: dict[str, Any], data: bytes | str) -> Event | None:
+        match operation.get("op"):
+            case "service_response":
+                return self._receive_answer(operation, data)
+            case "call_service":
+                return self._receive_request(operation, data)
+            case "status":
+                return StatusReceived(_text(operation.get("level")) or "error", _text(operation.get("msg")))
+            case "action_feedback" | "action_result":
+                return self._receive_of_goal(operation, data)
+            case str():
+                return Unusable(f"a message with an op that was not asked for arrived: {excerpt(data)}")
+            case _:
+                return Unusable(f"a message without an op arrived: {excerpt(data)}")
+
+    def _receive_publish(
+        self, operation: dict[str, Any], now: float, data: bytes | str, *, from_cbor: bool = False
+    ) -> Event | None:
         topic = operation.get("topic")
         msg = operation.get("msg")
         if type(topic) is not str or type(msg) is not dict:
@@ -449,7 +663,14 @@ class ClientCore:
             subscribed.heard = True
             self.seen_version = self.seen_version or ros_version_of_message(msg)
         receivers = subscribed.receivers(now)
-        return MessageReceived(topic, msg, receivers) if receivers else None
+        if not receivers:
+            return None
+        if self._numpy:
+            if subscribed.delivery.arrays == "list":
+                msg = with_lists(msg) if from_cbor else msg
+            elif not from_cbor:
+                msg = with_arrays(msg)
+        return MessageReceived(topic, msg, receivers)
 
     def _receive_answer(self, operation: dict[str, Any], data: bytes | str) -> Event | None:
         call = operation.get("id")
@@ -463,6 +684,27 @@ class ClientCore:
         if operation.get("result", True) is False:
             return CallAnswered(call, ok=False, values=_text(values))
         return CallAnswered(call, ok=True, values={} if values is None else values)
+
+    def _receive_of_goal(self, operation: dict[str, Any], data: bytes | str) -> Event | None:
+        goal = operation.get("id")
+        if not isinstance(goal, str):
+            return Unusable(f"something about an action's goal arrived without its id: {excerpt(data)}")
+        if goal not in self._goals:
+            return None
+        values = operation.get("values")
+        if operation["op"] == "action_feedback":
+            return GoalFeedback(goal, {} if values is None else values)
+        del self._goals[goal]
+        if operation.get("result", True) is False:
+            return GoalEnded(goal, ok=False, status=GoalStatus.UNKNOWN, values=_text(values))
+        status = operation.get("status", GoalStatus.SUCCEEDED)
+        known = type(status) is int and status in GoalStatus.__members__.values()
+        return GoalEnded(
+            goal,
+            ok=True,
+            status=GoalStatus(status) if known else GoalStatus.UNKNOWN,
+            values={} if values is None else values,
+        )
 
     def _receive_request(self, operation: dict[str, Any], data: bytes | str) -> Event | None:
         service = operation.get("service")
