@@ -1,0 +1,140 @@
+"""A real stack says of itself what it does: ready and not, who died, how many results there were."""
+
+import asyncio
+import json
+import os
+import re
+import signal
+import time
+
+from tests.integration.conftest import Robot
+
+SERVICES = {"master", "subscriber", "publisher", "pcie-app", "board0", "board1", "board2", "board3"}
+
+
+async def ask(stage, *options):
+    """`status` as a user calls it: exit code, and what it printed."""
+    asked = stage.start("python", "-m", "services.status", *options)
+    return await asked.end(), asked.out + asked.err
+
+
+async def ask_until(stage, wanted, timeout=40):
+    """The stack's status once `wanted` says so, and the exit code with it."""
+    deadline = time.monotonic() + timeout
+    while True:
+        code, printed = await ask(stage, "--json")
+        stack = json.loads(printed) if code in {0, 6} else None
+        if stack is not None and wanted(stack):
+            return code, stack
+        assert time.monotonic() < deadline, printed
+        await asyncio.sleep(0.2)
+
+
+def by_name(stack):
+    return {process["name"]: process for process in stack["processes"]}
+
+
+async def ready_exit(stage, name, directory):
+    asked = stage.start("python", "-m", "services.ready", name, environment={"BM_RUN_DIRECTORY": directory})
+    return await asked.end(), asked.out.strip()
+
+
+async def test_a_stack_is_ready_while_results_flow_and_says_what_it_waits_for(stage, boat):
+    _, uri = await stage.hub()
+    async with Robot(uri) as robot:
+        await robot.keep_publishing()
+        master = stage.start(
+            *("master", "--loop", "-d", str(boat), "--uri", uri, "--log-level", "debug"),
+            environment={"BM_READY_TIMEOUT": "4"},
+        )
+        await robot.have(3)
+        code, stack = await ask_until(stage, lambda stack: stack["ready"])
+        assert code == 0
+        assert set(by_name(stack)) == SERVICES
+        assert await ready_exit(stage, "master", stack["directory"]) == (0, "master: results flow")
+        assert by_name(stack)["publisher"]["connections"] == [
+            {"uri": uri, "state": "connected", "reconnections": 0}
+        ]
+        boards = by_name(stack)["pcie-app"]["boards"]
+        assert [board["index"] for board in boards] == [0, 1, 2, 3]
+        assert {board["state"] for board in boards} == {"programmed"}
+        assert len({board["image"] for board in boards}) == 4
+
+        code, screen = await ask(stage)
+        assert code == 0
+        assert "all 8 processes are ready" in screen
+        assert boards[2]["image"][:12] in screen
+
+        robot._tasks.pop().cancel()
+        code, stack = await ask_until(stage, lambda stack: not stack["ready"])
+        assert code == 6
+        assert any(
+            re.match(r"subscriber: no complete reading .* /boat/sensors", why) for why in stack["why"]
+        ), stack["why"]
+        assert any(why.startswith("master: no result for") for why in stack["why"])
+        published = by_name(stack)["publisher"]["frames"]
+        assert published["completed"] == len(robot.results) > 3
+        assert published["last_number"] == by_name(stack)["pcie-app"]["frames"]["last_number"]
+        code, why = await ready_exit(stage, "master", stack["directory"])
+        assert code == 1
+        assert why.startswith("master: no result for")
+
+        # one frame through all processes, as grep finds it
+        lines = [line for line in master.err.splitlines() if "frame=3 " in line]
+        assert {line.split()[1] for line in lines} == {"master:", "subscriber:", "pcie-app:", "publisher:"}
+        assert len(lines) == 4
+
+        master.send(signal.SIGTERM)
+        assert await master.end() == 143
+        code, printed = await ask(stage)
+        assert code == 2
+        assert "no run of this user was found" in printed
+        await stage.nothing_left("hub")
+
+
+async def test_a_killed_board_and_a_killed_service_are_shown(stage, boat):
+    _, uri = await stage.hub()
+    async with Robot(uri) as robot:
+        await robot.keep_publishing()
+        stage.start("master", "--loop", "-d", str(boat), "--uri", uri)
+        await robot.have(2)
+        _, stack = await ask_until(stage, lambda stack: stack["ready"])
+        os.kill(by_name(stack)["board2"]["pid"], signal.SIGKILL)
+        os.kill(by_name(stack)["publisher"]["pid"], signal.SIGKILL)
+
+        def shown(stack):
+            processes = by_name(stack)
+            if not stack["ready"] or len(processes) < len(SERVICES):
+                return False
+            return processes["board2"]["boards"][0]["restarts"] == 1
+
+        code, stack = await ask_until(stage, shown)
+        assert code == 0
+        processes = by_name(stack)
+        boards = processes["pcie-app"]["boards"]
+        assert [board["restarts"] for board in boards] == [0, 0, 1, 0]
+        peers = {peer["name"]: peer["restarts"] for peer in processes["master"]["peers"]}
+        assert peers == {"subscriber": 0, "publisher": 1, "pcie-app": 0}
+        assert processes["master"]["frames"]["lost"].keys() <= {
+            "failed on a board",
+            "lost with the publisher",
+            "passed over",
+        }
+
+
+async def test_a_process_that_does_not_answer_is_named(stage, boat):
+    _, uri = await stage.hub()
+    async with Robot(uri) as robot:
+        await robot.keep_publishing()
+        stage.start("master", "--loop", "-d", str(boat), "--uri", uri)
+        await robot.have(2)
+        _, stack = await ask_until(stage, lambda stack: stack["ready"])
+        stopped = by_name(stack)["subscriber"]["pid"]
+        os.kill(stopped, signal.SIGSTOP)
+        try:
+            code, stack = await ask_until(stage, lambda stack: stack["silent"])
+        finally:
+            os.kill(stopped, signal.SIGCONT)
+        assert code == 6
+        assert [silent["name"] for silent in stack["silent"]] == ["subscriber"]
+        assert "does not answer" in stack["silent"][0]["why"]
