@@ -1,0 +1,316 @@
+"""The command `status`: finds the run, asks everyone at once, and shows what it was told and nothing else."""
+
+import asyncio
+import contextlib
+import io
+import socket
+import subprocess
+import sys
+import time
+
+import msgspec
+import pytest
+from rich.console import Console
+
+from services import ready, status
+from services.errors import SettingsError
+from services.status_socket import (
+    BoardStatus,
+    ConnectionStatus,
+    FrameCounts,
+    PeerStatus,
+    ProcessStatus,
+    status_served,
+)
+
+
+def process(*, is_ready=True, why="fine", **more):
+    return ProcessStatus(ready=is_ready, why=why, **more)
+
+
+@contextlib.asynccontextmanager
+async def served(directory, **processes):
+    async with contextlib.AsyncExitStack() as stack:
+        for name, told in processes.items():
+            await stack.enter_async_context(
+                status_served(directory, name.replace("_", "-"), lambda told=told: told)
+            )
+        yield
+
+
+def shown(stack):
+    out = io.StringIO()
+    Console(file=out, width=140).print(status.screen(stack))
+    return out.getvalue()
+
+
+FRAMES = FrameCounts(
+    received=120, completed=100, lost={"passed over": 19}, last_number=100, last_age_s=0.2, rate=10.0
+)
+
+
+async def test_everyone_is_asked_and_all_is_ready(tmp_path):
+    async with served(
+        tmp_path, master=process(), subscriber=process(frames=FRAMES), board10=process(), board2=process()
+    ):
+        stack = await status.ask_stack(tmp_path)
+    assert stack.ready
+    assert not stack.why
+    assert [each.name for each in stack.processes] == ["master", "subscriber", "board2", "board10"]
+
+
+async def test_what_is_not_ready_says_why(tmp_path):
+    waiting = process(is_ready=False, why="waiting for the rosbridge server at ws://robot:9090")
+    async with served(tmp_path, master=process(), publisher=waiting):
+        stack = await status.ask_stack(tmp_path)
+    assert not stack.ready
+    assert stack.why == ["publisher: waiting for the rosbridge server at ws://robot:9090"]
+    assert "ws://robot:9090" in shown(stack)
+
+
+async def test_a_killed_process_is_named(tmp_path):
+    with socket.socket(socket.AF_UNIX) as dead:
+        dead.bind(str(tmp_path / "pcie-app.status.sock"))
+    async with served(tmp_path, master=process()):
+        stack = await status.ask_stack(tmp_path)
+    assert not stack.ready
+    assert [each.name for each in stack.silent] == ["pcie-app"]
+    assert "nobody listens" in stack.why[0]
+    assert "no answer" in shown(stack)
+
+
+async def test_those_who_do_not_answer_cost_one_second_together(tmp_path):
+    stuck = []
+    for name in ("subscriber", "publisher", "pcie-app", "board0"):
+        each = socket.socket(socket.AF_UNIX)
+        each.bind(str(tmp_path / f"{name}.status.sock"))
+        each.listen()
+        stuck.append(each)
+    started = time.monotonic()
+    async with served(tmp_path, master=process()):
+        stack = await status.ask_stack(tmp_path)
+    # one after the other they would take four; the rest is for a slow machine
+    assert time.monotonic() - started < 3.5
+    assert [each.name for each in stack.silent] == ["subscriber", "publisher", "pcie-app", "board0"]
+    assert all("does not answer" in each.why for each in stack.silent)
+    for each in stuck:
+        each.close()
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        b"",
+        b"hello",
+        b"{}",
+        b'{"ready": 1, "why": "x"}',
+        b"[" * 100_000,
+        b'{"ready":true,"why":3}',
+        b"\xff\xfe",
+    ],
+)
+async def test_nonsense_is_told_as_such(tmp_path, said):
+    async def answer(_reader, writer):
+        writer.write(said)
+        writer.close()
+
+    server = await asyncio.start_unix_server(answer, tmp_path / "hub.status.sock")
+    async with server:
+        stack = await status.ask_stack(tmp_path)
+        assert not stack.ready
+        assert "is no process of rosbayes" in stack.silent[0].why
+        heard, why = await asyncio.to_thread(ready.ask, str(tmp_path), "hub", 20)
+    assert not heard or b'"ready":true' in said  # the health check reads no more than it needs
+    assert why
+
+
+async def test_an_endless_answer_is_not_read_to_its_end(tmp_path):
+    async def answer(_reader, writer):
+        with contextlib.suppress(ConnectionError):
+            while True:
+                writer.write(b"x" * 65536)
+                await writer.drain()
+
+    server = await asyncio.start_unix_server(answer, tmp_path / "hub.status.sock")
+    async with server:
+        stack = await status.ask_stack(tmp_path)
+        assert stack.silent
+        assert not (await asyncio.to_thread(ready.ask, str(tmp_path), "hub", 20))[0]
+
+
+async def test_a_peer_that_the_master_waits_for_is_named_even_without_a_socket(tmp_path):
+    peers = [
+        PeerStatus(name="pcie-app", endpoint="unix:/run/pcie-app.sock", pid=0, restarts=0, ready=False),
+        PeerStatus(name="publisher", endpoint="unix:/run/publisher.sock", pid=0, restarts=0, ready=True),
+    ]
+    async with served(tmp_path, master=process(is_ready=False, why="waiting for pcie-app", peers=peers)):
+        stack = await status.ask_stack(tmp_path)
+    assert [each.name for each in stack.silent] == ["pcie-app"]
+    assert "unix:/run/pcie-app.sock" in stack.silent[0].why
+
+
+async def test_one_screen_has_services_boards_rates_and_losses(tmp_path):
+    board = BoardStatus(
+        index=1, endpoint="tcp://10.0.0.2:7000", state="programmed", image="ab" * 32, last_cycles=512
+    )
+    own = BoardStatus(index=1, endpoint="tcp://10.0.0.2:7000", state="listening", restarts=3)
+    async with served(
+        tmp_path,
+        publisher=process(frames=FRAMES, connections=[ConnectionStatus("ws://robot:9090", "connected", 2)]),
+        pcie_app=process(boards=[board]),
+        board1=process(boards=[own]),
+    ):
+        text = shown(await status.ask_stack(tmp_path))
+    for words in (
+        "100, 0.2 s ago",
+        "19 passed over",
+        "ws://robot:9090",
+        "abababababab",
+        "tcp://10.0.0.2:7000",
+        "512",
+    ):
+        assert words in text
+    row = next(line.split() for line in text.splitlines() if "tcp://" in line)
+    assert row[:4] == ["1", "programmed", "abababababab", "3"]
+
+
+async def test_what_a_process_says_can_not_write_over_the_terminal(tmp_path):
+    sly = process(is_ready=False, why="[red]\x1b[2Jgone\r\nall ready" + "x" * 10_000)
+    async with served(tmp_path, hub=sly):
+        text = shown(await status.ask_stack(tmp_path))
+    assert "\x1b" not in text
+    assert "[red]?[2Jgone??all" in text
+    assert len(text) < 3000
+
+
+@pytest.fixture
+def places(tmp_path, monkeypatch):
+    """Where runs are looked for: nothing but this test's."""
+    monkeypatch.setattr(status.tempfile, "gettempdir", lambda: str(tmp_path))
+    monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
+    monkeypatch.delenv("BM_RUN_DIRECTORY", raising=False)
+    return tmp_path
+
+
+def make_run(places, name):
+    run = places / f"rosbayes-{name}"
+    run.mkdir()
+    return run
+
+
+async def test_the_only_live_run_is_found(places):
+    make_run(places, "dead")
+    alive = make_run(places, "alive")
+    async with served(alive, master=process()):
+        assert await status.find_run() == alive
+
+
+async def test_several_runs_are_listed(places):
+    one, two = make_run(places, "one"), make_run(places, "two")
+    async with served(one, master=process()), served(two, master=process()):
+        with pytest.raises(SettingsError, match=f"2 runs .* {one}, {two}; choose one with --directory"):
+            await status.find_run()
+
+
+async def test_no_run_names_those_that_were_killed(places):
+    dead = make_run(places, "dead")
+    with pytest.raises(SettingsError, match=f"no run of this user was found .*{dead}"):
+        await status.find_run()
+
+
+async def test_exit_codes_and_json(places):
+    run = make_run(places, "it")
+    nothing = await asyncio.to_thread(subprocess_status, places)
+    assert nothing.returncode == 2
+    assert nothing.stderr.count("\n") == 1
+    assert nothing.stderr.startswith("error: no run")
+    async with served(run, master=process()):
+        whole = await asyncio.to_thread(subprocess_status, places, "--json")
+        assert whole.returncode == 0
+        stack = msgspec.json.decode(whole.stdout, type=status.StackStatus)
+        assert stack.directory == str(run)
+        assert stack.processes[0].name == "master"
+    async with served(run, master=process(is_ready=False, why="waiting")):
+        assert (await asyncio.to_thread(subprocess_status, places)).returncode == 6
+        assert (await asyncio.to_thread(subprocess_status, places, "--directory", str(run))).returncode == 6
+
+
+def subprocess_status(places, *arguments):
+    environment = {"PATH": "/usr/bin:/bin", "TMPDIR": str(places)}
+    return subprocess.run(
+        [sys.executable, "-m", "services.status", *arguments],
+        capture_output=True,
+        text=True,
+        env=environment,
+        timeout=60,
+        check=False,
+    )
+
+
+async def test_watching_prints_a_line_every_second_until_it_is_ended(places):
+    run = make_run(places, "it")
+    async with served(run, master=process()):
+        watching = await asyncio.create_subprocess_exec(
+            *(sys.executable, "-m", "services.status", "--watch", "--json", "--directory", str(run)),
+            stdout=asyncio.subprocess.PIPE,
+            stderr=asyncio.subprocess.PIPE,
+        )
+        for _ in range(2):
+            line = await asyncio.wait_for(watching.stdout.readline(), 30)
+            assert msgspec.json.decode(line, type=status.StackStatus).ready
+        watching.terminate()
+        assert await asyncio.wait_for(watching.wait(), 30) == 143
+        assert b"Traceback" not in await watching.stderr.read()
+
+
+# --- the health check --------------------------------------------------------------------------
+
+
+async def test_the_health_check_is_the_process_own_word(tmp_path):
+    async with served(
+        tmp_path,
+        subscriber=process(why="connected"),
+        master=process(is_ready=False, why="no result for 12 s"),
+    ):
+        assert await asyncio.to_thread(ready.ask, str(tmp_path), "subscriber") == (
+            True,
+            "subscriber: connected",
+        )
+        assert await asyncio.to_thread(ready.ask, str(tmp_path), "master") == (
+            False,
+            "master: no result for 12 s",
+        )
+
+
+def test_the_health_check_of_nobody(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("BM_RUN_DIRECTORY", str(tmp_path))
+    assert ready.main(["hub"]) == 1
+    assert "hub is not running, or shows no status at" in capsys.readouterr().out
+    with socket.socket(socket.AF_UNIX) as stuck:
+        stuck.bind(str(tmp_path / "hub.status.sock"))
+        stuck.listen()
+        assert ready.ask(str(tmp_path), "hub", 0.1) == (
+            False,
+            f"hub does not answer at {tmp_path}/hub.status.sock within 0.1 s",
+        )
+
+
+@pytest.mark.parametrize("arguments", [[], ["a", "b"], ["../x"], ["--what"]])
+def test_the_health_check_is_never_green_by_mistake(arguments, capsys, monkeypatch, tmp_path):
+    monkeypatch.setenv("BM_RUN_DIRECTORY", str(tmp_path))
+    assert ready.main(arguments) == 1
+    assert "usage:" in capsys.readouterr().out
+
+
+def test_the_health_check_without_a_directory(capsys, monkeypatch):
+    monkeypatch.delenv("BM_RUN_DIRECTORY", raising=False)
+    assert ready.main(["hub"]) == 1
+    assert "BM_RUN_DIRECTORY" in capsys.readouterr().out
+
+
+def test_the_health_check_starts_fast():
+    code = "import sys, services.ready; print(sorted(set(sys.modules) & {'msgspec','asyncio','typer','structlog','orjson','pydantic'}))"
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60
+    )
+    assert done.stdout.strip() == "[]"
