@@ -30,12 +30,18 @@ def joint_posterior(
     """
     if len(counts) != len(cycles):
         raise MachineError(f"There are counts of {len(counts)} boards and cycles of {len(cycles)}.")
-    shares = []
+    divisors = []
     for board, (count, run) in enumerate(zip(counts, cycles, strict=True)):
         if run <= 0 and np.any(count):
             raise MachineError(f"Board {board} has counts, but ran {run} cycles.")
-        shares.append(np.asarray(count, dtype=np.float64) / max(run, 1))
-    joint = np.concatenate(shares) if shares else np.zeros(0)
+        divisors.append(max(run, 1))
+    if not divisors:
+        return None
+    joint = np.concatenate(counts)
+    if len(set(divisors)) == 1:
+        joint = joint / divisors[0]
+    else:
+        joint = joint / np.repeat(np.array(divisors, dtype=np.float64), [len(count) for count in counts])
     total = float(joint.sum())
     return joint / total if total > 0 else None
 

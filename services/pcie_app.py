@@ -169,10 +169,7 @@ def result_record(number: int, output: FrameOutput) -> FrameResult:
     """The boards' outcome as a record."""
     return FrameResult(
         number=number,
-        boards=[
-            BoardOutcome(board.counts.astype("<u4", copy=False).tobytes(), board.cycles, int(board.reason))
-            for board in output.boards
-        ],
+        boards=[BoardOutcome(board.words, board.cycles, int(board.reason)) for board in output.boards],
         register_writes_ns=output.register_writes_ns,
         compute_ns=output.compute_ns,
         reads_ns=output.reads_ns,

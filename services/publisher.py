@@ -27,8 +27,8 @@ from services.records import AnyRecord, Begin, BoardOutcome, FrameResult, Publis
 from services.results import (
     FRAME_TOPIC,
     FRAME_TYPE,
+    FrameReport,
     Times,
-    frame_message,
     posterior_layout,
     posterior_of,
     times_of,
@@ -78,7 +78,7 @@ class ResultTopics:
         self._outputs: list[tuple[Ros, Publication]] = []
         self._frames: Publication | None = None
         self._watched: Subscription | None = None
-        self._ros_version: Literal[1, 2] = 2
+        self._report = FrameReport(deployment, 2)
         self._previous_out_ns = 0
         self.rosbridges: dict[str, Ros] = {}
 
@@ -106,10 +106,10 @@ class ResultTopics:
                 self._outputs.append((by_uri[uri], await by_uri[uri].advertise(output.topic, output.type)))
             first = self._outputs[0][0]
             self._frames = await first.advertise(FRAME_TOPIC, FRAME_TYPE)
+            version: Literal[1, 2] = 1 if settings.ros_version == "1" else 2
             if settings.ros_version == "auto":
-                self._ros_version = await first.detect_ros_version() or 2
-            else:
-                self._ros_version = 1 if settings.ros_version == "1" else 2
+                version = await first.detect_ros_version() or 2
+            self._report = FrameReport(deployment, version)
             topics = ", ".join(output.topic for output in deployment.outputs)
             yield f"publishing on {topics} at {', '.join(by_uri)}"
 
@@ -169,14 +169,7 @@ class ResultTopics:
     async def _send(self, publish: Publish, times: Times, posterior: Any) -> None:
         if self._frames is not None:
             await self._frames.publish(
-                frame_message(
-                    self._deployment,
-                    publish,
-                    times,
-                    published=posterior is not None,
-                    sent_ns=time.time_ns(),
-                    ros_version=self._ros_version,
-                )
+                self._report.message(publish, times, published=posterior is not None, sent_ns=time.time_ns())
             )
         if posterior is not None:
             await self.publish_array(posterior)

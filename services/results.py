@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
+import orjson
 
 from bridge.stamps import header
 from machines.bm1 import StopReason
@@ -46,6 +47,16 @@ def counts_of(result: FrameResult) -> list[npt.NDArray[np.uint32]]:
     return [np.frombuffer(board.counts, dtype="<u4") for board in result.boards]
 
 
+def totals_of(result: FrameResult) -> list[int]:
+    """The sum of each board's counts."""
+    words = [len(board.counts) // 4 for board in result.boards]
+    if not all(words):
+        return [int(counts.sum()) for counts in counts_of(result)]
+    together = np.frombuffer(b"".join([board.counts for board in result.boards]), dtype="<u4")
+    sums: list[int] = np.add.reduceat(together, [0, *accumulate(words[:-1])], dtype=np.uint64).tolist()
+    return sums
+
+
 def posterior_of(result: FrameResult) -> npt.NDArray[np.float64] | None:
     """The joint posterior over all lines, float64, or None when no line of any board counted."""
     return joint_posterior(counts_of(result), [board.cycles for board in result.boards])
@@ -78,67 +89,93 @@ def times_of(publish: Publish, now_tick: int, previous_out_ns: int) -> Times:
     )
 
 
-def frame_message(
-    deployment: Deployment,
-    publish: Publish,
-    times: Times,
-    *,
-    published: bool,
-    sent_ns: int,
-    ros_version: Literal[1, 2],
-) -> dict[str, Any]:
-    """The DiagnosticArray that precedes a result: number, cycles, reasons, and times (outputs.md names them)."""
-    result = publish.result
-    reasons = [StopReason(board.reason) for board in result.boards]
-    totals = [int(counts.sum()) for counts in counts_of(result)]
-    times_us = [
-        ("rosbridge_in_us", times.rosbridge_in),
-        ("local_hops_us", times.local_hops),
-        ("waited_us", times.waited),
-        ("register_writes_us", times.register_writes),
-        ("compute_us", times.compute),
-        ("reads_us", times.reads),
-        ("boards_compute_us", times.boards_compute),
-        ("rosbridge_out_us", times.rosbridge_out),
-    ]
-    values: list[tuple[str, str]] = [
-        ("number", str(result.number)),
-        ("published", "true" if published else "false"),
-        ("cycles", str(max((board.cycles for board in result.boards), default=0))),
-        ("counts_total", str(sum(totals))),
-        ("received_ns", str(publish.received_ns)),
-        ("sent_ns", str(sent_ns)),
-        *((name, f"{value:.1f}") for name, value in times_us),
-    ]
-    ok = 0 if published else 1
-    if published:
-        overall = "posterior"
-    elif all(reason is StopReason.IMPOSSIBLE for reason in reasons):
-        overall = "no posterior: the readings are impossible for every line"
-    else:
-        overall = "no posterior: no line counted within max_cycles"
-    statuses = [_status(ok, "rosbayes: frame", overall, deployment.name, values)]
-    for index, (board, reason, total) in enumerate(zip(result.boards, reasons, totals, strict=True)):
-        words = REASON_WORDS[reason]
-        statuses.append(
-            _status(
-                0,
-                f"rosbayes: board {index}",
-                words,
-                f"board{index}",
-                [("cycles", str(board.cycles)), ("counts_total", str(total)), ("reason", words)],
-            )
+class FrameReport:
+    """What /bm/frame says of a frame (outputs: number, cycles, reasons, times): its text is made once, and filled in.
+
+    It goes out before every result, so its cost is every frame's.
+    """
+
+    def __init__(self, deployment: Deployment, ros_version: Literal[1, 2]) -> None:
+        self._ros_version = ros_version
+        name = orjson.dumps(deployment.name).decode().replace("%", "%%")
+        self._frame = _status(
+            "%d",
+            '"rosbayes: frame"',
+            '"%s"',
+            name,
+            {
+                "number": "%d",
+                "published": "%s",
+                "cycles": "%d",
+                "counts_total": "%d",
+                "received_ns": "%d",
+                "sent_ns": "%d",
+                "rosbridge_in_us": "%.1f",
+                "local_hops_us": "%.1f",
+                "waited_us": "%.1f",
+                "register_writes_us": "%.1f",
+                "compute_us": "%.1f",
+                "reads_us": "%.1f",
+                "boards_compute_us": "%.1f",
+                "rosbridge_out_us": "%.1f",
+            },
         )
-    return {"header": header(publish.stamp_ns, "bm", ros_version), "status": statuses}
+        self._board = _status(
+            "0",
+            '"rosbayes: board %d"',
+            '"%s"',
+            '"board%d"',
+            {"cycles": "%d", "counts_total": "%d", "reason": "%s"},
+        )
+
+    def message(self, publish: Publish, times: Times, *, published: bool, sent_ns: int) -> dict[str, Any]:
+        """The DiagnosticArray that precedes a result.
+
+        Args:
+            publish: the result, and its reading's stamps.
+            times: where its time went.
+            published: whether it has a posterior.
+            sent_ns: Unix time.
+        """
+        result = publish.result
+        totals = totals_of(result)
+        if published:
+            overall = "posterior"
+        elif all(board.reason == StopReason.IMPOSSIBLE for board in result.boards):
+            overall = "no posterior: the readings are impossible for every line"
+        else:
+            overall = "no posterior: no line counted within max_cycles"
+        statuses = [
+            self._frame
+            % (
+                0 if published else 1,
+                overall,
+                result.number,
+                "true" if published else "false",
+                max((board.cycles for board in result.boards), default=0),
+                sum(totals),
+                publish.received_ns,
+                sent_ns,
+                times.rosbridge_in,
+                times.local_hops,
+                times.waited,
+                times.register_writes,
+                times.compute,
+                times.reads,
+                times.boards_compute,
+                times.rosbridge_out,
+            )
+        ]
+        for index, (board, total) in enumerate(zip(result.boards, totals, strict=True)):
+            words = REASON_WORDS[StopReason(board.reason)]
+            statuses.append(self._board % (index, words, index, board.cycles, total, words))
+        return {
+            "header": header(publish.stamp_ns, "bm", self._ros_version),
+            "status": orjson.Fragment(f"[{','.join(statuses)}]"),
+        }
 
 
-def _status(
-    level: int, name: str, message: str, hardware_id: str, values: Sequence[tuple[str, str]]
-) -> dict[str, Any]:
-    return {
-        "level": level,
-        "name": name,
-        "message": message,
-        "hardware_id": hardware_id,
-        "values": [{"key": key, "value": value} for key, value in values],
-    }
+def _status(level: str, name: str, message: str, hardware_id: str, values: dict[str, str]) -> str:
+    """A DiagnosticStatus as JSON, whose parts may be what `%` fills in: numbers, or words without quotes."""
+    pairs = ",".join(f'{{"key":"{key}","value":"{value}"}}' for key, value in values.items())
+    return f'{{"level":{level},"name":{name},"message":{message},"hardware_id":{hardware_id},"values":[{pairs}]}}'

@@ -514,6 +514,6 @@ def test_misbehaviours_are_parsed() -> None:
 
 
 def test_a_result_is_plain_data() -> None:
-    result = BoardResult(counts=np.zeros(1, np.uint32), cycles=0, reason=StopReason.NONE, compute_ns=0)
+    result = BoardResult(words=bytes(4), cycles=0, reason=StopReason.NONE, compute_ns=0)
     with pytest.raises(AttributeError):
         result.cycles = 1
