@@ -13,6 +13,10 @@ class ModelError(ToolchainError):
     """A model that is not a BM1's: wrong shapes, names, probabilities or parameters."""
 
 
+class NetworkFileError(ModelError):
+    """A network's file that can't be read: damaged, hostile, or of another kind; says the file and the line."""
+
+
 class BuildError(ToolchainError):
     """A build that cannot be done: options that don't fit, or a folder that can't be written."""
 

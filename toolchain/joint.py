@@ -212,10 +212,7 @@ class Question:
         for total in sums.values():
             prior = _scaled(prior * total)
         if not prior.sum() > 0:
-            fixed = ", ".join(f"{name} = {self.joint.symbol(name).type.labels or ''}" for name in ())
-            message = (
-                f"{self.joint.name}: what is given is impossible, so there is no distribution to ask{fixed}"
-            )
+            message = f"{self.joint.name}: what is given is impossible, so there is nothing to search"
             raise ModelError(message)
         prior /= prior.sum()
         select = None

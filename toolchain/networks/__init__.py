@@ -1,0 +1,77 @@
+"""Readers of Bayesian networks' files: BIF, XMLBIF, UAI and NET become joint distributions."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, Literal
+
+from toolchain.errors import ModelError, NetworkFileError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from toolchain.joint import JointDistribution
+    from toolchain.networks.builder import NetworkBuilder
+
+MAX_BYTES: Final = 32 << 20
+"""The largest file that is read."""
+
+SUFFIXES: Final = (".bif", ".xmlbif", ".bifxml", ".xml", ".uai", ".net")
+"""What a network's file is called."""
+
+
+def is_network(path: Path) -> bool:
+    """Whether a path's name is one of a network's file."""
+    return Path(path).suffix.lower() in SUFFIXES
+
+
+def read_network(path: Path, *, on_missing: Literal["error", "missing"] = "error") -> JointDistribution:
+    """Return the joint distribution of a network's file.
+
+    Args:
+        path: A file whose name ends in one of `SUFFIXES`.
+        on_missing: Whether readings of its variables may be missing.
+
+    Raises:
+        NetworkFileError: Not there, too large, or no such network; one sentence with file and line.
+    """
+    from toolchain.networks.builder import NetworkBuilder
+
+    path = Path(path)
+    reader = _reader(path)
+    try:
+        with path.open("rb") as file:
+            data = file.read(MAX_BYTES + 1)
+    except OSError as reason:
+        message = f"{path} can't be read: {reason.strerror or reason}"
+        raise NetworkFileError(message) from None
+    if len(data) > MAX_BYTES:
+        message = f"{path} is larger than {MAX_BYTES} bytes, the most that is read"
+        raise NetworkFileError(message)
+    builder = NetworkBuilder(path, on_missing=on_missing)
+    reader(data, builder)
+    try:
+        return builder.joint()
+    except NetworkFileError:
+        raise
+    except ModelError as reason:
+        message = f"{path}: {reason}"
+        raise NetworkFileError(message) from None
+
+
+def _reader(path: Path) -> Callable[[bytes, NetworkBuilder], None]:
+    match path.suffix.lower():
+        case ".bif":
+            from toolchain.networks.bif import read_bif as reader
+        case ".xmlbif" | ".bifxml" | ".xml":
+            from toolchain.networks.xmlbif import read_xmlbif as reader
+        case ".uai":
+            from toolchain.networks.uai import read_uai as reader
+        case ".net":
+            from toolchain.networks.net import read_net as reader
+        case _:
+            message = (
+                f"{path} is no network that is known here; expected a name that ends in {', '.join(SUFFIXES)}"
+            )
+            raise NetworkFileError(message)
+    return reader

@@ -1,0 +1,115 @@
+"""BIF, the Interchange Format for Bayesian networks (version 0.15): `variable` and `probability` blocks."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from toolchain.networks.builder import MAX_PARENTS, MAX_STATES
+from toolchain.networks.scanner import Scanner
+
+if TYPE_CHECKING:
+    from toolchain.networks.builder import NetworkBuilder
+
+_COMMENTS: Final = r"//[^\n]*|/\*"
+
+
+def read_bif(data: bytes, builder: NetworkBuilder) -> None:
+    """Read a BIF file.
+
+    `table` lists a distribution with the child's states slowest and the last parent fastest; `(a, b) ...` gives one
+    row, `default ...` those that are not given.
+
+    Raises:
+        NetworkFileError: It is none; says the line and what was expected there.
+    """
+    text = Scanner(data, builder.path, comments=_COMMENTS)
+    while (block := text.next()) or text.quoted:
+        match block:
+            case "network":
+                builder.name(text.word("the network's name"))
+                _properties(text)
+            case "variable":
+                _variable(text, builder)
+            case "probability":
+                _probability(text, builder)
+            case _:
+                raise text.error(f"{block[:40]!r} stands where network, variable or probability is expected")
+
+
+def _properties(text: Scanner) -> None:
+    text.sign("{")
+    while text.peek() != "}":
+        text.sign("property")
+        text.skip(";")
+    text.sign("}")
+
+
+def _variable(text: Scanner, builder: NetworkBuilder) -> None:
+    name = text.word("a variable's name")
+    states: list[str] | None = None
+    text.sign("{")
+    while (entry := text.next()) != "}":
+        if entry == "property":
+            text.skip(";")
+        elif entry == "type":
+            text.sign("discrete")
+            text.sign("[")
+            count = text.count("the number of states", MAX_STATES)
+            text.sign("]")
+            text.sign("{")
+            states = text.words("}", "states", MAX_STATES)
+            text.sign(";")
+            if len(states) != count:
+                raise text.error(f"{name} is to have {count} states, but {len(states)} are named")
+        else:
+            raise text.error(f"{entry[:40] or 'the end'!r} stands where type, property or '}}' is expected")
+    if states is None:
+        raise text.error(f"the variable {name} has no type")
+    builder.variable(name, states, text)
+
+
+def _probability(text: Scanner, builder: NetworkBuilder) -> None:
+    text.sign("(")
+    child = text.word("a variable's name")
+    parents: list[str] = []
+    separator = text.next()
+    if separator == "|":
+        parents = text.words(")", "parents", MAX_PARENTS)
+    elif separator != ")":
+        raise text.error(f"{separator[:40]!r} stands where '|' or ')' is expected")
+    shape = builder.shape((child, *parents), text)
+    rows = math.prod(shape[1:])
+    values = np.full((shape[0], rows), np.nan)
+    default = None
+    text.sign("{")
+    while (entry := text.next()) != "}":
+        match entry:
+            case "property":
+                text.skip(";")
+            case "table":
+                values[:] = text.numbers(";", values.size, f"the table of {child}").reshape(values.shape)
+            case "default":
+                default = text.numbers(";", shape[0], f"the default of {child}")
+            case "(":
+                labels = text.words(")", "the parents' states", MAX_PARENTS)
+                if len(labels) != len(parents):
+                    raise text.error(f"{len(labels)} states for the {len(parents)} parents of {child}")
+                at = 0
+                for parent, size, label in zip(parents, shape[1:], labels, strict=True):
+                    at = at * size + builder.state(parent, label, text)
+                if not np.isnan(values[0, at]):
+                    raise text.error(f"{child} has two rows for ({', '.join(labels)})")
+                values[:, at] = text.numbers(";", shape[0], f"a row of {child}")
+            case _:
+                raise text.error(
+                    f"{entry[:40] or 'the end'!r} stands where table, default, a row or '}}' is expected"
+                )
+    missing = np.isnan(values[0])
+    if default is not None:
+        values[:, missing] = default[:, np.newaxis]
+    elif missing.any():
+        raise text.error(f"{np.count_nonzero(missing)} of the {rows} rows of {child} are not given")
+    builder.distribution(child, parents, values.reshape(shape), text)

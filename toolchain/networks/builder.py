@@ -1,0 +1,196 @@
+"""What a reader has found so far: variables and tables, bounded, checked as they come, each mistake with its place."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import chain
+from typing import TYPE_CHECKING, Final, Literal, Protocol
+
+import numpy as np
+
+from toolchain.distribution import MAX_ENTRIES, Factor, potential, table
+from toolchain.errors import ModelError, NetworkFileError
+from toolchain.joint import JointDistribution
+from toolchain.symbol import IntegerType, LabelType, Symbol
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+MAX_VARIABLES: Final = 20_000
+MAX_STATES: Final = 65_535
+"""A column serves at most 2^16 - 1 values."""
+MAX_PARENTS: Final = 30
+"""NumPy's arrays have at most 64 axes; no table of 2^24 entries needs as many."""
+MAX_TOTAL: Final = 2 * MAX_ENTRIES
+"""Entries of all tables together."""
+MAX_NAME: Final = 200
+
+_ROUNDING: Final = 0.02
+"""How far from 1 a distribution may sum: networks in use are rounded to two or three digits."""
+
+
+class Place(Protocol):
+    """Where a reader stands in its file."""
+
+    def error(self, sentence: str) -> NetworkFileError:
+        """Return an error that says file and line before the sentence."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Table:
+    child: str
+    parents: tuple[str, ...]
+    values: NDArray[np.float64]
+    place: Place
+
+
+class NetworkBuilder:
+    """Takes a file's variables and tables, and makes a joint distribution of them."""
+
+    def __init__(self, path: Path, *, on_missing: Literal["error", "missing"] = "error") -> None:
+        self.path = path
+        self._on_missing = on_missing
+        self._name = ""
+        self._symbols: dict[str, Symbol] = {}
+        self._factors: list[Factor] = []
+        self._children: set[str] = set()
+        self._entries = 0
+
+    def name(self, name: str) -> None:
+        """Take the network's name; the file's stands for `unknown` and the like."""
+        if name.lower() not in {"unknown", "network", "unnamed", "default", ""}:
+            self._name = name[:MAX_NAME]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The variables so far, in the file's order."""
+        return tuple(self._symbols)
+
+    def size(self, name: str, place: Place) -> int:
+        """Return how many states a variable has.
+
+        Raises:
+            NetworkFileError: There is no such variable so far.
+        """
+        if name not in self._symbols:
+            raise place.error(f"there is no variable {name[:MAX_NAME]!r} before this line")
+        return self._symbols[name].size
+
+    def state(self, name: str, label: str, place: Place) -> int:
+        """Return which state of a variable a label is.
+
+        Raises:
+            NetworkFileError: No such variable or state.
+        """
+        self.size(name, place)
+        try:
+            return self._symbols[name].index(label)
+        except ModelError as reason:
+            raise place.error(str(reason)) from None
+
+    def variable(self, name: str, states: Sequence[str] | int, place: Place) -> None:
+        """Take a variable with its states' names, or with so many states that are numbers from 0.
+
+        Raises:
+            NetworkFileError: One that is there, one without a name or states, or more than the limits.
+        """
+        if not 0 < len(name) <= MAX_NAME:
+            raise place.error(f"a variable's name has {len(name)} characters, expected 1 to {MAX_NAME}")
+        if name in self._symbols:
+            raise place.error(f"the variable {name!r} is there twice")
+        if len(self._symbols) == MAX_VARIABLES:
+            raise place.error(f"more than {MAX_VARIABLES} variables")
+        count = states if isinstance(states, int) else len(states)
+        if not 0 < count <= MAX_STATES:
+            raise place.error(f"{name} has {count} states, expected 1 to {MAX_STATES}")
+        try:
+            kind = IntegerType(0, count - 1) if isinstance(states, int) else LabelType(*states)
+            if any(len(label) > MAX_NAME for label in kind.labels):
+                raise place.error(f"a state of {name} has more than {MAX_NAME} characters")
+            self._symbols[name] = Symbol(name, kind, on_missing=self._on_missing)
+        except ModelError as reason:
+            raise place.error(f"variable {name}: {reason}") from None
+
+    def shape(self, scope: Sequence[str], place: Place) -> tuple[int, ...]:
+        """Return the shape of a table over some variables, within the limits.
+
+        Raises:
+            NetworkFileError: A variable that is not there or there twice, or a table above the limits.
+        """
+        if len(scope) > MAX_PARENTS + 1:
+            raise place.error(f"a table of {len(scope)} variables; the most is {MAX_PARENTS + 1}")
+        if len(set(scope)) < len(scope):
+            raise place.error(f"the table of {', '.join(scope)} names a variable twice")
+        shape = tuple(self.size(name, place) for name in scope)
+        entries = math.prod(shape)
+        self._entries += entries
+        if entries > MAX_ENTRIES or self._entries > MAX_TOTAL:
+            raise place.error(
+                f"a table of {entries} entries makes {self._entries}; the most is {MAX_ENTRIES} in one table and "
+                f"{MAX_TOTAL} in all"
+            )
+        return shape
+
+    def distribution(
+        self, child: str, parents: Sequence[str], values: NDArray[np.float64], place: Place
+    ) -> None:
+        """Take P(child | parents), float64[child's states, states of each parent].
+
+        Numbers that sum to nearly 1 are rounded ones: they are divided by their sum.
+
+        Raises:
+            NetworkFileError: One that is there, numbers that are no probabilities, or that don't sum to 1.
+        """
+        if child in self._children:
+            raise place.error(f"{child} has two tables")
+        self._children.add(child)
+        symbols = [self._symbols[name] for name in (child, *parents)]
+        if not np.all(np.isfinite(values)) or np.any(values < 0):
+            raise place.error(f"the table of {child} holds a number that is no probability")
+        sums = values.sum(axis=0)
+        wrong = np.argwhere(np.abs(sums - 1) > _ROUNDING)
+        if len(wrong):
+            at = tuple(wrong[0])
+            where = ", ".join(
+                f"{symbol.name} = {symbol.type.labels[state] if symbol.type.labels else state}"
+                for symbol, state in zip(symbols[1:], at, strict=True)
+            )
+            raise place.error(
+                f"the probabilities of {child} sum to {float(sums[at]):.6g}"
+                + (f" for {where}" if where else "")
+            )
+        try:
+            self._factors.append(table(symbols[0], values / sums, given=symbols[1:]))
+        except ModelError as reason:
+            raise place.error(str(reason)) from None
+
+    def potential(self, scope: Sequence[str], values: NDArray[np.float64], place: Place) -> None:
+        """Take a factor that is no distribution, float64[states of each variable].
+
+        Raises:
+            NetworkFileError: Numbers that are negative, infinite or NaN.
+        """
+        try:
+            self._factors.append(potential([self._symbols[name] for name in scope], values))
+        except ModelError as reason:
+            raise place.error(str(reason)) from None
+
+    def joint(self) -> JointDistribution:
+        """Return the joint distribution; its symbols are in the file's order.
+
+        Raises:
+            ModelError: No variables, one without a table, or a circle of parents.
+        """
+        if not self._symbols:
+            message = "the file has no variables"
+            raise ModelError(message)
+        used = {symbol.name for symbol in chain.from_iterable(factor.scope for factor in self._factors)}
+        for name in self._symbols:
+            if name not in used:
+                message = f"{name} has no table"
+                raise ModelError(message)
+        return JointDistribution(self._name or self.path.stem, tuple(self._factors))

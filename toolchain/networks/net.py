@@ -1,0 +1,100 @@
+"""NET, Hugin's format: `node` blocks with their states, `potential` blocks with their data."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from toolchain.networks.builder import MAX_PARENTS, MAX_STATES
+from toolchain.networks.scanner import Scanner
+
+if TYPE_CHECKING:
+    from toolchain.networks.builder import NetworkBuilder
+
+_COMMENTS: Final = r"%[^\n]*"
+_OTHER_NODES: Final = {"continuous", "utility", "decision", "function"}
+
+
+def read_net(data: bytes, builder: NetworkBuilder) -> None:
+    """Read a NET file of discrete nodes; `data` has the parents in their order, the child fastest.
+
+    Raises:
+        NetworkFileError: It is none, or has nodes that are no discrete chance nodes; says the line.
+    """
+    text = Scanner(data, builder.path, signs="{}()|;,=", comments=_COMMENTS)
+    in_class = False
+    while (block := text.next()) or text.quoted:
+        match block:
+            case "class" if not in_class:
+                builder.name(text.word("the class's name"))
+                text.sign("{")
+                in_class = True
+            case "}" if in_class:
+                in_class = False
+            case "net" if text.peek() == "{":
+                text.sign("{")
+                text.skip("}")
+            case "discrete":
+                text.sign("node")
+                _node(text, builder)
+            case "node":
+                _node(text, builder)
+            case "potential":
+                _potential(text, builder)
+            case _ if block in _OTHER_NODES:
+                raise text.error(f"a {block} node: only discrete chance nodes can be read")
+            case _ if in_class:
+                text.sign("=")
+                text.skip(";")
+            case _:
+                raise text.error(f"{block[:40]!r} stands where net, node or potential is expected")
+    if in_class:
+        raise text.error("the end of the file stands where '}' of the class is expected")
+
+
+def _node(text: Scanner, builder: NetworkBuilder) -> None:
+    name = text.word("a node's name")
+    states: list[str] | None = None
+    text.sign("{")
+    while (key := text.next()) != "}":
+        if not key:
+            raise text.error("the end of the file stands where '}' is expected")
+        text.sign("=")
+        if key == "states":
+            text.sign("(")
+            states = text.words(")", "states", MAX_STATES)
+            text.sign(";")
+        else:
+            text.skip(";")
+    if states is None:
+        raise text.error(f"the node {name} has no states")
+    builder.variable(name, states, text)
+
+
+def _potential(text: Scanner, builder: NetworkBuilder) -> None:
+    text.sign("(")
+    child = text.word("a node's name")
+    separator = text.next()
+    parents: list[str] = []
+    if separator == "|":
+        parents = text.words(")", "parents", MAX_PARENTS)
+    elif separator != ")":
+        raise text.error(
+            f"{separator[:40]!r} stands where '|' or ')' is expected: a potential of one node is read"
+        )
+    shape = builder.shape((*parents, child), text)
+    values = None
+    text.sign("{")
+    while (key := text.next()) != "}":
+        if not key:
+            raise text.error("the end of the file stands where '}' is expected")
+        text.sign("=")
+        if key == "data":
+            numbers = text.numbers(";", int(np.prod(shape)), f"the data of {child}", between="(),")
+            values = np.moveaxis(numbers.reshape(shape), -1, 0)
+        else:
+            text.skip(";")
+    if values is None:
+        raise text.error(f"the potential of {child} has no data")
+    builder.distribution(child, parents, values, text)

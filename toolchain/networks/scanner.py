@@ -1,0 +1,236 @@
+"""Takes a text file apart into words, quoted words, signs and numbers, and knows at which line it stands."""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from toolchain.errors import NetworkFileError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+_SHOWN: Final = 40
+
+
+class Scanner:
+    """Reads on and on; `sign` and `word` take what stands next and refuse anything else."""
+
+    def __init__(self, data: bytes, path: Path, *, signs: str = "{}()[]|;,", comments: str = "") -> None:
+        """Take a file's bytes.
+
+        Args:
+            data: The bytes.
+            path: What the file is called in errors.
+            signs: Characters that stand for themselves; a word ends before one.
+            comments: A regular expression of the format's comments; of the form /* ... */ only the beginning.
+
+        Raises:
+            NetworkFileError: It is not UTF-8 text, or has a comment that is not closed.
+        """
+        self._path = path
+        try:
+            text = data.decode("utf-8-sig")
+        except UnicodeDecodeError as reason:
+            line = data.count(b"\n", 0, reason.start) + 1
+            message = f"{path}, line {line}: not UTF-8 text"
+            raise NetworkFileError(message) from None
+        self._text = text
+        self._start = self._end = 0
+        if comments:
+            self._text = self._without(re.compile(rf'"[^"\n]*"|{comments}'))
+        signs = re.escape(signs)
+        self._signs = re.compile(f"[{signs}]")
+        self._token = re.compile(rf'\s*(?:"([^"\n]*)"|([{signs}])|([^\s{signs}"]+)|(\Z)|(.))')
+        self.quoted = False
+        """Whether the word that was taken last stood in quotes."""
+
+    def error(self, sentence: str) -> NetworkFileError:
+        """Return an error at the line of what was taken last."""
+        start = self._end - len(self._text[self._start : self._end].lstrip())
+        line = self._text.count("\n", 0, start) + 1
+        return NetworkFileError(f"{self._path}, line {line}: {sentence}")
+
+    def next(self) -> str:
+        """Take what stands next: a word, a quoted word without its quotes, or a sign; empty at the end.
+
+        Raises:
+            NetworkFileError: A quote that is not closed on its line.
+        """
+        match = self._token.match(self._text, self._end)
+        if match is None:  # the last alternative takes any character
+            raise AssertionError
+        self._start, self._end = match.span()
+        self.quoted = match[1] is not None
+        if match[5] is not None:
+            raise self.error(f"{match[5]!r} opens a quote that is not closed")
+        return match[match.lastindex or 4]
+
+    def peek(self) -> str:
+        """Return what stands next without taking it."""
+        start, end, quoted = self._start, self._end, self.quoted
+        piece = self.next()
+        self._start, self._end, self.quoted = start, end, quoted
+        return piece
+
+    def sign(self, wanted: str) -> None:
+        """Take a sign or a keyword.
+
+        Raises:
+            NetworkFileError: Something else stands there.
+        """
+        found = self.next()
+        if found != wanted or self.quoted:
+            raise self.error(f"{_shown(found)} stands where {wanted!r} is expected")
+
+    def word(self, what: str) -> str:
+        """Take a word, plain or quoted; `what` says of what.
+
+        Raises:
+            NetworkFileError: A sign or the end stands there.
+        """
+        found = self.next()
+        if not self.quoted and (not found or self._is_sign(found)):
+            raise self.error(f"{_shown(found)} stands where {what} is expected")
+        return found
+
+    def words(self, end: str, what: str, most: int) -> list[str]:
+        """Take words up to a sign, with commas between them or without; the sign too.
+
+        Raises:
+            NetworkFileError: Another sign, the end, or more words than `most`.
+        """
+        found: list[str] = []
+        while True:
+            piece = self.next()
+            if piece == end and not self.quoted:
+                return found
+            if piece == "," and not self.quoted and found:
+                continue
+            if not self.quoted and (not piece or self._is_sign(piece)):
+                raise self.error(f"{_shown(piece)} stands where {what} or {end!r} is expected")
+            if len(found) == most:
+                raise self.error(f"more than {most} of {what}")
+            found.append(piece)
+
+    def count(self, what: str, most: int) -> int:
+        """Take a whole number from 0.
+
+        Raises:
+            NetworkFileError: It is none, or above `most`.
+        """
+        word = self.word(what)
+        if not (word.isascii() and word.isdigit() and len(word) <= 9) or int(word) > most:
+            raise self.error(f"{_shown(word)} stands where {what}, 0 to {most}, is expected")
+        return int(word)
+
+    def numbers(self, end: str, wanted: int, what: str, *, between: str = ",") -> NDArray[np.float64]:
+        """Take numbers up to a sign, with the signs `between` anywhere among them; the last sign too.
+
+        Returns:
+            float64[wanted].
+
+        Raises:
+            NetworkFileError: A word that is no number, or more or fewer of them.
+        """
+        stop = self._text.find(end, self._end)
+        if stop < 0:
+            self._start = self._end = len(self._text)
+            raise self.error(f"the end of the file stands where {end!r} is expected")
+        piece = self._text[self._end : stop]
+        begin, self._start, self._end = self._end, stop, stop + len(end)
+        for sign in between:
+            piece = piece.replace(sign, " ")
+        return self._floats(piece.split(maxsplit=wanted), wanted, what, begin)
+
+    def next_numbers(self, wanted: int, what: str) -> NDArray[np.float64]:
+        """Take so many numbers with nothing between them but space.
+
+        Returns:
+            float64[wanted].
+
+        Raises:
+            NetworkFileError: A word that is no number, or the end.
+        """
+        begin, words = self._end, []
+        for _ in range(wanted):
+            word = self.next()
+            if not word:
+                break
+            words.append(word)
+        return self._floats(words, wanted, what, begin)
+
+    def skip(self, end: str) -> None:
+        """Take everything up to a sign, that one too; brackets and quotes may hold it.
+
+        Raises:
+            NetworkFileError: The file ends first, or brackets don't match.
+        """
+        depth = 0
+        while True:
+            piece = self.next()
+            if self.quoted:
+                continue
+            if not piece:
+                raise self.error(f"the end of the file stands where {end!r} is expected")
+            if piece == end and depth == 0:
+                return
+            depth += (piece in "({[") - (piece in ")}]")
+            if depth < 0:
+                raise self.error(f"{piece!r} stands where {end!r} is expected")
+
+    def _without(self, comments: re.Pattern[str]) -> str:
+        """Return the text with spaces in the place of comments, and as many lines."""
+        parts, end, at = [], 0, 0
+        while match := comments.search(self._text, at):
+            begin, at = match.span()
+            if match[0].startswith('"'):
+                continue
+            if match[0] == "/*":
+                at = self._text.find("*/", at) + 2
+                if at < 2:
+                    self._start, self._end = begin, begin + 2
+                    raise self.error("this comment is not closed")
+            parts += [self._text[end:begin], " " + "\n" * self._text.count("\n", begin, at)]
+            end = at
+        return "".join(parts) + self._text[end:]
+
+    def _is_sign(self, piece: str) -> bool:
+        return self._signs.fullmatch(piece) is not None
+
+    def _floats(self, words: list[str], wanted: int, what: str, begin: int) -> NDArray[np.float64]:
+        try:
+            values = np.array([_float(word) for word in words])
+        except ValueError:
+            wrong = next(word for word in words if not _is_float(word))
+            at = self._text.find(wrong.split()[0], begin)
+            self._start, self._end = at, at + 1
+            raise self.error(f"{_shown(wrong)} in {what} is no number") from None
+        if len(values) != wanted:
+            count = f"more than {wanted}" if len(values) > wanted else str(len(values))
+            raise self.error(f"{what} has {count} numbers, expected {wanted}")
+        return values
+
+
+def _float(word: str) -> float:
+    if "_" in word:  # Python's own way to write digits
+        raise ValueError
+    return float(word)
+
+
+def _is_float(word: str) -> bool:
+    try:
+        _float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def _shown(piece: str) -> str:
+    if not piece:
+        return "the end of the file"
+    return repr(piece if len(piece) <= _SHOWN else piece[:_SHOWN] + "...")

@@ -1,0 +1,51 @@
+"""UAI: a network as numbers alone, BAYES or MARKOV; its variables are called 0, 1, 2 and so on."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from toolchain.networks.builder import MAX_PARENTS, MAX_STATES, MAX_VARIABLES
+from toolchain.networks.scanner import Scanner
+
+if TYPE_CHECKING:
+    from toolchain.networks.builder import NetworkBuilder
+
+_MAX_FACTORS = 4 * MAX_VARIABLES
+
+
+def read_uai(data: bytes, builder: NetworkBuilder) -> None:
+    """Read a UAI file: a preamble (kind, sizes, each factor's variables), then each factor's numbers.
+
+    A factor's last variable is the fastest in its numbers; in a BAYES file it is the child.
+
+    Raises:
+        NetworkFileError: It is none; says the line and what was expected there.
+    """
+    text = Scanner(data, builder.path)
+    kind = text.word("BAYES or MARKOV")
+    if kind not in {"BAYES", "MARKOV"}:
+        raise text.error(f"{kind[:40]!r} stands where BAYES or MARKOV is expected")
+    variables = text.count("the number of variables", MAX_VARIABLES)
+    for number in range(variables):
+        builder.variable(str(number), text.count("a variable's size", MAX_STATES), text)
+    factors = text.count("the number of factors", _MAX_FACTORS)
+    scopes = []
+    for _ in range(factors):
+        size = text.count("a factor's number of variables", MAX_PARENTS + 1)
+        scopes.append(tuple(str(text.count("a variable", variables - 1)) for _ in range(size)))
+    for number, scope in enumerate(scopes):
+        what = f"factor {number}"
+        shape = builder.shape(scope, text)
+        given = text.count(f"the number of entries of {what}", 10**9 - 1)
+        if given != math.prod(shape):
+            raise text.error(f"{what} is to have {given} entries, but its variables make {math.prod(shape)}")
+        values = text.next_numbers(given, what).reshape(shape)
+        if kind == "BAYES" and scope:
+            builder.distribution(scope[-1], scope[:-1], np.moveaxis(values, -1, 0), text)
+        else:
+            builder.potential(scope, values, text)
+    if rest := text.next():
+        raise text.error(f"{rest[:40]!r} stands after the last factor")
