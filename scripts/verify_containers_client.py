@@ -1,0 +1,162 @@
+"""Runs in a container beside the stack: compares each result with exact float64 fusion of the same readings.
+
+Prints one JSON object a result: `at` (Unix time), `number`, `tv` (total variation to float64, 0..1), or `wrong` with a
+sentence. With --bits N it ends after N results, having computed each anew with the reference kernel: cycles, counts
+and posterior must be the same to the bit.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import os
+import time
+from collections import OrderedDict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bridge.client import Ros, connect
+from bridge.errors import BridgeError
+from bridge.stamps import stamp_ns
+from casestudies.boat.geometry import SENSOR_NAMES
+from casestudies.boat.messages import SENSORS_TOPIC, SENSORS_TYPE
+from casestudies.boat.model import model
+from casestudies.listening import listen
+from casestudies.results import Instance
+from machines.bm1 import Start
+from machines.posterior import joint_posterior
+from machines.reference import ReferenceBM1
+from pcie_shim.programming_file import read_image
+from toolchain.deployment import load_deployment
+from toolchain.fusion import exact_posterior
+
+KEPT = 512
+"""Readings kept until their result comes."""
+PATIENCE_S = 60.0
+"""Seconds until the server is there, and until the first result."""
+
+
+class Readings:
+    """The readings heard on /boat/sensors, by their stamp."""
+
+    def __init__(self) -> None:
+        self._heard: OrderedDict[int, tuple[int, ...]] = OrderedDict()
+        self._news = asyncio.Event()
+
+    async def hear(self, ros: Ros) -> None:
+        """Keep what comes, until cancelled."""
+        async for message in ros.subscribe(SENSORS_TOPIC, SENSORS_TYPE, queue_size=KEPT):
+            fields: dict[str, Any] = dict(message.msg)
+            self._heard[stamp_ns(fields["header"]["stamp"])] = tuple(
+                int(fields[name]) for name in SENSOR_NAMES
+            )
+            if len(self._heard) > KEPT:
+                self._heard.popitem(last=False)
+            self._news.set()
+
+    async def of(self, stamp: int) -> tuple[int, ...] | None:
+        """The readings with this stamp; None if they were not heard."""
+        deadline = time.monotonic() + 1
+        while stamp not in self._heard and time.monotonic() < deadline:
+            self._news.clear()
+            try:
+                await asyncio.wait_for(self._news.wait(), deadline - time.monotonic())
+            except TimeoutError:
+                break
+        return self._heard.get(stamp)
+
+
+class Bits:
+    """The deployment's boards, computed by the reference kernel in this process."""
+
+    def __init__(self, folder: Path) -> None:
+        self._deployment = load_deployment(folder)
+        self._machines = [
+            read_image(self._deployment.image_path(board)).machine
+            for board in range(len(self._deployment.boards))
+        ]
+
+    def wrong(self, instance: Instance, addresses: tuple[int, ...]) -> str:
+        """What differs; nothing if all is the same."""
+        report, posterior = instance.report, instance.posterior
+        assert report is not None
+        assert report.number is not None
+        assert posterior is not None
+        machine = self._deployment.machine
+        counts, cycles = [], []
+        for at, (board, said) in enumerate(zip(self._machines, report.boards, strict=True)):
+            kernel = ReferenceBM1(board)
+            if said.cycles:
+                # it stopped there: by itself, or because another board had overflowed
+                bank = report.number % machine.rng_banks
+                kernel.start(
+                    Start(
+                        addresses=addresses,
+                        target_count=machine.target_count,
+                        max_cycles=said.cycles,
+                        bank=bank,
+                    )
+                )
+            if (kernel.cycles, int(kernel.counts.sum())) != (said.cycles, said.counts_total):
+                return f"board {at} says {said.cycles} cycles, counts {said.counts_total}; the reference {kernel.cycles}, {int(kernel.counts.sum())}"
+            counts.append(kernel.counts)
+            cycles.append(kernel.cycles)
+        ours = joint_posterior(counts, cycles)
+        if ours is None or not np.array_equal(ours, np.asarray(posterior.values)):
+            return "the posterior is not that of these counts"
+        return ""
+
+
+async def check(uri: str, width: int, height: int, bits: int) -> None:
+    """Print a line of each result, for ever or until `bits` of them were computed anew."""
+    boat = model(width, height)
+    reference = Bits(Path(os.environ["BM_DEPLOYMENT"])) if bits else None
+    readings = Readings()
+    async with connect(uri) as ros, listen(ros) as listener:
+        hearing = asyncio.create_task(readings.hear(ros))
+        print(json.dumps({"listening": uri}), flush=True)
+        number = 0
+        while not bits or number < bits:
+            instance = await listener.next(PATIENCE_S)
+            report, posterior = instance.report, instance.posterior
+            if posterior is None or report is None:
+                continue
+            number += 1
+            addresses = await readings.of(report.stamp_ns)
+            line: dict[str, Any] = {"at": posterior.heard_ns / 1e9, "number": report.number}
+            if addresses is None:
+                line["wrong"] = "no reading has its stamp"
+            elif len(posterior.values) != width * height:
+                line["wrong"] = f"it has {len(posterior.values)} lines, not {width * height}"
+            else:
+                exact = exact_posterior(boat, addresses)
+                line["tv"] = round(float(0.5 * np.abs(np.asarray(posterior.values) - exact).sum()), 4)
+                if reference is not None and (wrong := reference.wrong(instance, addresses)):
+                    line["wrong"] = wrong
+            print(json.dumps(line), flush=True)
+        hearing.cancel()
+
+
+async def main() -> None:
+    """Read the flags, wait for the server, check."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("uri")
+    parser.add_argument("--cells", type=int, nargs=2, default=(32, 32), help="width and height of the map")
+    parser.add_argument("--bits", type=int, default=0)
+    arguments = parser.parse_args()
+    deadline = time.monotonic() + PATIENCE_S
+    while True:
+        try:
+            await check(arguments.uri, *arguments.cells, arguments.bits)
+        except BridgeError:
+            if time.monotonic() > deadline:
+                raise
+            await asyncio.sleep(0.2)
+        else:
+            return
+
+
+asyncio.run(main())
