@@ -1,0 +1,113 @@
+"""docs/operating.md: alarms that the sources print, units that systemd takes."""
+
+import ast
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+PAGE = (ROOT / "docs/operating.md").read_text()
+PACKAGES = ("services", "bridge", "pcie_shim")
+
+
+def literals(*packages):
+    """All texts in the sources; of an f-string the pieces between its expressions, neighbours joined by …."""
+    found = set()
+    for package in packages:
+        for path in (ROOT / package).rglob("*.py"):
+            for node in ast.walk(ast.parse(path.read_text())):
+                if isinstance(node, ast.JoinedStr):
+                    found.add(
+                        "".join(part.value if isinstance(part, ast.Constant) else "…" for part in node.values)
+                    )
+                elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+                    found.add(re.sub(r"%[sd]", "…", node.value))
+    return found
+
+
+ALARMS = PAGE.split("## What each alarm means", 1)[1]
+
+
+def alarms():
+    return re.findall(r"^\| `(.+?)` \|", ALARMS, re.MULTILINE)
+
+
+TEXTS = literals(*PACKAGES)
+
+
+def is_printed(alarm):
+    """Whether every piece of an alarm between its `…` (one sentence may quote another) stands in the sources."""
+    pieces = [piece for piece in re.split("…|: ", alarm) if len(re.sub(r"\W", "", piece)) > 2]
+    return bool(pieces) and all(any(piece.strip() in text for text in TEXTS) for piece in pieces)
+
+
+@pytest.mark.parametrize("alarm", alarms())
+def test_every_alarm_of_the_page_is_one_of_the_sources(alarm):
+    assert is_printed(alarm)
+
+
+def test_an_alarm_that_nobody_prints_is_found():
+    assert not is_printed("… is quite unhappy with …")
+    assert len(alarms()) > 40
+
+
+def warnings_of_the_services():
+    """The texts of all `x.warning("...")` and `x.notice("warning", "...")` calls, where they are not variables."""
+    for path in sorted((ROOT / "services").glob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if not (isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute)):
+                continue
+            said = node.args[:1] if node.func.attr == "warning" else node.args[1:2]
+            if node.func.attr in {"warning", "notice"} and said and isinstance(said[0], ast.JoinedStr):
+                yield "".join(
+                    part.value if isinstance(part, ast.Constant) else "…" for part in said[0].values
+                )
+
+
+@pytest.mark.parametrize("warning", sorted(set(warnings_of_the_services())))
+def test_every_warning_of_the_services_is_on_the_page(warning):
+    piece = max(warning.split("…"), key=len)
+    assert any(piece.strip() in shown for shown in re.findall("`([^`]+)`", ALARMS))
+
+
+def units():
+    """The unit files of the page: name and text."""
+    found = re.findall(r"`/etc/systemd/system/([\w@.-]+)`:\n\n```ini\n(.*?)```", PAGE, re.DOTALL)
+    return [pytest.param(name, text, id=name) for name, text in found]
+
+
+def test_the_page_has_three_units():
+    assert len(units()) == 3
+
+
+@pytest.mark.parametrize(("name", "text"), units())
+def test_a_unit_starts_one_of_our_commands_and_settings_are_known(name, text):
+    from services.settings import ENV_PREFIX, Settings
+
+    command = re.search(r"^ExecStart=/opt/rosbayes/.venv/bin/([\w-]+)", text, re.MULTILINE)[1]
+    assert (Path(sys.executable).parent / command).exists()
+    known = {ENV_PREFIX + name.upper() for name in Settings.model_fields}
+    assert set(re.findall(r"\bBM_[A-Z_]+", PAGE)) <= known
+    assert "SuccessExitStatus=143" in text
+
+
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd is not installed here")
+@pytest.mark.parametrize(("name", "text"), units())
+def test_systemd_takes_the_unit(name, text, tmp_path):
+    unit = tmp_path / name
+    # what the unit starts has to be there for the check
+    unit.write_text(text.replace("/opt/rosbayes/.venv/bin", str(Path(sys.executable).parent)))
+    checked = subprocess.run(
+        ["systemd-analyze", "verify", "--man=no", str(unit)],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    about_it = [line for line in checked.stderr.splitlines() if name in line or str(tmp_path) in line]
+    assert not about_it, checked.stderr
+    assert checked.returncode == 0, checked.stderr
