@@ -5,10 +5,12 @@ from __future__ import annotations
 import asyncio
 import logging
 import sys
-from typing import Annotated
+from pathlib import Path
+from typing import Annotated, Literal
 
 import typer
 
+from bridge.hub.door import Door, is_loopback, read_tokens, tls_context
 from bridge.hub.server import serve_hub
 from services.command_line import ends_well, make_app, run_async
 from services.errors import SettingsError
@@ -18,8 +20,9 @@ from services.status_socket import ProcessStatus, status_served
 from services.supervision import end_with_parent
 
 app = make_app(
-    "Serve rosbridge without ROS: topics, services between clients, and rosapi.\n\n`hub --port 9090`\n\n"
-    "It knows no passwords: on another address than this machine's own, whoever reaches it may publish."
+    "Serve rosbridge without ROS: topics, services, actions, parameters and rosapi.\n\n`hub --port 9090`\n\n"
+    "On another address than this machine's own it wants TLS and tokens:\n\n"
+    "`hub --host 0.0.0.0 --tls-cert cert.pem --tls-key key.pem --token-file tokens.txt`"
 )
 
 
@@ -28,14 +31,36 @@ app = make_app(
 def hub(
     host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port; 0 takes any free one.")] = 9090,
+    ros_version: Annotated[
+        Literal["1", "2"], typer.Option(help="Which ROS it plays: how types are written, what rosapi says.")
+    ] = "1",
+    tls_cert: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Its certificate (PEM); then it serves wss://.")
+    ] = None,
+    tls_key: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="The certificate's private key (PEM).")
+    ] = None,
+    token_file: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Tokens that clients must show, one a line.")
+    ] = None,
+    origin: Annotated[
+        list[str] | None, typer.Option(help="Web page that may connect, besides this machine's; repeatable.")
+    ] = None,
     insecure: Annotated[
-        bool, typer.Option("--insecure", help="Say that another address than loopback is meant.")
+        bool,
+        typer.Option("--insecure", help="Say that another address without TLS and tokens is meant."),
     ] = False,
 ) -> int:
     """Serve rosbridge without ROS."""
     end_with_parent()
-    if host not in {"127.0.0.1", "::1", "localhost"} and not insecure:
-        msg = f"--host {host} lets everybody on that network publish to your robot, and the hub knows no passwords; add --insecure if that is meant"
+    door = _door(tls_cert, tls_key, token_file, origin or [])
+    if not is_loopback(host) and not insecure and (door.tls is None or not door.tokens):
+        missing = " and ".join(
+            flags
+            for flags, there in (("--tls-cert and --tls-key", door.tls), ("--token-file", door.tokens))
+            if not there
+        )
+        msg = f"--host {host} lets everybody on that network publish to your robot; give {missing}, or --insecure if that is meant"
         raise SettingsError(msg)
 
     # a refusal gets no word to its client (as at the reference server): the log is where it is seen
@@ -45,7 +70,7 @@ def hub(
 
     def ready(at: int) -> None:
         shown = f"[{host}]" if ":" in host else host
-        listening.append(f"listening on ws://{shown}:{at}")
+        listening.append(f"listening on {'wss' if door.tls else 'ws'}://{shown}:{at}")
         say(f"hub: {listening[0]}")
 
     def tell() -> ProcessStatus:
@@ -53,10 +78,33 @@ def hub(
 
     async def serve() -> int:
         async with status_served(load_settings().run_directory, "hub", tell):
-            await serve_hub(host, port, on_ready=ready, stop=asyncio.Event())
+            await serve_hub(
+                host,
+                port,
+                door=door,
+                ros_version=2 if ros_version == "2" else 1,
+                on_ready=ready,
+                stop=asyncio.Event(),
+            )
         return 0
 
     return run_async(serve())
+
+
+def _door(certificate: Path | None, key: Path | None, tokens: Path | None, origins: list[str]) -> Door:
+    """Who may come in, of the flags that say so."""
+    if (certificate is None) != (key is None):
+        msg = "TLS needs both the certificate and its key: give --tls-cert FILE and --tls-key FILE"
+        raise SettingsError(msg)
+    for page in origins:
+        if not page.startswith(("http://", "https://")) or page.count("/") != 2:
+            msg = f"--origin {page} is no web page's origin: expected for example https://robot.example:8000"
+            raise SettingsError(msg)
+    return Door(
+        tls=tls_context(certificate, key) if certificate is not None and key is not None else None,
+        tokens=read_tokens(tokens) if tokens is not None else (),
+        origins=tuple(origins),
+    )
 
 
 def main() -> None:

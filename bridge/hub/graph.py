@@ -1,17 +1,17 @@
-"""What the hub knows: its clients, and the topics and services that they have between them.
+"""What the hub knows: its clients, and the topics, services and actions that they have between them.
 
-The graph keeps its parts consistent with each other; what clients may do is the broker's to decide.
-Topics and services are found by their absolute name. A client that leaves the leading slash out means
+The graph keeps its parts consistent with each other; what clients may do is others' to decide.
+Topics, services and actions are found by their absolute name. A client that leaves the leading slash out means
 the same topic, and gets its messages under the name that it used.
 """
 
 from dataclasses import dataclass, field
 
+from bridge.fragments import Reassembler
+from bridge.hub.forms import Compression
+from bridge.hub.operations import OperationId
 from bridge.hub.outbox import Lane, Outbox
 from bridge.names import same_type
-
-#: What tells one operation of a client from another: rosbridge's optional ``id``.
-OperationId = str | int | None
 
 
 @dataclass(eq=False, slots=True)
@@ -30,7 +30,13 @@ class Client:
         asked: keys of the calls whose answers it waits for.
         asked_of: keys of the calls that it has yet to answer.
         refused: operations that it sent in vain.
-        takeovers: services that it took over from other clients.
+        takeovers: services and actions that it took over from other clients.
+        actions: absolute names of those it offers.
+        goals: keys of those it waits for the end of, by its own id.
+        goals_of: keys of those it has yet to end.
+        fragments: what it sent in fragments and is not complete, once it did.
+        wants_status: whether it asked to be told what is refused.
+        status_lane: the way of its status messages, once there was one.
         doomed: why it is to be disconnected, empty while it may stay.
         has_output: whether it is on the broker's list of those to be served.
     """
@@ -47,6 +53,12 @@ class Client:
     asked_of: set[str] = field(default_factory=set)
     refused: int = 0
     takeovers: int = 0
+    actions: set[str] = field(default_factory=set)
+    goals: dict[OperationId, str] = field(default_factory=dict)
+    goals_of: set[str] = field(default_factory=set)
+    fragments: Reassembler | None = None
+    wants_status: bool = False
+    status_lane: Lane | None = None
     doomed: str = ""
     has_output: bool = False
 
@@ -68,10 +80,19 @@ class Advertisement:
 
 @dataclass(frozen=True, slots=True)
 class Wish:
-    """What one subscribe operation asked for: seconds between messages, messages that may wait (or 0)."""
+    """What one subscribe operation asked for.
+
+    Attributes:
+        throttle: seconds between messages, or 0.
+        queue_length: messages that may wait, or 0.
+        compression: the form of the messages.
+        fragment_size: characters of one fragment, or 0.
+    """
 
     throttle: float
     queue_length: int
+    compression: Compression = "none"
+    fragment_size: int = 0
 
 
 @dataclass(eq=False, slots=True)
@@ -82,7 +103,9 @@ class Subscription:
         client: who hears.
         topic: what.
         prefix: the beginning of each of its messages on the wire, with the topic's name as the client has it.
+        name: the topic's name as the client has it.
         lane: its messages' way to the client.
+        compression: the form in which they go.
         typed: whether it named the type, and so keeps the topic to it.
         wishes: by operation; the least of each counts, as on the reference server.
     """
@@ -90,7 +113,9 @@ class Subscription:
     client: Client
     topic: "Topic"
     prefix: bytes
+    name: str
     lane: Lane = field(default_factory=Lane)
+    compression: Compression = "none"
     typed: bool = False
     wishes: dict[OperationId, Wish] = field(default_factory=dict)
 
@@ -104,6 +129,7 @@ class Topic:
         type: as the first who named it wrote it; empty while nobody has.
         advertisements: who publishes.
         subscriptions: who hears.
+        latching: whether one of its publishers latches.
         latched: the last message (its JSON) while somebody latches, else None.
     """
 
@@ -111,12 +137,8 @@ class Topic:
     type: str = ""
     advertisements: dict[Client, Advertisement] = field(default_factory=dict)
     subscriptions: dict[Client, Subscription] = field(default_factory=dict)
+    latching: bool = False
     latched: bytes | None = None
-
-    @property
-    def latching(self) -> bool:
-        """Whether one of its publishers latches."""
-        return any(advertisement.latching for advertisement in self.advertisements.values())
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,8 +150,17 @@ class Service:
     client: Client
 
 
+@dataclass(frozen=True, slots=True)
+class Action:
+    """An action that a client offers."""
+
+    name: str
+    type: str
+    client: Client
+
+
 class Graph:
-    """Clients by number, topics and services by absolute name.
+    """Clients by number; topics, services and actions by absolute name.
 
     Attributes:
         latched_bytes: all latched messages together.
@@ -139,6 +170,7 @@ class Graph:
         self.clients: dict[int, Client] = {}
         self.topics: dict[str, Topic] = {}
         self.services: dict[str, Service] = {}
+        self.actions: dict[str, Action] = {}
         self.latched_bytes = 0
 
     def topics_of_type(self, type_name: str) -> list[Topic]:
@@ -160,6 +192,7 @@ class Graph:
 
     def tidy(self, topic: Topic) -> None:
         """After somebody left a topic: forget what nobody latches, a type nobody named, what nobody uses."""
+        topic.latching = any(advertisement.latching for advertisement in topic.advertisements.values())
         if not topic.latching:
             self.latch(topic, None)
         if not topic.advertisements and not any(heard.typed for heard in topic.subscriptions.values()):

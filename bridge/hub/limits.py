@@ -14,6 +14,9 @@ _DEEPEST: Final = 250
 class HubLimits:
     """Bounds of one hub. Sizes are bytes, times are seconds; all are at least 1 (times: above 0).
 
+    What comes in fragments may have ``message_bytes`` characters when it is complete, and four times as many while
+    it is not (see `bridge.fragments.Reassembler`).
+
     What goes beyond a bound is refused and logged, as the reference server does with everything wrong: the
     client is not told, but for calls, which are answered ``result: false``. Only what harms others costs the
     connection: a message that is too large, an answer that is never read, a silent or a stuck socket.
@@ -25,8 +28,9 @@ class HubLimits:
         topics: topics at a time, over all clients.
         advertisements_per_client: advertise operations (topic and id) that one client has open.
         subscriptions_per_client: subscribe operations (topic and id) that one client has open.
-        services_per_client: services that one client offers.
+        services_per_client: services that one client offers, and actions.
         calls_per_client: calls that one client waits for, and calls that one client has yet to answer.
+        goals_per_client: goals that one client waits for, and goals that one client works on.
         call_timeout: a call without answer fails after this long; a client may ask for less.
         queue_length: messages that wait for a slow client per topic, the oldest dropped, if it did not say.
         longest_queue: the most that a client can ask for with ``queue_length``.
@@ -49,6 +53,7 @@ class HubLimits:
     subscriptions_per_client: int = 4096
     services_per_client: int = 256
     calls_per_client: int = 256
+    goals_per_client: int = 256
     call_timeout: float = 60.0
     queue_length: int = 100
     longest_queue: int = 1000

@@ -4,25 +4,39 @@ A hub's outbox is emptied by whoever owns the socket, as fast as the socket take
 messages of topics replace their elders here and nothing else in the hub slows down. Answers and requests
 of services are never dropped: a client that lets them pile up beyond the bound has *overflowed*.
 
-A message that is dropped leaves a gap in its place, so that dropping costs as little as sending.
+A message that is dropped leaves a gap in its place, so that dropping costs as little as sending. What a client
+wants in fragments waits whole, and is cut when its turn has come.
 """
 
+import itertools
 from collections import deque
 from math import inf
-from typing import Final
+from typing import TYPE_CHECKING, Final
+
+from bridge.fragments import split
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
 
 #: Gaps in a queue before it is packed, beyond as many as there are messages.
 _GAPS: Final = 64
+_BRACE: Final = ord("{")
+
+
+def is_text(payload: bytes) -> bool:
+    """Whether a payload is JSON, and not CBOR: its object begins with a brace, as no map of CBOR does."""
+    return payload[0] == _BRACE
 
 
 class _Entry:
     """One message in its place in the order, or a gap where one was (``payload`` is None)."""
 
-    __slots__ = ("lane", "payload")
+    __slots__ = ("fragment_size", "lane", "payload")
 
-    def __init__(self, payload: bytes, lane: "Lane | None") -> None:
+    def __init__(self, payload: bytes, lane: "Lane | None", fragment_size: int) -> None:
         self.payload: bytes | None = payload
         self.lane = lane
+        self.fragment_size = fragment_size
 
 
 class Lane:
@@ -34,14 +48,16 @@ class Lane:
         next_time: when the throttle lets the next message through (monotonic seconds).
         queued: its messages that wait for the socket.
         held: its messages that wait for its throttle.
+        fragment_size: characters of one fragment of a message, 0 for messages in one piece.
         lost: messages dropped because the client (or its throttle) was slower than the topic.
     """
 
-    __slots__ = ("held", "lost", "next_time", "queue_length", "queued", "throttle")
+    __slots__ = ("fragment_size", "held", "lost", "next_time", "queue_length", "queued", "throttle")
 
-    def __init__(self) -> None:
+    def __init__(self, queue_length: int = 1) -> None:
         self.throttle = 0.0
-        self.queue_length = 1
+        self.queue_length = queue_length
+        self.fragment_size = 0
         self.next_time = -inf
         self.queued: deque[_Entry] = deque()
         self.held: deque[bytes] = deque()
@@ -53,11 +69,23 @@ class Outbox:
 
     Attributes:
         size: bytes waiting.
+        wire: where a payload goes at once when nothing waits before it; None while the socket takes nothing.
         overflowed: what cannot be dropped is more than ``max_bytes``: the client does not read its answers.
         deadline: when `release` has something to do (monotonic seconds), infinity for never.
     """
 
-    __slots__ = ("_entries", "_gaps", "_holding", "_max_bytes", "deadline", "overflowed", "size")
+    __slots__ = (
+        "_entries",
+        "_fragments",
+        "_gaps",
+        "_holding",
+        "_max_bytes",
+        "_numbers",
+        "deadline",
+        "overflowed",
+        "size",
+        "wire",
+    )
 
     def __init__(self, max_bytes: int) -> None:
         """Bound what may wait to ``max_bytes``."""
@@ -65,6 +93,9 @@ class Outbox:
         self._entries: deque[_Entry] = deque()
         self._gaps = 0
         self._holding: set[Lane] = set()
+        self._fragments: Iterator[bytes] | None = None
+        self._numbers = itertools.count(1)
+        self.wire: list[bytes] | None = None
         self.size = 0
         self.overflowed = False
         self.deadline = inf
@@ -72,12 +103,20 @@ class Outbox:
     def __len__(self) -> int:
         return len(self._entries) - self._gaps
 
-    def put(self, payload: bytes) -> None:
-        """Queue what may not be lost: an answer or a request of a service."""
+    @property
+    def empty(self) -> bool:
+        """Whether nothing waits to be taken."""
+        return not self._entries and self._fragments is None
+
+    def put(self, payload: bytes, fragment_size: int = 0) -> None:
+        """Queue what may not be lost: an answer or a request of a service or an action."""
+        if self.wire is not None and not fragment_size and not self._entries and self._fragments is None:
+            self.wire.append(payload)
+            return
         if not self._make_room(len(payload)):
             self.overflowed = True
             return
-        self._entries.append(_Entry(payload, None))
+        self._entries.append(_Entry(payload, None, fragment_size))
         self.size += len(payload)
 
     def offer(self, lane: Lane, payload: bytes, now: float) -> None:
@@ -97,7 +136,12 @@ class Outbox:
         self._queue(lane, payload)
 
     def pop(self) -> bytes | None:
-        """Take the next message for the wire, None when there is none."""
+        """Take the next message or fragment for the wire, None when there is none."""
+        if self._fragments is not None:
+            fragment = next(self._fragments, None)
+            if fragment is not None:
+                return fragment
+            self._fragments = None
         entries = self._entries
         while entries:
             entry = entries.popleft()
@@ -108,8 +152,16 @@ class Outbox:
             if entry.lane is not None:
                 entry.lane.queued.popleft()  # this very entry: a lane is in order as the outbox is
             self.size -= len(payload)
+            if entry.fragment_size:
+                # One by one: a mebibyte in pieces of 16 characters need not be there at once.
+                self._fragments = split(payload, entry.fragment_size, f"hub:{next(self._numbers)}")
+                return next(self._fragments)
             return payload
         return None
+
+    def passes(self, lane: Lane, now: float) -> bool:
+        """Whether `offer` would do anything but drop a message: what would not need not be encoded."""
+        return not lane.throttle or bool(lane.queue_length) or (now >= lane.next_time and not lane.held)
 
     def release(self, now: float) -> None:
         """Queue what was held until ``now``, one message of each lane at most."""
@@ -139,11 +191,14 @@ class Outbox:
         self._find_deadline()
 
     def _queue(self, lane: Lane, payload: bytes) -> None:
+        if self.wire is not None and not lane.fragment_size and self.empty:
+            self.wire.append(payload)
+            return
         self._shorten(lane, max(lane.queue_length, 1) - 1)  # 0 with a throttle: one under way
         if not self._make_room(len(payload)):
             lane.lost += 1
             return
-        entry = _Entry(payload, lane)
+        entry = _Entry(payload, lane, lane.fragment_size if is_text(payload) else 0)
         self._entries.append(entry)
         lane.queued.append(entry)
         self.size += len(payload)

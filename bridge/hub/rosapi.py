@@ -1,11 +1,12 @@
 """The services of ROS's ``rosapi`` node, answered from what the hub knows.
 
-Clients ask these for diagnosis (which topics, of which type, who publishes) and for parameters. Names,
-fields and types are rosapi's of ROS 1 (http://wiki.ros.org/rosapi); ``get_ros_version``, which only ROS 2
-has, says 1. Times carry the fields of both (``secs``, ``nsecs`` and ``sec``, ``nanosec``).
+Clients ask these for diagnosis (which topics, of which type, who publishes), for parameters and for the fields of
+messages. Names, fields and types are rosapi's of the ROS version that the hub plays (http://wiki.ros.org/rosapi,
+rosapi_msgs); what one version alone has is answered in both. Times carry the fields of both (``secs``, ``nsecs``
+and ``sec``, ``nanosec``).
 
-Parameters are a flat dictionary of the hub's own: a name is a string, its value is JSON.
-The hub knows no message definitions: ``message_details`` and its kin do not exist here.
+Parameters are a flat dictionary of the hub's own: a name is a string, its value is JSON. A failure with one is an
+answer in ROS 2 (``successful``, ``reason``), and a failed call in ROS 1.
 """
 
 from collections.abc import Callable
@@ -13,17 +14,29 @@ from typing import Any, Final
 
 import orjson
 
+from bridge.errors import BridgeError
+from bridge.hub.definitions import Definitions
 from bridge.hub.graph import Graph
 from bridge.hub.limits import HubLimits
+from bridge.hub.operations import RefusedError
 from bridge.json_codec import depth
-from bridge.names import MAX_NAME, absolute, same_type
+from bridge.names import MAX_NAME, absolute, ros1_type, ros2_type, same_type
 
 #: The node that offers these services, and the beginning of their names, which no client can take.
 NODE: Final = "/rosapi"
 PREFIX: Final = NODE + "/"
+#: The topic on which ROS's nodes log: the hub's refusals are told there.
+ROSOUT: Final = "/rosout"
+#: Topics that a server of ROS 1's actionlib publishes or hears under its name.
+_ACTIONLIB: Final = ("goal", "cancel", "status", "feedback", "result")
 
 Values = dict[str, Any]
 Answer = Callable[..., Values]
+
+
+def rosout_type(ros_version: int) -> str:
+    """The type of `ROSOUT`."""
+    return "rcl_interfaces/msg/Log" if ros_version == 2 else "rosgraph_msgs/Log"
 
 
 class RosapiError(Exception):
@@ -33,24 +46,32 @@ class RosapiError(Exception):
 class Rosapi:
     """The services of one hub."""
 
-    def __init__(self, graph: Graph, limits: HubLimits, wall_clock: Callable[[], int]) -> None:
+    def __init__(
+        self, graph: Graph, limits: HubLimits, definitions: Definitions, wall_clock: Callable[[], int]
+    ) -> None:
         """Answer about ``graph``; ``wall_clock`` gives nanoseconds since 1970."""
         self._graph = graph
         self._limits = limits
+        self._definitions = definitions
         self._wall_clock = wall_clock
+        self.ros_version = definitions.ros_version
         self._parameters: dict[str, bytes] = {}
         self._parameter_bytes = 0
         # Short name -> type, arguments (all strings) in their order, what answers.
         self._services: dict[str, tuple[str, tuple[str, ...], Answer]] = {
             "action_servers": ("GetActionServers", (), self._action_servers),
+            "action_type": ("ActionType", ("action",), self._action_type),
             "delete_param": ("DeleteParam", ("name",), self._delete_param),
             "get_param": ("GetParam", ("name", "default"), self._get_param),
             "get_param_names": ("GetParamNames", (), self._get_param_names),
             "get_ros_version": ("GetROSVersion", (), self._get_ros_version),
             "get_time": ("GetTime", (), self._get_time),
             "has_param": ("HasParam", ("name",), self._has_param),
+            "interfaces": ("Interfaces", (), self._interfaces),
+            "message_details": ("MessageDetails", ("type",), self._message_details),
             "node_details": ("NodeDetails", ("node",), self._node_details),
             "nodes": ("Nodes", (), self._nodes),
+            "search_param": ("SearchParam", ("name",), self._search_param),
             "publishers": ("Publishers", ("topic",), self._publishers),
             "service_host": ("ServiceHost", ("service",), self._service_host),
             "service_node": ("ServiceNode", ("service",), self._service_node),
@@ -62,6 +83,7 @@ class Rosapi:
             "subscribers": ("Subscribers", ("topic",), self._subscribers),
             "topic_type": ("TopicType", ("topic",), self._topic_type),
             "topics": ("Topics", (), self._topics),
+            "topics_and_raw_types": ("TopicsAndRawTypes", (), self._topics_and_raw_types),
             "topics_for_type": ("TopicsForType", ("type",), self._topics_for_type),
         }
 
@@ -96,22 +118,59 @@ class Rosapi:
                 raise RosapiError(f"{service}: field {name} must be a string")
         return answer(*given)
 
+    def service_type_name(self, type_name: str) -> str:
+        """A service type's name as this ROS version writes it."""
+        return ros2_type(type_name, "srv") if self.ros_version == 2 else ros1_type(type_name)
+
     # --- topics
 
+    def _all_topics(self) -> dict[str, str]:
+        """Every topic's type, the hub's own among them."""
+        topics = {topic.name: topic.type for topic in self._graph.topics.values()}
+        return topics | {ROSOUT: rosout_type(self.ros_version)}
+
     def _topics(self) -> Values:
-        topics = self._graph.topics.values()
-        return {"topics": [topic.name for topic in topics], "types": [topic.type for topic in topics]}
+        topics = self._all_topics()
+        return {"topics": list(topics), "types": list(topics.values())}
+
+    def _topics_and_raw_types(self) -> Values:
+        topics = self._all_topics()
+        texts = {type_name: self._full_text(type_name) for type_name in set(topics.values())}
+        return {
+            "topics": list(topics),
+            "types": list(topics.values()),
+            "typedefs_full_text": [texts[type_name] for type_name in topics.values()],
+        }
+
+    def _full_text(self, type_name: str) -> str:
+        try:
+            return self._definitions.full_text(type_name) if type_name else ""
+        except RefusedError:
+            return ""
 
     def _topics_for_type(self, type_name: str) -> Values:
-        return {"topics": [topic.name for topic in self._graph.topics_of_type(type_name)]}
+        topics = self._all_topics().items()
+        return {"topics": [name for name, its_type in topics if its_type and same_type(its_type, type_name)]}
 
     def _topic_type(self, name: str) -> Values:
-        topic = self._graph.topics.get(absolute(name))
-        return {"type": topic.type if topic else ""}
+        return {"type": self._all_topics().get(absolute(name), "")}
 
     def _publishers(self, name: str) -> Values:
         topic = self._graph.topics.get(absolute(name))
-        return {"publishers": [client.node for client in topic.advertisements] if topic else []}
+        own = [NODE] if absolute(name) == ROSOUT else []
+        return {"publishers": own + ([client.node for client in topic.advertisements] if topic else [])}
+
+    def _interfaces(self) -> Values:
+        types = {*self._all_topics().values(), *self._own_types().values()}
+        types |= {service.type for service in self._graph.services.values()}
+        types |= {action.type for action in self._graph.actions.values()}
+        return {"interfaces": sorted(types - {""})}
+
+    def _message_details(self, type_name: str) -> Values:
+        try:
+            return {"typedefs": self._definitions.details(type_name)}
+        except (RefusedError, BridgeError) as error:
+            raise RosapiError(str(error)) from None
 
     def _subscribers(self, name: str) -> Values:
         topic = self._graph.topics.get(absolute(name))
@@ -120,7 +179,8 @@ class Rosapi:
     # --- services
 
     def _own_types(self) -> dict[str, str]:
-        return {PREFIX + name: f"rosapi/{entry[0]}" for name, entry in self._services.items()}
+        package = "rosapi_msgs/srv" if self.ros_version == 2 else "rosapi"
+        return {PREFIX + name: f"{package}/{entry[0]}" for name, entry in self._services.items()}
 
     def _all_services(self) -> Values:
         return {"services": [*self._own_types(), *self._graph.services]}
@@ -153,7 +213,14 @@ class Rosapi:
         return {"providers": list(dict.fromkeys(nodes))}
 
     def _action_servers(self) -> Values:
-        return {"action_servers": []}
+        topics = self._graph.topics
+        names = [name.removesuffix("/goal") for name in topics if name.endswith("/goal")]
+        theirs = [name for name in names if all(f"{name}/{part}" in topics for part in _ACTIONLIB)]
+        return {"action_servers": [*self._graph.actions, *theirs]}
+
+    def _action_type(self, name: str) -> Values:
+        action = self._graph.actions.get(absolute(name))
+        return {"type": action.type if action else ""}
 
     # --- nodes, time, version
 
@@ -163,7 +230,7 @@ class Rosapi:
     def _node_details(self, node: str) -> Values:
         node = absolute(node)
         if node == NODE:
-            return {"subscribing": [], "publishing": [], "services": list(self._own_types())}
+            return {"subscribing": [], "publishing": [ROSOUT], "services": list(self._own_types())}
         client = self._graph.client_of_node(node)
         if client is None:
             return {"subscribing": [], "publishing": [], "services": []}
@@ -178,42 +245,59 @@ class Rosapi:
         return {"time": {"secs": seconds, "nsecs": nanoseconds, "sec": seconds, "nanosec": nanoseconds}}
 
     def _get_ros_version(self) -> Values:
-        return {"version": 1, "distro": "hub"}
+        return {"version": self.ros_version, "distro": "hub"}
 
     # --- parameters
 
+    def _outcome(self, failure: str = "", **values: Any) -> Values:
+        """The answer about a parameter, or its failure, as this ROS version tells it."""
+        if self.ros_version == 2:
+            return values | {"successful": not failure, "reason": failure}
+        if failure:
+            raise RosapiError(failure)
+        return values
+
     def _get_param(self, name: str, default: str) -> Values:
         value = self._parameters.get(absolute(name))
-        return {"value": value.decode() if value is not None else default or "null"}
+        if value is not None:
+            return self._outcome(value=value.decode())
+        if self.ros_version == 2 and not default:
+            return self._outcome(f"there is no parameter {name}", value="null")
+        return self._outcome(value=default or "null")
 
     def _has_param(self, name: str) -> Values:
         return {"exists": absolute(name) in self._parameters}
+
+    def _search_param(self, name: str) -> Values:
+        key = absolute(name)
+        below = any(each == key or each.startswith(key + "/") for each in self._parameters)
+        return {"global_name": key if below else ""}
 
     def _get_param_names(self) -> Values:
         return {"names": list(self._parameters)}
 
     def _set_param(self, name: str, value: str) -> Values:
         if not name or len(name) > MAX_NAME:
-            raise RosapiError(f"the name of a parameter has 1 to {MAX_NAME} characters")
+            return self._outcome(f"the name of a parameter has 1 to {MAX_NAME} characters")
         try:
             parsed = orjson.loads(value)
         except orjson.JSONDecodeError:
-            raise RosapiError(f"the value of parameter {name} must be JSON text") from None
+            return self._outcome(f"the value of parameter {name} must be JSON text")
         if depth(parsed, self._limits.depth) > self._limits.depth:
-            raise RosapiError(
+            return self._outcome(
                 f"the value of parameter {name} is nested deeper than {self._limits.depth} levels"
             )
         data = orjson.dumps(parsed)
         key = absolute(name)
         size = self._parameter_bytes + len(data) - len(self._parameters.get(key, b""))
         if size > self._limits.parameter_bytes:
-            raise RosapiError(f"all parameters together may have {self._limits.parameter_bytes} bytes")
+            return self._outcome(f"all parameters together may have {self._limits.parameter_bytes} bytes")
         if key not in self._parameters and len(self._parameters) >= self._limits.parameters:
-            raise RosapiError(f"there are {self._limits.parameters} parameters already")
+            return self._outcome(f"there are {self._limits.parameters} parameters already")
         self._parameters[key] = data
         self._parameter_bytes = size
-        return {}
+        return self._outcome()
 
     def _delete_param(self, name: str) -> Values:
         self._parameter_bytes -= len(self._parameters.pop(absolute(name), b""))
-        return {}
+        return self._outcome()

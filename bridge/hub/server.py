@@ -1,8 +1,9 @@
 """The hub on a socket: a thin shell of WebSockets around the broker.
 
-Each connection is an `asyncio.Protocol` around the sans-I/O protocol of ``websockets``, without a task: a
-message is read, brokered and written to all who hear it within one callback of the event loop. Nothing is
-compressed: on loopback that costs more than it saves.
+Each connection is an `asyncio.Protocol`, without a task: what a socket brings is read, brokered and written to all
+who hear it within one callback of the event loop, with one write for each of them. Whole messages are found by
+`frames`; handshakes, pings, fragments and everything broken are left to the sans-I/O protocol of ``websockets``.
+Nothing is compressed: on loopback that costs more than it saves.
 
 What a socket doesn't take waits in its client's outbox, which drops the oldest; nobody else waits for it.
 """
@@ -10,10 +11,9 @@ What a socket doesn't take waits in its client's outbox, which drops the oldest;
 import asyncio
 import contextlib
 import logging
-import re
 import socket
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from http import HTTPStatus
 from math import inf
 from typing import Final, cast
@@ -22,23 +22,24 @@ from websockets.frames import CloseCode, Frame, Opcode
 from websockets.http11 import Request
 from websockets.protocol import State
 from websockets.server import ServerProtocol
-from websockets.typing import Origin
 
 from bridge.hub.broker import Broker
+from bridge.hub.definitions import RosVersion
+from bridge.hub.door import Door, choose_subprotocol
 from bridge.hub.errors import HubError
+from bridge.hub.frames import apply_mask, header, next_frame
 from bridge.hub.graph import Client
 from bridge.hub.limits import HubLimits
 
 log = logging.getLogger(__name__)
 
-#: Web pages of this machine; pages from elsewhere could speak to a robot through their visitor's browser.
-_LOCAL_ORIGIN: Final = re.compile(r"https?://(localhost|127\.\d+\.\d+\.\d+|\[::1\])(:\d+)?")
 #: Bytes that wait in the process for one socket before its client's outbox fills.
 _WRITE_BUFFER: Final = 64 * 1024
 #: Bytes that wait in the kernel for one socket: more would only be older when they arrive.
 _SEND_BUFFER: Final = 256 * 1024
-#: Frames of one client that are worked on before others have their turn, looked at after so many bytes.
+#: Frames of one client, or so many bytes of them, that are worked on before others have their turn.
 _TURN: Final = 64
+_TURN_BYTES: Final = 64 * 1024
 _SLICE: Final = 4 * 1024
 #: Seconds between two looks for silent and stuck clients.
 _SWEEP: Final = 1.0
@@ -47,9 +48,7 @@ _CLOSE_TIMEOUT: Final = 2.0
 #: Connections whose handshake is under way, beyond the clients.
 _HANDSHAKES: Final = 64
 _LAST_PORT: Final = 65535
-#: Payloads from these lengths on have a longer header (RFC 6455, section 5.2).
-_MEDIUM_FRAME: Final = 126
-_LONG_FRAME: Final = 1 << 16
+_END_OF_REQUEST: Final = b"\r\n\r\n"
 
 
 async def serve_hub(
@@ -57,19 +56,21 @@ async def serve_hub(
     port: int,
     *,
     limits: HubLimits | None = None,
-    origins: Sequence[str] = (),
+    door: Door | None = None,
+    ros_version: RosVersion = 1,
     on_ready: Callable[[int], None] | None = None,
     stop: asyncio.Event,
 ) -> None:
     """Serve rosbridge until ``stop`` is set, then close every connection (1001) and return.
 
     Args:
-        host: the address to listen on. The hub knows no passwords: give a loopback address, unless everybody
-            who reaches the address may publish to your robot.
+        host: the address to listen on. Without tokens and TLS give a loopback address, unless everybody who
+            reaches the address may publish to your robot.
         port: 0 for any free one.
         limits: what is refused.
-        origins: web pages (``https://robot.example``) that may connect, besides those of this machine.
-            Programs that are no browsers send no origin and may always connect.
+        door: who may come in, and whether what they say is encrypted; by default every program, and web pages
+            of this machine.
+        ros_version: which ROS it plays.
         on_ready: called with the port once clients can connect.
         stop: set it to end.
 
@@ -80,10 +81,17 @@ async def serve_hub(
         raise HubError(
             f"the hub cannot listen on {host} port {port}: a port is a number from 0 to {_LAST_PORT}"
         )
-    hub = _Hub(limits or HubLimits(), origins)
+    door = door or Door()
+    hub = _Hub(limits or HubLimits(), door, ros_version)
     loop = asyncio.get_running_loop()
     try:
-        server = await loop.create_server(lambda: _Connection(hub), host, port)
+        server = await loop.create_server(
+            lambda: _Connection(hub),
+            host,
+            port,
+            ssl=door.tls,
+            ssl_handshake_timeout=hub.limits.handshake_timeout if door.tls else None,
+        )
     except OSError as error:
         raise HubError(
             f"the hub cannot listen on {host} port {port} ({error.strerror or error}): "
@@ -102,10 +110,10 @@ async def serve_hub(
 class _Hub:
     """The broker, its connections and its timers."""
 
-    def __init__(self, limits: HubLimits, origins: Sequence[str]) -> None:
+    def __init__(self, limits: HubLimits, door: Door, ros_version: RosVersion) -> None:
         self.limits = limits
-        self.broker = Broker(limits)
-        self.origins: list[Origin | re.Pattern[str] | None] = [None, _LOCAL_ORIGIN, *map(Origin, origins)]
+        self.broker = Broker(limits, ros_version=ros_version)
+        self.door = door
         self.connections: set[_Connection] = set()
         self._by_client: dict[Client, _Connection] = {}
         self._timer: asyncio.TimerHandle | None = None
@@ -119,14 +127,10 @@ class _Hub:
         self._by_client[client] = connection
         return client
 
-    def receive(self, client: Client, data: bytes) -> None:
-        self.broker.receive(client, data, time.monotonic())
-        self._serve()
-
     def dismiss(self, client: Client) -> None:
         del self._by_client[client]
         self.broker.disconnect(client)
-        self._serve()
+        self.serve()
 
     def forget(self, connection: "_Connection") -> None:
         self.connections.discard(connection)
@@ -159,7 +163,7 @@ class _Hub:
         if self._timer is not None:
             self._timer.cancel()
 
-    def _serve(self) -> None:
+    def serve(self) -> None:
         """Send what the broker has for whom, and see that it is woken in time."""
         for client in self.broker.take_ready():
             connection = self._by_client.get(client)
@@ -179,7 +183,7 @@ class _Hub:
     def _wake(self) -> None:
         self._timer, self._timer_deadline = None, inf
         self.broker.wake(time.monotonic())
-        self._serve()
+        self.serve()
 
 
 class _Connection(asyncio.Protocol):
@@ -187,11 +191,19 @@ class _Connection(asyncio.Protocol):
 
     def __init__(self, hub: _Hub) -> None:
         self._hub = hub
-        self._protocol = ServerProtocol(origins=hub.origins, max_size=hub.limits.message_bytes)
+        self._protocol = ServerProtocol(
+            origins=hub.door.allowed_origins,
+            max_size=hub.limits.message_bytes,
+            select_subprotocol=lambda _, offered: choose_subprotocol(offered),
+        )
         self._transport: asyncio.Transport
         self._client: Client | None = None
         self._address = "?"
         self._partial: bytearray | None = None
+        # Whether whole frames are looked for here; else all that comes is the library's to read.
+        self._quick = False
+        self._rest: bytes | bytearray = b""
+        self._wanted = 0
         self._started = self._heard = time.monotonic()
         self._pinged: float | None = None
         self._stuck_since: float | None = None
@@ -214,13 +226,16 @@ class _Connection(asyncio.Protocol):
     def data_received(self, data: bytes) -> None:
         """Do what arrived, to the last answer it causes; but after many frames others have their turn."""
         self._heard = time.monotonic()
-        if len(data) <= _SLICE:
-            self._take(data)
-        else:
-            rest = self._take_turn(memoryview(data))
-            if rest:
-                self._transport.pause_reading()
-                asyncio.get_running_loop().call_soon(self._go_on, rest)
+        if self._rest:
+            if isinstance(
+                self._rest, bytes
+            ):  # a large frame comes in many pieces: they are put together once
+                self._rest = bytearray(self._rest)
+            self._rest += data
+            if len(self._rest) < self._wanted:
+                return
+            data, self._rest = bytes(self._rest), b""
+        self._work_on(data)
 
     def eof_received(self) -> None:
         """A client that ends its half ends the whole."""
@@ -235,6 +250,8 @@ class _Connection(asyncio.Protocol):
     def pause_writing(self) -> None:
         """The socket takes nothing now: its client's outbox fills from here on."""
         self._stuck_since = time.monotonic()
+        if self._client is not None:
+            self._client.outbox.wire = None
 
     def resume_writing(self) -> None:
         """The socket takes data again."""
@@ -244,19 +261,27 @@ class _Connection(asyncio.Protocol):
     # --- what the hub calls
 
     def flush(self) -> None:
-        """Write what waits for the client, as far as the socket takes it."""
+        """Write what waits for the client, as far as the socket takes it, in one piece where it is small."""
         client = self._client
         if client is None or self._protocol.state is not State.OPEN or self._transport.is_closing():
             return
         if client.doomed:
             self._give_up(client.doomed)
             return
-        pop, write = client.outbox.pop, self._transport.write
-        while self._stuck_since is None:
-            payload = pop()
-            if payload is None:
-                return
-            write(_header(len(payload)) + payload)
+        outbox = client.outbox
+        if outbox.wire:
+            payloads, outbox.wire = outbox.wire, []
+            parts: list[bytes] = []
+            for payload in payloads:
+                parts += header(payload), payload
+            self._transport.write(b"".join(parts))
+        # What waited while the socket took nothing, and what goes in fragments.
+        while self._stuck_since is None and not outbox.empty:
+            waiting = outbox.pop()
+            if waiting is not None:
+                self._transport.write(header(waiting) + waiting)
+        if self._stuck_since is None and outbox.wire is None:
+            outbox.wire = []
 
     def sweep(self, now: float) -> None:
         """Close what is too silent or too slow at ``now``."""
@@ -292,43 +317,79 @@ class _Connection(asyncio.Protocol):
 
     # --- the rest
 
-    def _go_on(self, data: memoryview) -> None:
-        rest = self._take_turn(data)
-        if rest:
-            asyncio.get_running_loop().call_soon(self._go_on, rest)
-        elif not self._transport.is_closing():
+    def _work_on(self, data: bytes, at: int = 0) -> None:
+        """Work on a client's bytes for one turn; what is left is for the next, when others had theirs."""
+        at = self._take(data, at)
+        if at < len(data) and not self._transport.is_closing():
+            self._transport.pause_reading()
+            asyncio.get_running_loop().call_soon(self._go_on, data, at)
+
+    def _go_on(self, data: bytes, at: int) -> None:
+        if not self._transport.is_closing():
             self._transport.resume_reading()
+            self._work_on(data, at)
 
-    def _take_turn(self, data: memoryview) -> memoryview:
-        """Work on a client's data until its turn is over; what is left of it."""
-        frames = 0
-        while data and frames < _TURN and not self._transport.is_closing():
-            frames += self._take(bytes(data[:_SLICE]))
-            data = data[_SLICE:]
-        return data[:0] if self._transport.is_closing() else data
+    def _take(self, data: bytes, at: int) -> int:
+        """Do what a turn's worth of bytes asks for; where it ended. An incomplete frame is kept for later."""
+        size, frames, turn_end = len(data), 0, at + _TURN_BYTES
+        receive, largest, now = self._hub.broker.receive, self._hub.limits.message_bytes, self._heard
+        while at < size and frames < _TURN and at < turn_end:
+            if not self._quick:
+                self._hand_over(data[at : at + _SLICE])
+                at = min(at + _SLICE, size)
+                break
+            frame = next_frame(data, at)
+            if frame.end - frame.body > largest:
+                self._quick = False  # the library closes the connection for it, before it has come
+                continue
+            if not frame.end or frame.end > size:
+                self._rest, self._wanted = data[at:], frame.end - at if frame.end else 0
+                at = size
+                break
+            frames += 1
+            if frame.plain and self._partial is None and self._client is not None:
+                body = frame.body
+                receive(self._client, apply_mask(data[body : frame.end], data[body - 4 : body]), now)
+            else:
+                self._hand_over(data[at : frame.end])
+            at = frame.end
+        self._hub.serve()
+        return at
 
-    def _take(self, data: bytes) -> int:
-        """Do what the next bytes ask for; how many frames they had."""
+    def _hand_over(self, data: bytes) -> None:
+        """Have the library read some bytes: a whole frame, or whatever comes once nothing is quick any more."""
+        was_open = self._client is not None
         self._protocol.receive_data(data)
-        events = self._protocol.events_received()
-        for event in events:
+        for event in self._protocol.events_received():
             if isinstance(event, Frame):
                 self._take_frame(event)
             elif isinstance(event, Request):
                 self._answer_request(event)
         self._after_protocol()
-        return len(events)
+        if self._protocol.state is not State.OPEN:
+            self._quick = False
+        elif not was_open:
+            # The library stands before a frame, unless the client sent some without waiting for the answer.
+            self._quick = data.endswith(_END_OF_REQUEST) and data.count(_END_OF_REQUEST) == 1
 
     def _answer_request(self, request: Request) -> None:
         protocol = self._protocol
         response = protocol.accept(request)
-        if response.status_code == HTTPStatus.SWITCHING_PROTOCOLS and self._hub.broker.full:
-            response = protocol.reject(
-                HTTPStatus.SERVICE_UNAVAILABLE, f"The hub has {self._hub.limits.clients} clients already.\n"
-            )
+        if response.status_code == HTTPStatus.SWITCHING_PROTOCOLS:
+            refusal = self._hub.door.refusal(request)
+            if refusal is not None:
+                response = protocol.reject(refusal, "The hub wants a token.\n")
+                response.headers["WWW-Authenticate"] = "Bearer"
+            elif self._hub.broker.full:
+                response = protocol.reject(
+                    HTTPStatus.SERVICE_UNAVAILABLE,
+                    f"The hub has {self._hub.limits.clients} clients already.\n",
+                )
         protocol.send_response(response)
         if protocol.state is State.OPEN:
             self._client = self._hub.admit(self, self._address)
+            if self._stuck_since is None:
+                self._client.outbox.wire = []
         else:
             log.warning("a connection from %s was refused: HTTP %d", self._address, response.status_code)
 
@@ -343,7 +404,7 @@ class _Connection(asyncio.Protocol):
             if not frame.fin:
                 return
             data, self._partial = bytes(self._partial), None
-        self._hub.receive(self._client, data)
+        self._hub.broker.receive(self._client, data, self._heard)
 
     def _after_protocol(self) -> None:
         """Send what the protocol itself has to say, and see to the end if it has come."""
@@ -352,8 +413,11 @@ class _Connection(asyncio.Protocol):
                 break
             if data:
                 self._transport.write(data)
-            else:  # our half is over; closing the whole could cost the last frame on its way
+            elif self._transport.can_write_eof():
+                # Our half is over; closing the whole could cost the last frame on its way.
                 self._transport.write_eof()
+            else:  # TLS has no halves
+                self._transport.close()
         if self._protocol.close_expected():
             self._close_by = min(self._close_by, time.monotonic() + _CLOSE_TIMEOUT)
             self._leave()
@@ -367,12 +431,3 @@ class _Connection(asyncio.Protocol):
         if not self._transport.is_closing():
             log.warning("the connection from %s is closed: %s", self._address, why)
             self.abort()
-
-
-def _header(length: int) -> bytes:
-    """The beginning of an unmasked text frame."""
-    if length < _MEDIUM_FRAME:
-        return bytes((0x81, length))
-    if length < _LONG_FRAME:
-        return b"\x81\x7e" + length.to_bytes(2, "big")
-    return b"\x81\x7f" + length.to_bytes(8, "big")

@@ -3,11 +3,13 @@
 import json
 from dataclasses import dataclass, field
 from math import inf
-from typing import Any
+from typing import Any, Literal
 
+from bridge import cbor_codec
 from bridge.hub.broker import Broker
 from bridge.hub.graph import Client
 from bridge.hub.limits import HubLimits
+from bridge.hub.outbox import is_text
 
 WALL_CLOCK = 1_700_000_000_123_456_789
 
@@ -44,7 +46,10 @@ class Guest:
         operations = []
         while (payload := self.client.outbox.pop()) is not None:
             assert len(payload) <= self.room.broker.limits.message_bytes
-            operations.append(json.loads(payload, parse_constant=_no_constant))
+            if is_text(payload):
+                operations.append(json.loads(payload, parse_constant=_no_constant))
+            else:
+                operations.append(cbor_codec.decode(payload))
         return operations
 
     def heard(self, topic: str | None = None) -> list[Any]:
@@ -73,8 +78,8 @@ class Guest:
 class Room:
     """A broker, its guests and the time."""
 
-    def __init__(self, **limits: Any) -> None:
-        self.broker = Broker(HubLimits(**limits), wall_clock=lambda: WALL_CLOCK)
+    def __init__(self, *, ros_version: Literal[1, 2] = 1, **limits: Any) -> None:
+        self.broker = Broker(HubLimits(**limits), ros_version=ros_version, wall_clock=lambda: WALL_CLOCK)
         self.now = 1000.0
 
     def enter(self, address: str = "127.0.0.1") -> Guest:
@@ -99,6 +104,7 @@ class Room:
             assert name.startswith("/")
             assert topic.advertisements or topic.subscriptions, "a topic of nobody"
             assert set(topic.advertisements) | set(topic.subscriptions) <= clients
+            assert topic.latching == any(each.latching for each in topic.advertisements.values())
             assert topic.latched is None or topic.latching
             assert topic.type or not topic.advertisements, "published without a type"
             for client, advertisement in topic.advertisements.items():
@@ -112,8 +118,18 @@ class Room:
         for name, service in graph.services.items():
             assert service.name == name
             assert name in service.client.services
-        calls = broker._calls
+        for name, action in graph.actions.items():
+            assert action.name == name
+            assert name in action.client.actions
+        calls, goals = broker._calls.waiting, broker._actions.goals
         for client in clients:
+            assert all(graph.actions[name].client is client for name in client.actions)
+            assert len(client.actions) <= limits.services_per_client
+            assert set(client.goals.values()) == {
+                key for key, goal in goals.items() if goal.asker.client is client
+            }
+            assert client.goals_of == {key for key, goal in goals.items() if goal.server is client}
+            assert max(len(client.goals), len(client.goals_of)) <= limits.goals_per_client
             assert all(graph.topics[name].advertisements[client] for name in client.advertisements)
             assert all(graph.topics[name].subscriptions[client] for name in client.subscriptions)
             assert client.open_advertisements == sum(len(a.ids) for a in client.advertisements.values())
@@ -122,11 +138,12 @@ class Room:
             assert client.open_subscriptions <= limits.subscriptions_per_client
             assert all(graph.services[name].client is client for name in client.services)
             assert len(client.services) <= limits.services_per_client
-            assert client.asked == {key for key, call in calls.items() if call.caller is client}
+            assert client.asked == {key for key, call in calls.items() if call.asker.client is client}
             assert client.asked_of == {key for key, call in calls.items() if call.server is client}
             assert max(len(client.asked), len(client.asked_of)) <= limits.calls_per_client
             self._check_outbox(client)
-        assert all(call.caller in clients and call.server in clients for call in calls.values())
+        assert all(call.asker.client in clients and call.server in clients for call in calls.values())
+        assert all(goal.asker.client in clients and goal.server in clients for goal in goals.values())
         deadlines = [call.deadline for call in calls.values()]
         deadlines += [client.outbox.deadline for client in clients]
         assert broker.deadline <= min(deadlines, default=inf), "it would be woken too late"
@@ -135,7 +152,11 @@ class Room:
         outbox = client.outbox
         entries = [entry for entry in outbox._entries if entry.payload is not None]
         lanes = {subscription.lane for subscription in client.subscriptions.values()}
-        assert {entry.lane for entry in entries} - {None} <= lanes, "a message of a subscription that is over"
+        own = {client.status_lane, None}  # and those of goals' feedback, which outlive their goals
+        over = {entry.lane for entry in entries if entry.lane not in lanes | own}
+        assert all(
+            b'"op":"action_feedback"' in (entry.payload or b"") for entry in entries if entry.lane in over
+        )
         assert len(outbox) == len(entries)
         held = sum(len(payload) for lane in lanes for payload in lane.held)
         assert outbox.size == sum(len(entry.payload or b"") for entry in entries) + held

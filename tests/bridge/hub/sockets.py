@@ -8,11 +8,12 @@ import socket
 import struct
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
-from typing import Any
+from typing import Any, Literal
 
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.frames import Frame, Opcode
 
+from bridge.hub.door import Door
 from bridge.hub.limits import HubLimits
 from bridge.hub.server import serve_hub
 
@@ -55,13 +56,25 @@ class Ears:
 
 @asynccontextmanager
 async def running_hub(
-    *, port: int = 0, limits: HubLimits | None = None, origins: tuple[str, ...] = ()
+    *,
+    port: int = 0,
+    limits: HubLimits | None = None,
+    door: Door | None = None,
+    ros_version: Literal[1, 2] = 1,
 ) -> AsyncIterator[int]:
     """A hub on a port of this machine (0: any free one); its port."""
     stop = asyncio.Event()
     ready: asyncio.Future[int] = asyncio.get_running_loop().create_future()
     served = asyncio.create_task(
-        serve_hub("127.0.0.1", port, limits=limits, origins=origins, on_ready=ready.set_result, stop=stop)
+        serve_hub(
+            "127.0.0.1",
+            port,
+            limits=limits,
+            door=door,
+            ros_version=ros_version,
+            on_ready=ready.set_result,
+            stop=stop,
+        )
     )
     try:
         async with asyncio.timeout(PATIENCE):

@@ -146,7 +146,7 @@ def _live(seed: int, steps: int) -> Counter[str]:
         room.check()
         graph = room.broker.graph
         happened["latched"] += graph.latched_bytes > 0
-        happened["held"] += bool(room.broker._throttled)
+        happened["held"] += bool(room.broker._delivery.throttled)
         ready = room.broker.take_ready()
         assert len(set(ready)) == len(ready)
     _end(room, visitors, happened)
@@ -167,9 +167,9 @@ def _end(room: Room, visitors: list[_Visitor], happened: Counter[str]) -> None:
     graph = room.broker.graph
     assert not graph.topics
     assert not graph.services
-    assert not room.broker._calls
+    assert not room.broker._calls.waiting
     room.pass_time(120)
-    assert not room.broker._throttled
+    assert not room.broker._delivery.throttled
 
 
 @given(st.integers(0, 2**32))

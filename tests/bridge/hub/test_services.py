@@ -85,7 +85,7 @@ def test_a_client_can_call_itself() -> None:
     ],
 )
 def test_a_refusal_is_told_as_a_string(values: object, told: str) -> None:
-    room = Room()
+    room = Room(ros_version=2)
     server, caller = room.enter(), room.enter()
     _serve(server)
     caller.send(op="call_service", service="/add")
@@ -93,6 +93,19 @@ def test_a_refusal_is_told_as_a_string(values: object, told: str) -> None:
     (answer,) = caller.read()
     assert answer["result"] is False
     assert told in answer["values"]
+
+
+def test_as_in_ros_1_an_answer_is_passed_on_whatever_its_result() -> None:
+    room = Room()
+    server, caller = room.enter(), room.enter()
+    _serve(server)
+    caller.send(op="call_service", service="/add")
+    server.send(op="service_response", id=_request(server)["id"], values={"sum": 3}, result=False)
+    (answer,) = caller.read()
+    assert (answer["values"], answer["result"]) == ({"sum": 3}, True)
+    caller.send(op="call_service", service="/add")
+    server.send(op="service_response", id=_request(server)["id"], result=False)
+    assert caller.read()[0]["result"] is False
 
 
 @pytest.mark.parametrize("values", ["text", 3, [1], None])
@@ -174,7 +187,7 @@ def test_a_client_that_serves_itself_and_vanishes_leaves_nothing() -> None:
     _serve(guest)
     guest.send(op="call_service", service="/add", id=1)
     guest.leave()
-    assert not room.broker._calls
+    assert not room.broker._calls.waiting
     assert not room.broker.graph.services
     room.check()
 

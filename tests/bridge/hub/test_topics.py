@@ -116,7 +116,10 @@ def test_publishing_advertises_where_the_type_is_known_or_said() -> None:
     publisher.publish("/known", {"a": 1})
     publisher.publish("/said", {"a": 2}, type="c/D")
     assert subscriber.heard() == [{"a": 1}, {"a": 2}]
-    assert subscriber.rosapi("topics") == {"topics": ["/known", "/said"], "types": ["a/B", "c/D"]}
+    assert subscriber.rosapi("topics") == {
+        "topics": ["/known", "/said", "/rosout"],
+        "types": ["a/B", "c/D", "rosgraph_msgs/Log"],
+    }
     assert set(publisher.client.advertisements) == {"/known", "/said"}
     room.check()
 
@@ -447,7 +450,7 @@ def test_a_message_that_grows_beyond_the_limit_is_refused() -> None:
     guest = room.enter()
     guest.advertise("/t")
     guest.subscribe("/t")
-    guest.send_raw(b'{"op":"publish","topic":"/t","msg":{"a":[%b]}}' % b",".join([b"1e15"] * 150))
+    guest.send_raw(b'{"op":"publish","topic":"/t","msg":{"b":"\\n","a":[%b]}}' % b",".join([b"1e15"] * 150))
     assert guest.read() == []
     assert guest.client.refused == 1
     guest.send_raw(b'{"op":"publish","topic":"/t","msg":{"a":[%b]}}' % b",".join([b"1e15"] * 40))
