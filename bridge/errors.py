@@ -7,8 +7,10 @@ what a command ends with when the error ends it.
     * `UriError`, `NameFormError`, `TypeConflictError`, `PathError`, `OptionError`,
       `ConcurrentReadError`, `EncodeError` (2: usage)
     * `UnreachableError`, `NotRosbridgeError`, `DisconnectedError` (3: the server is not there)
+    * `AccessRefusedError` (2: it is there, and wants a token or a certificate)
     * `NoMessageError`, `NoAnswerError`, `SlowPeerError`, `StateTimeoutError` (3: a wait was in vain)
-    * `ServiceError` (3: a service said no)
+    * `ServiceError`, `GoalError` (3: a service or an action said no)
+    * `DefinitionError` (2: a message's type is not known here, or rosbags is missing)
     * `DecodeError` (3: what arrived is no message)
     * `FieldMissingError`, `FieldAmbiguousError` (4: a variable cannot be found in a message)
 """
@@ -53,13 +55,13 @@ class ConcurrentReadError(BridgeError):
 
 
 class EncodeError(BridgeError):
-    """Raised when an object cannot leave as JSON: its type, a NaN, an infinity, its depth or its size."""
+    """Raised when an object cannot leave as JSON (or CBOR): its type, a NaN, an infinity, its depth or its size."""
 
     exit_code = 2
 
 
 class DecodeError(BridgeError):
-    """Raised when bytes that arrived are not one JSON object within the limits of size and depth."""
+    """Raised when bytes that arrived are no message within the limits of size and depth."""
 
 
 class UnreachableError(BridgeError):
@@ -68,6 +70,12 @@ class UnreachableError(BridgeError):
 
 class NotRosbridgeError(BridgeError):
     """Raised when something answers at the URI, but not as a WebSocket server does."""
+
+
+class AccessRefusedError(BridgeError):
+    """Raised when a server refuses this client: it wants a token or a certificate, or another one."""
+
+    exit_code = 2
 
 
 class DisconnectedError(BridgeError):
@@ -103,6 +111,25 @@ class ServiceError(BridgeError):
         self.service = service
         where = f"service {service} refused the call" if service else "the call was refused"
         super().__init__(f"{where}: {reason or 'it gave no reason'}")
+
+
+class GoalError(BridgeError):
+    """Raised when an action takes no goal, or its goal ended without a result.
+
+    Attributes:
+        reason: the text that the server gave.
+    """
+
+    def __init__(self, reason: str, action: str) -> None:
+        """Keep the reason apart from the sentence."""
+        self.reason = reason
+        super().__init__(f"action {action} has no result: {reason or 'it gave no reason'}")
+
+
+class DefinitionError(BridgeError):
+    """Raised when serialised bytes cannot be read: no definition of their type is known, or no library is there."""
+
+    exit_code = 2
 
 
 class PathError(BridgeError):

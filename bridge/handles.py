@@ -18,6 +18,8 @@ from bridge.errors import (
 )
 from bridge.events import ServiceRequested
 from bridge.names import absolute, same_type
+from bridge.protocol import Delivery
+from bridge.qos import Qos
 from bridge.session import Message, Session, State
 
 #: Messages that wait in a subscription for their reader, unless it says otherwise.
@@ -78,6 +80,8 @@ class Subscription(_Handle):
     Attributes:
         topic: what was subscribed to.
         lost: how many messages were dropped because the queue was full.
+        blind_seconds: how long, all in all, nothing could be heard because the connection was lost; each
+            message says how long it was just before it.
     """
 
     def __init__(
@@ -89,6 +93,7 @@ class Subscription(_Handle):
         throttle_rate: int,
         queue_length: int,
         queue_size: int,
+        delivery: Delivery,
     ) -> None:
         """Subscribe (see `bridge.client.Ros.subscribe`)."""
         super().__init__(session)
@@ -96,25 +101,49 @@ class Subscription(_Handle):
             raise OptionError(f"queue_size of topic {topic} must be at least 1, not {queue_size}")
         self.topic = topic
         self.lost = 0
+        self.blind_seconds = 0.0
+        self._blind = 0.0
+        self._begun = time.monotonic()
         self._type = type_name
         self._size = queue_size
         self._queue: deque[Message] = deque(maxlen=queue_size)
         self._waiter: asyncio.Future[None] | None = None
         self._number = session.core.subscribe(
-            topic, type_name, throttle_rate=throttle_rate, queue_length=queue_length
+            topic, type_name, throttle_rate=throttle_rate, queue_length=queue_length, delivery=delivery
         )
         session.receivers[self._number] = self._receive
+        session.on_blind.add(self._note_blind)
         self._begin()
         session.ask_later()
 
     def _receive(self, message: Message) -> None:
         queue = self._queue
+        if self._blind:
+            message = message._replace(blind_seconds=self._blind)
+            self._blind = 0.0
         if len(queue) == self._size:
             self.lost += 1
+            if queue[0].blind_seconds:
+                message = self._keep_blind(message)
         queue.append(message)
         waiter = self._waiter
         if waiter is not None and not waiter.done():
             waiter.set_result(None)
+
+    def _note_blind(self, seconds: float) -> None:
+        seconds = min(seconds, time.monotonic() - self._begun)
+        self._blind += seconds
+        self.blind_seconds += seconds
+
+    def _keep_blind(self, message: Message) -> Message:
+        """The message that comes next says how long it was dark before the one that is dropped now."""
+        queue = self._queue
+        heir = queue[1] if self._size > 1 else message
+        heir = heir._replace(blind_seconds=heir.blind_seconds + queue[0].blind_seconds)
+        if self._size == 1:
+            return heir
+        queue[1] = heir
+        return message
 
     def __aiter__(self) -> Self:
         return self
@@ -192,6 +221,7 @@ class Subscription(_Handle):
 
     def _take_back(self) -> None:
         del self._session.receivers[self._number]
+        self._session.on_blind.discard(self._note_blind)
         self._session.core.unsubscribe(self._number)
 
 
@@ -202,7 +232,16 @@ class Publication(_Handle):
         topic: its name.
     """
 
-    def __init__(self, session: Session, topic: str, type_name: str, *, latch: bool, queue_size: int) -> None:
+    def __init__(
+        self,
+        session: Session,
+        topic: str,
+        type_name: str,
+        *,
+        latch: bool,
+        queue_size: int,
+        qos: Qos | None,
+    ) -> None:
         """Advertise (see `bridge.client.Ros.advertise`)."""
         super().__init__(session)
         if queue_size < 1:
@@ -210,7 +249,7 @@ class Publication(_Handle):
         self.topic = topic
         self._size = queue_size
         self._waiting = 0
-        self._number = session.core.advertise(topic, type_name, latch=latch, queue_size=queue_size)
+        self._number = session.core.advertise(topic, type_name, latch=latch, queue_size=queue_size, qos=qos)
         self._begin()
 
     async def publish(self, msg: Mapping[str, Any], *, timeout: float = 5.0) -> None:  # noqa: ASYNC109  # as above

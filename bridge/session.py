@@ -6,12 +6,16 @@ import random
 import time
 from collections import deque
 from collections.abc import Callable, Coroutine, Mapping
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, fields
 from enum import StrEnum
-from typing import Any, Final
+from typing import Any, Final, NamedTuple, Protocol
+
+from websockets.uri import WebSocketURI
 
 from bridge.errors import (
     BridgeError,
+    DecodeError,
     DisconnectedError,
     NoAnswerError,
     OptionError,
@@ -19,9 +23,19 @@ from bridge.errors import (
     SlowPeerError,
     StateTimeoutError,
 )
-from bridge.events import CallAnswered, Event, MessageReceived, ServiceRequested, StatusReceived, Unusable
+from bridge.events import (
+    CallAnswered,
+    Event,
+    GoalEnded,
+    GoalFeedback,
+    MessageReceived,
+    ServiceRequested,
+    StatusReceived,
+    Unusable,
+)
 from bridge.protocol import ClientCore
-from bridge.websocket import WebSocket, check_uri, open_websocket
+from bridge.route import Route
+from bridge.websocket import WebSocket, open_websocket
 
 #: Seconds before the first attempt to reconnect, and at most before any.
 FIRST_DELAY: Final = 0.1
@@ -53,8 +67,17 @@ StateCallback = Callable[[State, str], None]
 Server = Callable[[ServiceRequested], Coroutine[Any, Any, None]]
 
 
-@dataclass(frozen=True, slots=True)
-class Message:
+class GoalReceiver(Protocol):
+    """Who is told of a goal of an action."""
+
+    def receive(self, event: GoalFeedback | GoalEnded) -> None:
+        """Take what the server says of it."""
+
+    def fail(self, reason: str) -> None:
+        """Take note that nothing more will be heard of it."""
+
+
+class Message(NamedTuple):
     """One message of a topic.
 
     Attributes:
@@ -62,12 +85,30 @@ class Message:
         msg: the ROS message; shared by all subscriptions of the topic, so not to be changed.
         received_ns: ``time.time_ns()`` at its arrival.
         received_monotonic_ns: ``time.monotonic_ns()`` at its arrival.
+        blind_seconds: for how long, before this message, nothing could be heard because the connection was lost;
+            0 but for the first message after a reconnection.
     """
 
     topic: str
     msg: dict[str, Any]
     received_ns: int
     received_monotonic_ns: int
+    blind_seconds: float = 0.0
+
+    @property
+    def raw(self) -> bytes:
+        """The serialised message, of a subscription with ``cbor-raw``.
+
+        Raises:
+            DecodeError: the message has no bytes: it came another way, or the server does not know cbor-raw.
+        """
+        data = self.msg.get("bytes")
+        if type(data) is not bytes:
+            raise DecodeError(
+                f"a message of {self.topic} has no serialised bytes: was it subscribed with "
+                "compression='cbor-raw', and does the server know that?"
+            )
+        return data
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -91,7 +132,7 @@ class Session:
     """The one connection of a client, over all of its WebSockets.
 
     Attributes:
-        uri: the server's.
+        uri: the server's, without secrets.
         core: what is wanted of the server.
         state: where the connection stands.
         reconnections: how often the connection was lost and came back.
@@ -99,17 +140,24 @@ class Session:
         unusable: how many messages arrived that no client can use.
         statuses: what the server said of itself lately, newest last.
         receivers: by subscription, who takes its messages.
+        on_blind: are told after a reconnection how many seconds nothing could be heard.
         servers: by service of this client, who answers its requests.
+        goals: by identity, who is told of a goal of an action.
         on_closed: are called once, when the connection is closed for good.
     """
 
-    def __init__(self, uri: str, core: ClientCore, limits: Limits, on_state: StateCallback | None) -> None:
-        """Prepare; `open` connects.
-
-        Raises:
-            UriError: the URI is none of a WebSocket.
-        """
-        self.uri = uri
+    def __init__(
+        self,
+        uri: WebSocketURI,
+        shown_uri: str,
+        core: ClientCore,
+        limits: Limits,
+        on_state: StateCallback | None,
+        *,
+        route: Route,
+    ) -> None:
+        """Prepare; `open` connects."""
+        self.uri = shown_uri
         self.core = core
         self.state = State.CONNECTING
         self.reconnections = 0
@@ -118,9 +166,13 @@ class Session:
         self.statuses: deque[StatusReceived] = deque(maxlen=KEPT_STATUSES)
         self._status_at = 0.0
         self.receivers: dict[int, Callable[[Message], None]] = {}
+        self.on_blind: set[Callable[[float], None]] = set()
         self.servers: dict[str, Server] = {}
+        self.goals: dict[str, GoalReceiver] = {}
         self.on_closed: set[Callable[[], None]] = set()
-        self._parsed_uri = check_uri(uri)
+        self._parsed_uri = uri
+        self._route = route
+        self._blind_since: float | None = None
         self._limits = limits
         self._on_state = on_state
         self._entered = False
@@ -180,6 +232,7 @@ class Session:
         websocket = await open_websocket(
             self._parsed_uri,
             self.uri,
+            route=self._route,
             timeout=seconds,
             max_size=self._limits.max_size,
             ping_interval=self._limits.ping_interval,
@@ -191,15 +244,23 @@ class Session:
         self._connected_at = websocket.loop.time()
         if self.state is State.RECONNECTING:
             self.reconnections += 1
+            self._tell_blind(websocket.loop.time())
         self.core.restore()
         self.flush()
         self.ask_later()
         self._set_state(State.CONNECTED, "")
 
+    def _tell_blind(self, now: float) -> None:
+        if self._blind_since is not None:
+            seconds, self._blind_since = now - self._blind_since, None
+            for tell in self.on_blind:
+                tell(seconds)
+
     def _lost(self, websocket: WebSocket, reason: str) -> None:
         if websocket is not self._websocket:
             return
         self._websocket = None
+        self._blind_since = websocket.last_heard
         self.core.lost()
         self.last_error = reason
         _log.warning("the connection to %s is lost: %s", self.uri, reason)
@@ -227,6 +288,9 @@ class Session:
                 return
 
     def _fail_calls(self, reason: str) -> None:
+        goals, self.goals = self.goals, {}
+        for goal in goals.values():
+            goal.fail(reason)
         calls, self._calls = self._calls, {}
         for call, future in calls.items():
             if not future.done():
@@ -305,11 +369,19 @@ class Session:
         Raises:
             DisconnectedError: there is no connection.
         """
-        self._open_websocket().send_now(data)
+        if self.core.fragment_size is None:
+            self._open_websocket().send_now(data)
+        else:
+            self._send_pieces(self._open_websocket(), data)
         self._in_a_row += 1
         if self._in_a_row >= _IN_A_ROW:
             self._in_a_row = 0
             await asyncio.sleep(0)
+
+    def together(self) -> AbstractContextManager[None]:
+        """Have what is sent inside leave in one piece (see `bridge.client.Ros.together`)."""
+        websocket = self._websocket
+        return nullcontext() if websocket is None else websocket.together()
 
     async def wait_turn(self, what: str, limit: float) -> None:
         """Wait until the server has taken what waits before.
@@ -338,7 +410,11 @@ class Session:
         websocket = self._websocket
         if websocket is not None and websocket.is_open:
             for message in data:
-                websocket.send_now(message)
+                self._send_pieces(websocket, message)
+
+    def _send_pieces(self, websocket: WebSocket, data: bytes) -> None:
+        for piece in self.core.pieces(data):
+            websocket.send_now(piece)
 
     def ask_later(self) -> None:
         """Ask again in a while for topics of unknown type, as long as they bring nothing."""
@@ -407,6 +483,10 @@ class Session:
                 task = asyncio.get_running_loop().create_task(self.servers[event.service](event))
                 self._serving.add(task)
                 task.add_done_callback(self._serving.discard)
+            case GoalFeedback() | GoalEnded():
+                goal = self.goals.get(event.goal)
+                if goal is not None:
+                    goal.receive(event)
             case StatusReceived():
                 self.statuses.append(event)
                 self._status_at = time.monotonic()

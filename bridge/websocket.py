@@ -6,9 +6,12 @@ a silent one is given up within ``ping_interval + ping_timeout``.
 """
 
 import asyncio
+import logging
 import socket
 import ssl
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from http import HTTPStatus
 from typing import Final
 
 from websockets.asyncio.client import ClientConnection
@@ -24,8 +27,9 @@ from websockets.frames import DATA_OPCODES, Frame
 from websockets.protocol import Event, State
 from websockets.uri import WebSocketURI, parse_uri
 
-from bridge.errors import NotRosbridgeError, UnreachableError, UriError
+from bridge.errors import AccessRefusedError, BridgeError, NotRosbridgeError, UnreachableError, UriError
 from bridge.json_codec import excerpt
+from bridge.route import Route, connect_along, shown
 
 #: Bytes that may wait for the peer before publishers have to wait too.
 WRITE_LIMIT: Final = 1 << 16
@@ -33,6 +37,17 @@ WRITE_LIMIT: Final = 1 << 16
 CLOSE_TIMEOUT: Final = 1.0
 #: Seconds by which the watch may be late before that counts as this process having slept, not the peer.
 _OVERSLEPT: Final = 0.5
+
+
+class _NoDebug(logging.LoggerAdapter[logging.Logger]):
+    """A log for the library without its debugging: that has all headers in it, tokens too."""
+
+    def isEnabledFor(self, level: int) -> bool:  # noqa: N802  # the standard library's name
+        """Whether a line of that level is wanted."""
+        return level > logging.DEBUG and super().isEnabledFor(level)
+
+
+_log = _NoDebug(logging.getLogger("bridge.websocket"), {})
 
 
 def check_uri(uri: str) -> WebSocketURI:
@@ -50,7 +65,7 @@ def check_uri(uri: str) -> WebSocketURI:
     ) as error:  # ValueError: a port that is no number, half a bracket, odd letters
         reason = error.msg if isinstance(error, InvalidURI) else str(error)
         raise UriError(
-            f"{uri!r} is no URI of a rosbridge server ({reason}): it must be like ws://192.168.1.10:9090"
+            f"{shown(uri)!r} is no URI of a rosbridge server ({reason}): it must be like ws://192.168.1.10:9090"
         ) from None
     return parsed
 
@@ -91,6 +106,12 @@ class WebSocket(ClientConnection):
         self._watch: asyncio.TimerHandle | None = None
         self._begun: bytearray | None = None
         self._silent_for = 0.0
+        self._held = 0
+
+    @property
+    def last_heard(self) -> float:
+        """When the peer last sent anything (the loop's time)."""
+        return self._last_heard
 
     @property
     def is_open(self) -> bool:
@@ -107,6 +128,26 @@ class WebSocket(ClientConnection):
         """Hand one text message to the socket (or to its buffer, without limit: see ``paused`` and ``drain``)."""
         self.protocol.send_text(data)
         self.send_data()
+
+    @contextmanager
+    def together(self) -> Iterator[None]:
+        """Keep what is sent inside back until its end, and hand it to the socket in one piece."""
+        self._held += 1
+        try:
+            yield
+        finally:
+            self._held -= 1
+            self.send_data()
+
+    def send_data(self) -> None:
+        """Write what the protocol has to say; the library's own, but for what is kept back."""
+        if self._held:
+            return
+        writes = self.protocol.writes
+        if len(writes) > 1:
+            # an empty one, always the last, stands for the end of the stream
+            self.protocol.writes = [b"".join(writes), *([b""] if not writes[-1] else [])]
+        super().send_data()
 
     def abandon(self) -> None:
         """Give the connection up at once."""
@@ -197,6 +238,7 @@ async def open_websocket(
     uri: WebSocketURI,
     shown_uri: str,
     *,
+    route: Route,
     timeout: float,  # noqa: ASYNC109  # the limit is part of the errors' sentences
     max_size: int,
     ping_interval: float,
@@ -208,7 +250,8 @@ async def open_websocket(
 
     Args:
         uri: where to.
-        shown_uri: the same as the user wrote it, for the errors.
+        shown_uri: the same without secrets, for the errors.
+        route: the way there: TLS, headers, a proxy.
         timeout: seconds for all of it.
         max_size: bytes of one incoming message; a larger one ends the connection.
         ping_interval: seconds of silence after which the peer is asked for a sign of life.
@@ -222,13 +265,13 @@ async def open_websocket(
     Raises:
         UnreachableError: nothing answers there.
         NotRosbridgeError: something answers there, but not as a WebSocket server.
+        AccessRefusedError: it wants a token or a certificate, or another one.
     """
-    loop = asyncio.get_running_loop()
     made: list[WebSocket] = []
 
     def factory() -> WebSocket:
         websocket = WebSocket(
-            ClientProtocol(uri, max_size=max_size),
+            ClientProtocol(uri, max_size=max_size, logger=_log),
             ping_interval=ping_interval,
             ping_timeout=ping_timeout,
             on_message=on_message,
@@ -239,14 +282,8 @@ async def open_websocket(
 
     try:
         async with asyncio.timeout(timeout):
-            _transport, websocket = await loop.create_connection(
-                factory,
-                uri.host,
-                uri.port,
-                ssl=True if uri.secure else None,
-                server_hostname=uri.host if uri.secure else None,
-            )
-            await websocket.handshake()
+            websocket = await connect_along(route, uri, shown_uri, factory)
+            await websocket.handshake(route.headers)
     except BaseException as error:
         attempt = made[-1] if made and hasattr(made[-1], "transport") else None
         if attempt is not None:
@@ -259,7 +296,7 @@ async def open_websocket(
         ):
             # What was heard says more than what came of it: a service that greets first breaks off the request.
             error = attempt.protocol.handshake_exc
-        if not isinstance(error, OSError | InvalidHandshake):
+        if isinstance(error, BridgeError) or not isinstance(error, OSError | InvalidHandshake):
             raise
         raise _connect_error(error, shown_uri, heard, timeout, answered=attempt is not None) from error
     if not websocket.is_open:
@@ -270,11 +307,15 @@ async def open_websocket(
 
 def _connect_error(
     error: Exception, uri: str, heard: bytes, seconds: float, *, answered: bool
-) -> UnreachableError | NotRosbridgeError:
+) -> UnreachableError | NotRosbridgeError | AccessRefusedError:
     """The sentence for a connection that did not come about."""
     if isinstance(error, InvalidStatus):
         response = error.response
-        seen = f"HTTP {response.status_code} {response.reason_phrase}".rstrip()
+        seen = f"HTTP {response.status_code} {response.reason_phrase[:80]}".rstrip()
+        if response.status_code in {HTTPStatus.UNAUTHORIZED, HTTPStatus.FORBIDDEN}:
+            return AccessRefusedError(f"{uri} does not let this client in ({seen}): check token and headers")
+        if response.status_code == HTTPStatus.SERVICE_UNAVAILABLE:
+            return UnreachableError(f"{uri} takes no more clients now ({seen})")
         to = response.headers.get("Location")
         seen += f", to {to[:200]}" if to else ""
         return NotRosbridgeError(
@@ -289,6 +330,10 @@ def _connect_error(
         )
     if isinstance(error, ssl.SSLCertVerificationError):
         return UnreachableError(f"{uri} is not to be trusted: its certificate: {error.verify_message}")
+    if isinstance(error, ssl.SSLError) and "ALERT" in (error.reason or ""):
+        return AccessRefusedError(
+            f"{uri} does not let this client in ({error.reason}): check client_certificate"
+        )
     if isinstance(error, ssl.SSLError):
         return NotRosbridgeError(
             f"{uri} does not speak TLS ({error.reason}): is it ws:// rather than wss://?"

@@ -12,6 +12,7 @@ import pytest
 
 from bridge.client import State, connect
 from bridge.errors import (
+    AccessRefusedError,
     BridgeError,
     DisconnectedError,
     NotRosbridgeError,
@@ -48,7 +49,7 @@ async def fails(uri: str, error: type[BridgeError], **options: Any) -> str:
         async with connect(uri, **options):
             pytest.fail("it connected")
     assert time.monotonic() - begun < options.get("connect_timeout", 10) + 2
-    assert caught.value.exit_code == (2 if error is UriError else 3)
+    assert caught.value.exit_code == (2 if error in {UriError, AccessRefusedError} else 3)
     assert uri in str(caught.value)
     assert "\n" not in str(caught.value)
     return str(caught.value)
@@ -180,9 +181,9 @@ async def test_a_service_that_speaks_something_else(greeting, stays):
 async def test_a_service_that_greets_before_it_is_asked(monkeypatch):
     handshake = WebSocket.handshake
 
-    async def late_handshake(self: WebSocket) -> None:
+    async def late_handshake(self: WebSocket, *headers: Any) -> None:
         await asyncio.sleep(0.1)
-        await handshake(self)
+        await handshake(self, *headers)
 
     async def answer(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         writer.write(b"220 mail ready\r\n")
@@ -234,10 +235,18 @@ async def test_a_web_server(answer, seen):
         assert seen in await fails(f"ws://127.0.0.1:{port}", NotRosbridgeError)
 
 
-@pytest.mark.parametrize("status", [401, 404, 503])
-async def test_a_server_that_refuses(status):
+@pytest.mark.parametrize(
+    ("status", "error"),
+    [
+        (401, AccessRefusedError),
+        (403, AccessRefusedError),
+        (404, NotRosbridgeError),
+        (503, UnreachableError),
+    ],
+)
+async def test_a_server_that_refuses(status, error):
     async with FakeRosbridge(refuses=status) as fake:
-        assert f"HTTP {status}" in await fails(fake.uri, NotRosbridgeError)
+        assert f"HTTP {status}" in await fails(fake.uri, error)
 
 
 async def test_tls_towards_a_server_without():

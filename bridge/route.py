@@ -1,0 +1,207 @@
+"""How a connection reaches its server: TLS and its certificates, headers and tokens, a proxy on the way.
+
+Nothing secret is in what is shown: a `Route`'s repr has no headers, `shown` takes credentials and queries out of a URI.
+"""
+
+import asyncio
+import ipaddress
+import logging
+import re
+import ssl
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from os import PathLike, fspath
+from typing import Final, TypeVar
+
+from websockets.asyncio.client import connect_http_proxy, connect_socks_proxy
+from websockets.exceptions import InvalidHandshake, InvalidProxy, InvalidProxyStatus
+from websockets.proxy import Proxy, get_proxy, parse_proxy
+from websockets.uri import WebSocketURI
+
+from bridge.errors import OptionError, UnreachableError
+
+#: The proxy that the environment names (``HTTPS_PROXY``, ``ALL_PROXY`` and the like, ``NO_PROXY``).
+FROM_ENVIRONMENT: Final = "environment"
+
+_log = logging.getLogger("bridge")
+
+_CREDENTIALS = re.compile(r"^([A-Za-z][A-Za-z0-9+.-]*://)?[^/?#]*@")
+_QUERY = re.compile(r"\?[^#]+")
+_HEADER_NAME = re.compile(r"[!#$%&'*+.^_`|~0-9A-Za-z-]+")
+_HEADER_VALUE = re.compile(r"[\t\x20-\x7e\x80-\xff]*")
+
+Path = str | PathLike[str]
+_ConnectionT = TypeVar("_ConnectionT", bound=asyncio.Protocol)
+
+
+def shown(uri: str) -> str:
+    """A URI as it may be read by anyone: without user, password and query."""
+    return _QUERY.sub("?***", _CREDENTIALS.sub(r"\1", uri))
+
+
+@dataclass(frozen=True, slots=True)
+class Route:
+    """The way to a server.
+
+    Attributes:
+        tls: what certificates are checked with and shown; None for ``ws://``.
+        headers: what is said beside the WebSocket's own headers.
+        proxy: who is asked to connect, None for nobody.
+    """
+
+    tls: ssl.SSLContext | None = None
+    headers: tuple[tuple[str, str], ...] = field(default=(), repr=False)
+    proxy: Proxy | None = field(default=None, repr=False)
+
+
+def make_route(
+    uri: WebSocketURI,
+    *,
+    token: str | None = None,
+    headers: Mapping[str, str] | None = None,
+    ca_file: Path | None = None,
+    client_certificate: Path | tuple[Path, Path] | None = None,
+    tls: ssl.SSLContext | None = None,
+    proxy: str | None = None,
+) -> Route:
+    """Read what a user says of the way (see `bridge.client.connect`).
+
+    Raises:
+        OptionError: something of it cannot be; the sentence names the option, never a secret.
+    """
+    said = dict(headers or {})
+    if token is not None:
+        if any(name.lower() == "authorization" for name in said):
+            raise OptionError("token and an Authorization header exclude each other")
+        if not token or not token.isascii() or not token.isprintable() or " " in token:
+            raise OptionError("token must be printable ASCII characters without spaces")
+        said["Authorization"] = f"Bearer {token}"
+    for name, value in said.items():
+        if _HEADER_NAME.fullmatch(name) is None:
+            raise OptionError(f"{name!r} is no name of a header")
+        if not isinstance(value, str) or _HEADER_VALUE.fullmatch(value) is None:
+            raise OptionError(f"the value of header {name} has characters that no header can have")
+    secret = token is not None or uri.user_info is not None or any(n.lower() == "authorization" for n in said)
+    if secret and not uri.secure and not _is_loopback(uri.host):
+        _log.warning("what lets this client in is sent to %s unencrypted: wss:// would protect it", uri.host)
+    return Route(_tls(uri, ca_file, client_certificate, tls), tuple(said.items()), _proxy(uri, proxy))
+
+
+def _tls(
+    uri: WebSocketURI,
+    ca_file: Path | None,
+    client_certificate: Path | tuple[Path, Path] | None,
+    tls: ssl.SSLContext | None,
+) -> ssl.SSLContext | None:
+    options = {"ca_file": ca_file, "client_certificate": client_certificate}
+    given = [name for name, value in options.items() if value is not None]
+    if not uri.secure:
+        if given or tls is not None:
+            raise OptionError(f"{(*given, 'tls')[0]} is of use with wss:// only")
+        return None
+    if tls is not None:
+        if given:
+            raise OptionError(f"tls and {given[0]} exclude each other")
+        return tls
+    try:
+        context = ssl.create_default_context(cafile=None if ca_file is None else fspath(ca_file))
+    except (OSError, ssl.SSLError) as error:
+        raise OptionError(f"ca_file {fspath(ca_file or '')} cannot be used: {_say(error)}") from None
+    if client_certificate is not None:
+        certificate, key = (
+            client_certificate if isinstance(client_certificate, tuple) else (client_certificate, None)
+        )
+        try:
+            # Without a password given here, OpenSSL would ask for one on the terminal.
+            context.load_cert_chain(certificate, key, password=lambda: b"")
+        except (OSError, ssl.SSLError, ValueError) as error:
+            named = fspath(certificate) + (f" and {fspath(key)}" if key is not None else "")
+            raise OptionError(f"client_certificate {named} cannot be used: {_say(error)}") from None
+    return context
+
+
+def _proxy(uri: WebSocketURI, proxy: str | None) -> Proxy | None:
+    if proxy == FROM_ENVIRONMENT:
+        proxy = get_proxy(uri)
+    if proxy is None:
+        return None
+    try:
+        return parse_proxy(proxy)
+    except (InvalidProxy, ValueError) as error:
+        reason = error.msg if isinstance(error, InvalidProxy) else "it is no URL"
+        raise OptionError(
+            f"proxy {shown(proxy)!r} cannot be used ({reason}): it must be like http://proxy:3128"
+        ) from None
+
+
+async def connect_along(
+    route: Route, uri: WebSocketURI, shown_uri: str, factory: Callable[[], _ConnectionT]
+) -> _ConnectionT:
+    """Open the transport under a WebSocket connection.
+
+    Args:
+        route: the way.
+        uri: where to.
+        shown_uri: the same for the errors.
+        factory: makes the connection, which is told of its transport.
+
+    Raises:
+        UnreachableError: the proxy does not let through.
+        OSError: what the system says.
+    """
+    loop = asyncio.get_running_loop()
+    hostname = uri.host if route.tls is not None else None
+    proxy = route.proxy
+    if proxy is None:
+        _transport, connection = await loop.create_connection(
+            factory, uri.host, uri.port, ssl=route.tls, server_hostname=hostname
+        )
+        return connection
+    name = f"{proxy.scheme}://{proxy.host}:{proxy.port}"
+    try:
+        if proxy.scheme.startswith("socks"):
+            sock = await connect_socks_proxy(proxy, uri)
+        else:
+            to_proxy = ssl.create_default_context() if proxy.scheme == "https" else None
+            transport = await connect_http_proxy(proxy, uri, ssl=to_proxy)
+    except ImportError:
+        raise OptionError(
+            f"the proxy {name} needs the package python-socks: pip install python-socks"
+        ) from None
+    except InvalidProxyStatus as error:
+        raise UnreachableError(
+            f"{shown_uri} is unreachable: the proxy {name} refuses (HTTP {error.response.status_code} "
+            f"{error.response.reason_phrase[:80]})"
+        ) from None
+    except (InvalidHandshake, OSError) as error:
+        raise UnreachableError(f"{shown_uri} is unreachable: the proxy {name} fails: {_say(error)}") from None
+    if proxy.scheme.startswith("socks"):
+        _transport, connection = await loop.create_connection(
+            factory, sock=sock, ssl=route.tls, server_hostname=hostname
+        )
+        return connection
+    try:
+        connection = factory()
+        transport.set_protocol(connection)
+        if route.tls is not None:
+            transport = (
+                await loop.start_tls(transport, connection, route.tls, server_hostname=hostname) or transport
+            )
+        connection.connection_made(transport)
+    except BaseException:
+        transport.abort()
+        raise
+    return connection
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost" or host.endswith(".localhost")
+
+
+def _say(error: Exception) -> str:
+    if isinstance(error, ssl.SSLError):
+        return error.reason or "OpenSSL does not take it"
+    return (error.strerror if isinstance(error, OSError) else None) or str(error)
