@@ -399,6 +399,8 @@ class Master:
     def _lost(self, peer: Peer) -> None:
         if peer.role == "pcie-app" and self._computing is not None:
             self._losses["lost with pcie-app"] += 1
+            if self._follows:
+                self._log.debug("lost with pcie-app", frame=self._computing[0].number)
             self._computing = None
         if peer.role == "publisher" and self._under_way:
             self._losses["lost with the publisher"] += self._under_way
@@ -595,6 +597,8 @@ class Master:
                 self._fail(BoardFailedError(msg))
                 return
             self._log.warning(record.sentence, frame=record.number)
+        elif self._follows:
+            self._log.debug(record.sentence, frame=record.number)
         self._next()
 
     def _was_published(self, record: Published) -> None:

@@ -285,7 +285,7 @@ class PcieApp:
         if self._ready is None:
             why = "waiting for the boards to be opened and programmed"
         elif gone is not None:
-            why = f"board {gone[0]} is gone ({gone[1]})"
+            why = gone[1]  # names the board
         else:
             why = self._ready.sentence
         return ProcessStatus(
