@@ -312,6 +312,23 @@ class _Board:
         )
 
 
+class _Course:
+    """How far the posted frame is."""
+
+    def __init__(self, max_cycles: int, end: int, boards: Sequence[_Board]) -> None:
+        self.max_cycles = max_cycles
+        self.begun = 0  # where the slice began
+        self.end = end  # where it ends; 0: where the frame does
+        self.running = boards
+        self.left = 0  # boards of the slice that have not said done
+        self.cycles = 0
+        self.limit = 0.0
+        self.deadline = 0.0
+        self.slices = 0
+        self.writes_ns = self.waits_ns = self.computing_ns = 0
+        self.clock_ns = time.perf_counter_ns()
+
+
 class MiniCluster:
     """All boards of a deployment, in the order of their partition; used by one thread."""
 
@@ -322,6 +339,7 @@ class MiniCluster:
         self._timeout = timeout
         self._slack = slack
         self._interrupted: list[_Board] = []
+        self._course: _Course | None = None
         self._poll = select.poll()
         self._by_descriptor: dict[int, _Board] = {}
         self._sensor_words = struct.Struct(f"<{self._parameters.sensors}I")
@@ -395,6 +413,7 @@ class MiniCluster:
 
     def close(self) -> None:
         """Close all links; boards that run stop."""
+        self._course = None
         for board in self._boards:
             self._close(board, "the mini-cluster was closed")
 
@@ -410,91 +429,147 @@ class MiniCluster:
             FrameInputError: The frame does not fit the machine; no board was touched.
             BoardError: A board failed; ``error.board`` is its number.
         """
+        self.post(frame)
+        while (output := self.collect(LONGEST_POLL_S)) is None:
+            pass
+        return output
+
+    def post(self, frame: FrameInput) -> None:
+        """Start a frame on all boards without waiting for any; :meth:`collect` has its result. Errors as :meth:`run`."""
+        if self._course is not None:
+            raise FrameInputError("A frame is under way; collect its result before the next is posted")
         settings, sensors = self._words(frame)
         priors = self._priors(frame)
         self._make_ready()
-        try:
-            return self._run(frame, settings, sensors, priors)
-        except BaseException:
-            # What the others still compute is of no use: a closed link stops them, the next frame opens it.
-            for board in self._boards:
-                if board.waiting and board.link is not None:
-                    self._close(board, "another board failed the frame")
-                    self._interrupted.append(board)
-            raise
-
-    def _run(
-        self,
-        frame: FrameInput,
-        settings: bytes,
-        sensors: bytes,
-        priors: Sequence[npt.NDArray[np.uint16] | None],
-    ) -> FrameOutput:
-        boards = self._boards
-        sliced = frame.stop == "slices"
-        end = first_slice(frame.target_count) if sliced else 0
+        end = first_slice(frame.target_count) if frame.stop == "slices" else 0
         if end >= frame.max_cycles:
             end = 0  # one slice, which ends where the frame does
-        writes = waits = computing = rounds = begun = 0
-        clock = time.perf_counter_ns
-        started = clock()
-        for board, prior in zip(boards, priors, strict=True):
-            try:
-                board.start(settings, sensors, prior, end)
-            except LinkError as error:
-                self._fail(board, error)
-        running: Sequence[_Board] = boards
-        while True:
-            posted = clock()
-            writes += posted - started
-            self._collect(running, (end or frame.max_cycles) - begun)
-            started = clock()
-            waits += started - posted
-            rounds += 1
-            computing += max(board.done.compute_ns for board in running if board.done is not None)
-            running = [board for board in running if board.reason == StopReason.SLICE]
-            if not running or any(board.reason == StopReason.OVERFLOW for board in boards):
-                break
-            begun, end = end, 2 * end
-            if end >= frame.max_cycles:
-                end = 0  # the last slice ends where the frame does
-            for board in running:
+        course = self._course = _Course(frame.max_cycles, end, self._boards)
+        try:
+            for board, prior in zip(self._boards, priors, strict=True):
                 try:
-                    board.resume(end)
+                    board.start(settings, sensors, prior, end)
                 except LinkError as error:
                     self._fail(board, error)
-        results = tuple(board.result() for board in boards)
-        return FrameOutput(
-            boards=results,
-            register_writes_ns=writes,
-            compute_ns=waits,
-            reads_ns=clock() - started,
-            boards_compute_ns=computing,
-            slices=rounds,
-        )
+            self._posted(course)
+        except BaseException:
+            self._abandon()
+            raise
 
-    def _collect(self, running: Sequence[_Board], cycles: int) -> None:
-        """Wait until every running board has said done, ``cycles`` cycles from now at most."""
+    def collect(self, seconds: float) -> FrameOutput | None:
+        """Take what the boards have said of the posted frame, and go on with its next slice where there is one.
+
+        Args:
+            seconds: To wait at most, if nothing has come yet; 0 for a look.
+
+        Returns:
+            The frame's result, or None while boards still run: then :attr:`awaited` says which link to watch.
+
+        Raises:
+            BoardError: As :meth:`run`.
+        """
+        course = self._course
+        if course is None:
+            raise FrameInputError("There is no frame under way: post one first")
+        try:
+            if not self._receive(course, seconds):
+                return None
+            output = self._next_slice(course)
+        except BaseException:
+            self._abandon()
+            raise
+        if output is not None:
+            self._course = None
+        return output
+
+    @property
+    def awaited(self) -> int | None:
+        """Descriptor of the link that is worth watching until the next :meth:`collect`; None if no frame is under way."""
+        course = self._course
+        if course is None:
+            return None
+        board = next((board for board in reversed(course.running) if board.waiting), None)
+        return None if board is None or board.link is None else board.link.fileno()
+
+    @property
+    def seconds_left(self) -> float:
+        """Seconds until a board of the posted frame is late: :meth:`collect` is to be called then at the latest."""
+        return 0.0 if self._course is None else max(0.0, self._course.deadline - time.monotonic())
+
+    def _posted(self, course: _Course) -> None:
+        """All boards of a slice have been started: from now on they are waited for."""
         # emulated boards may all share one core
-        limit = self._slack + cycles * len(self._boards) / min(board.speed for board in self._boards)
-        deadline = time.monotonic() + limit
-        left = len(running)
+        cycles = (course.end or course.max_cycles) - course.begun
+        course.cycles = cycles
+        course.limit = self._slack + cycles * len(self._boards) / min(board.speed for board in self._boards)
+        course.deadline = time.monotonic() + course.limit
+        course.left = len(course.running)
+        now = time.perf_counter_ns()
+        course.writes_ns += now - course.clock_ns
+        course.clock_ns = now
+
+    def _receive(self, course: _Course, seconds: float) -> bool:
+        """Hear the boards, for so many seconds at most; True once every running board has said done."""
         # The board that was started last is mostly the last to be done: waking for each of the others would only
-        # take their cores from those that compute. Who fails or takes longer is seen below.
-        running[-1].readable.poll(min(limit, FIRST_WAIT_S) * 1000)
-        while left:
-            remaining = deadline - time.monotonic()
-            events = self._poll.poll(min(max(remaining, 0.0), LONGEST_POLL_S) * 1000)
-            if not events and remaining <= LONGEST_POLL_S:
-                late = next(board for board in running if board.waiting)
-                assert late.link is not None  # noqa: S101 - it is waited for
-                self._fail(late, late.link.late(limit, f"say done after {cycles} cycles"))
+        # take their cores from those that compute. Who fails or takes longer is seen by the poll of all.
+        if seconds and course.left == len(course.running):
+            course.running[-1].readable.poll(min(seconds, FIRST_WAIT_S) * 1000)
+        while course.left:
+            remaining = course.deadline - time.monotonic()
+            events = self._poll.poll(min(max(remaining, 0.0), seconds) * 1000)
+            if not events:
+                if remaining <= 0:
+                    late = next(board for board in course.running if board.waiting)
+                    assert late.link is not None  # noqa: S101 - it is waited for
+                    self._fail(late, late.link.late(course.limit, f"say done after {course.cycles} cycles"))
+                return False
             for descriptor, _ in events:
                 board = self._by_descriptor[descriptor]
                 try:
-                    left -= board.receive()
+                    course.left -= board.receive()
                 except LinkError as error:
                     self._fail(board, error)
+        return True
+
+    def _next_slice(self, course: _Course) -> FrameOutput | None:
+        """After a slice: the frame's result, or None where boards go on with the next one."""
+        now = time.perf_counter_ns()
+        course.waits_ns += now - course.clock_ns
+        course.clock_ns = now
+        course.slices += 1
+        course.computing_ns += max(
+            board.done.compute_ns for board in course.running if board.done is not None
+        )
+        running = [board for board in course.running if board.reason == StopReason.SLICE]
+        if running and not any(board.reason == StopReason.OVERFLOW for board in self._boards):
+            course.running = running
+            course.begun, course.end = course.end, 2 * course.end
+            if course.end >= course.max_cycles:
+                course.end = 0  # the last slice ends where the frame does
+            for board in running:
+                try:
+                    board.resume(course.end)
+                except LinkError as error:
+                    self._fail(board, error)
+            self._posted(course)
+            return None
+        results = tuple(board.result() for board in self._boards)
+        return FrameOutput(
+            boards=results,
+            register_writes_ns=course.writes_ns,
+            compute_ns=course.waits_ns,
+            reads_ns=time.perf_counter_ns() - course.clock_ns,
+            boards_compute_ns=course.computing_ns,
+            slices=course.slices,
+        )
+
+    def _abandon(self) -> None:
+        """The frame is lost. What the other boards still compute is of no use: a closed link stops them."""
+        self._course = None
+        for board in self._boards:
+            if board.waiting and board.link is not None:
+                self._close(board, "another board failed the frame")
+                self._interrupted.append(board)
 
     def _fail(self, board: _Board, error: LinkError) -> NoReturn:
         """The frame fails because of this board; only one that merely refused stays usable."""

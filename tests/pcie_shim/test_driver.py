@@ -2,9 +2,10 @@
 # What the boards give through registers is what the kernels give, to the bit; and every failure is said.
 import dataclasses
 import re
+import select
 import tempfile
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -94,6 +95,27 @@ def cluster(request: pytest.FixtureRequest) -> Iterator[MiniCluster]:
 def test_frames_are_the_kernels_to_the_bit(cluster: MiniCluster, given_frames: list[FrameInput]) -> None:
     for each in given_frames:
         assert outcome(cluster.run(each)) == expected(PARTS, each)
+
+
+def test_a_frame_in_pieces_is_the_same_frame(cluster: MiniCluster) -> None:
+    whole = frame(5, 8, target_count=255, max_cycles=2**17)
+    assert cluster.awaited is None
+    with pytest.raises(FrameInputError, match="There is no frame under way: post one first"):
+        cluster.collect(0)
+    cluster.post(whole)
+    with pytest.raises(FrameInputError, match="A frame is under way; collect its result"):
+        cluster.post(whole)
+    output = None
+    while output is None:
+        assert cluster.seconds_left > 0
+        descriptor = cluster.awaited
+        assert descriptor is not None
+        assert select.select([descriptor], [], [], 10)[0]
+        output = cluster.collect(0)
+    assert output.slices > 1
+    assert outcome(output) == expected(PARTS, whole)
+    assert cluster.awaited is None
+    assert outcome(cluster.run(whole)) == expected(PARTS, whole)
 
 
 def test_slices_end_together(cluster: MiniCluster) -> None:
@@ -424,7 +446,7 @@ def test_an_interrupted_frame_leaves_all_boards_usable(
             raise KeyboardInterrupt
 
         with monkeypatch.context() as patch:
-            patch.setattr(cluster, "_collect", interrupted)
+            patch.setattr(cluster, "_receive", interrupted)
             with pytest.raises(KeyboardInterrupt):
                 cluster.run(frame())
         assert outcome(cluster.run(frame(bank=5))) == expected(parts, frame(bank=5))
@@ -435,14 +457,14 @@ def test_a_done_of_another_number_is_not_taken(
 ) -> None:
     parts = images(95, (3, 2))
     with MiniCluster.open(endpoints_of(boards), parts) as cluster:
-        good = cluster._collect
+        good = cluster._posted
 
-        def expecting_another(running: Sequence[object], cycles: int) -> None:
+        def expecting_another(course: object) -> None:
             cluster._boards[1].number += 1
-            good(running, cycles)
+            good(course)
 
         with monkeypatch.context() as patch:
-            patch.setattr(cluster, "_collect", expecting_another)
+            patch.setattr(cluster, "_posted", expecting_another)
             with pytest.raises(BoardLinkError, match="Board 1: .* said done number 1 where 2 was due"):
                 cluster.run(frame())
         cluster.reopen(1)
