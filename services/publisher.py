@@ -167,12 +167,15 @@ class ResultTopics:
         )
 
     async def _send(self, publish: Publish, times: Times, posterior: Any) -> None:
-        if self._frames is not None:
-            await self._frames.publish(
-                self._report.message(publish, times, published=posterior is not None, sent_ns=time.time_ns())
-            )
-        if posterior is not None:
-            await self.publish_array(posterior)
+        with self._outputs[0][0].together():
+            if self._frames is not None:
+                await self._frames.publish(
+                    self._report.message(
+                        publish, times, published=posterior is not None, sent_ns=time.time_ns()
+                    )
+                )
+            if posterior is not None:
+                await self.publish_array(posterior)
 
     async def publish_array(self, values: Any) -> None:
         """Publish probabilities (float64, one per line) on every output."""

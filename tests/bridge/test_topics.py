@@ -48,6 +48,46 @@ async def test_a_message_goes_round():
             await publication.publish({})
 
 
+async def test_messages_of_one_moment_leave_in_one_piece():
+    async with FakeRosbridge() as fake, connect(fake.uri) as ros:
+        subscription = ros.subscribe("/b", "p/T")
+        one, two = await ros.advertise("/a", "p/T"), await ros.advertise("/b", "p/T")
+        await fake.wait_for_op("advertise", topic="/b")
+        transport = ros._session._websocket.transport
+        written, write = [], transport.write
+
+        class Noting:
+            def __getattr__(self, name):
+                return getattr(transport, name)
+
+            def write(self, data):
+                written.append(bytes(data))
+                write(data)
+
+        ros._session._websocket.transport = Noting()
+        with ros.together():
+            await one.publish({"n": 1})
+            await two.publish({"n": 2})
+            assert not written
+        assert len(written) == 1
+        await two.publish({"n": 3})
+        assert len(written) == 2
+        assert [(await subscription.next(5)).msg["n"] for _ in range(2)] == [2, 3]
+        assert (await fake.wait_for_op("publish", topic="/a"))["msg"] == {"n": 1}
+
+
+async def test_the_end_in_the_middle_of_such_a_moment():
+    async with FakeRosbridge() as fake:
+        ros = connect(fake.uri)
+        await ros.__aenter__()
+        publication = await ros.advertise("/a", "p/T")
+        with ros.together():
+            await publication.publish({"n": 1})
+            await ros.close()
+        with ros.together(), pytest.raises(DisconnectedError):
+            await publication.publish({"n": 2})
+
+
 async def test_iteration_ends_with_the_subscription_or_the_client():
     async def read(subscription: Any) -> list[int]:
         return [message.msg["n"] async for message in subscription]
