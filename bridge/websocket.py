@@ -137,7 +137,8 @@ class WebSocket(ClientConnection):
             yield
         finally:
             self._held -= 1
-            self.send_data()
+            if not self.transport.is_closing():  # it may have come to its end meanwhile
+                self.send_data()
 
     def send_data(self) -> None:
         """Write what the protocol has to say; the library's own, but for what is kept back."""
