@@ -697,7 +697,7 @@ class ClientCore:
         del self._goals[goal]
         if operation.get("result", True) is False:
             return GoalEnded(goal, ok=False, status=GoalStatus.UNKNOWN, values=_text(values))
-        status = operation.get("status", GoalStatus.SUCCEEDED)
+        status = operation.get("status", GoalStatus.SUCCEEDED.value)
         known = type(status) is int and status in GoalStatus.__members__.values()
         return GoalEnded(
             goal,
