@@ -14,6 +14,7 @@ from types import UnionType
 from typing import TYPE_CHECKING, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from toolchain.errors import ModelError, ToolchainError
+from toolchain.joint import Question
 from toolchain.model import Model
 
 if TYPE_CHECKING:
@@ -27,8 +28,8 @@ def load_model(case: Path, settings: Mapping[str, str]) -> Model:
     """Return the model of a case study's folder.
 
     Args:
-        case: A folder with a `model.py` that defines `model(...) -> toolchain.model.Model`. Modules beside it
-            can be imported by it.
+        case: A folder with a `model.py` that defines `model(...)`, which returns a `toolchain.model.Model` or a
+            `toolchain.joint.Question`. Modules beside it can be imported by it.
         settings: Values for `model()`'s parameters as a user writes them; each is read as the type that the
             parameter is annotated with (int, float, bool, str, Path, an Enum, a Literal).
 
@@ -45,8 +46,13 @@ def load_model(case: Path, settings: Mapping[str, str]) -> Model:
         function = _model_function(path)
         arguments = _arguments(path, function, settings)
         model = _guarded(path, "model()", lambda: function(**arguments))
+    if isinstance(model, Question):
+        return model.model()
     if not isinstance(model, Model):
-        message = f"{path}: model() returned {type(model).__name__}, expected a toolchain.model.Model"
+        message = (
+            f"{path}: model() returned {type(model).__name__}, expected a toolchain.model.Model or a "
+            "toolchain.joint.Question"
+        )
         raise ModelError(message)
     return model
 

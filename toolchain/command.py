@@ -1,6 +1,8 @@
-"""The `toolchain` command: `toolchain build` makes a deployment of a case study's model (thesis 3.4)."""
+"""The `toolchain` command (thesis 3.4): its flags; each subcommand's work is in a module of its own."""
 
 import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 from typing import Annotated
@@ -8,10 +10,11 @@ from typing import Annotated
 import typer
 
 # NumPy and what needs it are imported where they are used: --help answers at once.
-from machines.parameters import RngKind, RngReset
-from toolchain.deployment import Queue, Stop, parse_interface
-from toolchain.errors import BuildError, ToolchainError
-from toolchain.options import BuildOptions, Scale
+from machines.parameters import PriorMode, RngKind, RngReset
+from toolchain.deployment import Queue, Stop
+from toolchain.errors import ToolchainError
+from toolchain.fit_options import FitMethod, FitOptions, FitPrior
+from toolchain.options import BuildOptions, OnMissing, Scale
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -23,13 +26,16 @@ app = typer.Typer(
 
 @app.callback()
 def toolchain() -> None:
-    """From a model in Python to everything a Bayesian machine needs."""
+    """From a model, in Python or in a network's file, to everything a Bayesian machine needs."""
 
 
 @app.command()
 def build(
-    case: Annotated[
-        Path, typer.Argument(help="Folder of a case study; it holds model.py.", metavar="CASE_DIR")
+    model: Annotated[
+        Path,
+        typer.Argument(
+            help="Folder that holds model.py, or a network: .bif, .xmlbif, .uai, .net.", metavar="MODEL"
+        ),
     ],
     directory: Annotated[
         Path, typer.Option("--output-dir", "-o", help="Folder of the deployment.", metavar="DIR")
@@ -41,6 +47,24 @@ def build(
         list[str] | None,
         typer.Option("--set", help="A parameter of the model; repeat for more.", metavar="KEY=VALUE"),
     ] = None,
+    searched: Annotated[
+        str, typer.Option(help="Of a network: the variables that are searched, A,B.", metavar="NAMES")
+    ] = "",
+    known: Annotated[
+        str,
+        typer.Option(help="Of a network: those with readings, in the order of the columns.", metavar="NAMES"),
+    ] = "",
+    given: Annotated[
+        list[str] | None,
+        typer.Option(help="Of a network: what always has this state; repeat for more.", metavar="NAME=STATE"),
+    ] = None,
+    prior_select: Annotated[
+        str,
+        typer.Option(help="Of a network: the variable with readings that selects the prior.", metavar="NAME"),
+    ] = "",
+    on_missing: Annotated[
+        OnMissing, typer.Option(help="Of a network: what an absent reading is.")
+    ] = OnMissing.ERROR,
     output: Annotated[str, typer.Option(help="Topic for the posteriors.")] = "/BMresults",
     partitions: Annotated[int, typer.Option(help="Boards to split the lines over.")] = 1,
     interface: Annotated[
@@ -54,6 +78,12 @@ def build(
         Scale, typer.Option(help="What is divided by its maximum before quantising.")
     ] = Scale.ADDRESS,
     prob_bits: Annotated[int, typer.Option(help="Bits of a code, 1 to 16.")] = 8,
+    prior_mode: Annotated[
+        PriorMode, typer.Option(help="table: the prior is in the images; written: the host writes it.")
+    ] = PriorMode.TABLE,
+    prior_path: Annotated[
+        str | None, typer.Option(help="Where in the message a written prior is.", metavar="PATH")
+    ] = None,
     counter_bits: Annotated[int, typer.Option(help="Bits of a line's counter, 1 to 32.")] = 8,
     target_count: Annotated[
         int | None, typer.Option(help="Count that stops a machine; default the counters' largest.")
@@ -79,18 +109,22 @@ def build(
     """Build a deployment: programming files for the boards, deployment.toml and a report.
 
     For example `toolchain build casestudies/boat -o build/boat --partitions 4 --uri ws://localhost:9090
-    --topic /boat/sensors --type boat_msgs/Sensors`
+    --topic /boat/sensors --type boat_msgs/Sensors`, or of a network `toolchain build asia.bif --searched bronc
+    --known smoke,dysp -o build/asia --uri ws://localhost:9090 --topic /patient --type clinic_msgs/Patient`
     """
-    try:
+    with _one_sentence():
+        from toolchain.build_command import NetworkQuestion, run_build
+
         options = BuildOptions(
             uri=uri,
             topic=topic,
             type=message_type,
             output=output,
             partitions=partitions,
-            interface=None if interface is None else _interface(interface),
             scale=scale,
             prob_bits=prob_bits,
+            prior_mode=prior_mode,
+            prior_path=prior_path,
             counter_bits=counter_bits,
             target_count=target_count,
             max_cycles=max_cycles,
@@ -101,10 +135,112 @@ def build(
             queue=queue,
             tolerance_s=tolerance,
         )
-        _build(case, directory, _key_values(settings or []), options)
-    except ToolchainError as error:
-        typer.echo(f"error: {error}", err=True)
-        raise typer.Exit(error.exit_code) from None
+        question = NetworkQuestion(
+            searched=searched,
+            known=known,
+            given=tuple(given or ()),
+            prior_select=prior_select,
+            on_missing=on_missing.value,
+        )
+        run_build(model, directory, settings or [], question, options, interface)
+
+
+@app.command()
+def new(
+    name: Annotated[Path, typer.Argument(help="The folder to make; its last part names the model.")],
+) -> None:
+    """Start a model from a template that runs: a robot in a corridor.
+
+    For example `toolchain new mymodel`; it prints how to go on.
+    """
+    with _one_sentence():
+        from toolchain.new import new_model
+
+        typer.echo(new_model(name), nl=False)
+
+
+@app.command()
+def fit(
+    case: Annotated[
+        Path, typer.Argument(help="Folder that holds model.py: its variables are fitted.", metavar="MODEL")
+    ],
+    recordings: Annotated[
+        list[Path],
+        typer.Argument(help="CSV, MCAP or bag, with readings and the truth.", metavar="RECORDING..."),
+    ],
+    output: Annotated[
+        Path,
+        typer.Option(
+            "--output", "-o", help="The file to write: .toml of normals, .npz of counts.", metavar="FILE"
+        ),
+    ],
+    truth: Annotated[
+        list[str],
+        typer.Option(
+            help="Where a searched dimension's true value is; one for each.", metavar="LABEL=COLUMN"
+        ),
+    ],
+    readings: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--reading",
+            help="Where a known variable's readings are; * stands for the same in both. Default: its name.",
+            metavar="NAME=COLUMN",
+        ),
+    ] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="A parameter of the model; repeat for more.", metavar="KEY=VALUE"),
+    ] = None,
+    method: Annotated[
+        FitMethod, typer.Option(help="normals: sigma and the outliers' share; counts: whole tables.")
+    ] = FitMethod.NORMALS,
+    pool: Annotated[
+        list[str] | None,
+        typer.Option(help="normals: variables with one sigma for all, such as 'range_*'.", metavar="PATTERN"),
+    ] = None,
+    bias: Annotated[bool, typer.Option("--bias", help="normals: fit a constant error too.")] = False,
+    floor: Annotated[
+        float,
+        typer.Option(help="normals: the least an outlier gets, relative to the peak; codes must hold it."),
+    ] = 0.01,
+    pseudo_count: Annotated[
+        float, typer.Option(help="counts: readings that the Dirichlet prior of a cell is worth.")
+    ] = 1.0,
+    prior: Annotated[
+        FitPrior, typer.Option(help="counts: what the prior looks like: the model's own table, or uniform.")
+    ] = FitPrior.MODEL,
+    check: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="A recording to compare the model and the fit on; never learnt from.", metavar="RECORDING"
+        ),
+    ] = None,
+    tolerance: Annotated[
+        float, typer.Option(help="bags: seconds between a reading and the truth that belongs to it.")
+    ] = 0.1,
+) -> None:
+    """Learn a model's tables from recordings with ground truth, and say how much data each rests on.
+
+    For example `toolchain fit casestudies/mrclam DATA/ds1_robot3.csv -o fit.toml --set landmarks=DATA/landmarks.csv
+    --truth y=ref_y_m --truth x=ref_x_m --reading 'range_*=range_*_m' --reading 'bearing_*=bearing_*_rad'
+    --pool 'range_*' --pool 'bearing_*' --check DATA/ds1_robot5.csv`
+    """
+    with _one_sentence():
+        from toolchain.fit_command import run_fit
+
+        options = FitOptions(
+            truth=tuple(truth),
+            readings=tuple(readings or ()),
+            method=method,
+            pool=tuple(pool or ()),
+            bias=bias,
+            floor=floor,
+            pseudo_count=pseudo_count,
+            prior=prior,
+            tolerance_s=tolerance,
+        )
+        typer.echo(run_fit(case, recordings, output, settings or [], options, check or []), nl=False)
 
 
 def main() -> None:
@@ -115,44 +251,15 @@ def main() -> None:
 
 
 def _end(number: int, _frame: FrameType | None) -> None:
-    typer.echo(f"error: ended by {signal.Signals(number).name}; the deployment is not complete", err=True)
+    typer.echo(f"error: ended by {signal.Signals(number).name}; what was asked for is not complete", err=True)
     raise SystemExit(128 + number)
 
 
-def _build(case: Path, directory: Path, settings: dict[str, str], options: BuildOptions) -> None:
-    from dataclasses import replace
-
-    from toolchain.build import REPORT_NAME, build_date, build_deployment
-    from toolchain.case_study import FILE_NAME, load_model
-
-    model_file = case / FILE_NAME
-    typer.echo(f"Reading {model_file}", err=True)
-    model = load_model(case, settings)
-    typer.echo(f"Quantising {model.name} and writing its images", err=True)
-    options = replace(options, build_date=build_date(model_file))
-    built = build_deployment(model, directory, options)
-    typer.echo(built.report, nl=False)
-    typer.echo(f"Wrote {built.deployment.path} and {directory / REPORT_NAME}", err=True)
-
-
-def _interface(text: str) -> tuple[int, int]:
+@contextmanager
+def _one_sentence() -> Iterator[None]:
+    """Turn what the toolchain refuses into one sentence and its exit code."""
     try:
-        return parse_interface(text)
-    except ValueError as reason:
-        message = f"--interface: {reason}"
-        raise BuildError(message) from None
-
-
-def _key_values(settings: list[str]) -> dict[str, str]:
-    found: dict[str, str] = {}
-    for setting in settings:
-        key, equals, value = setting.partition("=")
-        key = key.strip()
-        if not equals or not key:
-            message = f"--set {setting}: expected KEY=VALUE, such as --set width=64"
-            raise BuildError(message)
-        if key in found:
-            message = f"--set {key} is given twice"
-            raise BuildError(message)
-        found[key] = value
-    return found
+        yield
+    except ToolchainError as error:
+        typer.echo(f"error: {error}", err=True)
+        raise typer.Exit(error.exit_code) from None

@@ -20,6 +20,15 @@ class Scale(StrEnum):
     """Nothing: the raw probabilities."""
 
 
+class OnMissing(StrEnum):
+    """What an absent reading is."""
+
+    ERROR = "error"
+    """An error: every frame has all readings."""
+    MISSING = "missing"
+    """A missing reading, which says nothing."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BuildOptions:
     """How a model becomes a deployment, beside the model itself.

@@ -11,6 +11,7 @@ import numpy as np
 from casestudies.mrclam.landmarks import read_landmarks
 from toolchain.conditional import normal, wrapped_normal
 from toolchain.errors import ModelError
+from toolchain.fitted import with_fit
 from toolchain.model import Known, Model, cell_centres, interval
 
 X_LIMITS = (-2.0, 7.0)
@@ -28,6 +29,7 @@ def model(
     range_step: float = 0.05,
     range_values: int = 255,
     bearing_values: int = 255,
+    fit: Path | None = None,
 ) -> Model:
     """Return the model of a robot's position, in metres, from what it sees of landmarks.
 
@@ -40,6 +42,7 @@ def model(
         range_step: Metres between the ranges told apart, from 0 on; longer ones than the last clamp.
         range_values: How many ranges are told apart.
         bearing_values: How many bearings are told apart in a turn; readings are radians, any turn.
+        fit: What `toolchain fit` learnt from a recording, in the place of the sigmas and floors set by hand.
 
     Raises:
         ModelError: A file that holds no landmarks, or a size that is not positive.
@@ -74,4 +77,4 @@ def model(
                 on_missing="missing",
             )
         )
-    return Model(name="mrclam", searched=(rows, columns), known=tuple(known))
+    return with_fit(Model(name="mrclam", searched=(rows, columns), known=tuple(known)), fit)

@@ -1,0 +1,197 @@
+"""Recorded readings with ground truth, as columns: from CSV files, MCAP files and bags.
+
+A CSV's columns are those of its heading. A bag's are TOPIC:PATH, such as `/scan:ranges[3]`; its rows are the
+messages of the first column's topic, and of every other topic the message nearest in time belongs to them.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+from bisect import bisect_left
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+from toolchain.errors import ModelError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+    from pathlib import Path
+
+MAX_ROWS: Final = 2_000_000
+
+_STEP: Final = re.compile(r"(\w+)((?:\[\d{1,9}\])*)")
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """Columns of a recording.
+
+    Attributes:
+        path: Where it came from.
+        rows: How many rows it has.
+        columns: By name, one value a row: a number, a word, or None where there is nothing.
+    """
+
+    path: Path
+    rows: int
+    columns: dict[str, list[object]]
+
+
+def read_recording(path: Path, columns: Sequence[str], *, tolerance_s: float = 0.1) -> Recording:
+    """Return the named columns of a recording.
+
+    Args:
+        path: A CSV file (`.csv`), or an MCAP file, a ROS 1 bag or a ROS 2 bag's folder.
+        columns: Which columns; the first one's topic gives a bag's rows.
+        tolerance_s: In a bag, how far from a row another topic's message may be, seconds.
+
+    Raises:
+        ModelError: Not there, damaged, without a column (lists those there are), or longer than `MAX_ROWS`.
+    """
+    if not path.exists():
+        message = f"the recording {path} is not there"
+        raise ModelError(message)
+    if path.suffix.lower() == ".csv":
+        return _read_csv(path, columns)
+    return _read_bag(path, columns, round(tolerance_s * 1e9))
+
+
+def _read_csv(path: Path, columns: Sequence[str]) -> Recording:
+    found: dict[str, list[object]] = {column: [] for column in columns}
+    rows = 0
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            lines = csv.reader(file, strict=True)
+            heading = next(lines, [])
+            places = {column: _place(path, heading, column) for column in found}
+            for line in lines:
+                if not line:
+                    continue
+                if len(line) != len(heading):
+                    message = f"{path}, line {lines.line_num}: {len(line)} values, but the heading has {len(heading)}"
+                    raise ModelError(message)
+                rows += 1
+                _check_rows(path, rows)
+                for column, place in places.items():
+                    found[column].append(_cell(line[place]))
+    except OSError as reason:
+        message = f"{path} can't be read: {reason.strerror or reason}"
+        raise ModelError(message) from None
+    except (UnicodeDecodeError, csv.Error) as reason:
+        message = f"{path} is no CSV file: {reason}"
+        raise ModelError(message) from None
+    return Recording(path, rows, found)
+
+
+def _check_rows(path: Path, rows: int) -> None:
+    if rows > MAX_ROWS:
+        message = f"{path} has more than {MAX_ROWS} rows or messages, the most that is read"
+        raise ModelError(message)
+
+
+def _check_topics(path: Path, topics: Sequence[str], there: set[str]) -> None:
+    for topic in topics:
+        if topic not in there:
+            message = f"{path} has no topic {topic!r}; it has {_listed(sorted(there))}"
+            raise ModelError(message)
+
+
+def _place(path: Path, heading: Sequence[str], column: str) -> int:
+    if column not in heading:
+        message = f"{path} has no column {column!r}; it has {_listed(heading)}"
+        raise ModelError(message)
+    return heading.index(column)
+
+
+def _cell(text: str) -> object:
+    text = text.strip()
+    if not text:
+        return None
+    try:
+        return float(text)
+    except ValueError:
+        return text
+
+
+def _read_bag(path: Path, columns: Sequence[str], tolerance_ns: int) -> Recording:
+    """Read what rosbags reads; the first column's topic gives the rows."""
+    topics: dict[str, list[str]] = {}
+    for column in columns:
+        topic, colon, _ = column.partition(":")
+        if not colon:
+            message = (
+                f"the column {column!r} of {path}: in a bag a column is TOPIC:PATH, such as /scan:ranges[3]"
+            )
+            raise ModelError(message)
+        topics.setdefault(topic, []).append(column)
+    times: dict[str, list[int]] = {topic: [] for topic in topics}
+    values: dict[str, list[object]] = {column: [] for column in columns}
+    for topic, stamp, message in _messages(path, tuple(topics)):
+        times[topic].append(stamp)
+        for column in topics[topic]:
+            values[column].append(_field(message, column.partition(":")[2]))
+    base = next(iter(topics))
+    found: dict[str, list[object]] = {}
+    for topic, names in topics.items():
+        nearest = [_nearest(times[topic], stamp, tolerance_ns) for stamp in times[base]]
+        for column in names:
+            found[column] = [None if at is None else values[column][at] for at in nearest]
+    return Recording(path, len(times[base]), found)
+
+
+def _messages(path: Path, topics: tuple[str, ...]) -> Iterator[tuple[str, int, Any]]:
+    try:
+        from rosbags.highlevel import AnyReader
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError:
+        message = f"{path} is no CSV file, and bags are read by rosbags: pip install 'rosbayes[messages]'"
+        raise ModelError(message) from None
+    count = 0
+    try:
+        with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as reader:
+            _check_topics(path, topics, {connection.topic for connection in reader.connections})
+            wanted = [connection for connection in reader.connections if connection.topic in topics]
+            for connection, stamp, raw in reader.messages(connections=wanted):
+                count += 1
+                _check_rows(path, count)
+                yield connection.topic, stamp, reader.deserialize(raw, connection.msgtype)
+    except ModelError:
+        raise
+    except Exception as reason:  # rosbags reads many formats, and each fails in its own way
+        text = " ".join(str(reason).split())[:200]
+        message = f"{path} can't be read as a bag, after {count} messages: {text or type(reason).__name__}"
+        raise ModelError(message) from None
+
+
+def _field(message: Any, path: str) -> object:
+    """Return a message's field; NaN, what is not there and an index beyond an array are nothing."""
+    value = message
+    for step in path.split("."):
+        match = _STEP.fullmatch(step)
+        if match is None:
+            text = f"{path!r} is no path; expected one such as pose.position.x or ranges[3]"
+            raise ModelError(text)
+        if not hasattr(value, match[1]):
+            text = f"the message has no field {match[1]!r} of {path!r}"
+            raise ModelError(text)
+        value = getattr(value, match[1])
+        for index in re.findall(r"\d+", match[2]):
+            if not hasattr(value, "__len__") or int(index) >= len(value):
+                return None
+            value = value[int(index)]
+    with suppress(AttributeError):
+        value = value.item()  # NumPy's scalars
+    return None if isinstance(value, float) and math.isnan(value) else value
+
+
+def _nearest(times: Sequence[int], stamp: int, tolerance: int) -> int | None:
+    after = bisect_left(times, stamp)
+    near = [at for at in (after - 1, after) if 0 <= at < len(times) and abs(times[at] - stamp) <= tolerance]
+    return min(near, key=lambda at: abs(times[at] - stamp), default=None)
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(names[:20]) + (f" and {len(names) - 20} more" if len(names) > 20 else "")

@@ -1,0 +1,30 @@
+"""KEY=VALUE, as a user writes it behind a flag."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from toolchain.errors import BuildError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+
+def key_values(settings: Iterable[str], flag: str = "--set", example: str = "width=64") -> dict[str, str]:
+    """Return what a flag says, by key.
+
+    Raises:
+        BuildError: One without `=` or a key, or a key that is given twice.
+    """
+    found: dict[str, str] = {}
+    for setting in settings:
+        key, equals, value = setting.partition("=")
+        key = key.strip()
+        if not equals or not key:
+            message = f"{flag} {setting}: expected KEY=VALUE, such as {flag} {example}"
+            raise BuildError(message)
+        if key in found:
+            message = f"{flag} {key} is given twice"
+            raise BuildError(message)
+        found[key] = value
+    return found
