@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import sys
+from collections.abc import Coroutine, Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -46,6 +47,10 @@ def hub(
     origin: Annotated[
         list[str] | None, typer.Option(help="Web page that may connect, besides this machine's; repeatable.")
     ] = None,
+    announce: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="Announce it on the network under this name (see `discover`)."),
+    ] = None,
     insecure: Annotated[
         bool,
         typer.Option("--insecure", help="Say that another address without TLS and tokens is meant."),
@@ -76,19 +81,50 @@ def hub(
     def tell() -> ProcessStatus:
         return ProcessStatus(ready=bool(listening), why=listening[0] if listening else "not listening yet")
 
+    ros: Literal[1, 2] = 2 if ros_version == "2" else 1
+
     async def serve() -> int:
+        listens: asyncio.Future[int] = asyncio.get_running_loop().create_future()
+
+        def on_ready(at: int) -> None:
+            ready(at)
+            listens.set_result(at)
+
+        work = [serve_hub(host, port, door=door, ros_version=ros, on_ready=on_ready, stop=asyncio.Event())]
+        if announce is not None:
+            work.append(_announce(announce, host, listens, ros, door))
         async with status_served(load_settings().run_directory, "hub", tell):
-            await serve_hub(
-                host,
-                port,
-                door=door,
-                ros_version=2 if ros_version == "2" else 1,
-                on_ready=ready,
-                stop=asyncio.Event(),
-            )
+            await _all_of(work)
         return 0
 
     return run_async(serve())
+
+
+async def _announce(
+    name: str, host: str, listens: asyncio.Future[int], ros_version: Literal[1, 2], door: Door
+) -> None:
+    """Announce the hub once it listens, until this is cancelled."""
+    from bridge.discovery import announced
+
+    port = await listens
+    async with announced(
+        name, host, port, ros_version=ros_version, tls=door.tls is not None, token=bool(door.tokens)
+    ):
+        say(f"hub: announced as robot:{name}")
+        await asyncio.Event().wait()
+
+
+async def _all_of(work: Sequence[Coroutine[None, None, None]]) -> None:
+    """Do all of it until one ends, which ends the others; its error is the one."""
+    tasks = [asyncio.ensure_future(each) for each in work]
+    try:
+        done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        for task in done:
+            task.result()
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
 
 
 def _door(certificate: Path | None, key: Path | None, tokens: Path | None, origins: list[str]) -> Door:

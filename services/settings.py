@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 import difflib
 import os
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -47,6 +49,9 @@ class Settings(BaseSettings):
     stop_timeout: Seconds = Field(default=5, description="seconds a process has to end")
     seen_timeout: Seconds = Field(default=2, description="seconds until a result is seen on the wire")
 
+    fused: bool = Field(
+        default=False, description="subscriber, publisher and pcie-app inside the master's process"
+    )
     run_directory: Path | None = Field(default=None, description="folder of the processes' status sockets")
     ready_timeout: Seconds = Field(
         default=10, description="seconds without a frame after which a process is not ready"
@@ -70,8 +75,8 @@ class Settings(BaseSettings):
     @field_validator("uri")
     @classmethod
     def _uri(cls, value: str | None) -> str | None:
-        if value is not None and not value.startswith(("ws://", "wss://")):
-            msg = "a rosbridge URI starts with ws:// or wss://, for example ws://192.168.1.10:9090"
+        if value is not None and not value.startswith(("ws://", "wss://", "robot:")):
+            msg = "a rosbridge URI starts with ws:// or wss://, for example ws://192.168.1.10:9090 (or robot:NAME, as `discover` lists it)"
             raise ValueError(msg)
         return value
 
@@ -92,6 +97,7 @@ def load_settings(**flags: Any) -> Settings:
 
     Raises:
         SettingsError: an unknown `BM_*` variable, or a value that can't be used; says which, and what was expected.
+        BridgeError: --uri names a robot that does not announce itself.
     """
     known = {ENV_PREFIX + name.upper() for name in Settings.model_fields}
     for name in sorted(os.environ):
@@ -102,7 +108,7 @@ def load_settings(**flags: Any) -> Settings:
             raise SettingsError(msg)
     given = {name: value for name, value in flags.items() if value is not None and value != ()}
     try:
-        return Settings(**given)
+        settings = Settings(**given)
     except ValidationError as error:
         first = error.errors()[0]
         name = str(first["loc"][0]) if first["loc"] else "?"
@@ -114,6 +120,21 @@ def load_settings(**flags: Any) -> Settings:
         reason = str(first["msg"]).removeprefix("Value error, ")
         msg = f"{where}: {reason} (got {first.get('input')!r})"
         raise SettingsError(msg) from error
+    if "uri" in flags and settings.uri is not None and settings.uri.startswith("robot:"):
+        return settings.model_copy(update={"uri": _found(settings.uri.removeprefix("robot:"))})
+    return settings
+
+
+def _found(robot: str) -> str:
+    """The URI of a robot that announces its rosbridge server, asked for in a thread: a caller may have a loop.
+
+    Raises:
+        BridgeError: nobody of that name does, or it can't be asked for.
+    """
+    from bridge.discovery import resolve
+
+    with ThreadPoolExecutor(1) as pool:
+        return pool.submit(lambda: asyncio.run(resolve(robot))).result()
 
 
 def endpoint_in(directory: Path, name: str) -> Endpoint:

@@ -43,6 +43,9 @@ _LEVELS: Final = {"info": True, "warning": True, "error": True, "none": False}
 #: ERROR of rosgraph_msgs/Log, and of rcl_interfaces/msg/Log.
 _LOG_ERROR: Final = {1: 8, 2: 40}
 
+#: Bytes of a message in which brackets are looked for, and not counted.
+_LARGE: Final = 1024
+
 _Handler = Callable[[Client, Operation, float], None]
 
 
@@ -160,9 +163,9 @@ class Broker:
         ):  # too large, no object, no JSON, or NaN in it: decode knows, and reads NaN
             operation = decode(data, max_size=self.limits.message_bytes, max_depth=self.limits.depth)
             raw = None
-        # No message can be deeper than its opening brackets are many: small ones need no walk.
+        # No message can be deeper than its opening brackets are many: most need no walk.
         elif (
-            data.count(b"{") + data.count(b"[") > self.limits.depth
+            _more_brackets(data, self.limits.depth)
             and depth(operation, self.limits.depth) > self.limits.depth
         ):
             raise RefusedError(f"a message nested deeper than {self.limits.depth} levels")
@@ -229,3 +232,18 @@ class Broker:
         if self._ros_version == 2:
             return {"stamp": time_, **message}
         return {"header": {"seq": 0, "stamp": time_, "frame_id": ""}, **message, "topics": []}
+
+
+def _more_brackets(data: bytes, limit: int) -> bool:
+    """Whether a message has more than ``limit`` opening brackets."""
+    if len(data) <= limit:
+        return False
+    if len(data) < _LARGE:
+        return data.count(b"{") + data.count(b"[") > limit
+    found = 0
+    for bracket in (b"{", b"["):  # to jump from one to the next is much faster than to count where there are few
+        at = data.find(bracket)
+        while at >= 0 and found <= limit:
+            found += 1
+            at = data.find(bracket, at + 1)
+    return found > limit

@@ -30,6 +30,8 @@ from bridge.names import absolute, same_type, split_type
 #: A message is cut out of what arrived from this size on; smaller ones are written anew as quickly.
 _WORTH_CUTTING: Final = 512
 _KEY: Final = b'"msg"'
+#: Quotes in a message that is cut out, at most: to look at each of more takes as long as to write it.
+_QUOTES: Final = 200
 
 
 class Topics:
@@ -272,8 +274,17 @@ def _cut_out(operation: Operation, raw: bytes | None) -> bytes | None:
     the key once, so that this is the message's own; it ends with two braces and nothing but the message is an
     object, so that the message is what stands last.
     """
-    if raw is None or len(raw) < _WORTH_CUTTING or raw[-2:] != b"}}" or b"\\" in raw or raw.count(_KEY) != 1:
+    if raw is None or len(raw) < _WORTH_CUTTING or raw[-2:] != b"}}" or b"\\" in raw:
         return None
     if sum(type(value) is dict for value in operation.values()) != 1:
         return None
-    return raw[raw.index(b"{", raw.index(_KEY)) : -1]
+    key = at = -1
+    for _ in range(_QUOTES):  # one byte is looked for ten times as fast as five are
+        at = raw.find(b'"', at + 1)
+        if at < 0:
+            return raw[raw.index(b"{", key) : -1] if key > 0 else None
+        if raw.startswith(_KEY, at):
+            if key > 0:
+                return None
+            key = at
+    return None
