@@ -1,7 +1,8 @@
 """From a reading's publication to its result's arrival, beside the floor of the same client, hub and message sizes.
 
-client --reading--> hub --> subscriber -> master -> pcie-app -> 4 boards -> pcie-app -> master -> publisher --> hub --> client
-client --reading--> hub --> echo --------------------------------------------------------------------------> hub --> client
+processes  client --reading--> hub --> subscriber -> master -> pcie-app -> 4 boards -> pcie-app -> master -> publisher --> hub --> client
+fused      client --reading--> hub --> master --------------> 4 boards --------------> master -----------------------> hub --> client
+floor      client --reading--> hub --> echo -----------------------------------------------------------------------> hub --> client
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import tempfile
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from processes import BOAT_TOPIC, BOAT_TYPE, Process, build, run_script
 from rich.console import Console
@@ -38,17 +40,22 @@ STAGES = (
     "wire_out",
 )
 _TICKS = os.sysconf("SC_CLK_TCK")
+LINES = 32 * 32
 WINDOW = 4
 """Readings under way at once when frames per second are measured."""
 
 
+FUSED_TOPIC = BOAT_TOPIC + "_fused"
+
+
 @dataclass
 class Measured:
-    """Microseconds of each cycle, and of each of its stages."""
+    """Microseconds of each cycle, and of each of its stages; CPU microseconds of a frame by command; frames a second."""
 
     cycle: list[float] = field(default_factory=list)
-    floor: list[float] = field(default_factory=list)
     stages: dict[str, list[float]] = field(default_factory=lambda: {name: [] for name in STAGES})
+    cpu: dict[str, float] = field(default_factory=dict)
+    per_second: float = 0.0
 
 
 def readings(seed: int, count: int) -> list[dict[str, int]]:
@@ -102,6 +109,11 @@ def cpu_seconds(pid: int) -> float:
     """User and system time of a process so far."""
     fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
     return (int(fields[11]) + int(fields[12])) / _TICKS
+
+
+def cpu_of(pids: dict[str, list[int]]) -> dict[str, float]:
+    """User and system time so far of all processes, by command."""
+    return {command: sum(map(cpu_seconds, all_)) for command, all_ in pids.items()}
 
 
 def processes_of(master: int) -> dict[str, list[int]]:
@@ -161,104 +173,129 @@ def quantile(values: list[float], share: float) -> float:
 
 
 async def bench(arguments: argparse.Namespace) -> int:
-    """Measure in turns, so that a noisy machine is noisy for both; print the table, write the JSON."""
+    """Measure in turns, so that a noisy machine is noisy for all; print the table, write the JSON."""
     console = Console(stderr=True)
-    measured = Measured()
     seed = arguments.seed if arguments.seed is not None else random.randrange(2**32)
     some = readings(seed, arguments.frames)
+    floor: list[float] = []
+    stacks = {"processes": Measured(), "fused": Measured()}
+    topics = {"processes": BOAT_TOPIC, "fused": FUSED_TOPIC}
     with tempfile.TemporaryDirectory(prefix="rosbayes-bench-") as folder:
         where = Path(folder)
-        hub, master, echo = (Process(name, where / f"{name}.log") for name in ("hub", "master", "echo"))
+        hub, echo = (Process(name, where / f"{name}.log") for name in ("hub", "echo"))
+        masters = {name: Process(f"master ({name})", where / f"{name}.log") for name in stacks}
         try:
             await hub.start("hub", "--port", "0")
             uri = (await hub.line(r"ws://\S+"))[0]
-            await build("boat", where / "boat", uri, BOAT_TOPIC, BOAT_TYPE)
-            lines = 32 * 32
-            await echo.start(sys.executable, str(Path(__file__).with_name("echo.py")), uri, str(lines))
-            await master.start("master", "--loop", "-d", str(where / "boat"), "--uri", uri, "--queue", "all")
+            await echo.start(sys.executable, str(Path(__file__).with_name("echo.py")), uri, str(LINES))
+            for name, master in masters.items():
+                await build("boat", where / f"boat-{name}", uri, topics[name], BOAT_TYPE)
+                flags = ["--fused"] if name == "fused" else []
+                await master.start(
+                    *("master", "--loop", "-d", str(where / f"boat-{name}"), "--uri", uri, "--queue", "all"),
+                    *flags,
+                )
             async with connect(uri) as ros:
-                to_stack = await ros.advertise(BOAT_TOPIC, BOAT_TYPE)
                 to_echo = await ros.advertise("/bench/reading", BOAT_TYPE)
+                publications = {name: await ros.advertise(topics[name], BOAT_TYPE) for name in stacks}
                 results = ros.subscribe("/BMresults", "std_msgs/Float64MultiArray")
                 echoes = ros.subscribe("/bench/echo", "std_msgs/Float64MultiArray")
                 await echo.line("listening")
-                await master.line("pcie-app: 4 boards")
+                for master in masters.values():
+                    await master.line("pcie-app: 4 boards")
                 await asyncio.sleep(0.5)
                 warm = some[: max(20, len(some) // 10)]
-                await one_by_one(to_stack, results, warm, [])
                 await one_by_one(to_echo, echoes, warm, [])
-                pids = processes_of(master.pid)
-                before = {name: sum(map(cpu_seconds, all_)) for name, all_ in pids.items()}
+                for name in stacks:
+                    await one_by_one(publications[name], results, warm, [])
+                pids = {name: processes_of(master.pid) for name, master in masters.items()}
+                before = {name: cpu_of(pids[name]) for name in stacks}
                 for at in range(0, len(some), arguments.turn):
                     turn = some[at : at + arguments.turn]
-                    await one_by_one(to_echo, echoes, turn, measured.floor)
-                    await one_by_one(to_stack, results, turn, measured.cycle)
-                cpu = {
-                    name: (sum(map(cpu_seconds, all_)) - before[name]) / len(some) * 1e6
-                    for name, all_ in pids.items()
-                }
-                await collect_stages(ros, to_stack, some[: max(50, len(some) // 4)], measured)
-                rates = {
-                    "floor": await per_second(to_echo, echoes, some),
-                    "stack": await per_second(to_stack, results, some),
-                }
+                    await one_by_one(to_echo, echoes, turn, floor)
+                    for name, measured in stacks.items():
+                        await one_by_one(publications[name], results, turn, measured.cycle)
+                for name, measured in stacks.items():
+                    used = cpu_of(pids[name])
+                    measured.cpu = {
+                        command: (seconds - before[name][command]) / len(some) * 1e6
+                        for command, seconds in used.items()
+                    }
+                    await collect_stages(ros, publications[name], some[: max(50, len(some) // 4)], measured)
+                floor_per_second = await per_second(to_echo, echoes, some)
+                for name, measured in stacks.items():
+                    measured.per_second = await per_second(publications[name], results, some)
         finally:
-            await asyncio.gather(*(process.end() for process in (master, echo, hub)))
-    figures = summary(measured, cpu, rates, seed)
-    show(console, figures)
+            await asyncio.gather(*(process.end() for process in (*masters.values(), echo, hub)))
+    figures = {
+        "frames": len(some),
+        "seed": seed,
+        "cores": len(os.sched_getaffinity(0)),
+        "floor": {
+            "median_us": statistics.median(floor),
+            "p99_us": quantile(floor, 0.99),
+            "per_second": floor_per_second,
+        },
+        **{name: summary(measured, statistics.median(floor)) for name, measured in stacks.items()},
+    }
+    show(figures)
+    console.print("times of the stages are medians; rosbridge out is encoding and sending alone", style="dim")
     if arguments.json is not None:
         arguments.json.write_text(json.dumps(figures, indent=2) + "\n")
     return 0
 
 
-def summary(
-    measured: Measured, cpu: dict[str, float], rates: dict[str, float], seed: int
-) -> dict[str, object]:
-    """All figures: microseconds, frames per second, ratios."""
-    floor, cycle = statistics.median(measured.floor), statistics.median(measured.cycle)
+def summary(measured: Measured, floor: float) -> dict[str, Any]:
+    """One stack's figures: microseconds, frames per second, and its ratio to the floor beyond the boards' computing."""
+    cycle = statistics.median(measured.cycle)
     boards = statistics.median(measured.stages["boards_compute"])
     return {
-        "frames": len(measured.cycle),
-        "seed": seed,
-        "floor_us": {"median": floor, "p99": quantile(measured.floor, 0.99)},
-        "cycle_us": {"median": cycle, "p99": quantile(measured.cycle, 0.99)},
+        "median_us": cycle,
+        "p99_us": quantile(measured.cycle, 0.99),
+        "per_second": measured.per_second,
         "boards_compute_us": boards,
         "ratio_beyond_boards": (cycle - boards) / floor,
         "bound_us": 2.5 * floor + boards,
         "stages_us": {name: statistics.median(values) for name, values in measured.stages.items()},
-        "cpu_us_per_frame": cpu,
-        "frames_per_second": rates,
+        "cpu_us_per_frame": measured.cpu,
     }
 
 
-def show(console: Console, figures: dict[str, object]) -> None:
+def show(figures: dict[str, Any]) -> None:
     """Print the table on standard output."""
-    floor, cycle = figures["floor_us"], figures["cycle_us"]
-    stages, cpu, rates = figures["stages_us"], figures["cpu_us_per_frame"], figures["frames_per_second"]
-    assert isinstance(floor, dict)
-    assert isinstance(cycle, dict)
-    assert isinstance(stages, dict)
-    assert isinstance(cpu, dict)
-    assert isinstance(rates, dict)
+    stacks = ("processes", "fused")
     table = Table(title=f"one cycle, {figures['frames']} frames, 32 x 32 cells on four boards")
-    for column in ("", "median us", "99 % us", "frames/s"):
-        table.add_column(column, justify="left" if not column else "right")
-    table.add_row("floor (echo)", f"{floor['median']:.0f}", f"{floor['p99']:.0f}", f"{rates['floor']:.0f}")
-    table.add_row("stack", f"{cycle['median']:.0f}", f"{cycle['p99']:.0f}", f"{rates['stack']:.0f}")
-    table.add_row("boards' own computing", f"{figures['boards_compute_us']:.0f}", "", "")
+    for column in ("", "floor (echo)", *stacks):
+        table.add_column(column, justify="right" if column else "left")
+
+    def row(title: str, key: str) -> None:
+        table.add_row(title, *(f"{figures[name][key]:.0f}" for name in ("floor", *stacks)))
+
+    row("median, us", "median_us")
+    row("99 %, us", "p99_us")
+    row("frames a second", "per_second")
+    table.add_row(
+        "boards' own computing, us", "", *(f"{figures[name]['boards_compute_us']:.0f}" for name in stacks)
+    )
+    table.add_row(
+        "(median - boards) / floor", "1", *(f"{figures[name]['ratio_beyond_boards']:.2f}" for name in stacks)
+    )
     table.add_section()
-    for name, value in stages.items():
-        table.add_row(f"stage: {name.replace('_', ' ')}", f"{value:.0f}", "", "")
+    for stage in STAGES:
+        if stage != "boards_compute":
+            table.add_row(
+                f"{stage.replace('_', ' ')}, us",
+                "",
+                *(f"{figures[name]['stages_us'][stage]:.0f}" for name in stacks),
+            )
     table.add_section()
-    for name, value in sorted(cpu.items()):
-        table.add_row(f"CPU: {name}", f"{value:.0f}", "", "")
+    for command in sorted({command for name in stacks for command in figures[name]["cpu_us_per_frame"]}):
+        used = (figures[name]["cpu_us_per_frame"].get(command) for name in stacks)
+        table.add_row(f"CPU of {command}, us", "", *("" if each is None else f"{each:.0f}" for each in used))
     out = Console()
     out.print(table)
-    out.print(
-        f"(cycle - boards) / floor = {figures['ratio_beyond_boards']:.2f}; "
-        f"bound 2.5 x floor + boards = {figures['bound_us']:.0f} us; seed {figures['seed']}"
-    )
-    console.print("times of the stages are medians; rosbridge out is encoding and sending alone", style="dim")
+    bounds = ", ".join(f"{name} {figures[name]['bound_us']:.0f} us" for name in stacks)
+    out.print(f"bound, 2.5 x floor + boards: {bounds}; {figures['cores']} cores; seed {figures['seed']}")
 
 
 def main() -> int:

@@ -46,7 +46,14 @@ def get_logger(role: str, level: str = "info") -> FilteringBoundLogger:
     """
     # what the libraries log, our own records say in words; only their errors are news
     logging.basicConfig(level=logging.ERROR, stream=sys.stderr, format="%(name)s: %(message)s")
-    structlog.configure_once(
+    if not structlog.is_configured():
+        _configure(level)
+    logger: FilteringBoundLogger = structlog.get_logger().bind(process=role)
+    return logger
+
+
+def _configure(level: str) -> None:
+    structlog.configure(
         processors=[
             structlog.processors.add_log_level,
             structlog.processors.TimeStamper(fmt="%H:%M:%S.%f", utc=False),
@@ -56,8 +63,6 @@ def get_logger(role: str, level: str = "info") -> FilteringBoundLogger:
         logger_factory=structlog.PrintLoggerFactory(file=_SurvivingStream(sys.stderr)),  # type: ignore[arg-type]  # only write and flush are used
         cache_logger_on_first_use=True,
     )
-    logger: FilteringBoundLogger = structlog.get_logger().bind(process=role)
-    return logger
 
 
 def _one_line(_: Any, level: str, event: structlog.typing.EventDict) -> str:

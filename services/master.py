@@ -8,8 +8,9 @@ import shutil
 import sys
 import time
 from collections import Counter, deque
+from collections.abc import Callable, Coroutine
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import orjson
 import typer
@@ -67,6 +68,9 @@ from services.supervision import (
 )
 from toolchain.deployment import Deployment
 
+if TYPE_CHECKING:
+    from services.fused import FusedEnd  # with all that the three services import
+
 ROLE = "master"
 RESULTS_UNDER_WAY = 8
 """Results that the publisher may have unanswered; then frames wait, and `queue` says which."""
@@ -80,13 +84,17 @@ _GRACE = 2.0
 
 
 class Peer:
-    """One service that the master talks to: its endpoint, its process if it is the master's own, its connection."""
+    """One service that the master talks to: its process if it is the master's own, its connection.
 
-    def __init__(self, role: str, endpoint: Endpoint, child: Child | None) -> None:
+    A service inside the master's process has no endpoint.
+    """
+
+    def __init__(self, role: str, endpoint: Endpoint | None, child: Child | None) -> None:
         self.role = role
         self.endpoint = endpoint
+        self.where = "this process" if endpoint is None else str(endpoint)
         self.child = child
-        self.protocol: RecordProtocol | None = None
+        self.protocol: RecordProtocol | FusedEnd | None = None
         self.greeted = False
         self.ready = False
         self.closed = asyncio.Event()
@@ -124,6 +132,7 @@ class Master:
         self._published_at = 0.0
         self._directory: Path | None = None
         self._boards: Child | None = None
+        self._board_endpoints: tuple[str, ...] = ()
         self._peers: dict[str, Peer] = {}
         self._started = time.monotonic()
         self._shown = (0.0, 0)
@@ -135,6 +144,7 @@ class Master:
             ServiceError: what ended the run, with its exit code.
         """
         tasks: list[asyncio.Task[None]] = []
+        inside: list[asyncio.Task[None]] = []
         status = contextlib.AsyncExitStack()
         try:
             self._prepare()
@@ -146,13 +156,18 @@ class Master:
             for peer in self._peers.values():
                 if peer.child is not None:
                     peer.child.start()
-            tasks.extend(asyncio.ensure_future(self._keep(peer)) for peer in self._peers.values())
+            if self._settings.fused:
+                inside = self._start_inside()
+            else:
+                tasks.extend(asyncio.ensure_future(self._keep(peer)) for peer in self._peers.values())
             if sys.stderr.isatty() and not self._once:
                 tasks.append(asyncio.ensure_future(self._show_progress()))
             await self._end
         finally:
-            for task in (*tasks, *([self._expecting] if self._expecting else [])):
+            for task in (*tasks, *inside, *([self._expecting] if self._expecting else [])):
                 task.cancel()
+            if inside:
+                await asyncio.wait(inside, timeout=self._settings.stop_timeout)
             await status.aclose()
             await self._finish()
         return ExitCode.DONE
@@ -171,6 +186,10 @@ class Master:
         directory = self._directory
         if settings.boards or any(board.endpoint for board in deployment.boards):
             board_endpoints(settings, deployment)  # a wrong list is told before anything starts
+        if settings.fused and any(given.values()):
+            role = next(role for role, text in given.items() if text)
+            msg = f"--fused runs subscriber, publisher and pcie-app in the master's own process; take --connect or --{role} away"
+            raise SettingsError(msg)
         common = ["--deployment", str(settings.deployment), "--log-level", settings.log_level]
         rosbridge = [*(["--uri", settings.uri] if settings.uri else [])]
         rosbridge += [
@@ -206,6 +225,10 @@ class Master:
                 str(settings.board_timeout),
             ],
         }
+        self._board_endpoints = tuple(boards)
+        if settings.fused:
+            self._peers = {role: Peer(role, None, None) for role in given}
+            return
         for role, text in given.items():
             child = None
             if text:
@@ -250,7 +273,7 @@ class Master:
         peers = [
             PeerStatus(
                 name=peer.role,
-                endpoint=str(peer.endpoint),
+                endpoint=peer.where,
                 pid=peer.child.pid if peer.child else 0,
                 restarts=peer.child.restarts if peer.child else 0,
                 ready=peer.ready,
@@ -295,6 +318,34 @@ class Master:
         try:
             await self._restart_boards(boards)
         except Exception as error:
+            self._fail(error)
+
+    def _start_inside(self) -> list[asyncio.Task[None]]:
+        """`--fused`: run the services here, each as a task."""
+        from services.fused import fused_services
+
+        settings = self._settings.model_copy(
+            update={
+                "boards": self._board_endpoints,
+                "run_directory": self._settings.run_directory or self._directory,
+            }
+        )
+
+        def to_master(role: str) -> Callable[[AnyRecord], None]:
+            peer = self._peers[role]
+            return lambda record: self._take(peer, peer.protocol, record)
+
+        tasks = []
+        for role, (end, service) in fused_services(settings, self._deployment, to_master).items():
+            peer = self._peers[role]
+            peer.protocol, peer.greeted = end, True
+            tasks.append(asyncio.ensure_future(self._run_inside(service)))
+        return tasks
+
+    async def _run_inside(self, service: Coroutine[Any, Any, int]) -> None:
+        try:
+            await service
+        except Exception as error:  # what a user can mend was reported before, and ended the run
             self._fail(error)
 
     async def _restart_boards(self, boards: Child) -> None:
@@ -345,7 +396,7 @@ class Master:
             limit, since, what = settings.seen_timeout + _ANSWER_TIME, self._published_at, "publish"
         if not what or now - since <= limit:
             return
-        sentence = f"{peer.role} at {peer.endpoint} did not {what} within {limit:g} s"
+        sentence = f"{peer.role} at {peer.where} did not {what} within {limit:g} s"
         if self._once or peer.child is None:
             self._fail(ChildDiedError(sentence))
         else:
@@ -369,7 +420,7 @@ class Master:
 
         def make() -> RecordProtocol:
             return RecordProtocol(
-                f"{peer.role} at {peer.endpoint}",
+                f"{peer.role} at {peer.where}",
                 lambda protocol, record: self._take(peer, protocol, record),
                 lambda protocol: self._opened(peer, protocol),
                 lambda protocol, why: self._closed(peer, protocol, why),
@@ -385,11 +436,13 @@ class Master:
                 child.relay()
                 if child.exit_code() is not None:
                     raise child.failure()
+            if peer.endpoint is None:
+                return
             try:
                 await open_connection(peer.endpoint, make)
             except OSError as error:
                 if time.monotonic() > deadline:
-                    msg = f"no {peer.role} answers at {peer.endpoint} within {patience:g} s ({error.strerror or error}); is it running?"
+                    msg = f"no {peer.role} answers at {peer.where} within {patience:g} s ({error.strerror or error}); is it running?"
                     raise ChildDiedError(msg) from error
                 await asyncio.sleep(_CONNECT_EVERY)
             else:
@@ -413,9 +466,9 @@ class Master:
         child = peer.child
         if child is None:
             if self._once:
-                msg = f"{peer.role} at {peer.endpoint} closed the connection"
+                msg = f"{peer.role} at {peer.where} closed the connection"
                 raise ChildDiedError(msg)
-            self._log.warning(f"{peer.role} at {peer.endpoint} is gone; waiting for it")
+            self._log.warning(f"{peer.role} at {peer.where} is gone; waiting for it")
             return
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(child.ended(), self._settings.stop_timeout)
@@ -441,7 +494,7 @@ class Master:
             peer.reason = why
             peer.closed.set()
 
-    def _take(self, peer: Peer, protocol: RecordProtocol, record: AnyRecord) -> None:
+    def _take(self, peer: Peer, protocol: RecordProtocol | FusedEnd | None, record: AnyRecord) -> None:
         try:
             self._handle(peer, protocol, record)
         except OtherPeerError:
@@ -449,12 +502,12 @@ class Master:
         except Exception as error:  # a closed standard output, or a bug: neither may pass for a lost peer
             self._fail(error)
 
-    def _handle(self, peer: Peer, protocol: RecordProtocol, record: AnyRecord) -> None:
+    def _handle(self, peer: Peer, protocol: RecordProtocol | FusedEnd | None, record: AnyRecord) -> None:
         if isinstance(record, Trouble):
             self._fail(ReportedError(record.exit_code, f"{peer.role}: {record.sentence}"))
             return
         if not peer.greeted:
-            check_hello(record, peer.role, self._deployment.hash, f"{peer.role} at {peer.endpoint}")
+            check_hello(record, peer.role, self._deployment.hash, f"{peer.role} at {peer.where}")
             peer.greeted = True
             return
         match record:
@@ -474,7 +527,7 @@ class Master:
                 self._was_published(record)
             case _:
                 self._log.warning(
-                    f"{protocol.where} sent a {type(record).__name__}, which is not its to send"
+                    f"{protocol.where if protocol else peer.role} sent a {type(record).__name__}, which is not its to send"
                 )
 
     def _ready(self, peer: Peer, record: Ready) -> None:
@@ -715,6 +768,13 @@ def master(
     peer_timeout: options.PeerTimeout = None,
     board_timeout: options.BoardTimeout = None,
     stop_timeout: options.StopTimeout = None,
+    fused: Annotated[
+        bool | None,
+        typer.Option(
+            "--fused",
+            help="Run subscriber, publisher and pcie-app inside this process: fewer hops, nothing else differs.",
+        ),
+    ] = None,
     log_level: options.LogLevel = None,
     json: Annotated[bool, typer.Option("--json", help="Print one JSON object per result.")] = False,
     print_config: Annotated[
@@ -739,6 +799,7 @@ def master(
         peer_timeout=peer_timeout,
         board_timeout=board_timeout,
         stop_timeout=stop_timeout,
+        fused=fused,
         log_level=log_level,
         **connected,
     )

@@ -47,7 +47,7 @@ from services.supervision import end_with_parent, leave_private_directory
 from toolchain.deployment import Deployment
 
 ROLE = "pcie-app"
-_TICK = 0.2
+TICK = 0.2
 """Seconds between attempts to open a board that is gone, and for each of them."""
 
 
@@ -102,26 +102,57 @@ class Boards:
         Raises:
             BoardError: a board failed; it is then in `gone` until `mend` has it back.
         """
-        if self._cluster is None or self.gone:
-            board, why = next(iter(self.gone.items()))
-            msg = f"board {board} is not back yet ({why})"
-            raise BoardError(msg, board=board)
-        machine = self._machine
+        cluster = self._whole_cluster()
         try:
-            return self._cluster.run(
-                FrameInput(
-                    addresses=tuple(frame.addresses),
-                    target_count=machine.target_count,
-                    max_cycles=machine.max_cycles,
-                    bank=frame.bank,
-                    stop="own" if (self._settings.stop or machine.stop) == "own" else "slices",
-                )
-            )
+            return cluster.run(self._input(frame))
         except BoardError as error:
-            self._look(error)
+            self.look(error)
             raise
 
-    def _look(self, error: BoardError) -> None:
+    def post(self, frame: Frame) -> None:
+        """Start a frame without waiting for it: `collect` has its result.
+
+        Raises:
+            BoardError: a board failed, or is not back yet; `look` is to be called.
+        """
+        self._whole_cluster().post(self._input(frame))
+
+    def collect(self) -> FrameOutput | None:
+        """The posted frame's result, or None while boards still run.
+
+        Raises:
+            BoardError: a board failed, or is late; `look` is to be called.
+        """
+        return self._whole_cluster().collect(0)
+
+    @property
+    def awaited(self) -> int | None:
+        """The descriptor that is worth watching until the next `collect`."""
+        return None if self._cluster is None else self._cluster.awaited
+
+    @property
+    def is_late(self) -> bool:
+        """Whether a board of the posted frame has had its time: `collect` says which."""
+        return self._cluster is not None and not self._cluster.seconds_left
+
+    def _whole_cluster(self) -> MiniCluster:
+        if self._cluster is None or self.gone:
+            board, why = next(iter(self.gone.items()), (0, "it was not opened"))
+            msg = f"board {board} is not back yet ({why})"
+            raise BoardError(msg, board=board)
+        return self._cluster
+
+    def _input(self, frame: Frame) -> FrameInput:
+        machine = self._machine
+        return FrameInput(
+            addresses=tuple(frame.addresses),
+            target_count=machine.target_count,
+            max_cycles=machine.max_cycles,
+            bank=frame.bank,
+            stop="own" if (self._settings.stop or machine.stop) == "own" else "slices",
+        )
+
+    def look(self, error: BoardError) -> None:
         """After a failure: find all boards that are gone, so that several deaths at once fail one frame."""
         if self._cluster is None:
             return
@@ -130,7 +161,7 @@ class Boards:
         for board in range(len(self._endpoints)):
             if board != error.board and board not in self.gone:
                 try:
-                    self._cluster.reopen(board, timeout=_TICK)
+                    self._cluster.reopen(board, timeout=TICK)
                 except BoardError as other:
                     self._is_gone(board, other)
 
@@ -149,7 +180,7 @@ class Boards:
             if self._cluster is None:
                 break
             try:
-                self._cluster.reopen(board, timeout=_TICK)
+                self._cluster.reopen(board, timeout=TICK)
             except BoardMismatchError:
                 raise
             except BoardError as error:
@@ -177,6 +208,62 @@ def result_record(number: int, output: FrameOutput) -> FrameResult:
     )
 
 
+def frame_failed(number: int, error: BoardError) -> FrameFailed:
+    """A frame that the boards did not finish, as a record."""
+    return FrameFailed(number, error.board, exit_code_of(error), str(error))
+
+
+class Progress:
+    """What was asked of the boards and what became of it: counts for the status, lines for the log."""
+
+    def __init__(self, boards: Boards, deployment_hash: str, log_level: str) -> None:
+        self._boards = boards
+        self._hash = deployment_hash
+        self._follows = log_level == "debug"
+        self._log = get_logger(ROLE, log_level)
+        self._computed = 0
+        self._last: tuple[int, int, FrameOutput] | None = None
+        self.asked = 0
+        self.failed = 0
+        self.ready: Ready | None = None
+
+    def computed(self, number: int, output: FrameOutput) -> None:
+        """A frame has its result."""
+        self._computed += 1
+        self._last = (number, time.monotonic_ns(), output)
+        if self._follows:
+            self._log.debug(
+                "computed",
+                frame=number,
+                cycles=max(board.cycles for board in output.boards),
+                compute_us=output.compute_ns // 1000,
+            )
+
+    def status(self) -> ProcessStatus:
+        """What this process knows; may be called by another thread."""
+        number, tick, output = self._last or (0, 0, None)
+        gone = next(iter(dict(self._boards.gone).items()), None)
+        if self.ready is None:
+            why = "waiting for the boards to be opened and programmed"
+        elif gone is not None:
+            why = gone[1]  # names the board
+        else:
+            why = self.ready.sentence
+        return ProcessStatus(
+            ready=self.ready is not None and gone is None,
+            why=why,
+            deployment=self._hash,
+            boards=self._boards.status(output),
+            frames=FrameCounts(
+                received=self.asked,
+                completed=self._computed,
+                lost=reasons({"failed on a board": self.failed}),
+                last_number=number or None,
+                last_age_s=seconds_since(tick),
+            ),
+        )
+
+
 class PcieApp:
     """Serves one master at a time over a local socket."""
 
@@ -189,11 +276,7 @@ class PcieApp:
         self._where = f"{ROLE} at {endpoint}"
         self._master: BlockingRecordSocket | None = None
         self._greeted = False
-        self._ready: Ready | None = None
-        self._follows = log_level == "debug"
-        self._log = get_logger(ROLE, log_level)
-        self._asked = self._computed = self._failed = 0
-        self._last: tuple[int, int, FrameOutput] | None = None
+        self._progress = Progress(boards, deployment_hash, log_level)
         self._selector = selectors.DefaultSelector()
 
     def serve(self) -> int:
@@ -207,9 +290,9 @@ class PcieApp:
         self._selector.register(listener, selectors.EVENT_READ)
         try:
             try:
-                self._ready = Ready(self._boards.open())
+                self._progress.ready = Ready(self._boards.open())
                 while True:
-                    for key, _ in self._selector.select(_TICK):
+                    for key, _ in self._selector.select(TICK):
                         if key.fileobj is listener:
                             self._accept(listener)
                         else:
@@ -270,8 +353,8 @@ class PcieApp:
                 if not self._greeted:
                     check_hello(record, "master", self._hash, self._where)
                     self._greeted = True
-                    if self._ready is not None:
-                        self._send(self._ready)
+                    if self._progress.ready is not None:
+                        self._send(self._progress.ready)
                 elif isinstance(record, Frame):
                     self._compute(record)
         except (LocalSocketError, OtherPeerError) as error:
@@ -280,46 +363,19 @@ class PcieApp:
 
     def status(self) -> ProcessStatus:
         """What this process knows; called by the status socket's thread."""
-        number, tick, output = self._last or (0, 0, None)
-        gone = next(iter(dict(self._boards.gone).items()), None)
-        if self._ready is None:
-            why = "waiting for the boards to be opened and programmed"
-        elif gone is not None:
-            why = gone[1]  # names the board
-        else:
-            why = self._ready.sentence
-        return ProcessStatus(
-            ready=self._ready is not None and gone is None,
-            why=why,
-            deployment=self._hash,
-            boards=self._boards.status(output),
-            frames=FrameCounts(
-                received=self._asked,
-                completed=self._computed,
-                lost=reasons({"failed on a board": self._failed}),
-                last_number=number or None,
-                last_age_s=seconds_since(tick),
-            ),
-        )
+        return self._progress.status()
 
     def _compute(self, frame: Frame) -> None:
-        self._asked += 1
+        progress = self._progress
+        progress.asked += 1
         try:
             output = self._boards.run(frame)
         except BoardError as error:
-            self._failed += 1
-            self._send(FrameFailed(frame.number, error.board, exit_code_of(error), str(error)))
+            progress.failed += 1
+            self._send(frame_failed(frame.number, error))
         else:
             self._send(result_record(frame.number, output))
-            self._computed += 1
-            self._last = (frame.number, time.monotonic_ns(), output)
-            if self._follows:
-                self._log.debug(
-                    "computed",
-                    frame=frame.number,
-                    cycles=max(board.cycles for board in output.boards),
-                    compute_us=output.compute_ns // 1000,
-                )
+            progress.computed(frame.number, output)
 
     def _mend_boards(self) -> None:
         for board in self._boards.mend():

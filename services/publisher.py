@@ -33,7 +33,7 @@ from services.results import (
     posterior_of,
     times_of,
 )
-from services.serving import MasterLink, deployment_for, endpoint_from
+from services.serving import MakeLink, deployment_for, endpoint_from, listening
 from services.settings import Settings, load_settings
 from services.status_socket import (
     FrameCounts,
@@ -186,12 +186,12 @@ class ResultTopics:
 class Publisher:
     """Serves a master: publishes each result that it sends."""
 
-    def __init__(self, settings: Settings, deployment: Deployment, listen: str) -> None:
+    def __init__(self, settings: Settings, deployment: Deployment, link: MakeLink) -> None:
         self._topics = ResultTopics(settings, deployment)
         self._waiting: asyncio.Queue[Publish] = asyncio.Queue(RESULTS_DEPTH)
         self._begun = asyncio.Event()
         self._once = False
-        self._link = MasterLink(endpoint_from(listen, "--listen"), ROLE, deployment.hash, self._take)
+        self._link = link(self._take)
         self._deployment = deployment
         self._follows = settings.log_level == "debug"
         self._log = get_logger(ROLE, settings.log_level)
@@ -372,7 +372,8 @@ def publisher(
     )
     loaded = deployment_for(settings)
     if listen is not None:
-        return run_async(Publisher(settings, loaded, listen).run())
+        link = listening(endpoint_from(listen, "--listen"), ROLE, loaded.hash)
+        return run_async(Publisher(settings, loaded, link).run())
     if sys.stdin.isatty():
         msg = "the publisher reads results from standard input, which is a terminal: pipe them in, or use --listen (publisher --help)"
         raise SettingsError(msg)

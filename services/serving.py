@@ -6,7 +6,7 @@ import asyncio
 import socket
 from collections.abc import Callable
 from types import TracebackType
-from typing import Self
+from typing import Protocol, Self
 
 from pcie_shim.endpoint import Endpoint, listen, parse_endpoint, remove_listener
 from pcie_shim.errors import PcieShimError
@@ -19,6 +19,39 @@ from toolchain.deployment import Deployment, load_deployment
 
 GREETING_TIME = 5.0
 """Seconds that who connects has to greet, before the place is free for another."""
+
+
+class Link(Protocol):
+    """What a service holds of its master: over a local socket, or inside the same process."""
+
+    @property
+    def has_master(self) -> bool:
+        """Whether a master is there and has greeted."""
+
+    @property
+    def backlog(self) -> int:
+        """Bytes that the master has not taken yet."""
+
+    def send(self, record: Record) -> bool:
+        """Send to the master; False where there is none."""
+
+    def keep(self, record: Record) -> None:
+        """Send now, and again to every later master: what is true from now on (readiness)."""
+
+    def notice(self, level: str, sentence: str) -> None:
+        """Tell the master something that ends nothing."""
+
+    async def __aenter__(self) -> Self:
+        """Begin to serve."""
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """End."""
+
+
+MakeLink = Callable[[Callable[[AnyRecord], None]], Link]
+"""Makes a service's link; the argument takes the master's records."""
 
 
 class MasterLink:
@@ -123,6 +156,11 @@ class MasterLink:
     def notice(self, level: str, sentence: str) -> None:
         """Tell the master something that ends nothing."""
         self.send(Notice(level, sentence))
+
+
+def listening(endpoint: Endpoint, role: str, deployment_hash: str) -> MakeLink:
+    """A link over a local socket that the service listens on."""
+    return lambda on_record: MasterLink(endpoint, role, deployment_hash, on_record)
 
 
 def endpoint_from(text: str, flag: str) -> Endpoint:

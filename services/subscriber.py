@@ -23,7 +23,7 @@ from services.frames import CompleteReading, FrameAssembler
 from services.local_socket import MAX_RECORD
 from services.logs import get_logger, say
 from services.records import AnyRecord, Begin, Notice, Reading, Ready, Trouble, Unusable
-from services.serving import MasterLink, deployment_for, endpoint_from
+from services.serving import MakeLink, deployment_for, endpoint_from, listening
 from services.settings import Settings, load_settings
 from services.status_socket import (
     FrameCounts,
@@ -64,7 +64,7 @@ async def newest_now(subscription: Subscription, message: Message) -> tuple[Mess
 class Subscriber:
     """Serves a master: readings of a deployment's topics, as addresses of the machine's columns."""
 
-    def __init__(self, settings: Settings, deployment: Deployment, listen: str) -> None:
+    def __init__(self, settings: Settings, deployment: Deployment, link: MakeLink) -> None:
         self._settings = settings
         self._deployment = deployment
         self._assembler = FrameAssembler(deployment)
@@ -74,7 +74,7 @@ class Subscriber:
         self._follows = settings.log_level == "debug"
         self._log = get_logger(ROLE, settings.log_level)
         self._passed_over = 0
-        self._link = MasterLink(endpoint_from(listen, "--listen"), ROLE, deployment.hash, self._take)
+        self._link = link(self._take)
         self._lost: asyncio.Future[None] | None = None
         self._rosbridges: dict[str, Ros] = {}
         self._received = self._completed = self._unusable = self._passed_over_before = 0
@@ -353,7 +353,9 @@ def subscriber(
         log_level=log_level,
     )
     if listen is not None:
-        return run_async(Subscriber(settings, deployment_for(settings), listen).run())
+        loaded = deployment_for(settings)
+        link = listening(endpoint_from(listen, "--listen"), ROLE, loaded.hash)
+        return run_async(Subscriber(settings, loaded, link).run())
     if settings.deployment is not None:
         return run_async(print_addresses(settings, deployment_for(settings), count))
     if settings.uri is None or topic is None or type_ is None:

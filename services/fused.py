@@ -1,0 +1,217 @@
+"""Subscriber, publisher and PCIe application inside the master's process (`master --fused`): fewer hops, same code.
+
+Their records go from call to call instead of over local sockets, and nothing is written or read in between.
+Boards stay processes, or devices, of their own.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Coroutine
+from types import TracebackType
+from typing import Any, Self
+
+from pcie_shim.errors import BoardError, PcieShimError
+from services.errors import exit_code_of
+from services.pcie_app import ROLE as PCIE_APP
+from services.pcie_app import TICK, Boards, Progress, frame_failed, result_record
+from services.publisher import ROLE as PUBLISHER
+from services.publisher import Publisher
+from services.records import AnyRecord, Frame, Notice, Ready, Record, Trouble
+from services.serving import Link, MakeLink, board_endpoints
+from services.settings import Settings
+from services.status_socket import status_served
+from services.subscriber import ROLE as SUBSCRIBER
+from services.subscriber import Subscriber
+from toolchain.deployment import Deployment
+
+Hear = Callable[[AnyRecord], None]
+
+
+class FusedLink:
+    """A service's link to the master that it lives in."""
+
+    def __init__(self, to_master: Hear) -> None:
+        self._to_master: Hear | None = to_master
+
+    async def __aenter__(self) -> Self:
+        """There is nothing to listen on."""
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Say no more."""
+        self._to_master = None
+
+    @property
+    def has_master(self) -> bool:
+        """The master is there until the link is closed."""
+        return self._to_master is not None
+
+    @property
+    def backlog(self) -> int:
+        """Nothing ever waits."""
+        return 0
+
+    def send(self, record: Record) -> bool:
+        """Hand a record to the master."""
+        if self._to_master is None:
+            return False
+        self._to_master(record)  # type: ignore[arg-type]  # every record that a service sends is one of them
+        return True
+
+    def keep(self, record: Record) -> None:
+        """Hand a record to the master: there will be no other one."""
+        self.send(record)
+
+    def notice(self, level: str, sentence: str) -> None:
+        """Tell the master something that ends nothing."""
+        self.send(Notice(level, sentence))
+
+
+class FusedEnd:
+    """The master's end of such a link: what a local socket's connection is to it otherwise."""
+
+    def __init__(self, role: str, to_service: Hear) -> None:
+        self.where = f"{role} in this process"
+        self._to_service = to_service
+
+    def send(self, record: Record) -> bool:
+        """Hand a record to the service."""
+        self._to_service(record)  # type: ignore[arg-type]  # every record that the master sends is one of them
+        return True
+
+    def close(self) -> None:
+        """The service ends when what runs it is cancelled."""
+
+
+class FusedBoards:
+    """The PCIe application in an event loop: a frame is posted, and collected when the last board's answer is there.
+
+    What takes long, opening boards and looking for those that are gone, is done by a thread; meanwhile no frame is posted.
+    """
+
+    def __init__(self, boards: Boards, deployment: Deployment, settings: Settings, link: MakeLink) -> None:
+        self._boards = boards
+        self._run_directory = settings.run_directory
+        self._progress = Progress(boards, deployment.hash, settings.log_level)
+        self._link = link(self._take)
+        self._number: int | None = None
+        self._watched: int | None = None
+        self._loop = asyncio.get_running_loop()
+        self._looking: asyncio.Task[None] | None = None
+
+    async def run(self) -> int:
+        """Serve until cancelled.
+
+        Raises:
+            PcieShimError: the boards can't be opened, or one came back as another.
+        """
+        async with self._link, status_served(self._run_directory, PCIE_APP, self._progress.status):
+            try:
+                self._progress.ready = Ready(await asyncio.to_thread(self._boards.open))
+                self._link.keep(self._progress.ready)
+                while True:
+                    await asyncio.sleep(TICK)
+                    if self._number is not None:
+                        if self._boards.is_late:
+                            self._collect()
+                    elif self._boards.gone and self._looking is None:
+                        for board in await asyncio.to_thread(self._boards.mend):
+                            self._link.send(Notice("info", f"board {board} is back, programmed"))
+            except PcieShimError as error:
+                self._link.send(Trouble(exit_code_of(error), str(error)))
+                raise
+            finally:
+                self._unwatch()
+                if self._looking is not None:
+                    self._looking.cancel()
+                self._boards.close()
+
+    def _take(self, record: AnyRecord) -> None:
+        if not isinstance(record, Frame):
+            return
+        self._progress.asked += 1
+        try:
+            self._boards.post(record)
+        except BoardError as error:
+            self._failed(record.number, error)
+        else:
+            self._number = record.number
+            self._watch()
+
+    def _watch(self) -> None:
+        """Wake when the awaited board has said something."""
+        awaited = self._boards.awaited
+        if awaited != self._watched:
+            self._unwatch()
+            if awaited is not None:
+                self._loop.add_reader(awaited, self._collect)
+                self._watched = awaited
+
+    def _unwatch(self) -> None:
+        if self._watched is not None:
+            self._loop.remove_reader(self._watched)
+            self._watched = None
+
+    def _collect(self) -> None:
+        number = self._number
+        if number is None:  # a board that speaks unasked is leaving: the next frame finds out
+            self._unwatch()
+            return
+        try:
+            output = self._boards.collect()
+        except BoardError as error:
+            self._failed(number, error)
+            return
+        if output is None:
+            self._watch()
+            return
+        self._number = None
+        self._progress.computed(number, output)
+        self._link.send(result_record(number, output))
+
+    def _failed(self, number: int, error: BoardError) -> None:
+        self._unwatch()
+        self._progress.failed += 1
+        self._number = None
+        self._looking = self._loop.create_task(self._look(number, error))
+
+    async def _look(self, number: int, error: BoardError) -> None:
+        try:
+            await asyncio.to_thread(self._boards.look, error)
+        finally:
+            self._looking = None
+        self._link.send(frame_failed(number, error))
+
+
+def fused_services(
+    settings: Settings, deployment: Deployment, to_master: Callable[[str], Hear]
+) -> dict[str, tuple[FusedEnd, Coroutine[Any, Any, int]]]:
+    """The three services by role: the master's end of each one's link, and what runs it.
+
+    Args:
+        settings: the master's, with the boards' endpoints filled in.
+        deployment: the deployment.
+        to_master: gives what hears the records of a role.
+
+    Raises:
+        SettingsError: the boards' endpoints are wrong.
+    """
+    ends: dict[str, FusedEnd] = {}
+
+    def link_of(role: str) -> MakeLink:
+        def make(to_service: Hear) -> Link:
+            ends[role] = FusedEnd(role, to_service)
+            return FusedLink(to_master(role))
+
+        return make
+
+    boards = Boards(settings, deployment, board_endpoints(settings, deployment))
+    running = {
+        SUBSCRIBER: Subscriber(settings, deployment, link_of(SUBSCRIBER)).run(),
+        PUBLISHER: Publisher(settings, deployment, link_of(PUBLISHER)).run(),
+        PCIE_APP: FusedBoards(boards, deployment, settings, link_of(PCIE_APP)).run(),
+    }
+    return {role: (ends[role], coroutine) for role, coroutine in running.items()}
