@@ -53,6 +53,8 @@ BOAT: Final = ("hub", "boat-simulator", "boat-normaliser")
 VIEWER: Final = ("boat-viewer",)
 SERVICES: Final = (*CORE, *BOARDS, *BOAT, *VIEWER)
 ROBOT_PORT, BOARD_PORT = 9191, 7100
+BUILT, UP = "the image is built", "docker compose up"
+ALWAYS: Final = (BUILT, UP)
 
 
 class Engine:
@@ -134,6 +136,7 @@ class Client:
         self._process: subprocess.Popen[str] | None = None
         self.results: list[Result] = []
         self._news = threading.Condition()
+        self._log = (OUT / "client.log").open("a", buffering=1)
 
     def __enter__(self) -> Self:
         self._process = subprocess.Popen(
@@ -141,7 +144,7 @@ class Client:
             env=self._stack.environment,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
-            stderr=(OUT / "client.log").open("a"),
+            stderr=self._log,
             text=True,
             start_new_session=True,
         )
@@ -152,11 +155,13 @@ class Client:
         self._stack.docker("rm", "--force", self._name, check=False)
         if self._process is not None:
             self._process.wait(20)
+        self._log.close()
 
     def _read(self, process: subprocess.Popen[str]) -> None:
         assert process.stdout is not None
         for line in process.stdout:
             told = json.loads(line)
+            self._log.write(line)
             if "at" in told:
                 with self._news:
                     self.results.append(Result(told["at"], told.get("tv"), told.get("wrong", "")))
@@ -222,7 +227,8 @@ def check_results(results: list[Result]) -> str:
 class Stack:
     """The compose project, and the docker commands to treat it with."""
 
-    def __init__(self, engine: Engine, project: Path) -> None:
+    def __init__(self, engine: Engine, project: Path, only: str) -> None:
+        self.only = only
         self.engine = engine
         self.project = project
         self.variables: dict[str, str] = {}
@@ -372,7 +378,7 @@ class Stack:
         )
         return done.stdout
 
-    def restarted(self, service: str, before: int, limit: float = 30) -> float:
+    def restarted(self, service: str, before: int, since: float, limit: float = 30) -> float:
         """Wait until the engine has started a service anew; gives when.
 
         Raises:
@@ -381,8 +387,15 @@ class Stack:
         deadline = time.time() + limit
         while True:
             (told,) = self.inspect(service)
-            if told["RestartCount"] > before and told["State"]["Running"]:
-                return seconds(told["State"]["StartedAt"])
+            state = told["State"]
+            # the count rises before the start, and until then the old one's times stand there
+            if (
+                told["RestartCount"] > before
+                and state["Running"]
+                and not state["Restarting"]
+                and seconds(state["StartedAt"]) > since
+            ):
+                return seconds(state["StartedAt"])
             expect(time.time() < deadline, f"{service} was not restarted within {limit:g} s")
             time.sleep(0.1)
 
@@ -390,10 +403,11 @@ class Stack:
         """How often the engine has restarted a service."""
         return int(self.inspect(service)[0]["RestartCount"])
 
-    def save_logs(self) -> None:
-        """Keep all logs in the folder of results."""
+    def save_logs(self, check: str) -> None:
+        """Keep all logs in the folder of results, as they are after a check."""
         with contextlib.suppress(CheckError):
-            (OUT / "stack.log").write_text(self.compose("logs", "--timestamps", "--no-color", limit=30))
+            logs = self.compose("logs", "--timestamps", "--no-color", limit=30)
+            (OUT / f"{re.sub(r'[^A-Za-z0-9]+', '-', check)}.log").write_text(logs)
 
 
 def seconds(stamp: str) -> float:
@@ -480,7 +494,7 @@ def kill(service: str) -> Callable[[Stack, Client], None]:
         before = stack.restarts(service)
         at = time.time()
         stack.signal(service, "KILL")
-        again(stack, client, at, stack.restarted(service, before))
+        again(stack, client, at, stack.restarted(service, before, at))
 
     return check
 
@@ -501,7 +515,7 @@ def kill_mid_frame(stack: Stack, client: Client) -> None:
     client.silent(0.5, 20)
     at = time.time()
     stack.signal("board1", "KILL")
-    back = stack.restarted("board1", before)
+    back = stack.restarted("board1", before, at)
     again(stack, client, at, back)
     told = stack.log("master", at)
     expect("board 1" in told, f"the master says nothing of board 1: {told[-300:]}")
@@ -612,8 +626,10 @@ def check_robot(stack: Stack) -> None:
                 with Client(stack, here, "host") as client:
                     client.flowing(began, 20)
                     stack.notes.append(f"healthy after {took:.1f} s; {check_results(client.results)}")
+            except CheckError:
+                stack.save_logs("ROSBRIDGE_URI before down")
+                raise
             finally:
-                stack.save_logs()
                 stack.down()
 
 
@@ -720,6 +736,8 @@ def build_another(folder: Path) -> None:
 
 def run_check(stack: Stack, tally: Tally, name: str, check: Callable[[], object]) -> bool:
     """Run one check and print its line; whether it passed."""
+    if stack.only not in name and name not in ALWAYS:
+        return True
     started = time.monotonic()
     stack.notes.clear()
     why = None
@@ -727,13 +745,13 @@ def run_check(stack: Stack, tally: Tally, name: str, check: Callable[[], object]
         check()
     except (CheckError, subprocess.SubprocessError, OSError) as error:
         why = str(error)
-        stack.save_logs()
+        stack.save_logs(name)
     tally.tell(name, started, why, "\n".join(f"    {note}" for note in stack.notes))
     return why is None
 
 
-def verify() -> int:
-    """All checks; the exit code."""
+def verify(only: str) -> int:
+    """All checks, or those with a word in their names; the exit code."""
     OUT.mkdir(parents=True, exist_ok=True)
     for log in OUT.glob("*.log"):
         log.unlink()
@@ -747,11 +765,11 @@ def verify() -> int:
         copy_project(project, wheels)
         shutil.rmtree(another, ignore_errors=True)
         build_another(another)
-        stack = Stack(engine, project)
+        stack = Stack(engine, project, only)
         stack.docker("compose", "down", "--volumes", "--remove-orphans", check=False)
         try:
-            if run_check(stack, tally, "the image is built", lambda: check_build(stack)) and run_check(
-                stack, tally, "docker compose up", lambda: check_up(stack)
+            if run_check(stack, tally, BUILT, lambda: check_build(stack)) and run_check(
+                stack, tally, UP, lambda: check_up(stack)
             ):
                 run_check(stack, tally, "a client container: results to the bit", lambda: check_bits(stack))
                 run_check(stack, tally, "services are confined", lambda: check_confined(stack))
@@ -764,7 +782,7 @@ def verify() -> int:
                 run_check(stack, tally, "a processor of another name", lambda: check_processor(stack))
         finally:
             signal.alarm(0)
-            stack.save_logs()
+            stack.save_logs("last")
             stack.variables.clear()
             stack.docker("compose", "down", "--volumes", "--remove-orphans", check=False)
             shutil.rmtree(project, ignore_errors=True)
@@ -777,7 +795,11 @@ def verify() -> int:
 
 def main() -> int:
     """Say whether it can run here at all, then run it with an end to its patience."""
-    argparse.ArgumentParser(prog="scripts/verify containers", description=__doc__).parse_args()
+    parser = argparse.ArgumentParser(prog="scripts/verify containers", description=__doc__)
+    parser.add_argument(
+        "--only", default="", help="only the checks with this in their names, and what they need"
+    )
+    only = parser.parse_args().only
     able = subprocess.run([str(ENGINE), "able"], stderr=subprocess.PIPE, text=True, check=False, timeout=30)
     if able.returncode:
         must = os.environ.get("CI", "") == "true"
@@ -799,7 +821,7 @@ def main() -> int:
     signal.signal(signal.SIGHUP, end)
     signal.alarm(LIMIT)
     try:
-        return verify()
+        return verify(only)
     except CheckError as error:
         print(f"FAIL {error}")
         print("0 passed, 1 failed")
