@@ -11,6 +11,7 @@ Everything that waits has a limit, everything that queues has a size, and what i
 import asyncio
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
+from dataclasses import replace
 from ssl import SSLContext
 from typing import Any, Final, Literal, Self
 
@@ -392,4 +393,5 @@ def connect(
         proxy=proxy,
     )
     core = ClientCore(ros_version=told, max_size=max_size, fragment_size=fragment_size)
+    parsed = replace(parsed, username=None, password=None)  # the route has them
     return Ros(Session(parsed, shown(uri), core, limits, on_state, route=route))

@@ -15,6 +15,7 @@ from typing import Final, TypeVar
 
 from websockets.asyncio.client import connect_http_proxy, connect_socks_proxy
 from websockets.exceptions import InvalidHandshake, InvalidProxy, InvalidProxyStatus
+from websockets.headers import build_authorization_basic
 from websockets.proxy import Proxy, get_proxy, parse_proxy
 from websockets.uri import WebSocketURI
 
@@ -64,12 +65,16 @@ def make_route(
     tls: ssl.SSLContext | None = None,
     proxy: str | None = None,
 ) -> Route:
-    """Read what a user says of the way (see `bridge.client.connect`).
+    """Read what a user says of the way (see `bridge.client.connect`); a user in the URI becomes a header.
 
     Raises:
         OptionError: something of it cannot be; the sentence names the option, never a secret.
     """
     said = dict(headers or {})
+    if uri.user_info is not None and not any(name.lower() == "authorization" for name in said):
+        if token is not None:
+            raise OptionError("token and a user in the URI exclude each other")
+        said["Authorization"] = build_authorization_basic(*uri.user_info)
     if token is not None:
         if any(name.lower() == "authorization" for name in said):
             raise OptionError("token and an Authorization header exclude each other")
@@ -81,7 +86,7 @@ def make_route(
             raise OptionError(f"{name!r} is no name of a header")
         if not isinstance(value, str) or _HEADER_VALUE.fullmatch(value) is None:
             raise OptionError(f"the value of header {name} has characters that no header can have")
-    secret = token is not None or uri.user_info is not None or any(n.lower() == "authorization" for n in said)
+    secret = any(name.lower() == "authorization" for name in said)
     if secret and not uri.secure and not _is_loopback(uri.host):
         _log.warning("what lets this client in is sent to %s unencrypted: wss:// would protect it", uri.host)
     return Route(_tls(uri, ca_file, client_certificate, tls), tuple(said.items()), _proxy(uri, proxy))

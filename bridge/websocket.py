@@ -75,6 +75,7 @@ class WebSocket(ClientConnection):
 
     Attributes:
         opened: the handshake is done; only then are messages handed over and the end is told.
+        first_bytes: what the peer said first, before the handshake was done.
     """
 
     def __init__(
@@ -323,7 +324,8 @@ def _connect_error(
             f"{uri} is no rosbridge server: it answers as a web server ({seen}); check port and path"
         )
     if isinstance(error, InvalidMessage) and not heard:
-        return UnreachableError(f"{uri} is unreachable: it closed the connection without an answer")
+        perhaps = " (as servers do that want a client_certificate)" if uri.startswith("wss:") else ""
+        return UnreachableError(f"{uri} is unreachable: it closed the connection without an answer{perhaps}")
     if isinstance(error, InvalidHandshake) or (isinstance(error, TimeoutError) and heard):
         why = f"within {seconds:g} s " if isinstance(error, TimeoutError) else ""
         return NotRosbridgeError(
