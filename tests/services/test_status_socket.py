@@ -11,6 +11,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from services import status_socket
 from services.errors import SettingsError
 from services.status_socket import (
     FrameCounts,
@@ -132,16 +133,24 @@ def test_who_asks_and_does_not_read_keeps_nobody_from_asking(tmp_path):
         assert asked(tmp_path / "board0.status.sock").ready
 
 
-def test_a_rate_is_of_the_last_seconds(tmp_path):
-    started = time.monotonic()
-
-    def growing():
-        return ProcessStatus(ready=True, why="", frames=counts(int(100 * (time.monotonic() - started))))
-
-    with status_thread(tmp_path, "pcie-app", growing):
-        time.sleep(1.5)
-        rate = asked(tmp_path / "pcie-app.status.sock").frames.rate
-    assert rate == pytest.approx(100, rel=0.1)
+def test_a_rate_is_of_the_last_seconds(monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr(status_socket.time, "monotonic", lambda: now[0])
+    done = [0]
+    answerer = status_socket._Answerer(
+        "pcie-app", lambda: ProcessStatus(ready=True, why="", frames=counts(done[0]))
+    )
+    for _ in range(20):
+        answerer.sample()
+        now[0] += 1
+        done[0] += 30
+    for _ in range(6):  # it is slower now, and the past does not count any more
+        answerer.sample()
+        now[0] += 1
+        done[0] += 5
+    status = msgspec.json.decode(answerer.answer(), type=ProcessStatus)
+    assert status.frames.rate == 5
+    assert status.uptime_s == 26
 
 
 def test_reasons_that_did_not_occur_are_not_told():
