@@ -37,11 +37,12 @@ def joint_posterior(
         divisors.append(max(run, 1))
     if not divisors:
         return None
-    joint = np.concatenate(counts)
+    together = np.concatenate(counts)
+    joint: npt.NDArray[np.float64]
     if len(set(divisors)) == 1:
-        joint = joint / divisors[0]
+        joint = together / divisors[0]
     else:
-        joint = joint / np.repeat(np.array(divisors, dtype=np.float64), [len(count) for count in counts])
+        joint = together / np.repeat(np.array(divisors, dtype=np.float64), [len(count) for count in counts])
     total = float(joint.sum())
     return joint / total if total > 0 else None
 
