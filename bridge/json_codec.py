@@ -11,8 +11,10 @@ Inbound:
 Outbound: floats that are NaN or infinite either leave as ``null`` (what the reference server does), or are
 refused with their place named (what a publisher wants: servers drop ``null`` in a float field silently).
 NumPy arrays and scalars are written without lists in between when NumPy is loaded; it is never imported here.
+Bytes are written as base64, as servers have ``uint8[]``.
 """
 
+import base64
 import json
 import math
 from collections.abc import Mapping
@@ -156,7 +158,9 @@ def encode(
     try:
         data = orjson.dumps(message, _not_json, _OPTIONS)
     except TypeError as error:  # orjson.JSONEncodeError is a TypeError; default's own errors are its cause
-        raise EncodeError(f"the message cannot be written as JSON: {error.__cause__ or error}") from None
+        if "native-endianness" not in str(error):
+            raise EncodeError(f"the message cannot be written as JSON: {error.__cause__ or error}") from None
+        data = orjson.dumps(_in_own_byte_order(message), _not_json, _OPTIONS)
     if len(data) > max_size:
         raise EncodeError(f"the message has {len(data)} bytes as JSON, at most {max_size} are sent")
     if nonfinite == "refuse" and _has_null(data):
@@ -185,13 +189,26 @@ def _has_null(data: bytes) -> bool:
 
 
 def _not_json(value: object) -> Any:
-    """What orjson does not know: NumPy arrays that are not contiguous, and mappings that are no dicts."""
+    """What orjson does not know: arrays that are not contiguous, bytes (``uint8[]``), mappings that are no dicts."""
     if isinstance(value, Mapping):
         return dict(value)
-    to_list = getattr(value, "tolist", None)
-    if to_list is not None:
-        return to_list()
+    if isinstance(value, bytes | bytearray):
+        return base64.b64encode(value).decode()
+    dtype = getattr(value, "dtype", None)
+    if dtype is not None:
+        array: Any = value
+        return array.copy() if array.ndim and dtype.kind in "buif" else array.tolist()
     raise EncodeError(f"{type(value).__name__} is no type of JSON")
+
+
+def _in_own_byte_order(value: Any) -> Any:
+    """The message with arrays of the other byte order, which orjson refuses, in this machine's."""
+    if isinstance(value, Mapping):
+        return {key: _in_own_byte_order(part) for key, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [_in_own_byte_order(part) for part in value]
+    dtype = getattr(value, "dtype", None)
+    return value if dtype is None or dtype.isnative else value.astype(dtype.newbyteorder("="))
 
 
 def find_nonfinite(message: Any) -> str | None:
@@ -208,6 +225,17 @@ def find_nonfinite(message: Any) -> str | None:
             )
         elif isinstance(value, list | tuple):
             inner.extend((f"{place}[{index}]", value[index]) for index in reversed(range(len(value))))
-        elif (to_list := getattr(value, "tolist", None)) is not None:
-            inner.append((place, to_list()))
+        elif getattr(value, "dtype", None) is not None and not _all_finite(value):
+            inner.append((place, value.tolist()))
     return None
+
+
+def _all_finite(value: Any) -> bool:
+    """Whether a NumPy array or scalar has neither NaN nor infinity."""
+    if value.dtype.kind in "bui":
+        return True
+    if value.dtype.kind != "f":
+        return False  # looked at one by one
+    import numpy as np  # it is loaded: the value is its
+
+    return bool(np.isfinite(value).all())

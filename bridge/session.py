@@ -484,7 +484,8 @@ class Session:
                 self._serving.add(task)
                 task.add_done_callback(self._serving.discard)
             case GoalFeedback() | GoalEnded():
-                goal = self.goals.get(event.goal)
+                ended = isinstance(event, GoalEnded)
+                goal = self.goals.pop(event.goal, None) if ended else self.goals.get(event.goal)
                 if goal is not None:
                     goal.receive(event)
             case StatusReceived():

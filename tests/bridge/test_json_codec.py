@@ -163,6 +163,46 @@ def test_the_limit_of_depth_is_exact_whatever_the_size(filling, text):
 # Outbound
 
 
+def test_bytes_are_base64():
+    assert encode({"a": b"\x00\xff", "b": bytearray(b"x")}) == b'{"a":"AP8=","b":"eA=="}'
+
+
+@pytest.mark.parametrize(
+    "array",
+    [
+        np.arange(6.0).astype(">f4"),
+        np.arange(12.0)[::2],
+        np.arange(6.0).reshape(2, 3).T,
+        np.arange(6, dtype=">i8")[::-1],
+        np.array(1.5, ">f8"),
+        np.arange(3, dtype=np.float16),
+        np.array([True, False]),
+        np.array(["a", "b"]),
+    ],
+)
+def test_arrays_of_any_layout(array):
+    message = {"deep": [{"a": array}], "s": np.float32(0.5), "t": (np.int8(1), None)}
+    expected = {"deep": [{"a": array.tolist()}], "s": 0.5, "t": [1, None]}
+    assert json.loads(encode(message)) == expected
+    assert json.loads(encode(message, nonfinite="refuse")) == expected
+
+
+@pytest.mark.parametrize("array", [np.zeros(2, complex), np.array([object()], object)])
+def test_arrays_of_what_json_has_not_got(array):
+    with pytest.raises(EncodeError, match="cannot be written as JSON"):
+        encode({"a": array})
+
+
+def test_a_nan_in_any_array_has_a_place():
+    for array in (
+        np.array([[1, np.nan]]),
+        np.array([[1, np.nan]], ">f4"),
+        np.array([[1, 0, np.nan]])[:, ::2],
+    ):
+        with pytest.raises(EncodeError, match=r"a\[0\]\[1\] is NaN"):
+            encode({"a": array, "b": None}, nonfinite="refuse")
+
+
 @pytest.mark.parametrize("before", ["", "n" * 2000, "an" * 700, "x" * 2000])
 def test_a_nan_is_found_wherever_it_is(before):
     for message in ({"a": before, "b": math.nan}, {"b": [math.inf], "a": before}):
