@@ -3,8 +3,12 @@
 The rules of ``deployment.toml``'s variables: a name with ``.`` or ``[`` is a path (``pose.position.x``,
 ``ranges[3]``). A bare name is searched in the whole message, depth first, not inside arrays; it may be there
 only once, and the place found first is kept, so that later messages cost no search.
+
+An index reaches into whatever a server's form of delivery makes of an array: a list, a NumPy array, bytes, and the
+base64 text that JSON has for ``uint8[]``.
 """
 
+import base64
 import re
 from typing import Any, Final
 
@@ -84,9 +88,16 @@ class Field:
             if isinstance(step, str):
                 if not isinstance(value, dict) or step not in value:
                     return False, None
-            elif not isinstance(value, list) or step >= len(value):
-                return False, None
-            value = value[step]
+                value = value[step]
+            elif type(value) is list:
+                if step >= len(value):
+                    return False, None
+                value = value[step]
+            else:
+                length = _length(value)
+                if length is None or step >= length:
+                    return False, None
+                value = _element(value, step)
         return True, value
 
     def missing(self, message: dict[str, Any]) -> FieldMissingError:
@@ -99,12 +110,13 @@ class Field:
             before = _show(self.place[:depth])
             where = f" in {before!r}" if before else ""
             if isinstance(step, int):
-                if not isinstance(value, list):
+                length = _length(value)
+                if length is None:
                     reason = f"{before!r} is {_kind(value)}, not an array"
-                elif step >= len(value):
-                    reason = f"{before!r} has {len(value)} elements, the index {step} is none of theirs"
+                elif step >= length:
+                    reason = f"{before!r} has {length} elements, the index {step} is none of theirs"
                 else:
-                    value = value[step]
+                    value = _element(value, step)
                     continue
             elif not isinstance(value, dict):
                 reason = f"{before!r} is {_kind(value)}, not an object"
@@ -199,7 +211,7 @@ def _list_fields(message: dict[str, Any]) -> str:
             return ", ".join(listed) + " and more"
         if isinstance(value, dict) and value:
             inner.extend(((*place, key), part) for key, part in reversed(value.items()))
-        elif isinstance(value, list):
+        elif isinstance(value, list | bytes) or hasattr(value, "dtype"):
             listed.append(f"{_show(place)} ({_kind(value)})")
         else:
             listed.append(_show(place))
@@ -214,12 +226,34 @@ def _show(place: Place) -> str:
     return text if text.isprintable() else repr(text)
 
 
+def _length(value: Any) -> int | None:
+    """How many elements an array has, in whatever form it came; None if it is none."""
+    if isinstance(value, str):
+        # Four characters are three bytes, fewer where = stands for what is missing.
+        return None if len(value) % 4 or not value else len(value) // 4 * 3 - value[-2:].count("=")
+    if isinstance(value, list | bytes) or getattr(value, "ndim", 0) == 1:
+        return len(value)
+    return None
+
+
+def _element(value: Any, index: int) -> Any:
+    """One element; None of a text that is no base64 there."""
+    if isinstance(value, str):
+        four = value[index // 3 * 4 : index // 3 * 4 + 4]
+        try:
+            return base64.b64decode(four, validate=True)[index % 3]
+        except (ValueError, IndexError):
+            return None
+    element = value[index]
+    return element.item() if hasattr(element, "dtype") else element
+
+
 def _kind(value: Any) -> str:
     if value is None:
         return "null"
     if isinstance(value, dict):
         return "an object"
-    if isinstance(value, list):
+    if isinstance(value, list | bytes) or hasattr(value, "dtype"):
         return f"an array of {len(value)}"
     if isinstance(value, bool):
         return "a boolean"

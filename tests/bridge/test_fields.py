@@ -1,3 +1,7 @@
+import base64
+import math
+
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -196,3 +200,102 @@ def test_any_name_is_found_or_told(name, message):
         find_field(message, name)
     except BridgeError as error:
         assert str(error)
+
+
+# What real sensors send, in every form in which it may come
+
+STAMP = {"sec": 1700000000, "nanosec": 250000000}
+HEADER = {"stamp": STAMP, "frame_id": "base_link"}
+RANGE = {
+    "header": HEADER,
+    "radiation_type": 0,
+    "field_of_view": 0.26,
+    "min_range": 0.02,
+    "max_range": 4.0,
+    "range": 1.25,
+    "variance": 0.0,
+}
+BEAMS = [0.1 * n for n in range(360)]
+SCAN = {
+    "header": HEADER,
+    "angle_min": -3.14,
+    "angle_max": 3.14,
+    "angle_increment": 0.0175,
+    "time_increment": 0.0,
+    "scan_time": 0.1,
+    "range_min": 0.12,
+    "range_max": 3.5,
+    "ranges": BEAMS,
+    "intensities": [],
+}
+VECTOR = {"x": 0.1, "y": 0.2, "z": 9.81}
+IMU = {
+    "header": HEADER,
+    "orientation": {"x": 0.0, "y": 0.0, "z": 0.5, "w": 0.866},
+    "orientation_covariance": [0.01] * 9,
+    "angular_velocity": {"x": 0.0, "y": 0.0, "z": 1.5},
+    "angular_velocity_covariance": [-1.0] + [0.0] * 8,
+    "linear_acceleration": VECTOR,
+    "linear_acceleration_covariance": [0.0] * 9,
+}
+PIXELS = bytes(range(250, 256)) + b"\x00\x7f"
+IMAGE = {"header": HEADER, "height": 2, "width": 4, "encoding": "mono8", "step": 4, "data": PIXELS}
+
+
+@pytest.mark.parametrize(
+    ("message", "path", "value"),
+    [
+        (RANGE, "range", 1.25),
+        (RANGE, "header.stamp.sec", 1700000000),
+        (SCAN, "ranges[0]", 0.0),
+        (SCAN, "ranges[90]", 9.0),
+        (SCAN, "ranges[359]", pytest.approx(35.9)),
+        (IMU, "angular_velocity.z", 1.5),
+        (IMU, "linear_acceleration.z", 9.81),
+        (IMU, "orientation_covariance[8]", 0.01),
+        (IMU, "w", 0.866),
+    ],
+)
+def test_a_sensor_needs_no_more_than_a_path(message, path, value):
+    assert find_field(message, path) == value
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_a_beam_of_an_array(dtype):
+    scan = SCAN | {"ranges": np.array([*BEAMS[:3], np.nan, np.inf], dtype)}
+    for index in range(3):
+        value = find_field(scan, f"ranges[{index}]")
+        assert type(value) is float
+        assert value == pytest.approx(BEAMS[index], rel=1e-6)
+    assert math.isnan(find_field(scan, "ranges[3]"))
+    assert find_field(scan, "ranges[4]") == math.inf
+    with pytest.raises(FieldMissingError, match="'ranges' has 5 elements, the index 5"):
+        find_field(scan, "ranges[5]")
+    with pytest.raises(FieldMissingError, match=r"ranges \(an array of 5\)"):
+        find_field(scan, "nothing")
+    with pytest.raises(FieldMissingError, match="'ranges' is an array of 5, not an object"):
+        find_field(scan, "ranges.x")
+    assert type(find_field({"n": np.array([7], np.uint8)}, "n[0]")) is int
+
+
+@pytest.mark.parametrize("length", range(9))
+def test_a_byte_of_an_image_in_any_form(length):
+    pixels = PIXELS[:length]
+    for data in (pixels, list(pixels), np.frombuffer(pixels, np.uint8), base64.b64encode(pixels).decode()):
+        image = IMAGE | {"data": data}
+        found = [find_field(image, f"data[{index}]") for index in range(length)]
+        assert found == list(pixels)
+        assert {type(value) for value in found} <= {int}
+        assert Field(f"data[{length}]").value(image) == (False, None)
+        with pytest.raises(FieldMissingError):
+            find_field(image, f"data[{length}]")
+
+
+@pytest.mark.parametrize("text", ["\u00e4\u00e4\u00e4\u00e4", "a b!", "====", "a===", "ab=c"])
+def test_a_text_that_is_no_base64_has_no_bytes(text):
+    for index in range(3):
+        present, value = Field(f"a[{index}]").value({"a": text})
+        assert not present or value is None or type(value) is int
+    assert Field("a[0]").value({"a": "abc"}) == (False, None)
+    assert Field("a[0]").value({"a": 5}) == (False, None)
+    assert Field("a[0]").value({"a": np.zeros((2, 2))}) == (False, None)
