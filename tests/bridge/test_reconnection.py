@@ -325,3 +325,80 @@ async def test_nothing_is_left_open():
     with socket.socket() as again:
         again.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         again.bind(("127.0.0.1", fake.port))
+
+
+# How long it was dark
+
+
+async def test_the_first_message_after_a_loss_says_how_long_it_was_dark():
+    async with FakeRosbridge() as fake, connect(fake.uri) as ros:
+        subscription = ros.subscribe("/a", "p/T")
+        await fake.wait_for_op("subscribe")
+        await fake.publish("/a", {"n": 0})
+        assert (await subscription.next(10)).blind_seconds == 0
+        begun = time.monotonic()
+        await fake.vanish()
+        await asyncio.sleep(0.5)
+        fake.received.clear()
+        await fake.come_back()
+        await fake.wait_for_op("subscribe", timeout=20)
+        late = ros.subscribe("/b", "p/T")
+        await fake.wait_for_op("subscribe", count=2)
+        for topic in ("/a", "/a", "/b"):
+            await fake.publish(topic, {"n": 1})
+        first, second = await subscription.next(10), await subscription.next(10)
+        assert 0.5 <= first.blind_seconds <= time.monotonic() - begun
+        assert second.blind_seconds == 0
+        assert subscription.blind_seconds == first.blind_seconds
+        assert (await late.next(10)).blind_seconds == 0
+        assert late.blind_seconds == 0
+
+
+async def test_losses_without_a_message_between_add_up():
+    async with FakeRosbridge() as fake, connect(fake.uri) as ros:
+        subscription = ros.subscribe("/a", "p/T")
+        for _ in range(2):
+            await gone_and_back(fake, ros)
+        await fake.wait_for_op("subscribe")
+        await fake.publish("/a", {})
+        message = await subscription.next(10)
+        assert message.blind_seconds == subscription.blind_seconds > 0
+        await subscription.close()
+        await gone_and_back(fake, ros)
+        assert subscription.blind_seconds == message.blind_seconds
+
+
+@pytest.mark.parametrize("queue_size", [1, 2, 5])
+async def test_darkness_is_told_even_if_its_message_is_dropped(queue_size):
+    async with FakeRosbridge() as fake, connect(fake.uri) as ros:
+        subscription = ros.subscribe("/a", "p/T", queue_size=queue_size)
+        await gone_and_back(fake, ros)
+        await fake.wait_for_op("subscribe")
+        for n in range(20):
+            await fake.publish("/a", {"n": n})
+        await asyncio.wait_for(_until(lambda: subscription.lost == 20 - queue_size), 10)
+        messages = [await subscription.next(10) for _ in range(queue_size)]
+        assert [message.msg["n"] for message in messages] == list(range(20 - queue_size, 20))
+        dark = [message.blind_seconds for message in messages]
+        assert dark == [subscription.blind_seconds] + [0.0] * (queue_size - 1)
+        assert dark[0] > 0
+
+
+async def test_silence_counts_from_the_last_sign_of_life():
+    async with (
+        FakeRosbridge() as fake,
+        connect(fake.uri, ping_interval=0.4, ping_timeout=0.3) as ros,
+    ):
+        subscription = ros.subscribe("/a", "p/T")
+        await fake.wait_for_op("subscribe")
+        fake.freeze()
+        await ros.wait_for_state(State.RECONNECTING, 20)
+        await ros.wait_for_state(State.CONNECTED, 20)
+        await fake.wait_for_op("subscribe", count=2)
+        await fake.publish("/a", {})
+        assert (await subscription.next(10)).blind_seconds >= 0.7
+
+
+async def _until(condition: Any) -> None:
+    while not condition():
+        await asyncio.sleep(0.01)

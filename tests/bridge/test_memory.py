@@ -1,0 +1,83 @@
+"""Memory stays flat, however long it runs: behind a slow reader, over reconnections, calls and broken messages."""
+
+import gc
+import json
+import tracemalloc
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from bridge import cbor_codec
+from bridge.client import connect
+from bridge.fragments import split
+from bridge.protocol import Compression
+from tests.fake_rosbridge import FakeRosbridge
+
+#: Bytes that may be more in use after many rounds than after few: caches, not one object a round.
+SLACK = 60_000
+
+
+def growth(play: Callable[[int], None], rounds: int) -> int:
+    """Bytes by which memory in use grew over the later rounds."""
+    play(rounds // 4)
+    gc.collect()
+    tracemalloc.start()
+    try:
+        play(rounds // 4)
+        gc.collect()
+        before, _peak = tracemalloc.get_traced_memory()
+        play(rounds)
+        gc.collect()
+        after, _peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    return after - before
+
+
+def said(msg: object, kind: str) -> list[bytes]:
+    operation = {"op": "publish", "topic": "/a", "msg": msg}
+    if kind == "cbor":
+        return [cbor_codec.encode(operation)]
+    data = json.dumps(operation).encode()
+    return list(split(data, 100, 1)) if kind == "fragments" else [data]
+
+
+@pytest.mark.parametrize("kind", ["json", "cbor", "fragments", "broken"])
+async def test_a_reader_that_never_reads(kind):
+    """The queue is full at once; each further message takes the place of the oldest."""
+    compression: Compression = "cbor" if kind == "cbor" else "none"
+    async with FakeRosbridge() as fake, connect(fake.uri) as ros:
+        subscription = ros.subscribe("/a", "p/T", compression=compression, queue_size=8)
+        values = np.arange(100.0)
+        pieces = said({"data": values if kind == "cbor" else values.tolist()}, kind)
+        if kind == "broken":
+            pieces = [b"{", b"[1]", b"\xff\xfe", b'{"op":"fragment","id":1,"data":"x","num":0,"total":9}']
+        take = ros._session._take
+
+        def play(rounds: int) -> None:
+            for number in range(rounds):
+                for piece in pieces:
+                    take(piece.replace(b'"id":1,', b'"id":%d,' % number) if kind == "broken" else piece)
+
+        assert growth(play, 2000) < SLACK
+        assert subscription.lost == (0 if kind == "broken" else 3000 - 8)
+        assert ros.unusable >= (3 * 3000 if kind == "broken" else 0)
+
+
+async def test_calls_and_goals_that_come_and_go():
+    async with FakeRosbridge() as fake, connect(fake.uri) as ros:
+        fake.serve("/echo", lambda args: args)
+        take = ros._session._take
+
+        def play(rounds: int) -> None:
+            core = ros._session.core
+            for number in range(rounds):
+                call = core.call("/echo", {"n": number})
+                take(b'{"op":"service_response","id":"%b","values":{},"result":true}' % call.encode())
+                goal = core.send_goal("/fly", "p/Fly", {}, feedback=True)
+                take(b'{"op":"action_result","id":"%b","values":{},"status":4}' % goal.encode())
+                core.unsubscribe(core.subscribe("/b", "p/T"))
+                core.data_to_send()
+
+        assert growth(play, 3000) < SLACK
