@@ -1,6 +1,6 @@
 """Runs in a container beside the stack: compares each result with exact float64 fusion of the same readings.
 
-Prints one JSON object a result: `at` (Unix time), `number`, `tv` (total variation to float64, 0..1), or `wrong` with a
+Prints one JSON object a result: `at` (Unix time), `number`, `cycles`, `tv` (total variation to float64, 0..1), or `wrong` with a
 sentence. With --bits N it ends after N results, having computed each anew with the reference kernel: cycles, counts
 and posterior must be the same to the bit.
 """
@@ -126,7 +126,11 @@ async def check(uri: str, width: int, height: int, bits: int) -> None:
                 continue
             number += 1
             addresses = await readings.of(report.stamp_ns)
-            line: dict[str, Any] = {"at": posterior.heard_ns / 1e9, "number": report.number}
+            line: dict[str, Any] = {
+                "at": posterior.heard_ns / 1e9,
+                "number": report.number,
+                "cycles": report.cycles,
+            }
             if addresses is None:
                 line["wrong"] = "no reading has its stamp"
             elif len(posterior.values) != width * height:
