@@ -278,9 +278,42 @@ class Publication(_Handle):
                 await session.wait_turn(f"a message of {self.topic}", timeout)
             finally:
                 self._waiting -= 1
+        await session.send(self._written(msg))
+
+    @property
+    def must_wait(self) -> bool:
+        """Whether a message would have to wait now: for a slow server, or for a connection."""
+        session = self._session
+        return session.state is not State.CONNECTED or not session.is_open or session.must_wait()
+
+    async def ready(self, timeout: float = 5.0) -> None:  # noqa: ASYNC109  # as above
+        """Wait until the server has taken what was sent before.
+
+        Raises:
+            DisconnectedError: there is no connection now, or it was lost meanwhile.
+            SlowPeerError: the server did not take it within ``timeout`` seconds.
+        """
+        if self._session.must_wait():
+            await self._session.wait_turn(f"a message of {self.topic}", timeout)
+
+    def publish_nowait(self, msg: Mapping[str, Any]) -> None:
+        """Send one message at once or not at all: for who must not wait.
+
+        Raises:
+            SlowPeerError: the server has not taken what was sent before; nothing was sent.
+            DisconnectedError, EncodeError: as `publish`.
+        """
+        session = self._session
+        if session.must_wait():
+            raise SlowPeerError(
+                f"{session.uri} does not keep up: a message of {self.topic} would have to wait for its turn"
+            )
+        session.send_now(self._written(msg))
+
+    def _written(self, msg: Mapping[str, Any]) -> bytes:
         if self._closed:
             raise DisconnectedError(f"{self.topic} is not advertised any more: its publication was closed")
-        await session.send(session.core.publish(self._number, msg))
+        return self._session.core.publish(self._number, msg)
 
     def _take_back(self) -> None:
         self._session.core.unadvertise(self._number)

@@ -342,6 +342,11 @@ class Session:
 
     # Sending
 
+    @property
+    def is_open(self) -> bool:
+        """Whether there is a connection that takes messages."""
+        return self._websocket is not None and self._websocket.is_open
+
     def must_wait(self) -> bool:
         """Whether what is to be sent has to wait for its turn.
 
@@ -363,8 +368,8 @@ class Session:
             return "`async with` opens it"
         return self.last_error or "the server is closing it"
 
-    async def send(self, data: bytes) -> None:
-        """Hand a message to the socket; every now and then other tasks get their turn after it.
+    def send_now(self, data: bytes) -> None:
+        """Hand a message to the socket.
 
         Raises:
             DisconnectedError: there is no connection.
@@ -373,6 +378,10 @@ class Session:
             self._open_websocket().send_now(data)
         else:
             self._send_pieces(self._open_websocket(), data)
+
+    async def send(self, data: bytes) -> None:
+        """Hand a message to the socket; every now and then other tasks get their turn after it. Errors as `send_now`."""
+        self.send_now(data)
         self._in_a_row += 1
         if self._in_a_row >= _IN_A_ROW:
             self._in_a_row = 0

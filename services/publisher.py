@@ -13,6 +13,9 @@ from collections import Counter
 from collections.abc import AsyncIterator
 from typing import Annotated, Any, Literal
 
+import msgspec
+import numpy as np
+import numpy.typing as npt
 import orjson
 import typer
 
@@ -28,7 +31,6 @@ from services.results import (
     FRAME_TOPIC,
     FRAME_TYPE,
     FrameReport,
-    Times,
     posterior_layout,
     posterior_of,
     times_of,
@@ -132,55 +134,78 @@ class ResultTopics:
                 return True
         return False
 
+    @property
+    def must_wait(self) -> bool:
+        """Whether a server is away, or has not taken what was sent before."""
+        return any(publication.must_wait for _, publication in self._outputs)
+
     async def publish(self, publish: Publish, *, look: bool) -> Published:
-        """Publish a frame's data and then its posterior, where it has one.
+        """Publish a frame's data and then its posterior, where it has one, once the servers take them.
 
         Args:
             publish: the result and its frame's times.
             look: wait until the result was seen on the wire, or the settings' time is over.
         """
+        posterior = posterior_of(publish.result)
+        if all(ros.state is not State.CONNECTED for ros, _ in self._outputs):
+            return _became_of(publish, posterior, "rosbridge away")
+        try:
+            for _, publication in self._outputs:
+                await publication.ready()
+        except BridgeError as error:
+            return self._away(publish, posterior, error)
+        published = self.publish_or_say(publish, posterior)
+        if look and published.outcome == "published" and posterior is not None:
+            seen = await self._seen(posterior.tolist(), self._settings.seen_timeout)
+            published = msgspec.structs.replace(published, seen=seen)
+        return published
+
+    def publish_or_say(self, publish: Publish, posterior: npt.NDArray[np.float64] | None) -> Published:
+        """Publish a frame's data and its posterior at once, or say that it could not be."""
+        try:
+            return self._publish_now(publish, posterior)
+        except BridgeError as error:
+            return self._away(publish, posterior, error)
+
+    def _away(
+        self, publish: Publish, posterior: npt.NDArray[np.float64] | None, error: BridgeError
+    ) -> Published:
+        get_logger(ROLE).warning(str(error), frame=publish.result.number)
+        return _became_of(publish, posterior, "rosbridge away")
+
+    def _publish_now(self, publish: Publish, posterior: npt.NDArray[np.float64] | None) -> Published:
         started = time.monotonic_ns()
         times = times_of(publish, started, self._previous_out_ns)
-        posterior = posterior_of(publish.result)
-        best = int(posterior.argmax()) if posterior is not None else -1
-        outcome = "published" if posterior is not None else "no posterior"
-        seen: bool | None = None
-        if all(ros.state is not State.CONNECTED for ros, _ in self._outputs):
-            outcome = "rosbridge away"
-        else:
-            try:
-                await self._send(publish, times, posterior)
-                self._previous_out_ns = time.monotonic_ns() - started
-                if look and posterior is not None:
-                    seen = await self._seen(posterior.tolist(), self._settings.seen_timeout)
-            except BridgeError as error:
-                get_logger(ROLE).warning(str(error), frame=publish.result.number)
-                outcome = "rosbridge away"
-        return Published(
-            number=publish.result.number,
-            outcome=outcome,
-            seen=seen,
-            best_line=best,
-            best_probability=float(posterior[best]) if posterior is not None else 0.0,
-            cycles=max((board.cycles for board in publish.result.boards), default=0),
-            total_ns=time.monotonic_ns() - publish.received_tick,
-        )
-
-    async def _send(self, publish: Publish, times: Times, posterior: Any) -> None:
         with self._outputs[0][0].together():
             if self._frames is not None:
-                await self._frames.publish(
+                self._frames.publish_nowait(
                     self._report.message(
                         publish, times, published=posterior is not None, sent_ns=time.time_ns()
                     )
                 )
             if posterior is not None:
-                await self.publish_array(posterior)
+                for _, publication in self._outputs:
+                    publication.publish_nowait({"layout": self._layout, "data": posterior})
+        self._previous_out_ns = time.monotonic_ns() - started
+        return _became_of(publish, posterior, "no posterior" if posterior is None else "published")
 
     async def publish_array(self, values: Any) -> None:
         """Publish probabilities (float64, one per line) on every output."""
         for _, publication in self._outputs:
             await publication.publish({"layout": self._layout, "data": values})
+
+
+def _became_of(publish: Publish, posterior: npt.NDArray[np.float64] | None, outcome: str) -> Published:
+    best = int(posterior.argmax()) if posterior is not None else -1
+    return Published(
+        number=publish.result.number,
+        outcome=outcome,
+        seen=None,
+        best_line=best,
+        best_probability=float(posterior[best]) if posterior is not None else 0.0,
+        cycles=max((board.cycles for board in publish.result.boards), default=0),
+        total_ns=time.monotonic_ns() - publish.received_tick,
+    )
 
 
 class Publisher:
@@ -191,6 +216,7 @@ class Publisher:
         self._waiting: asyncio.Queue[Publish] = asyncio.Queue(RESULTS_DEPTH)
         self._begun = asyncio.Event()
         self._once = False
+        self._busy = True  # there are no topics yet
         self._link = link(self._take)
         self._deployment = deployment
         self._follows = settings.log_level == "debug"
@@ -228,11 +254,30 @@ class Publisher:
                 self._topics.watch()
             self._begun.set()
         elif isinstance(record, Publish):
+            if not (self._once or self._busy or self._topics.must_wait):
+                # the usual case: nothing to wait for, and so no other task to wake
+                self._tell(self._topics.publish_or_say(record, posterior_of(record.result)))
+                return
+            self._busy = True  # until the queue is empty again: results stay in order
             try:
                 self._waiting.put_nowait(record)
             except asyncio.QueueFull:
                 self._outcomes["rosbridge away"] += 1
                 self._link.send(Published(record.result.number, "rosbridge away", None, -1, 0.0, 0, 0))
+
+    def _tell(self, published: Published) -> None:
+        """What became of a result."""
+        self._link.send(published)
+        self._outcomes[published.outcome] += 1
+        if published.outcome == "published":
+            self._last = (published.number, time.monotonic_ns())
+        if self._follows:
+            self._log.debug(
+                published.outcome,
+                frame=published.number,
+                probability=f"{published.best_probability:.3g}",
+                ms=f"{published.total_ns / 1e6:.2f}",
+            )
 
     def _state_changed(self, state: State, reason: str) -> None:
         if state is State.RECONNECTING:
@@ -245,20 +290,11 @@ class Publisher:
                 async with self._topics.opened(self._state_changed) as where:
                     self._where = where
                     self._link.keep(Ready(where))
+                    self._busy = False
                     while True:
                         publish = await self._waiting.get()
-                        published = await self._topics.publish(publish, look=self._once)
-                        self._link.send(published)
-                        self._outcomes[published.outcome] += 1
-                        if published.outcome == "published":
-                            self._last = (published.number, time.monotonic_ns())
-                        if self._follows:
-                            self._log.debug(
-                                published.outcome,
-                                frame=published.number,
-                                probability=f"{published.best_probability:.3g}",
-                                ms=f"{published.total_ns / 1e6:.2f}",
-                            )
+                        self._tell(await self._topics.publish(publish, look=self._once))
+                        self._busy = not self._waiting.empty()
             except BridgeError as error:
                 for _ in range(100):
                     if self._link.send(Trouble(exit_code_of(error), str(error))):

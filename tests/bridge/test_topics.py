@@ -88,6 +88,24 @@ async def test_the_end_in_the_middle_of_such_a_moment():
             await publication.publish({"n": 2})
 
 
+async def test_a_message_that_need_not_wait_does_not():
+    async with FakeRosbridge() as fake:
+        async with connect(fake.uri) as ros:
+            publication = await ros.advertise("/a", "p/T")
+            await publication.ready()
+            assert not publication.must_wait
+            publication.publish_nowait({"n": 1})
+            assert (await fake.wait_for_op("publish", topic="/a"))["msg"] == {"n": 1}
+            with pytest.raises(EncodeError, match="n is NaN"):
+                publication.publish_nowait({"n": math.nan})
+            await publication.close()
+            with pytest.raises(DisconnectedError, match="/a is not advertised any more"):
+                publication.publish_nowait({})
+        assert publication.must_wait
+        with pytest.raises(DisconnectedError):
+            publication.publish_nowait({})
+
+
 async def test_iteration_ends_with_the_subscription_or_the_client():
     async def read(subscription: Any) -> list[int]:
         return [message.msg["n"] async for message in subscription]
@@ -344,6 +362,11 @@ async def test_a_server_that_takes_nothing_more():
             await waiting[3]
         with pytest.raises(SlowPeerError, match="a call of /s"):
             await ros.call("/s", timeout=0.1)
+        assert publication.must_wait
+        with pytest.raises(SlowPeerError, match="does not keep up: a message of /a would have to wait"):
+            publication.publish_nowait({"n": 9})
+        with pytest.raises(SlowPeerError, match="did not take a message of /a"):
+            await publication.ready(timeout=0.1)
         fake.thaw()
         await asyncio.wait_for(asyncio.gather(*waiting[:3]), 20)
         await fake.wait_for_op("publish", count=sent + 3)
