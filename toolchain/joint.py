@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
+from itertools import combinations, pairwise
 from typing import TYPE_CHECKING, Final, TypeAlias
 
 import numpy as np
@@ -165,7 +165,8 @@ class Question:
             ModelError: The question has no such form (says which known symbols are joined by which path), is
                 impossible, or needs a table above the limit.
         """
-        factors = _relevant([_without_idle(factor) for factor in self.joint.factors], self._asked())
+        observed = [symbol.name for symbol in self.observed]
+        factors, terms = self._factors(observed)
         searched = [symbol.name for symbol in self.searched]
         sizes = {symbol.name: symbol.size for symbol in self.joint.symbols}
         lines = math.prod(symbol.size for symbol in self.searched)
@@ -176,27 +177,55 @@ class Question:
                 f"most is {MAX_ENTRIES}: search fewer variables"
             )
             raise ModelError(message)
-        terms = [
-            reduced(Term(tuple(symbol.name for symbol in factor.scope), factor.table), self.given)
-            for factor in factors
-        ]
         links = _Links(terms, factors, {*searched, *self.given})
-        links.check_independent([symbol.name for symbol in self.observed], self.searched)
+        if links.joined(observed):
+            raise self._refusal(observed)
         own: dict[str, list[Term]] = {symbol.name: [] for symbol in self.observed}
         common: list[Term] = []
         for component in links.components():
             here = [term for term in terms if component.intersection(term.scope)]
-            observed = component.intersection(own)
-            left = eliminate(here, component - observed, sizes)
-            if observed:
-                own[observed.pop()] += left
+            kept = component.intersection(own)
+            left = eliminate(here, component - kept, sizes)
+            if kept:
+                own[kept.pop()] += left
             else:
                 common += left
         common += [term for term in terms if set(term.scope) <= set(searched)]
         return self._fusion(own, product(common, searched, sizes).ravel(), sizes)
 
-    def _asked(self) -> set[str]:
-        return {symbol.name for symbol in (*self.searched, *self.observed)} | set(self.given)
+    def _factors(self, observed: Sequence[str]) -> tuple[list[Factor], list[Term]]:
+        """Return what matters for some observed symbols, and the same as terms with what is given put in."""
+        asked = {symbol.name for symbol in self.searched} | set(observed) | set(self.given)
+        factors = _relevant([_without_idle(factor) for factor in self.joint.factors], asked)
+        terms = [
+            reduced(Term(tuple(symbol.name for symbol in factor.scope), factor.table), self.given)
+            for factor in factors
+        ]
+        return factors, terms
+
+    def _refusal(self, observed: Sequence[str]) -> ModelError:
+        """Return why this is no naive fusion: two observed symbols, the shortest path between them, and a way out.
+
+        Where not all are independent, some two are not, whatever the others do (d-separation has this property).
+        """
+        cut = {symbol.name for symbol in self.searched} | set(self.given)
+        found: tuple[list[str], str] | None = None
+        for one, other in combinations(observed, 2):
+            factors, terms = self._factors([one, other])
+            links = _Links(terms, factors, cut)
+            path = links.path(one, other)
+            if path and (found is None or len(path) < len(found[0])):
+                found = path, links.drawn(path)
+        if found is None:  # then the observed ones would not be joined
+            raise AssertionError
+        path, drawn = found
+        ends = f"{path[0]} or {path[-1]}"
+        way_out = f"search {path[1]} too, or leave {ends} out" if len(path) > 2 else f"leave {ends} out"
+        names = ", ".join(each.name for each in self.searched)
+        return ModelError(
+            f"{path[0]} and {path[-1]} are not independent given {names}: {drawn} joins them; {way_out} of the known "
+            "variables"
+        )
 
     def _fusion(
         self, own: Mapping[str, Sequence[Term]], weight: NDArray[np.float64], sizes: Mapping[str, int]
@@ -300,26 +329,13 @@ class _Links:
             left = {name: None for name in left if name not in component}
         return found
 
-    def check_independent(self, observed: Sequence[str], searched: Sequence[Symbol]) -> None:
-        """Refuse two observed symbols that are joined.
+    def joined(self, observed: Sequence[str]) -> bool:
+        """Return whether two of some symbols are joined."""
+        return any(len(component.intersection(observed)) > 1 for component in self.components())
 
-        Raises:
-            ModelError: Names them, the shortest path between them, and what would cut it.
-        """
-        others = set(observed)
-        for name in observed:
-            paths = self._paths_from(name)
-            joined = [paths[other] for other in observed if other != name and other in paths]
-            if not joined:
-                continue
-            path = min(joined, key=len)
-            between = [each for each in path[1:-1] if each not in others]
-            cut = f"search {between[0]} too, or leave" if between else "leave"
-            message = (
-                f"{path[0]} and {path[-1]} are not independent given {', '.join(each.name for each in searched)}: "
-                f"{self._drawn(path)} joins them; {cut} {path[0]} or {path[-1]} out of the known variables"
-            )
-            raise ModelError(message)
+    def path(self, start: str, end: str) -> list[str]:
+        """Return the shortest path between two symbols; empty where they are not joined."""
+        return self._paths_from(start).get(end, [])
 
     def _paths_from(self, start: str) -> dict[str, list[str]]:
         paths = {start: [start]}
@@ -332,7 +348,8 @@ class _Links:
                     waiting.append(other)
         return paths
 
-    def _drawn(self, path: Sequence[str]) -> str:
+    def drawn(self, path: Sequence[str]) -> str:
+        """Return a path as arrows; a common child stands between its two parents."""
         text = path[0]
         for before, after in pairwise(path):
             factor = self._neighbours[before][after]

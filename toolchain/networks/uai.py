@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -13,18 +13,20 @@ from toolchain.networks.scanner import Scanner
 if TYPE_CHECKING:
     from toolchain.networks.builder import NetworkBuilder
 
-_MAX_FACTORS = 4 * MAX_VARIABLES
+_MAX_FACTORS: Final = 4 * MAX_VARIABLES
+_COMMENTS: Final = r"#[^\n]*|(?m:^c\b[^\n]*)"
 
 
 def read_uai(data: bytes, builder: NetworkBuilder) -> None:
     """Read a UAI file: a preamble (kind, sizes, each factor's variables), then each factor's numbers.
 
-    A factor's last variable is the fastest in its numbers; in a BAYES file it is the child.
+    A factor's last variable is the fastest in its numbers; in a BAYES file it is the child. (pyagrum 3.3.1 writes the
+    first parent fastest, against the format's definition.)
 
     Raises:
         NetworkFileError: It is none; says the line and what was expected there.
     """
-    text = Scanner(data, builder.path)
+    text = Scanner(data, builder.path, comments=_COMMENTS)
     kind = text.word("BAYES or MARKOV")
     if kind not in {"BAYES", "MARKOV"}:
         raise text.error(f"{kind[:40]!r} stands where BAYES or MARKOV is expected")
