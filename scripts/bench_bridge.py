@@ -1,0 +1,541 @@
+"""rosbridge clients beside each other on one hub, and the hub beside a double of the reference server's design.
+
+A bare socket, which encodes and decodes nothing, is at the other end of whatever is measured:
+published: client -> hub -> bare socket.   received: bare socket -> hub -> client.   round trip: client -> hub -> client.
+All in one run and in turns, so that a noisy machine is noisy for all.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import base64
+import json
+import os
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Awaitable, Callable, Iterator
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+from conformance import install_roslib, install_roslibpy
+from processes import ROOT, Process, run_script
+from rich.console import Console
+from rich.table import Table
+
+from services.errors import ServiceError
+
+Result = TypeVar("Result")
+
+HERE = Path(__file__).resolve().parent
+TYPE = "std_msgs/Float64MultiArray"
+PATIENCE = 30.0
+SMALL, LARGE = 6, 1024
+SIZES = (1, 4, 16, 64, 256, 1024, 4096)
+TURNS = 3
+IN_FLIGHT = 32
+"""Messages under way when servers are compared."""
+WINDOW = {SMALL: 400, LARGE: 100}
+"""Messages that a receiving client may be behind, by their values: less than the hub would drop for it."""
+COUNTS = {SMALL: (4000, 4000, 300), LARGE: (300, 600, 100)}
+"""By values of a message: how many are published, received and sent round in a turn."""
+PER_SIZE = 40
+SERVER_MESSAGES = {"hub": 40_000, "Tornado double": 5_000}
+
+
+class Bare(asyncio.Protocol):
+    """A WebSocket client that costs next to nothing: frames are made once, and only counted when they come."""
+
+    def __init__(self) -> None:
+        self.ready: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self.count = 0
+        self.on_frames: Callable[[int, bytes], None] | None = None
+        self._rest = b""
+        self._transport: asyncio.Transport
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Ask for a WebSocket."""
+        self._transport = cast("asyncio.Transport", transport)
+        key = base64.b64encode(os.urandom(16)).decode()
+        lines = ["GET / HTTP/1.1", "Host: localhost", "Upgrade: websocket", "Connection: Upgrade"]
+        lines += [f"Sec-WebSocket-Key: {key}", "Sec-WebSocket-Version: 13", "", ""]
+        self._transport.write("\r\n".join(lines).encode())
+
+    def data_received(self, data: bytes) -> None:
+        """Count whole frames; ``on_frames`` gets how many came and the last one's payload."""
+        data = self._rest + data
+        if not self.ready.done():
+            head, separator, data = data.partition(b"\r\n\r\n")
+            if not separator:
+                self._rest = head
+                return
+            self.ready.set_result(None)
+        at = came = 0
+        last = b""
+        while len(data) - at >= 2:
+            length, body = data[at + 1], at + 2
+            if length >= 126:
+                body += 2 if length == 126 else 8
+                length = int.from_bytes(data[at + 2 : body], "big") if body <= len(data) else len(data)
+            if body + length > len(data):
+                break
+            if data[at] & 15 in {1, 2}:
+                came += 1
+                last = data[body : body + length]
+            at = body + length
+        self._rest = data[at:]
+        self.count += came
+        if came and self.on_frames is not None:
+            self.on_frames(came, last)
+
+    def send(self, frames: bytes) -> None:
+        """Send frames made before."""
+        self._transport.write(frames)
+
+    def close(self) -> None:
+        """Hang up."""
+        self._transport.abort()
+
+
+async def soon(awaited: Awaitable[Result], what: str) -> Result:
+    """Wait for it, with an end to patience.
+
+    Raises:
+        ServiceError: it did not come.
+    """
+    try:
+        async with asyncio.timeout(PATIENCE):
+            return await awaited
+    except TimeoutError:
+        msg = f"{what} did not come within {PATIENCE:.0f} s"
+        raise ServiceError(msg) from None
+
+
+def frame(operation: dict[str, Any]) -> bytes:
+    """A masked frame (with a mask of zeros)."""
+    payload = json.dumps(operation, separators=(",", ":")).encode()
+    size = len(payload)
+    if size < 126:
+        header = bytes((0x81, 0x80 | size))
+    elif size < 1 << 16:
+        header = b"\x81\xfe" + size.to_bytes(2, "big")
+    else:
+        header = b"\x81\xff" + size.to_bytes(8, "big")
+    return header + bytes(4) + payload
+
+
+@asynccontextmanager
+async def bare(uri: str) -> Any:
+    """A bare client of a server."""
+    host, _, port = uri.removeprefix("ws://").rpartition(":")
+    _, client = await asyncio.get_running_loop().create_connection(Bare, host, int(port))
+    try:
+        await soon(client.ready, f"the connection to {uri}")
+        yield client
+    finally:
+        client.close()
+
+
+async def settled(client: Bare) -> None:
+    """Back when the server has done all that this client sent before."""
+    answered: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+    client.on_frames = lambda _count, _last: None if answered.done() else answered.set_result(None)
+    client.send(frame({"op": "call_service", "id": "s", "service": "/rosapi/get_time", "args": {}}))
+    await soon(answered, "the answer to a call")
+    client.on_frames = None
+
+
+def message_of(values: int) -> dict[str, list[float]]:
+    """Numbers as sensors have them, all digits used."""
+    return {"data": [(at + 1) / 7.0 for at in range(values)]}
+
+
+# --- servers
+
+
+async def server_rate(uri: str, count: int) -> float:
+    """Messages of 64 bytes a second from one bare client to another, 32 in flight."""
+    loop = asyncio.get_running_loop()
+    async with bare(uri) as publisher, bare(uri) as subscriber:
+        subscriber.send(frame({"op": "subscribe", "topic": "/load", "type": TYPE, "queue_length": 1000}))
+        await settled(subscriber)
+        publisher.send(frame({"op": "advertise", "topic": "/load", "type": TYPE}))
+        await settled(publisher)
+        one = frame({"op": "publish", "topic": "/load", "msg": {"data": [0.5, 12.25, 7.0]}})
+        done: asyncio.Future[None] = loop.create_future()
+        subscriber.count, sent = 0, IN_FLIGHT
+
+        def again(came: int, _last: bytes) -> None:
+            nonlocal sent
+            more = min(came, count - sent)
+            sent += more
+            if more:
+                publisher.send(one * more)
+            if subscriber.count >= count and not done.done():
+                done.set_result(None)
+
+        subscriber.on_frames = again
+        started = time.perf_counter()
+        publisher.send(one * IN_FLIGHT)
+        await soon(done, f"the last message through {uri}")
+        return count / (time.perf_counter() - started)
+
+
+# --- clients
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A client to be measured: its name, how it is started, in which forms it takes messages."""
+
+    name: str
+    command: tuple[str, ...]
+    environment: dict[str, str] = field(default_factory=dict)
+    forms: tuple[str, ...] = ("none", "cbor")
+
+
+class Child:
+    """A client under measurement, in a process of its own."""
+
+    def __init__(self, kind: Kind, process: asyncio.subprocess.Process) -> None:
+        self.kind = kind
+        self._process = process
+
+    async def answer(self) -> Any:
+        """The next line that is an answer."""
+        assert self._process.stdout is not None
+        while True:
+            line = await soon(self._process.stdout.readline(), f"an answer of {self.kind.name}")
+            if not line:
+                msg = f"{self.kind.name} ended in the middle of a measurement"
+                raise ServiceError(msg)
+            try:
+                return json.loads(line)
+            except ValueError:
+                continue  # what the library itself prints
+
+    def tell(self, **command: Any) -> None:
+        """Begin a measurement."""
+        assert self._process.stdin is not None
+        self._process.stdin.write(json.dumps(command).encode() + b"\n")
+
+
+@asynccontextmanager
+async def child_of(kind: Kind, uri: str) -> Any:
+    """Start a client, and end it."""
+    process = await asyncio.create_subprocess_exec(
+        *kind.command,
+        uri,
+        env=os.environ | kind.environment,
+        stdin=asyncio.subprocess.PIPE,
+        stdout=asyncio.subprocess.PIPE,
+        limit=1 << 20,
+    )
+    try:
+        child = Child(kind, process)
+        await child.answer()
+        yield child
+    finally:
+        if process.returncode is None:
+            process.kill()
+        await process.wait()
+
+
+async def published(child: Child, uri: str, topic: str, values: int, count: int) -> float:
+    """Messages a second that the client gets out."""
+    async with bare(uri) as counter:
+        counter.send(frame({"op": "subscribe", "topic": topic, "type": TYPE, "queue_length": 1000}))
+        await settled(counter)
+        last: asyncio.Future[float] = asyncio.get_running_loop().create_future()
+
+        def look(_came: int, payload: bytes) -> None:
+            if b"-1" in payload[-16:] and not last.done():
+                last.set_result(time.perf_counter())
+
+        counter.on_frames, counter.count = look, 0
+        started = time.perf_counter()
+        child.tell(do="publish", topic=topic, values=values, count=count)
+        ended = await soon(last, f"the last message that {child.kind.name} published")
+        await child.answer()
+        return float(counter.count / (ended - started))
+
+
+async def received(child: Child, uri: str, topic: str, values: int, count: int, form: str) -> float:
+    """Messages a second that the client takes in."""
+    async with bare(uri) as publisher:
+        publisher.send(frame({"op": "advertise", "topic": topic, "type": TYPE}))
+        publisher.send(frame({"op": "subscribe", "topic": f"{topic}/heard", "type": TYPE}))
+        await settled(publisher)
+        child.tell(do="receive", topic=topic, count=count, compression=form)
+        await child.answer()
+        one, sent = frame({"op": "publish", "topic": topic, "msg": message_of(values)}), 0
+
+        def send_until(limit: int) -> None:
+            nonlocal sent
+            more = min(limit, count) - sent
+            if more > 0:
+                sent += more
+                publisher.send(one * more)
+
+        publisher.on_frames = lambda _came, last: send_until(
+            int(json.loads(last)["msg"]["data"][0]) + WINDOW[values]
+        )
+        started = time.perf_counter()
+        send_until(WINDOW[values])
+        await child.answer()
+        return count / (time.perf_counter() - started)
+
+
+async def round_trips(child: Child, topic: str, values: int, count: int, form: str) -> list[float]:
+    """Microseconds of round trips, one after the other."""
+    child.tell(do="round_trip", topic=topic, values=values, count=count, compression=form)
+    times: list[float] = (await child.answer())["us"]
+    return times[count // 10 :]  # the first ones warm up
+
+
+def kinds() -> list[Kind]:
+    """All clients; installs those of other projects where they are missing."""
+    python = str(install_roslibpy() / "venv" / "bin" / "python")
+    roslibpy = (python, str(HERE / "bench_bridge_roslibpy.py"))
+    return [
+        Kind("ours", (sys.executable, str(HERE / "bench_bridge_ours.py"))),
+        *(
+            Kind(f"roslibpy, {transport}", roslibpy, {"ROSLIBPY_TRANSPORT": transport}, ("none",))
+            for transport in ("twisted", "asyncio")
+        ),
+        Kind("roslib, Node", ("node", str(HERE / "bench_bridge_roslib.mjs"), str(install_roslib()))),
+    ]
+
+
+def topics() -> Iterator[str]:
+    """A new topic for each measurement."""
+    number = 0
+    while True:
+        number += 1
+        yield f"/bench/turn{number}"
+
+
+# --- everything
+
+
+def codec() -> dict[str, float]:
+    """Microseconds to write and read 1024 doubles: the standard library's JSON, and CBOR as client and hub have it."""
+    import numpy as np
+
+    from bridge import cbor_codec
+
+    message = {"op": "publish", "topic": "/t", "msg": message_of(LARGE)}
+    as_array = message | {"msg": {"data": np.array(message_of(LARGE)["data"])}}
+
+    def best_of(work: Callable[[], object]) -> float:
+        times = []
+        for _ in range(300):
+            started = time.perf_counter_ns()
+            work()
+            times.append((time.perf_counter_ns() - started) / 1e3)
+        return statistics.median(times)
+
+    return {
+        "json": best_of(lambda: json.loads(json.dumps(message))),
+        "cbor": best_of(lambda: cbor_codec.decode(cbor_codec.encode(as_array), arrays="numpy")),
+    }
+
+
+async def bench(arguments: argparse.Namespace) -> int:
+    """Measure everything, print the tables, write the picture and the JSON."""
+    clients, found = kinds(), Figures()
+    with tempfile.TemporaryDirectory(prefix="rosbayes-bench-") as folder:
+        hub, tornado = (Process(name, Path(folder, name)) for name in ("hub", "tornado"))
+        try:
+            await hub.start("hub", "--port", "0")
+            await tornado.start(clients[1].command[0], str(HERE / "bench_bridge_tornado.py"))
+            uris = {
+                "hub": (await hub.line(r"ws://\S+"))[0],
+                "Tornado double": (await tornado.line(r"ws://\S+"))[0],
+            }
+            for _ in range(TURNS):
+                for name, uri in uris.items():
+                    found.servers.setdefault(name, []).append(await server_rate(uri, SERVER_MESSAGES[name]))
+            await tornado.end()
+            await measure_clients(clients, uris["hub"], found)
+        finally:
+            await asyncio.gather(hub.end(), tornado.end())
+    found.codec = codec()
+    summary = found.summary()
+    show(summary)
+    picture = ROOT / "out" / "bridge-round-trip.png"
+    if draw(summary["round_trip_us_by_values"], picture):
+        print(f"round trips by size: {picture.relative_to(ROOT)}")
+    if arguments.json is not None:
+        arguments.json.write_text(json.dumps(summary, indent=2) + "\n")
+    return 0
+
+
+@dataclass
+class Figures:
+    """All that was measured, by client, form and number of values."""
+
+    servers: dict[str, list[float]] = field(default_factory=dict)
+    published: dict[tuple[str, int], list[float]] = field(default_factory=dict)
+    received: dict[tuple[str, str, int], list[float]] = field(default_factory=dict)
+    times: dict[tuple[str, str, int], list[float]] = field(default_factory=dict)
+    by_size: dict[tuple[str, str], dict[int, list[float]]] = field(default_factory=dict)
+    codec: dict[str, float] = field(default_factory=dict)
+
+    def summary(self) -> dict[str, Any]:
+        """Medians, and the ratios that were aimed at."""
+        median = statistics.median
+        rows = [
+            {
+                "client": name,
+                "form": form,
+                "values": values,
+                "published_per_s": median(self.published[name, values]) if form == "none" else None,
+                "received_per_s": median(rates),
+                "round_trip_us": median(self.times[name, form, values]),
+                "round_trip_p99_us": sorted(self.times[name, form, values])[
+                    int(0.99 * len(self.times[name, form, values]))
+                ],
+            }
+            for (name, form, values), rates in self.received.items()
+        ]
+        servers = {name: median(rates) for name, rates in self.servers.items()}
+        return {
+            "servers_per_s": servers,
+            "clients": rows,
+            "codec_us": self.codec,
+            "ratios": self.ratios()
+            | {
+                "hub to Tornado double": servers["hub"] / servers["Tornado double"],
+                "CBOR to stdlib json, 1024 doubles": self.codec["cbor"] / self.codec["json"],
+            },
+            "round_trip_us_by_values": {
+                f"{name}, {'CBOR' if form == 'cbor' else 'JSON'}": {
+                    str(values): median(times) for values, times in sizes.items()
+                }
+                for (name, form), sizes in self.by_size.items()
+            },
+        }
+
+    def ratios(self) -> dict[str, float]:
+        """This project's client against the better of roslibpy's transports."""
+        median, theirs = (
+            statistics.median,
+            [name for name, _ in self.published if name.startswith("roslibpy")],
+        )
+        found = {}
+        for values in (SMALL, LARGE):
+            out = max(median(self.published[name, values]) for name in theirs)
+            into = max(median(self.received[name, "none", values]) for name in theirs)
+            trip = min(median(self.times[name, "none", values]) for name in theirs)
+            found[f"published, {values} values"] = median(self.published["ours", values]) / out
+            found[f"received, {values} values"] = median(self.received["ours", "none", values]) / into
+            found[f"round trip, {values} values"] = median(self.times["ours", "none", values]) / trip
+            found[f"received as CBOR, {values} values"] = median(self.received["ours", "cbor", values]) / into
+            found[f"round trip as CBOR, {values} values"] = median(self.times["ours", "cbor", values]) / trip
+        return found
+
+
+async def measure_clients(clients: list[Kind], uri: str, found: Figures) -> None:
+    """All measurements of clients, in turns; a client's process lives for one turn."""
+    names = topics()
+    for turn in range(TURNS):
+        for kind in clients:
+            async with child_of(kind, uri) as child:
+                for values, (out, into, trips) in COUNTS.items():
+                    rate = await published(child, uri, next(names), values, out)
+                    found.published.setdefault((kind.name, values), []).append(rate)
+                    for form in kind.forms:
+                        key = kind.name, form, values
+                        rate = await received(child, uri, next(names), values, into, form)
+                        found.received.setdefault(key, []).append(rate)
+                        times = await round_trips(child, next(names), values, trips, form)
+                        found.times.setdefault(key, []).extend(times)
+                if turn:
+                    continue
+                for form in kind.forms:
+                    found.by_size[kind.name, form] = {
+                        values: await round_trips(child, next(names), values, PER_SIZE, form)
+                        for values in SIZES
+                    }
+
+
+def show(summary: dict[str, Any]) -> None:
+    """The tables on standard output."""
+    out = Console() if sys.stdout.isatty() else Console(width=110)
+    servers = Table(title=f"messages of 64 bytes a second, {IN_FLIGHT} in flight")
+    servers.add_column("server")
+    servers.add_column("per second", justify="right")
+    for name, rate in summary["servers_per_s"].items():
+        servers.add_row(name, f"{rate:,.0f}")
+    out.print(servers)
+    table = Table(title="clients on the hub (float64 values in a message; medians)")
+    for column in ("client", "form", "values", "published/s", "received/s", "round trip us", "99 % us"):
+        table.add_column(column, justify="left" if column in {"client", "form"} else "right")
+    for row in sorted(summary["clients"], key=lambda row: row["values"]):
+        form = "CBOR" if row["form"] == "cbor" else "JSON"
+        rate = "" if row["published_per_s"] is None else f"{row['published_per_s']:,.0f}"
+        figures = (
+            f"{row['received_per_s']:,.0f}",
+            f"{row['round_trip_us']:,.0f}",
+            f"{row['round_trip_p99_us']:,.0f}",
+        )
+        table.add_row(row["client"], form, str(row["values"]), rate, *figures)
+    out.print(table)
+    ratios = Table(title="ratios (ours to the better of roslibpy's transports, where nothing else is said)")
+    ratios.add_column("of what")
+    ratios.add_column("ratio", justify="right")
+    for name, ratio in summary["ratios"].items():
+        ratios.add_row(name, f"{ratio:.2f}")
+    out.print(ratios)
+    print(
+        "The Tornado double is this project's own: the reference server's design without ROS, and so without its cost."
+    )
+
+
+def draw(by_values: dict[str, dict[str, float]], path: Path) -> bool:
+    """Round-trip time against message size, as a picture; False without matplotlib."""
+    try:
+        import matplotlib as mpl
+    except ImportError:
+        print("no picture: install matplotlib (pip install 'rosbayes[pictures]')", file=sys.stderr)
+        return False
+    mpl.use("Agg")
+    from matplotlib import pyplot as plt
+
+    figure, axes = plt.subplots(figsize=(7, 4.5), layout="constrained")
+    for name, times in by_values.items():
+        style = "--" if name.endswith("CBOR") else "-"
+        axes.plot([int(values) for values in times], list(times.values()), style, marker="o", label=name)
+    axes.set(
+        xscale="log",
+        yscale="log",
+        xlabel="float64 values in a message",
+        ylabel="round trip client, hub, client (us, median)",
+        xticks=SIZES,
+        xticklabels=[str(size) for size in SIZES],
+    )
+    axes.minorticks_off()
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize="small")
+    path.parent.mkdir(exist_ok=True)
+    figure.savefig(path, dpi=150)
+    return True
+
+
+def main() -> int:
+    """Read the flags and measure."""
+    parser = argparse.ArgumentParser(
+        prog="scripts/bench bridge", description="rosbridge clients and servers side by side."
+    )
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write all figures")
+    arguments = parser.parse_args()
+    return run_script(lambda: bench(arguments), 300)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

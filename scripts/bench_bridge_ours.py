@@ -1,0 +1,93 @@
+"""This project's client under measurement: commands of scripts/bench bridge on standard input, answers on standard output."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import sys
+import time
+from typing import Any
+
+import numpy as np
+import uvloop
+
+from bridge.client import Ros, connect
+
+PATIENCE = 60
+TYPE = "std_msgs/Float64MultiArray"
+ACK_EVERY = 50
+#: Messages that leave together where they are published as fast as it goes.
+TOGETHER = 50
+
+
+def message_of(count: int) -> dict[str, Any]:
+    """Numbers as sensors have them, all digits used; as an array where they are many."""
+    values = (np.arange(count) + 1) / 7.0
+    return {"data": values if count > 16 else values.tolist()}
+
+
+async def publish(ros: Ros, topic: str, values: int, count: int) -> dict[str, Any]:
+    """Publish as fast as it goes; the last message says so."""
+    publisher = await ros.advertise(topic, TYPE)
+    message = message_of(values)
+    for _ in range(count):
+        await publisher.publish(message)
+    await publisher.publish({"data": [-1.0]})
+    return {}
+
+
+async def receive(ros: Ros, topic: str, count: int, compression: Any) -> dict[str, Any]:
+    """Hear so many messages; every now and then say how many there were."""
+    acks = await ros.advertise(topic + "/heard", TYPE)
+    arrays: Any = "numpy" if compression == "cbor" else "list"
+    listener = ros.subscribe(
+        topic, TYPE, queue_length=1000, queue_size=1000, compression=compression, arrays=arrays
+    )
+    await ros.call("/rosapi/get_time")
+    tell("ready")
+    total = 0.0
+    for seen in range(1, count + 1):
+        message = await listener.next(PATIENCE)
+        total += message.msg["data"][-1]
+        if seen % ACK_EVERY == 0:
+            await acks.publish({"data": [seen]})
+    return {"sum": float(total)}
+
+
+async def round_trip(ros: Ros, topic: str, values: int, count: int, compression: Any) -> dict[str, Any]:
+    """Publish a message and hear it again, one after the other; microseconds of each."""
+    publisher = await ros.advertise(topic, TYPE)
+    arrays: Any = "numpy" if compression == "cbor" else "list"
+    listener = ros.subscribe(topic, TYPE, compression=compression, arrays=arrays)
+    await ros.call("/rosapi/get_time")
+    message, times = message_of(values), []
+    for _ in range(count):
+        started = time.perf_counter_ns()
+        await publisher.publish(message)
+        await listener.next(PATIENCE)
+        times.append((time.perf_counter_ns() - started) / 1e3)
+    await listener.close()
+    await publisher.close()
+    return {"us": times}
+
+
+def tell(answer: object) -> None:
+    """One line of JSON."""
+    print(json.dumps(answer), flush=True)
+
+
+async def main() -> None:
+    """Do what each line says until there is none."""
+    do = {"publish": publish, "receive": receive, "round_trip": round_trip}
+    lines = asyncio.StreamReader()
+    await asyncio.get_running_loop().connect_read_pipe(lambda: asyncio.StreamReaderProtocol(lines), sys.stdin)
+    async with connect(sys.argv[1]) as ros:
+        tell("connected")
+        while line := await lines.readline():
+            command = json.loads(line)
+            tell(await do[command.pop("do")](ros, **command))
+
+
+if __name__ == "__main__":
+    with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
+        runner.run(main())
