@@ -165,6 +165,7 @@ class Session:
         self.unusable = 0
         self.statuses: deque[StatusReceived] = deque(maxlen=KEPT_STATUSES)
         self._status_at = 0.0
+        self._said = 0
         self.receivers: dict[int, Callable[[Message], None]] = {}
         self.on_blind: set[Callable[[float], None]] = set()
         self.servers: dict[str, Server] = {}
@@ -500,11 +501,13 @@ class Session:
             case StatusReceived():
                 self.statuses.append(event)
                 self._status_at = time.monotonic()
-                level = logging.WARNING if event.level in {"error", "warning"} else logging.INFO
-                _log.log(level, "%s says (%.20s): %.500s", self.uri, event.level, event.text)
+                self._said += 1
+                if self._said <= KEPT_STATUSES or self._said & (self._said - 1) == 0:
+                    level = logging.WARNING if event.level in {"error", "warning"} else logging.INFO
+                    _log.log(level, "%s says (%.20s): %.500s", self.uri, event.level, event.text)
             case Unusable():
                 self.unusable += 1
-                # The 1st, 2nd, 4th, 8th ...: a server that goes mad does not fill the log.
+                # The 1st, 2nd, 4th, 8th ...: a server that goes mad does not fill the log (as with statuses).
                 if self.unusable & (self.unusable - 1) == 0:
                     _log.warning("%s, %d so far: %s", self.uri, self.unusable, event.reason)
             case _:
