@@ -1,11 +1,12 @@
-"""A double of the reference server's design, for scripts/bench bridge: Tornado, threads, json for every message.
+"""A double of the reference server's design, for scripts/bench bridge: Tornado, threads, json, a message class per type.
 
-It is no rosbridge_suite: that needs ROS. It does what costs there and leaves out the rest, which is all in its favour:
-no conversion to ROS messages and back, no ROS transport in between, no checks. As in the reference server, a connection
-has a queue that a thread of its own empties; the thread parses a message, and writes it anew for every subscriber; what
-is written is handed to Tornado's loop, which alone may touch the sockets.
+It is no rosbridge_suite: that needs ROS. What a message passes through there is done here too, for one type of message:
+Tornado reads it; a queue takes it to a thread of its connection, which parses it and fills a message object, every
+field checked against its type; the message is serialised and goes through a socket, as between ROS nodes; the
+subscription's thread reads it, makes a message object, takes the values out of it again and writes them as JSON;
+Tornado's loop, which alone may touch the connections, is handed the text. All else is left out, in the double's favour.
 
-Prints the port it listens at. Runs in an environment with Tornado, so it imports nothing of this project.
+Prints its URI. Runs in an environment with Tornado, so it imports nothing of this project.
 """
 
 from __future__ import annotations
@@ -13,20 +14,100 @@ from __future__ import annotations
 import asyncio
 import json
 import queue
+import socket
+import struct
 import threading
 from collections import defaultdict
-from typing import Any
+from typing import Any, ClassVar
 
 import tornado.ioloop
 import tornado.web
 import tornado.websocket
 
-subscribers: dict[str, list[Connection]] = defaultdict(list)
+
+class Message:
+    """A ROS message: its fields by name, with their types."""
+
+    fields: ClassVar[dict[str, str]] = {}
+
+    def __init__(self) -> None:
+        """Give every field its default."""
+        for name, kind in self.fields.items():
+            setattr(self, name, [] if kind.endswith("[]") else "" if kind == "string" else 0)
+            if kind in TYPES:
+                setattr(self, name, TYPES[kind]())
+
+
+class Dimension(Message):
+    """std_msgs/MultiArrayDimension."""
+
+    fields: ClassVar[dict[str, str]] = {"label": "string", "size": "uint32", "stride": "uint32"}
+
+
+class Layout(Message):
+    """std_msgs/MultiArrayLayout."""
+
+    fields: ClassVar[dict[str, str]] = {"dim": "Dimension[]", "data_offset": "uint32"}
+
+
+class Float64MultiArray(Message):
+    """std_msgs/Float64MultiArray."""
+
+    fields: ClassVar[dict[str, str]] = {"layout": "Layout", "data": "float64[]"}
+
+
+TYPES: dict[str, type[Message]] = {"Dimension": Dimension, "Layout": Layout}
+PYTHON_TYPES = {"string": (str,), "uint32": (int,), "float64": (int, float)}
+
+
+def filled(message: Message, values: dict[str, Any]) -> Message:
+    """Fill a message with what came as JSON; a value that does not fit its type is an error."""
+    for name, value in values.items():
+        setattr(message, name, fitting(message.fields[name], value))
+    return message
+
+
+def fitting(kind: str, value: Any) -> Any:
+    """A value of a field's type."""
+    if kind.endswith("[]"):
+        return [fitting(kind[:-2], item) for item in value]
+    if kind in TYPES:
+        return filled(TYPES[kind](), value)
+    if not isinstance(value, PYTHON_TYPES[kind]):
+        raise TypeError(kind)
+    return value
+
+
+def taken_out(value: Any) -> Any:
+    """What a message holds, for JSON."""
+    if isinstance(value, Message):
+        return {name: taken_out(getattr(value, name)) for name in value.fields}
+    if isinstance(value, list):
+        return [taken_out(item) for item in value]
+    return value
+
+
+def serialised(message: Any) -> bytes:
+    """A Float64MultiArray (without dimensions) as ROS 1 sends it."""
+    data = message.data
+    body = struct.pack(f"<III{len(data)}d", 0, message.layout.data_offset, len(data), *data)
+    return struct.pack("<I", len(body)) + body
+
+
+def deserialised(body: bytes) -> Message:
+    """The message of these bytes."""
+    message: Any = Float64MultiArray()
+    _, message.layout.data_offset, count = struct.unpack_from("<III", body)
+    message.data = list(struct.unpack_from(f"<{count}d", body, 12))
+    return message
+
+
+subscribers: dict[str, list[socket.socket]] = defaultdict(list)
 lock = threading.Lock()
 
 
 class Connection(tornado.websocket.WebSocketHandler):
-    """One client: a queue, and the thread that empties it."""
+    """One client: a queue, the thread that empties it, and a thread for each of its subscriptions."""
 
     def open(self, *_args: str) -> None:
         """Start the thread."""
@@ -40,11 +121,7 @@ class Connection(tornado.websocket.WebSocketHandler):
         self.incoming.put(message)
 
     def on_close(self) -> None:
-        """Forget the client, and end its thread."""
-        with lock:
-            for those in subscribers.values():
-                if self in those:
-                    those.remove(self)
+        """End the thread."""
         self.incoming.put(None)
 
     def check_origin(self, _origin: str) -> bool:
@@ -57,17 +134,27 @@ class Connection(tornado.websocket.WebSocketHandler):
             self.perform(json.loads(message))
 
     def perform(self, operation: dict[str, Any]) -> None:
-        """Know the two operations that are measured, and answer calls."""
+        """Know the operations that are measured with, and answer calls."""
         if operation["op"] == "publish":
+            data = serialised(filled(Float64MultiArray(), operation["msg"]))
             with lock:
                 those = list(subscribers[operation["topic"]])
             for each in those:
-                each.send({"op": "publish", "topic": operation["topic"], "msg": operation["msg"]})
+                each.sendall(data)
         elif operation["op"] == "subscribe":
+            mine, theirs = socket.socketpair()
             with lock:
-                subscribers[operation["topic"]].append(self)
+                subscribers[operation["topic"]].append(theirs)
+            threading.Thread(target=self.listen, args=(mine, operation["topic"]), daemon=True).start()
         elif operation["op"] == "call_service":
             self.send({"op": "service_response", "id": operation.get("id"), "values": {}, "result": True})
+
+    def listen(self, source: socket.socket, topic: str) -> None:
+        """Pass on what comes on a topic."""
+        reader = source.makefile("rb")
+        while size := reader.read(4):
+            message = deserialised(reader.read(struct.unpack("<I", size)[0]))
+            self.send({"op": "publish", "topic": topic, "msg": taken_out(message)})
 
     def send(self, operation: dict[str, Any]) -> None:
         """Write it here, have the loop send it."""

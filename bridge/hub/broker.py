@@ -241,7 +241,10 @@ def _more_brackets(data: bytes, limit: int) -> bool:
     if len(data) < _LARGE:
         return data.count(b"{") + data.count(b"[") > limit
     found = 0
-    for bracket in (b"{", b"["):  # to jump from one to the next is much faster than to count where there are few
+    for bracket in (
+        b"{",
+        b"[",
+    ):  # to jump from one to the next is much faster than to count where there are few
         at = data.find(bracket)
         while at >= 0 and found <= limit:
             found += 1

@@ -3,6 +3,7 @@
 A message is written once in each form, however many subscribers want it.
 """
 
+from functools import lru_cache
 from typing import Any, Final, Literal
 
 import orjson
@@ -33,6 +34,8 @@ def json_prefix(name: str) -> bytes:
     return b'{"op":"publish","topic":"%b","msg":' % name.encode()
 
 
+#: Objects and arrays within each other in what the hub itself has read: more than it takes.
+_DEEPEST: Final = 256
 #: Bytes around a topic's name and a message's JSON.
 AROUND: Final = len(json_prefix("")) + 1
 
@@ -89,21 +92,32 @@ class Message:
             if len(wrapped) > self._max_size:
                 raise RefusedError(f"a message of {name} as PNG has more than {self._max_size} bytes")
             return wrapped
-        from bridge.cbor_codec import encode
+        import cbor2
 
         if self.parsed is None:
             self.parsed = orjson.loads(self.data)
         if compression == "cbor-raw":
             seconds, nanoseconds = divmod(self._time_ns, 10**9)
-            raw = {
-                "secs": seconds,
-                "nsecs": nanoseconds,
-                "bytes": self._definitions.serialise(self._type, self.parsed),
-            }
-            return encode({"op": "publish", "topic": name, "msg": raw}, max_size=self._max_size)
-        typed = self._definitions.typed(self._type, self.parsed)
-        return encode(
-            {"op": "publish", "topic": name, "msg": self.parsed if typed is None else typed},
-            max_size=self._max_size,
-            pack_floats=typed is None,
-        )
+            serialised = self._definitions.serialise(self._type, self.parsed)
+            msg = cbor2.dumps({"secs": seconds, "nsecs": nanoseconds, "bytes": serialised})
+        else:
+            typed = self._definitions.typed(self._type, self.parsed)
+            if typed is None:
+                from bridge.cbor_codec import encode
+
+                msg = encode(self.parsed, max_size=self._max_size, max_depth=_DEEPEST, pack_floats=True)
+            else:  # of JSON, typed arrays and bytes: nothing that needs a second look
+                msg = cbor2.dumps(typed)
+        payload = _cbor_prefix(name) + msg
+        if len(payload) > self._max_size:
+            raise RefusedError(f"a message of {name} as CBOR has more than {self._max_size} bytes")
+        return payload
+
+
+@lru_cache(maxsize=1024)
+def _cbor_prefix(name: str) -> bytes:
+    """The beginning of a message of topic ``name`` as CBOR: a map of three, its last value yet to come."""
+    import cbor2
+
+    dumps = cbor2.dumps
+    return b"\xa3" + b"".join(map(dumps, ("op", "publish", "topic", name, "msg")))
