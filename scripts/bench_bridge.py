@@ -493,7 +493,7 @@ def show(summary: dict[str, Any]) -> None:
         ratios.add_row(name, f"{ratio:.2f}")
     out.print(ratios)
     print(
-        "The Tornado double is this project's own: the reference server's design without ROS, and so without its cost."
+        "The Tornado double is this project's own: the reference server's design for one type, without the rest of ROS."
     )
 
 
