@@ -1,0 +1,389 @@
+"""One network in four formats is one joint distribution; whatever else a file holds is one sentence with its line.
+
+Dog problem (Charniak 1991): family-out -> light-on, family-out and bowel-problem -> dog-out -> hear-bark.
+"""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from toolchain.distribution import Potential
+from toolchain.errors import NetworkFileError
+from toolchain.fusion import exact_posterior
+from toolchain.networks import MAX_BYTES, is_network, read_network
+from toolchain.symbol import IntegerType, LabelType
+
+BIF = """\
+// The dog problem, in BIF
+network "dog problem" { property "credit Charniak; 1991" ; }
+variable family-out { type discrete [ 2 ] { true, false }; property position = (1, 2) ; }
+variable bowel-problem { type discrete[2] { "true" false }; }
+variable dog-out { type discrete [ 2 ] { true, false }; }
+variable light-on { type discrete [ 2 ] { true, false }; }
+variable hear-bark { type discrete [ 3 ] { <5, >=5, n/a }; }
+probability ( family-out ) { table 0.15, 0.85; }
+probability ( bowel-problem ) { table 0.01 0.99; } /* no commas
+  here, and a comment of two lines: " { */
+probability ( dog-out | bowel-problem, family-out ) {
+  table 0.99 0.97 0.9 0.3 0.01 0.03 0.1 0.7;
+}
+probability ( light-on | family-out ) {
+  (true) 0.6, 0.4;
+  default 0.05, 0.95;
+}
+probability ( hear-bark | dog-out ) {
+  (false) 0.01, 0.98, 0.01;
+  (true) 0.7, 2e-1, .1;
+}
+"""
+
+XMLBIF = """\
+<?xml version="1.0" encoding="US-ASCII"?>
+<!DOCTYPE BIF [
+  <!ELEMENT BIF ( NETWORK )*>
+  <!ATTLIST BIF VERSION CDATA #REQUIRED>
+]>
+<BIF VERSION="0.3"><NETWORK><NAME>Dog-Problem</NAME>
+<VARIABLE TYPE="nature"><NAME>family-out</NAME><OUTCOME>true</OUTCOME><OUTCOME>false</OUTCOME></VARIABLE>
+<VARIABLE TYPE="nature"><NAME>bowel-problem</NAME><OUTCOME>true</OUTCOME><OUTCOME>false</OUTCOME>
+  <PROPERTY>position = (1, 2)</PROPERTY></VARIABLE>
+<DEFINITION><FOR>dog-out</FOR><GIVEN>bowel-problem</GIVEN><GIVEN>family-out</GIVEN>
+  <TABLE>0.99 0.01 <!-- bowel true, family out --> 0.97 0.03 0.9 0.1 0.3 0.7</TABLE></DEFINITION>
+<VARIABLE TYPE="nature"><NAME>dog-out</NAME><OUTCOME>true</OUTCOME><OUTCOME>false</OUTCOME></VARIABLE>
+<VARIABLE TYPE="nature"><NAME>light-on</NAME><OUTCOME>true</OUTCOME><OUTCOME>false</OUTCOME></VARIABLE>
+<VARIABLE TYPE="nature"><NAME>hear-bark</NAME><OUTCOME>&lt;5</OUTCOME><OUTCOME>>=5</OUTCOME>
+  <OUTCOME>n/a</OUTCOME></VARIABLE>
+<DEFINITION><FOR>family-out</FOR><TABLE>0.15 0.85</TABLE></DEFINITION>
+<DEFINITION><FOR>bowel-problem</FOR><TABLE>0.01 0.99</TABLE></DEFINITION>
+<DEFINITION><FOR>light-on</FOR><GIVEN>family-out</GIVEN><TABLE>0.6 0.4 0.05 0.95</TABLE></DEFINITION>
+<DEFINITION><FOR>hear-bark</FOR><GIVEN>dog-out</GIVEN><TABLE>0.7 2e-1 .1 0.01 0.98 0.01</TABLE></DEFINITION>
+</NETWORK></BIF>
+"""
+
+NET = """\
+% The dog problem, in Hugin's format
+net { node_size = (80 40); comment = "a } in a string"; }
+node family_out { states = ("true" "false"); label = "50% out"; position = (100 100); }
+node bowel_problem { states = ("true" "false"); }
+discrete node dog_out { states = ( "true" "false" ); subtype = boolean; }
+node light_on { states = ("true" "false"); }
+node hear_bark { states = ("<5" ">=5" "n/a"); }
+potential ( family_out ) { data = ( 0.15 0.85 ); }
+potential ( bowel_problem | ) { data = ( 0.01 0.99 ); }
+potential ( dog_out | bowel_problem family_out )
+{ data = ((( 0.99 0.01 )   % bowel_problem=true, family_out=true
+           ( 0.97 0.03 ))
+          (( 0.9 0.1 )
+           ( 0.3 0.7 ))); }
+potential ( light_on | family_out ) { data = ((0.6 0.4)(0.05 0.95)); experience = (1 2); }
+potential ( hear_bark | dog_out ) { data = ((0.7 0.2 0.1)(0.01 0.98 0.01)); }
+"""
+
+UAI = """\
+BAYES
+5
+2 2 2 2 3
+5
+1 0  # family-out
+1 1
+3 1 0 2
+2 0 3
+2 2 4
+2  0.15 0.85
+2  0.01 0.99
+8
+0.99 0.01 0.97 0.03
+0.9 0.1 0.3 0.7
+4  0.6 0.4 0.05 0.95
+6  0.7 0.2 0.1 0.01 0.98 0.01
+"""
+
+TEXTS = {"dog.bif": BIF, "dog.xmlbif": XMLBIF, "dog.net": NET, "dog.uai": UAI}
+NAMES = ("family-out", "bowel-problem", "dog-out", "light-on", "hear-bark")
+
+
+def read(folder, name, text):
+    path = folder / name
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    return read_network(path)
+
+
+def names_in(file):
+    """The variables' names as the format can write them."""
+    if file.endswith(".uai"):
+        return ("0", "1", "2", "3", "4")
+    return tuple(name.replace("-", "_") for name in NAMES) if file.endswith(".net") else NAMES
+
+
+@pytest.mark.parametrize("file", TEXTS)
+def test_the_same_network_in_every_format(tmp_path, file):
+    joint = read(tmp_path, file, TEXTS[file])
+    names = names_in(file)
+    assert {symbol.name for symbol in joint.symbols} == set(names)
+    factors = {factor.symbol.name: factor for factor in joint.factors}
+    family, bowel, dog, light, bark = (factors[name] for name in names)
+    assert family.table.tolist() == [0.15, 0.85]
+    assert bowel.table.tolist() == [0.01, 0.99]
+    assert [symbol.name for symbol in dog.given] == [names[1], names[0]]
+    assert dog.table == pytest.approx(np.array([[[0.99, 0.97], [0.9, 0.3]], [[0.01, 0.03], [0.1, 0.7]]]))
+    assert light.table == pytest.approx(np.array([[0.6, 0.05], [0.4, 0.95]]))
+    assert bark.table == pytest.approx(np.array([[0.7, 0.01], [0.2, 0.98], [0.1, 0.01]]))
+    labels = IntegerType(0, 2) if file.endswith(".uai") else LabelType("<5", ">=5", "n/a")
+    assert joint.symbol(names[4]).type == labels
+    # P(family-out | light-on, hear-bark): the two are independent given family-out, and so this is a BM1's
+    model = joint.ask([names[0]], [names[3], names[4]]).model()
+    out, at_home = 0.01 * 0.99 + 0.99 * 0.9, 0.01 * 0.97 + 0.99 * 0.3  # P(dog-out | family-out, or not)
+    odds = (
+        0.15 * 0.6 * (0.7 * out + 0.01 * (1 - out)) / (0.85 * 0.05 * (0.7 * at_home + 0.01 * (1 - at_home)))
+    )
+    assert exact_posterior(model, [0, 0])[0] == pytest.approx(odds / (1 + odds))
+
+
+def test_names_of_networks(tmp_path):
+    assert read(tmp_path, "dog.bif", BIF).name == "dog problem"
+    assert read(tmp_path, "dog.xmlbif", XMLBIF).name == "Dog-Problem"
+    assert read(tmp_path, "dog.net", NET).name == "dog"
+    assert read(tmp_path, "dog.bif", BIF.replace('"dog problem"', "unknown")).name == "dog"
+
+
+def test_rounded_probabilities_are_divided_by_their_sum(tmp_path):
+    text = BIF.replace("0.15, 0.85", "0.15, 0.849")
+    assert read(tmp_path, "dog.bif", text).factors[0].table.sum() == pytest.approx(1, abs=1e-15)
+
+
+def test_a_hugin_class_and_a_network_without_names(tmp_path):
+    text = "class Dogs {\ninheritance = ();\n" + NET.split("\n", 2)[2] + "}\n"
+    assert read(tmp_path, "dog.net", text).name == "Dogs"
+
+
+def test_a_markov_network(tmp_path):
+    joint = read(tmp_path, "m.uai", "c a comment\nMARKOV 3\n2 2 2\n2\n2 0 1\n2 1 2\n4 1 2 3 4\n4\n5 6 7 8\n")
+    assert all(isinstance(factor, Potential) for factor in joint.factors)
+    assert joint.factors[1].table.tolist() == [[5, 6], [7, 8]]
+    assert joint.ask(["1"], ["0", "2"]).model().prior_distribution == pytest.approx([44 / 134, 90 / 134])
+
+
+def changed(file, old, new):
+    assert old in TEXTS[file], old
+    return file, TEXTS[file].replace(old, new, 1)
+
+
+MISTAKES = [
+    (
+        *changed("dog.bif", "variable dog-out", "varable dog-out"),
+        5,
+        "'varable' stands where network, variable",
+    ),
+    (*changed("dog.bif", "[ 3 ]", "[ 4 ]"), 7, "hear-bark is to have 4 states, but 3 are named"),
+    (*changed("dog.bif", "[ 3 ]", "[ three ]"), 7, "'three' stands where the number of states"),
+    (*changed("dog.bif", "{ <5, >=5, n/a }", "{ a, a, b }"), 7, "names that differ"),
+    (
+        *changed("dog.bif", "variable light-on", "variable dog-out"),
+        6,
+        "the variable 'dog-out' is there twice",
+    ),
+    (
+        *changed("dog.bif", "table 0.15, 0.85", "table 0.15, x0.85"),
+        8,
+        "'x0.85' in the table of family-out is no number",
+    ),
+    (
+        *changed("dog.bif", "table 0.15, 0.85", "table 0.15, 1_0"),
+        8,
+        "'1_0' in the table of family-out is no number",
+    ),
+    (
+        *changed("dog.bif", "table 0.15, 0.85", "table 0.15, 0.84, 0.01"),
+        8,
+        "has more than 2 numbers, expected 2",
+    ),
+    (*changed("dog.bif", "table 0.15, 0.85", "table 0.15"), 8, "has 1 numbers, expected 2"),
+    (*changed("dog.bif", "table 0.15, 0.85", "table 0.15, 0.35"), 8, "of family-out sum to 0.5"),
+    (*changed("dog.bif", "table 0.15, 0.85", "table -0.15, 1.15"), 8, "no probability"),
+    (
+        *changed("dog.bif", "table 0.15, 0.85", "table nan, 0.85"),
+        8,
+        "1 of the 1 rows of family-out are not given",
+    ),
+    (*changed("dog.bif", "table 0.15, 0.85", "table inf, 0.85"), 8, "no probability"),
+    (*changed("dog.bif", "default 0.05, 0.95;", ""), 17, "1 of the 2 rows of light-on are not given"),
+    (
+        *changed("dog.bif", "(false) 0.01", "(maybe) 0.01"),
+        19,
+        "dog-out is never 'maybe'; expected true, false",
+    ),
+    (
+        *changed("dog.bif", "(true) 0.7, 2e-1, .1", "(false) 0.7, 0.2, 0.1"),
+        20,
+        "hear-bark has two rows for (false)",
+    ),
+    (*changed("dog.bif", "(true) 0.7", "(true, true) 0.7"), 20, "2 states for the 1 parents"),
+    (
+        *changed("dog.bif", "| dog-out )", "| cat-out )"),
+        18,
+        "there is no variable 'cat-out' before this line",
+    ),
+    (
+        *changed("dog.bif", "bowel-problem, family-out", "family-out, family-out"),
+        11,
+        "names a variable twice",
+    ),
+    (
+        *changed("dog.bif", "probability ( light-on |", "probability ( dog-out |"),
+        17,
+        "dog-out has two tables",
+    ),
+    (*changed("dog.bif", "/* no commas", "/* */ /* no commas"), None, None),
+    (*changed("dog.bif", 'lines: " { */', "lines:"), 9, "this comment is not closed"),
+    (*changed("dog.bif", '"dog problem"', '"dog problem'), 2, "'credit' stands where '{' is expected"),
+    ("dog.bif", BIF + "probability ( ", 22, "the end of the file stands where a variable's name is expected"),
+    ("dog.bif", BIF.rstrip()[:-3] + "\n", 21, "the end of the file stands where ';' is expected"),
+    ("dog.bif", "", None, "the file has no variables"),
+    ("dog.bif", BIF.split("probability", 1)[0], None, "family-out has no table"),
+    ("dog.bif", BIF.encode() + b"\xff", 22, "not UTF-8 text"),
+    (
+        *changed(
+            "dog.bif",
+            "probability ( family-out ) { table 0.15, 0.85; }",
+            "probability ( family-out | dog-out ) { default 0.5, 0.5; }",
+        ),
+        None,
+        "is a circle",
+    ),
+    (*changed("dog.xmlbif", "<NAME>light-on</NAME>", "<NAME>dog-out</NAME>"), 13, "'dog-out' is there twice"),
+    (
+        *changed("dog.xmlbif", "0.15 0.85", "0.15 0.8.5"),
+        17,
+        "'0.8.5' in the table of family-out is no number",
+    ),
+    (*changed("dog.xmlbif", "0.15 0.85", "0.15"), 16, "the table of family-out has 1 numbers, expected 2"),
+    (*changed("dog.xmlbif", "<FOR>family-out</FOR>", ""), 16, "there are 0 elements FOR, expected one"),
+    (*changed("dog.xmlbif", "<FOR>family-out</FOR>", "<FOR>x</FOR>"), 16, "there is no variable 'x'"),
+    (*changed("dog.xmlbif", 'TYPE="nature"', 'TYPE="decision"'), 7, "a variable of the type 'decision'"),
+    (*changed("dog.xmlbif", "</BIF>", ""), 21, "no element found"),
+    (*changed("dog.xmlbif", "<BIF ", "<HTML "), 6, "the file is 'HTML'"),
+    (*changed("dog.xmlbif", "US-ASCII", "nonsense"), 1, "encoding"),
+    (
+        *changed("dog.xmlbif", "<!ELEMENT BIF ( NETWORK )*>", '<!ENTITY a "aaaaaaaaaa">'),
+        3,
+        "the entity 'a': a network needs none, and none is read",
+    ),
+    (
+        *changed("dog.xmlbif", "<!ELEMENT BIF ( NETWORK )*>", '<!ENTITY e SYSTEM "file:///etc/passwd">'),
+        3,
+        "the entity 'e'",
+    ),
+    (
+        *changed(
+            "dog.xmlbif", "<!ELEMENT BIF ( NETWORK )*>", '<!ENTITY % p SYSTEM "http://127.0.0.1/x"> %p;'
+        ),
+        3,
+        "the entity 'p'",
+    ),
+    ("dog.xmlbif", "<BIF>" * 40, 1, "more than 16 deep"),
+    ("dog.xmlbif", "<html/>", 1, "the file is 'html', expected BIF"),
+    (
+        *changed("dog.net", "node light_on", "utility light_on"),
+        6,
+        "a utility node: only discrete chance nodes",
+    ),
+    (
+        *changed("dog.net", 'states = ("true" "false"); label', "label"),
+        3,
+        "the node family_out has no states",
+    ),
+    (*changed("dog.net", "data = ( 0.15 0.85 );", ""), 8, "the potential of family_out has no data"),
+    (*changed("dog.net", "( 0.15 0.85 )", "( 0.15 0.85 0.1 )"), 8, "more than 2 numbers, expected 2"),
+    (*changed("dog.net", "dog_out | bowel", "dog_out bowel"), 10, "'bowel_problem' stands where '|' or ')'"),
+    ("dog.net", NET + "class A { class B {", 17, "'B' stands where '=' is expected"),
+    (*changed("dog.uai", "BAYES", "BAYESIAN"), 1, "'BAYESIAN' stands where BAYES or MARKOV is expected"),
+    (*changed("dog.uai", "3 1 0 2", "3 1 0 5"), 7, "'5' stands where a variable, 0 to 4, is expected"),
+    (
+        *changed("dog.uai", "8\n0.99", "9\n0.99"),
+        12,
+        "factor 2 is to have 9 entries, but its variables make 8",
+    ),
+    (*changed("dog.uai", "0.98 0.01\n", "0.98\n"), 17, "factor 4 has 5 numbers, expected 6"),
+    ("dog.uai", UAI + "7", 17, "'7' stands after the last factor"),
+    ("dog.uai", "BAYES 1 99999999", 1, "'99999999' stands where a variable's size"),
+    ("dog.uai", "BAYES 3 60000 60000 2 1 3 0 1 2", 1, "a table of 7200000000 entries"),
+    ("dog.uai", "MARKOV 2 2 2 1 1 0 2 1 1", None, "1 has no table"),
+    ("dog.uai", "MARKOV 1 2 1 1 0 2 1 -1", 1, "negative, infinite or NaN"),
+]
+
+
+@pytest.mark.parametrize(("file", "text", "line", "sentence"), MISTAKES)
+def test_mistakes_are_one_sentence_with_the_line(tmp_path, file, text, line, sentence):
+    if sentence is None:
+        read(tmp_path, file, text)
+        return
+    with pytest.raises(NetworkFileError) as caught:
+        read(tmp_path, file, text)
+    said = str(caught.value)
+    where = f"{tmp_path / file}" + (f", line {line}: " if line else ": ")
+    assert said.startswith(where), said
+    assert sentence in said
+    assert "\n" not in said
+    assert caught.value.exit_code == 2
+
+
+def test_files_that_are_none(tmp_path):
+    with pytest.raises(NetworkFileError, match="nowhere.bif can't be read: No such file"):
+        read_network(tmp_path / "nowhere.bif")
+    with pytest.raises(NetworkFileError, match=r"dog.csv is no network .* expected a name that ends in .bif"):
+        read(tmp_path, "dog.csv", BIF)
+    assert is_network(Path("a/B.BIF"))
+    assert not is_network(Path("a/model.py"))
+
+
+def test_a_file_above_the_limit(tmp_path):
+    path = tmp_path / "long.bif"
+    with path.open("wb") as file:
+        file.truncate(MAX_BYTES + 1)
+    with pytest.raises(NetworkFileError, match="larger than 33554432 bytes"):
+        read_network(path)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "/*" * 400_000,
+        '"' * 400_000,
+        "network a {" + "(" * 400_000,
+        "variable a { type discrete [ 2 ] { " + "a " * 400_000,
+        "probability ( a | " + "b, " * 400_000,
+        "a" * 800_000,
+        BIF + "probability ( dog-out ) { table " + "1 " * 400_000 + "; }",
+    ],
+    ids=["comments", "quotes", "brackets", "states", "parents", "word", "numbers"],
+)
+def test_long_nonsense_is_refused_without_taking_long(tmp_path, text):
+    with pytest.raises(NetworkFileError) as caught:
+        read(tmp_path, "long.bif", text)
+    assert len(str(caught.value)) < 600 + len(str(tmp_path))
+
+
+@settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    st.sampled_from(sorted(TEXTS)),
+    st.data(),
+)
+def test_a_damaged_file_is_read_or_refused(tmp_path, file, data):
+    text = TEXTS[file].encode()
+    at = data.draw(st.integers(0, len(text) - 1))
+    length = data.draw(st.integers(0, 40))
+    put = data.draw(
+        st.binary(max_size=6) | st.sampled_from([b"", b"{", b"}", b"(", b")", b";", b'"', b"|", b"<", b"9"])
+    )
+    damaged = text[:at] + put + text[at + length :]
+    if data.draw(st.booleans()):
+        damaged = damaged[: data.draw(st.integers(0, len(damaged)))]
+    try:
+        read(tmp_path, file, damaged)
+    except NetworkFileError as error:
+        assert re.match(re.escape(str(tmp_path / file)), str(error))
+        assert "\n" not in str(error)
