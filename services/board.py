@@ -153,8 +153,9 @@ class BoardProcesses:
                 continue
             break
         for pid in self._started:
-            with contextlib.suppress(ProcessLookupError):
+            with contextlib.suppress(ProcessLookupError, ChildProcessError):
                 os.kill(pid, signal.SIGKILL)
+                os.waitpid(pid, 0)  # while it is not gone, its sockets answer
         for at in range(len(self._endpoints)):
             self._forget(self._endpoints[at])
         if self._run_directory is not None:
