@@ -81,6 +81,12 @@ def decode(
     return message
 
 
+class _Bytes(bytes):
+    """The content of a typed array of bytes until all is read: no tag around it takes it for its own content."""
+
+    __slots__ = ()
+
+
 class _Tags(dict[int, _Decoder]):
     """What is made of each tag: typed arrays of those that stand here, nothing of all others."""
 
@@ -107,7 +113,7 @@ def _list(tag: int) -> _Decoder:
         if type(value) is not bytes or len(value) % size:
             raise DecodeError(f"a typed array (tag {tag}) has no whole number of {size}-byte elements")
         if code == "B":
-            return value
+            return _Bytes(value)
         numbers = array(code, value)
         if byteorder == "big":
             numbers.byteswap()
@@ -154,6 +160,8 @@ def _check(message: dict[str, Any], arrays: Arrays, data: bytes) -> None:
             elif kind is bytes:
                 if from_bytes is not None:
                     container[key] = from_bytes(value, False)
+            elif kind is _Bytes:
+                container[key] = bytes(value)
             elif kind is cbor2.CBORSimpleValue or value is cbor2.undefined:
                 raise DecodeError(f"a message with a value that has no meaning arrived: {excerpt(data)}")
 

@@ -46,7 +46,7 @@ class Field:
         self.place: Place | None = parse_path(name) if self._is_path else None
         if not self._is_path and _STEP.fullmatch(name) is None:
             raise PathError(
-                f"{name!r} is no name of a field: letters, digits and _ (example: D1), or a path "
+                f"{name[:MAX_SHOWN]!r} is no name of a field: letters, digits and _ (example: D1), or a path "
                 "(examples: pose.position.x, ranges[3])"
             )
 
@@ -167,7 +167,7 @@ def parse_path(path: str) -> Place:
         # A dot stands before every name but the first, and before nothing else.
         if step is None or (step[1] is not None) != (at > start or not steps):
             raise PathError(
-                f"the path {path!r} breaks at character {at + 1}: it must be names joined by dots with "
+                f"the path {path[:MAX_SHOWN]!r} breaks at character {at + 1}: it must be names joined by dots with "
                 "indices in brackets (examples: pose.position.x, ranges[3])"
             )
         steps.append(step[1] if step[1] is not None else int(step[2]))

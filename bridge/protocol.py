@@ -565,7 +565,8 @@ class ClientCore:
             operation["id"] = wire_id
         data = encode(operation, nonfinite="refuse", max_size=self._max_size, max_depth=self._max_depth)
         del self._requests[ticket]
-        self._outbox.append(data)
+        if self.connected:
+            self._outbox.append(data)
 
     # Receiving
 

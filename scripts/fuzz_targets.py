@@ -1,0 +1,488 @@
+"""What is fuzzed: each target takes any bytes and fails if the bridge does what it must never do.
+
+A target reads its input as a little program (`Source`), so that one input says what is asked of the client, what a
+server says, in which form, and when the connection breaks. `scripts/fuzz` plays them under atheris; tests/bridge
+plays them with generated input, and every input that ever failed (tests/bridge/findings).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from bridge import cbor_codec, fields, json_codec, png
+from bridge.arrays import with_arrays, with_lists
+from bridge.errors import BridgeError, DecodeError, EncodeError, PathError
+from bridge.events import (
+    CallAnswered,
+    GoalEnded,
+    GoalFeedback,
+    MessageReceived,
+    ServiceRequested,
+    StatusReceived,
+    Unusable,
+)
+from bridge.fragments import Reassembler, split
+from bridge.protocol import MAX_CALLS, MAX_GOALS, MAX_REQUESTS, ClientCore, Delivery
+from bridge.qos import Qos
+from bridge.serialised import MessageTypes
+
+LONGEST_SENTENCE = 700
+"""Characters of an error's sentence: what arrived is quoted, not repeated."""
+MAX_SIZE, MAX_DEPTH = 4096, 8
+TOPICS = ("/a", "b", "/a/b")
+DELIVERIES = (
+    Delivery(),
+    Delivery(compression="cbor"),
+    Delivery(compression="cbor", arrays="numpy"),
+    Delivery(compression="cbor-raw"),
+    Delivery(compression="png", fragment_size=7),
+    Delivery(arrays="numpy", qos=Qos(depth=1)),
+)
+OPS = (
+    "publish",
+    "service_response",
+    "call_service",
+    "status",
+    "action_feedback",
+    "action_result",
+    "fragment",
+    "png",
+    "bogus",
+)
+ODD = (
+    None,
+    True,
+    0,
+    -1,
+    3,
+    1.5,
+    1e300,
+    2**63,
+    2**70,
+    "",
+    "x",
+    "/a",
+    "9",
+    "\ud800",
+    [],
+    [1.5, None],
+    [[[]]],
+    {},
+    {"a": [1]},
+)
+EVENTS = (
+    MessageReceived,
+    CallAnswered,
+    ServiceRequested,
+    StatusReceived,
+    GoalFeedback,
+    GoalEnded,
+    Unusable,
+)
+TYPES = ("sensor_msgs/LaserScan", "std_msgs/String", "std_msgs/Float64MultiArray", "tf2_msgs/TFMessage")
+
+
+class Source:
+    """Bytes as a program: choices, numbers and pieces until they end; then everything is 0 and empty."""
+
+    def __init__(self, data: bytes) -> None:
+        self._data = data
+        self._at = 0
+
+    def __bool__(self) -> bool:
+        return self._at < len(self._data)
+
+    def byte(self) -> int:
+        """The next byte."""
+        self._at += 1
+        return self._data[self._at - 1] if self._at <= len(self._data) else 0
+
+    def pick(self, choices: Any) -> Any:
+        """One of some."""
+        return choices[self.byte() % len(choices)]
+
+    def piece(self) -> bytes:
+        """Up to 255 of the next bytes."""
+        size = self.byte()
+        self._at += size
+        return self._data[self._at - size : self._at]
+
+    def rest(self) -> bytes:
+        """All that is left."""
+        rest, self._at = self._data[self._at :], len(self._data)
+        return rest
+
+
+def check_sentence(error: BridgeError) -> None:
+    """An error is one line for a person, whatever caused it."""
+    said = str(error)
+    assert said
+    assert "\n" not in said
+    assert len(said) <= LONGEST_SENTENCE, len(said)
+
+
+def check_plain(value: Any, *, finite: bool, depth: int) -> None:
+    """A message holds nothing but what a ROS message has."""
+    assert depth >= 0
+    if isinstance(value, dict):
+        for key, part in value.items():
+            assert type(key) is str
+            check_plain(part, finite=finite, depth=depth - 1)
+    elif isinstance(value, list):
+        for part in value:
+            check_plain(part, finite=finite, depth=depth - 1)
+    elif type(value) is float:
+        assert math.isfinite(value) or not finite
+    else:
+        assert value is None or type(value) in {str, int, bool, bytes, np.ndarray}, type(value)
+
+
+def fuzz_json(data: bytes) -> None:
+    """JSON in: an object of plain values or one sentence; what was read can be written and read again."""
+    try:
+        message = json_codec.decode(data, max_size=MAX_SIZE, max_depth=MAX_DEPTH)
+    except DecodeError as error:
+        check_sentence(error)
+        return
+    assert type(message) is dict
+    assert len(data) <= MAX_SIZE
+    check_plain(message, finite=True, depth=MAX_DEPTH)
+    written = json_codec.encode(message, nonfinite="refuse", max_size=100 * MAX_SIZE, max_depth=MAX_DEPTH)
+    assert json_codec.decode(written, max_size=100 * MAX_SIZE, max_depth=MAX_DEPTH) == message
+    as_text = json_codec.decode(data.decode("utf-8"), max_size=MAX_SIZE, max_depth=MAX_DEPTH)
+    assert as_text == message
+    with_lists(with_arrays(message))
+
+
+def fuzz_cbor(data: bytes) -> None:
+    """CBOR in: a map of plain values or one sentence, as lists and as arrays alike; and out again."""
+    forms: dict[str, Any] = {}
+    for arrays in ("list", "numpy"):
+        try:
+            forms[arrays] = cbor_codec.decode(
+                data, max_size=MAX_SIZE, max_depth=MAX_DEPTH, arrays="list" if arrays == "list" else "numpy"
+            )
+        except DecodeError as error:
+            check_sentence(error)
+    assert len(forms) in {0, 2}
+    if not forms:
+        return
+    for message in forms.values():
+        check_plain(message, finite=False, depth=MAX_DEPTH + 1)
+    for pack in (False, True):
+        written = cbor_codec.encode(forms["list"], max_size=100 * MAX_SIZE, pack_floats=pack)
+        again = cbor_codec.decode(written, max_size=100 * MAX_SIZE)
+        assert pack or repr(again) == repr(forms["list"])
+    assert repr(with_lists(forms["numpy"])) == repr(forms["list"])
+
+
+def fuzz_png(data: bytes) -> None:
+    """A picture in: some bytes within the limit or one sentence; and every message comes out of its own."""
+    try:
+        found = png.decode(data.decode("latin-1"), max_size=MAX_SIZE)
+        assert len(found) <= 16 * MAX_SIZE
+    except DecodeError as error:
+        check_sentence(error)
+    assert png.decode(png.encode(data[:MAX_SIZE]), max_size=2 * MAX_SIZE).startswith(data[:MAX_SIZE])
+
+
+def fuzz_fragments(data: bytes) -> None:
+    """Fragments in any order and number: bounded in every way; a message comes out only as it was cut."""
+    source = Source(data)
+    box = Reassembler(max_size=64, max_sets=3, max_age=10)
+    now = 0.0
+    while source:
+        now += source.byte() / 16
+        fragment = {
+            "id": source.pick((0, 1, "a", None, True)),
+            "num": source.pick((0, 1, 2, 3, "1", "0x1", 2.0, -1, 1.5, None, math.nan)),
+            "total": source.pick((1, 2, 3, 2.5, "3", 0, -1, 1e9, math.inf, None)),
+            "data": source.pick(("", "a", "b" * 30, "c" * 70, None, 5)),
+        }
+        try:
+            whole = box.take(fragment, now)
+            assert whole is None or len(whole) <= 64
+        except DecodeError as error:
+            check_sentence(error)
+        assert len(box) <= 3
+        assert 0 <= box.waiting_bytes <= 4 * (64 + 128)
+        assert (box.waiting_bytes == 0) == (len(box) == 0)
+
+
+def fuzz_fields(data: bytes) -> None:
+    """Any path in any message: a value or nothing, and a sentence that says why."""
+    source = Source(data)
+    name = source.piece().decode("utf-8", "replace")
+    try:
+        field = fields.Field(name)
+        message = json_codec.decode(source.rest(), max_size=MAX_SIZE)
+    except (PathError, DecodeError) as error:
+        check_sentence(error)
+        return
+    for form in (message, with_arrays(message)):
+        try:
+            present, _value = field.value(form)
+            said = "" if present else str(field.missing(form))
+        except BridgeError as error:
+            said = str(error)
+        assert "\n" not in said
+
+
+_TYPES = MessageTypes()
+
+
+def fuzz_serialised(data: bytes) -> None:
+    """Serialised bytes in: a message of the type or one sentence."""
+    source = Source(data)
+    name = source.pick(TYPES)
+    try:
+        message = _TYPES.read(source.rest()[:MAX_SIZE], name)
+    except DecodeError as error:
+        check_sentence(error)
+    else:
+        assert type(message) is dict
+
+
+class Play:
+    """A client's core between a user and a server that may do anything."""
+
+    def __init__(self, source: Source) -> None:
+        self.source = source
+        self.core = ClientCore(
+            max_size=MAX_SIZE, max_depth=MAX_DEPTH, fragment_size=source.pick((None, 1, 50))
+        )
+        self.now = 0.0
+        self.subscriptions: set[int] = set()
+        self.advertisements: list[int] = []
+        self.calls: list[str] = []
+        self.goals: list[str] = []
+        self.tickets: list[int] = []
+
+    def run(self) -> None:
+        """Play until the input ends."""
+        steps: tuple[Callable[[], None], ...] = (
+            self.hear_raw,
+            self.hear,
+            self.hear,
+            self.hear,
+            self.connect,
+            self.core.lost,
+            self.subscribe,
+            self.unsubscribe,
+            self.advertise,
+            self.publish,
+            self.unadvertise,
+            self.call,
+            self.send_goal,
+            self.serve,
+            self.answer,
+            self.look,
+        )
+        while self.source:
+            self.now += 0.5
+            try:
+                self.source.pick(steps)()
+            except BridgeError as error:
+                check_sentence(error)
+            self.check()
+
+    def check(self) -> None:
+        """What must hold at any time."""
+        core = self.core
+        for data in core.data_to_send():
+            assert core.connected
+            assert len(data) <= MAX_SIZE
+            operation = json.loads(data, parse_constant=_no_constant)
+            assert type(operation) is dict
+            assert type(operation["op"]) is str
+            pieces = list(core.pieces(data))
+            assert pieces == [data] or all(json.loads(piece)["op"] == "fragment" for piece in pieces)
+        assert len(core._requests) <= MAX_REQUESTS  # noqa: SLF001  # no one else can see what it keeps
+        assert len(core._calls) <= MAX_CALLS  # noqa: SLF001  # as above
+        assert len(core._goals) <= MAX_GOALS  # noqa: SLF001  # as above
+        assert core._fragments.waiting_bytes <= 4 * (MAX_SIZE + 128)  # noqa: SLF001  # as above
+
+    def hear_raw(self) -> None:
+        """The server says anything."""
+        data = self.source.piece()
+        self.take(data)
+        with contextlib.suppress(UnicodeDecodeError):
+            self.take(data.decode())
+
+    def hear(self) -> None:
+        """The server says an operation, right or wrong in any of its fields, in any form."""
+        source = self.source
+        operation: dict[str, Any] = {"op": source.pick(OPS)}
+        right = {
+            "topic": source.pick(TOPICS),
+            "msg": source.pick(({}, {"a": [1.5, 2]}, {"header": {"stamp": {"sec": 1}}}, {"bytes": "x"})),
+            "id": source.pick((*self.calls[-2:], *self.goals[-2:], 7, "x")),
+            "service": source.pick(("/s", "t", "u")),
+            "values": source.pick(({}, {"a": 1}, "no")),
+            "args": {},
+            "result": bool(source.byte() % 3),
+            "status": source.byte() % 9,
+            "level": "error",
+            "num": source.byte() % 3,
+            "total": 2,
+            "data": "x",
+        }
+        for name, value in right.items():
+            choice = source.byte()
+            if choice < 200:
+                operation[name] = value
+            elif choice < 240:
+                operation[name] = source.pick(ODD)
+        if operation.get("level") == "\ud800" or "\ud800" in map(str, operation.values()):
+            return  # no server can write half a character
+        form = source.pick(("json", "json", "cbor", "fragments", "png", "both"))
+        text = json.dumps(operation).encode()
+        if form == "cbor":
+            try:
+                self.take(cbor_codec.encode(operation))
+            except EncodeError:
+                return
+        elif form == "png":
+            self.take(_picture(text))
+        elif form == "json":
+            self.take(text)
+        else:
+            for piece in split(_picture(text) if form == "both" else text, 20, "f"):
+                self.take(piece)
+
+    def take(self, data: bytes | str) -> None:
+        """Hand something to the core; whatever it is, one event or none comes of it."""
+        event = self.core.receive(data, self.now)
+        assert event is None or type(event) in EVENTS
+        if type(event) is MessageReceived:
+            assert event.subscriptions
+            assert set(event.subscriptions) <= self.subscriptions
+            assert type(event.msg) is dict
+        elif type(event) is ServiceRequested:
+            self.tickets.append(event.ticket)
+        elif type(event) is Unusable:
+            assert len(event.reason) <= LONGEST_SENTENCE
+            assert "\n" not in event.reason
+
+    def connect(self) -> None:
+        """A connection is there (again)."""
+        self.core.lost()
+        self.core.restore()
+
+    def subscribe(self) -> None:
+        """The user subscribes, perhaps as someone did otherwise before."""
+        number = self.core.subscribe(
+            self.source.pick(TOPICS),
+            self.source.pick(("p/T", "p/msg/T", None, "p/U")),
+            throttle_rate=self.source.pick((0, 0, 700, -1)),
+            delivery=self.source.pick(DELIVERIES),
+        )
+        self.subscriptions.add(number)
+
+    def unsubscribe(self) -> None:
+        """The user has enough of a topic."""
+        if self.subscriptions:
+            number = sorted(self.subscriptions)[self.source.byte() % len(self.subscriptions)]
+            self.subscriptions.remove(number)
+            self.core.unsubscribe(number)
+
+    def advertise(self) -> None:
+        """The user advertises a topic."""
+        self.advertisements.append(
+            self.core.advertise(
+                self.source.pick(TOPICS),
+                self.source.pick(("p/T", "p/msg/T", "q")),
+                latch=self.source.byte() % 2 == 0,
+            )
+        )
+
+    def publish(self) -> None:
+        """The user publishes something, which may be nothing that can be."""
+        if self.advertisements:
+            number = self.advertisements[self.source.byte() % len(self.advertisements)]
+            value = self.source.pick((*ODD, math.nan, np.arange(3.0), np.array([math.inf]), b"x", {1: 2}))
+            data = self.core.publish(number, {"value": value})
+            assert type(json.loads(data, parse_constant=_no_constant)["msg"]) is dict
+
+    def unadvertise(self) -> None:
+        """The user stops publishing."""
+        if self.advertisements:
+            self.core.unadvertise(self.advertisements.pop(self.source.byte() % len(self.advertisements)))
+
+    def call(self) -> None:
+        """The user calls a service, and perhaps waits no longer."""
+        self.calls.append(self.core.call(self.source.pick(("/s", "t")), {"x": self.source.pick(ODD)}))
+        if self.source.byte() % 4 == 0:
+            self.core.forget_call(self.calls[-1])
+
+    def send_goal(self) -> None:
+        """The user sends a goal, and perhaps cancels or forgets it."""
+        goal = self.core.send_goal("/fly", "p/Fly", {"x": self.source.pick(ODD)}, feedback=True)
+        self.goals.append(goal)
+        what = self.source.byte() % 4
+        if what == 0:
+            self.core.cancel_goal(goal)
+        elif what == 1:
+            self.core.forget_goal(goal)
+
+    def serve(self) -> None:
+        """The user serves a service, or serves it no longer."""
+        service = self.source.pick(("/s", "/t"))
+        if service in self.core._services:  # noqa: SLF001  # no one else knows
+            self.core.unadvertise_service(service)
+        else:
+            self.core.advertise_service(service, "p/T")
+
+    def answer(self) -> None:
+        """The user answers a request, perhaps one that nobody waits for any more."""
+        if self.tickets:
+            ticket = self.tickets.pop(self.source.byte() % len(self.tickets))
+            self.core.answer(ticket, {"x": self.source.pick(ODD)}, ok=self.source.byte() % 2 == 0)
+
+    def look(self) -> None:
+        """Time goes by."""
+        self.now += 20 * (self.source.byte() % 2)
+        self.core.ask_again()
+
+
+def fuzz_core(data: bytes) -> None:
+    """Any user and any server: no error but the bridge's own, nothing grows, everything sent is JSON."""
+    Play(Source(data)).run()
+
+
+def _picture(text: bytes) -> bytes:
+    return json.dumps({"op": "png", "data": png.encode(text)}).encode()
+
+
+def _no_constant(name: str) -> None:
+    raise AssertionError(f"{name} left as JSON")
+
+
+TARGETS: dict[str, Callable[[bytes], None]] = {
+    "json": fuzz_json,
+    "cbor": fuzz_cbor,
+    "png": fuzz_png,
+    "fragments": fuzz_fragments,
+    "fields": fuzz_fields,
+    "serialised": fuzz_serialised,
+    "core": fuzz_core,
+}
+
+_PUBLISH = b'{"op":"publish","topic":"/a","msg":{"data":[1.5,null,2],"deep":{"x":[{}]}}}'
+SEEDS: dict[str, tuple[bytes, ...]] = {
+    "json": (_PUBLISH, b'{"a":NaN,"b":[1e999,-Infinity,18446744073709551616],"c":"\\ud83d\\ude00"}'),
+    "cbor": (
+        cbor_codec.encode({"op": "publish", "msg": {"data": np.arange(3.0), "n": [1, "x", None, {}]}}),
+        cbor_codec.encode({"a": b"\x01\x02", "b": np.arange(3, dtype=np.int16)}),
+    ),
+    "png": (png.encode(_PUBLISH).encode(),),
+    "fields": (b"\x07a.b[10]" + _PUBLISH, b"\x01d" + _PUBLISH, b'\x04a[1]{"a":"AQID"}'),
+    "serialised": (b"\x01\0\1\0\0\x04\0\0\0abc\0", b"\x02" + bytes(24), b"\x01\x03\0\0\0abc"),
+    "core": (b"\0" + bytes(range(256)), bytes([0, 4, 6, 0, 0, 0, 1, *([1, 0] * 40)])),
+}
