@@ -138,7 +138,7 @@ def install_roslib() -> Path:
     """
     node, npm = shutil.which("node"), shutil.which("npm")
     if node is None or npm is None:
-        msg = f"roslib needs Node {OLDEST_NODE} or later with npm, which are not on PATH: install them (Debian: apt-get install nodejs npm), or leave it out with --only roslibpy"
+        msg = f"roslib needs Node {OLDEST_NODE} or later with npm, which are not on PATH: install them (Debian: apt-get install nodejs npm), or use --only roslibpy"
         raise SettingsError(msg)
     version = subprocess.run([node, "--version"], capture_output=True, text=True, check=True, timeout=30)
     if int(re.sub(r"^v(\d+).*\n", r"\1", version.stdout)) < OLDEST_NODE:

@@ -6,6 +6,7 @@ from typing import Any, Final
 
 import orjson
 
+from bridge.errors import BridgeError
 from bridge.events import GoalStatus
 from bridge.hub.calls import Asker, asker_of, note_takeover
 from bridge.hub.delivery import Delivery
@@ -86,7 +87,7 @@ class Actions:
         asker = asker_of(client, text(operation, "action"), operation)
         try:
             self._start(asker, operation)
-        except RefusedError as error:
+        except (RefusedError, BridgeError) as error:
             self._fail(asker, str(error))
 
     def _start(self, asker: Asker, operation: Operation) -> None:

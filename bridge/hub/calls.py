@@ -9,6 +9,7 @@ from typing import Any
 
 import orjson
 
+from bridge.errors import BridgeError
 from bridge.hub.delivery import Delivery, fragment_size_of
 from bridge.hub.forms import compression_of
 from bridge.hub.graph import Client, Graph, Service
@@ -126,7 +127,7 @@ class Calls:
         asker = asker_of(client, text(operation, "service"), operation)
         try:
             self._start(asker, operation, now)
-        except RefusedError as error:
+        except (RefusedError, BridgeError) as error:
             self._fail(asker, str(error))
 
     def _start(self, asker: Asker, operation: Operation, now: float) -> None:

@@ -74,7 +74,7 @@ class Definitions:
             convert = self._typed[type_name] = _message_to_typed(store, known, {})
         try:
             converted: dict[str, Any] = convert(message)
-        except (BridgeError, TypeError, ValueError, AttributeError):
+        except (BridgeError, TypeError, ValueError, AttributeError, OverflowError):
             return None
         return converted
 
@@ -92,7 +92,9 @@ class Definitions:
                 if self.ros_version == 2
                 else store.serialize_ros1(made, known)
             )
-        except (TypeError, ValueError, OverflowError, AttributeError, AssertionError) as error:
+        except (
+            Exception
+        ) as error:  # rosbags, NumPy and struct each say in their own way that a value does not fit
             raise RefusedError(f"a message does not fit its type {self.name(type_name)}: {error}") from None
         return bytes(data)
 

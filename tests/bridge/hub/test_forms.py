@@ -1,0 +1,504 @@
+"""The forms of a message that subscribers ask for: PNG, CBOR, serialised, in fragments; each written once."""
+
+import base64
+import json
+import logging
+import math
+import sys
+from typing import Any
+
+import pytest
+from rosbags.typesys import Stores, get_typestore
+
+from bridge import cbor_codec, png
+from bridge.fragments import Reassembler
+from bridge.hub import topics
+from bridge.hub.forms import Message
+from tests.bridge.hub.room import WALL_CLOCK, Guest, Room
+
+ARRAY = "std_msgs/Float64MultiArray"
+
+
+def _publisher_and_subscriber(type_name: str, ros_version: Any = 1, **wish: Any) -> tuple[Room, Guest, Guest]:
+    room = Room(ros_version=ros_version)
+    publisher, subscriber = room.enter(), room.enter()
+    publisher.advertise("/t", type_name)
+    subscriber.subscribe("/t", **wish)
+    return room, publisher, subscriber
+
+
+def _raw(guest: Guest) -> list[bytes]:
+    payloads = []
+    while (payload := guest.client.outbox.pop()) is not None:
+        payloads.append(payload)
+    return payloads
+
+
+def _whole(payloads: list[bytes]) -> bytes:
+    reassembler = Reassembler()
+    parts = [reassembler.take(json.loads(payload), 0) for payload in payloads]
+    assert parts[:-1] == [None] * (len(parts) - 1)
+    assert parts[-1] is not None
+    return parts[-1].encode()
+
+
+# --- CBOR
+
+
+def test_cbor_has_typed_arrays_of_the_types_elements() -> None:
+    room, publisher, subscriber = _publisher_and_subscriber("sensor_msgs/LaserScan", compression="cbor")
+    scan = {"ranges": [1.5, 2, None], "intensities": [], "angle_min": -1.5, "header": {"frame_id": "é"}}
+    publisher.publish("/t", scan)
+    (payload,) = _raw(subscriber)
+    msg = cbor_codec.decode(payload, arrays="numpy")["msg"]
+    assert msg["ranges"].dtype == "f4"
+    assert msg["ranges"][:2].tolist() == [1.5, 2]
+    assert math.isnan(msg["ranges"][2])
+    assert msg["intensities"].dtype == "f4"
+    assert (msg["angle_min"], msg["header"]) == (-1.5, {"frame_id": "é"})
+    room.check()
+
+
+def test_cbor_has_bytes_and_nested_arrays() -> None:
+    _, publisher, subscriber = _publisher_and_subscriber("sensor_msgs/PointCloud2", compression="cbor")
+    cloud = {"data": "AAH/", "fields": [{"name": "x", "offset": 0}], "width": 3}
+    publisher.publish("/t", cloud)
+    publisher.publish("/t", {"data": [0, 1, 255]})
+    first, second = (cbor_codec.decode(payload)["msg"] for payload in _raw(subscriber))
+    assert first == {"data": b"\x00\x01\xff", "fields": [{"name": "x", "offset": 0}], "width": 3}
+    assert second == {"data": b"\x00\x01\xff"}
+
+
+@pytest.mark.parametrize(
+    ("type_name", "message"),
+    [
+        ("boat_msgs/Sensors", {"data": [1.5, 2, None], "n": [1, 2]}),
+        (ARRAY, {"data": [1.5, 2, None], "n": [1, 2]}),  # has no field n: nothing to go by for it
+    ],
+)
+def test_of_an_unknown_field_floats_alone_are_packed(type_name: str, message: Any) -> None:
+    _, publisher, subscriber = _publisher_and_subscriber(type_name, compression="cbor")
+    publisher.publish("/t", message)
+    (payload,) = _raw(subscriber)
+    msg = cbor_codec.decode(payload, arrays="numpy")["msg"]
+    assert msg["data"].dtype == "f8"
+    assert msg["n"] == [1, 2]
+
+
+def test_a_message_that_does_not_fit_its_type_comes_as_it_is() -> None:
+    _, publisher, subscriber = _publisher_and_subscriber(ARRAY, compression="cbor")
+    publisher.publish("/t", {"data": "no array", "layout": 7})
+    assert cbor_codec.decode(_raw(subscriber)[0])["msg"] == {"data": "no array", "layout": 7}
+
+
+def test_without_rosbags_floats_are_packed_and_the_rest_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "rosbags.typesys", None)
+    _, publisher, subscriber = _publisher_and_subscriber(ARRAY, compression="cbor")
+    publisher.publish("/t", {"data": [1.5, 2.5]})
+    (payload,) = _raw(subscriber)
+    assert cbor_codec.decode(payload, arrays="numpy")["msg"]["data"].tolist() == [1.5, 2.5]
+    answer = subscriber.ask("/rosapi/message_details", {"type": ARRAY})
+    assert answer["result"] is False
+    assert "rosbags" in answer["values"]
+
+
+def test_a_latched_message_comes_in_the_form_asked_for() -> None:
+    room = Room()
+    publisher, late = room.enter(), room.enter()
+    publisher.advertise("/t", ARRAY, latch=True)
+    publisher.publish("/t", {"data": [1.5]})
+    late.subscribe("/t", compression="cbor")
+    assert late.heard() == [{"data": [1.5]}]
+
+
+# --- serialised
+
+
+@pytest.mark.parametrize("ros_version", [1, 2])
+def test_cbor_raw_is_what_ros_would_send(ros_version: Any) -> None:
+    room, publisher, subscriber = _publisher_and_subscriber(
+        "geometry_msgs/PoseStamped", ros_version, compression="cbor-raw"
+    )
+    own, other = (("secs", "nsecs"), ("sec", "nanosec"))[:: 1 if ros_version == 1 else -1]
+    for names in (own, other):
+        header = {"stamp": dict(zip(names, (12, 34), strict=True)), "frame_id": "map"}
+        publisher.publish("/t", {"header": header, "pose": {"position": {"x": 1.5, "y": 2}}})
+    payloads = _raw(subscriber)
+    store = get_typestore(Stores.ROS1_NOETIC if ros_version == 1 else Stores.ROS2_JAZZY)
+    read = store.deserialize_ros1 if ros_version == 1 else store.deserialize_cdr
+    for payload in payloads:
+        msg = cbor_codec.decode(payload)["msg"]
+        assert set(msg) == {"secs", "nsecs", "bytes"}
+        assert msg["secs"] > 1_600_000_000
+        pose: Any = read(msg["bytes"], "geometry_msgs/msg/PoseStamped")
+        assert (pose.header.stamp.sec, pose.header.stamp.nanosec) == (12, 34)
+        assert pose.header.frame_id == "map"
+        assert (pose.pose.position.x, pose.pose.position.y, pose.pose.position.z) == (1.5, 2.0, 0.0)
+    assert len(payloads) == 2
+    room.check()
+
+
+def test_arrays_are_serialised_with_their_type_and_length() -> None:
+    _, publisher, subscriber = _publisher_and_subscriber("sensor_msgs/Imu", 2, compression="cbor-raw")
+    publisher.publish("/t", {"orientation_covariance": [0.5, *[None] * 8]})
+    imu: Any = get_typestore(Stores.ROS2_JAZZY).deserialize_cdr(
+        cbor_codec.decode(_raw(subscriber)[0])["msg"]["bytes"], "sensor_msgs/msg/Imu"
+    )
+    assert imu.orientation_covariance[0] == 0.5
+    assert math.isnan(imu.orientation_covariance[8])
+    assert imu.linear_acceleration_covariance.tolist() == [0.0] * 9
+
+
+@pytest.mark.parametrize(
+    ("type_name", "message", "said"),
+    [
+        ("boat_msgs/Sensors", {}, "boat_msgs/Sensors"),
+        ("std_msgs/String", {"date": "x"}, "date"),
+        ("std_msgs/String", {"data": 7}, "data"),
+        ("std_msgs/Int32", {"data": "7"}, "data"),
+        ("std_msgs/UInt8", {"data": 300}, "UInt8"),
+        ("std_msgs/Int32MultiArray", {"data": [1.5]}, "data"),
+        ("std_msgs/UInt8MultiArray", {"data": "!!"}, "UInt8MultiArray"),
+        ("std_msgs/Header", {"stamp": 7}, "stamp"),
+        ("sensor_msgs/Imu", {"orientation_covariance": [1.0]}, "orientation_covariance"),
+        (ARRAY, {"layout": {"dim": 7}}, "dim"),
+    ],
+)
+def test_what_cannot_be_serialised_is_told_once(type_name: str, message: Any, said: str) -> None:
+    room, publisher, subscriber = _publisher_and_subscriber(type_name, compression="cbor-raw", id="the one")
+    for _ in range(3):
+        publisher.publish("/t", message)
+    (status,) = subscriber.read()
+    assert (status["op"], status["level"], status["id"]) == ("status", "error", "the one")
+    assert said in status["msg"]
+    assert publisher.read() == []
+    room.check()
+
+
+# --- PNG
+
+
+@pytest.mark.parametrize("size", [0, 1, 2, 100, 10_000])
+def test_png_holds_the_operation(size: int) -> None:
+    room, publisher, subscriber = _publisher_and_subscriber("a/B", compression="png")
+    publisher.publish("/t", {"data": "é" * size})
+    (operation,) = subscriber.read()
+    assert set(operation) == {"op", "data"}
+    assert operation["op"] == "png"
+    assert base64.b64decode(operation["data"]).startswith(b"\x89PNG")
+    inner = json.loads(png.decode(operation["data"]))
+    assert inner == {"op": "publish", "topic": "/t", "msg": {"data": "é" * size}}
+    room.check()
+
+
+def test_a_png_that_is_larger_than_may_be_is_refused() -> None:
+    room = Room(message_bytes=400)
+    publisher, subscriber = room.enter(), room.enter()
+    publisher.advertise("/t")
+    subscriber.subscribe("/t", compression="png")
+    publisher.publish("/t", {"data": base64.b85encode(bytes(range(256))).decode()[:300]})
+    assert subscriber.read()[0]["op"] == "status"
+    assert subscriber.client.refused == 1
+
+
+# --- fragments
+
+
+@pytest.mark.parametrize(("asked", "size"), [(1, 16), (16, 16), (50, 50)])
+@pytest.mark.parametrize("compression", ["none", "png"])
+def test_a_message_in_fragments(asked: int, size: int, compression: str) -> None:
+    room, publisher, subscriber = _publisher_and_subscriber(
+        "a/B", fragment_size=asked, compression=compression
+    )
+    messages = [{"data": "é" * 200}, {"data": "☃" * 100}]
+    for message in messages:
+        publisher.publish("/t", message)
+    room.check()
+    by_id: dict[str, list[bytes]] = {}
+    for payload in _raw(subscriber):
+        operation = json.loads(payload)
+        assert operation["op"] == "fragment"
+        assert 1 <= len(operation["data"]) <= size
+        assert type(operation["total"]) is int
+        by_id.setdefault(operation["id"], []).append(payload)
+    heard = []
+    for payloads in by_id.values():
+        whole = json.loads(_whole(payloads))
+        heard.append(json.loads(png.decode(whole["data"])) if compression == "png" else whole)
+    assert [operation["msg"] for operation in heard] == messages
+
+
+def test_what_fits_into_one_piece_and_what_is_cbor_comes_whole() -> None:
+    _, publisher, subscriber = _publisher_and_subscriber("a/B", fragment_size=60)
+    publisher.publish("/t", {"a": 1})
+    assert subscriber.heard() == [{"a": 1}]
+    _, publisher, subscriber = _publisher_and_subscriber("a/B", fragment_size=16, compression="cbor")
+    publisher.publish("/t", {"data": "x" * 100})
+    assert subscriber.heard() == [{"data": "x" * 100}]
+
+
+def test_fragments_are_dropped_as_messages_are() -> None:
+    room = Room(queue_length=2)
+    publisher, slow = room.enter(), room.enter()
+    publisher.advertise("/t")
+    slow.subscribe("/t", fragment_size=16)
+    for index in range(10):
+        publisher.publish("/t", {"i": index, "data": "x" * 100})
+    room.check()
+    payloads = _raw(slow)
+    half = len(payloads) // 2
+    assert [json.loads(_whole(part))["msg"]["i"] for part in (payloads[:half], payloads[half:])] == [8, 9]
+
+
+def test_the_answer_to_a_call_in_fragments_and_as_png() -> None:
+    guest = Room().enter()
+    guest.send(op="call_service", service="/rosapi/services", id="x", fragment_size=100)
+    assert "/rosapi/topics" in json.loads(_whole(_raw(guest)))["values"]["services"]
+    guest.send(op="call_service", service="/rosapi/services", id="x", compression="png")
+    (operation,) = guest.read()
+    assert json.loads(png.decode(operation["data"]))["id"] == "x"
+
+
+def test_what_comes_in_fragments_is_one_operation() -> None:
+    room = Room()
+    guest, other = room.enter(), room.enter()
+    other.subscribe("/t", type="a/B")
+    whole = json.dumps({"op": "publish", "topic": "/t", "type": "a/B", "msg": {"data": "é" * 30}})
+    parts = [whole[at : at + 20] for at in range(0, len(whole), 20)]
+    for number in reversed(range(len(parts))):
+        guest.send(op="fragment", id="f", data=parts[number], num=number, total=float(len(parts)))
+        room.check()
+    assert other.heard() == [{"data": "é" * 30}]
+    assert guest.client.refused == 0
+
+
+# --- several wishes, one writing
+
+
+def test_of_several_wishes_the_last_form_and_the_least_size_count() -> None:
+    room, publisher, subscriber = _publisher_and_subscriber("a/B", id=1, fragment_size=64)
+    subscriber.subscribe("/t", id=2, compression="cbor")
+    subscriber.subscribe("/t", id=3, compression="png", fragment_size=32)
+    publisher.publish("/t", {"data": "x" * 50})
+    assert subscriber.heard() == [{"data": "x" * 50}], "as CBOR"
+    subscriber.send(op="unsubscribe", topic="/t", id=2)
+    publisher.publish("/t", {"data": "x" * 50})
+    payloads = _raw(subscriber)
+    assert max(len(json.loads(payload)["data"]) for payload in payloads) == 32
+    assert json.loads(_whole(payloads))["op"] == "png"
+    room.check()
+
+
+@pytest.mark.parametrize("compression", ["bson", "", None, 7, ["png"], {}])
+def test_what_nobody_knows_is_plain_json(compression: object) -> None:
+    _, publisher, subscriber = _publisher_and_subscriber("a/B", compression=compression)
+    publisher.publish("/t", {"a": 1})
+    assert subscriber.heard() == [{"a": 1}]
+
+
+@pytest.mark.parametrize("compression", ["png", "cbor", "cbor-raw"])
+def test_each_form_is_written_once(compression: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    written: list[Any] = []
+    write = Message._write
+
+    def count(message: Message, *form: Any) -> bytes:
+        written.append(form)
+        return write(message, *form)
+
+    monkeypatch.setattr(Message, "_write", count)
+    room = Room()
+    publisher, *subscribers = (room.enter() for _ in range(4))
+    publisher.advertise("/t", ARRAY)
+    for subscriber in subscribers:
+        subscriber.subscribe("/t", compression=compression)
+    subscribers[0].subscribe("/t", id="throttled", throttle_rate=1000)
+    publisher.publish("/t", {"data": [1.5]})
+    assert len([form for form in written if form[0] == compression]) == 1
+
+
+def test_what_a_throttle_drops_is_not_even_written(monkeypatch: pytest.MonkeyPatch) -> None:
+    _, publisher, subscriber = _publisher_and_subscriber(ARRAY, compression="cbor", throttle_rate=1000)
+    publisher.publish("/t", {"data": [1.5]})
+    monkeypatch.setattr(topics.Message, "payload", None)
+    publisher.publish("/t", {"data": [2.5]})
+    assert subscriber.heard() == [{"data": [1.5]}]
+
+
+# --- cut out of what came
+
+
+@pytest.mark.parametrize(
+    ("raw", "cut"),
+    [
+        (b'{"op":"publish","topic":"/t","msg":{"a":"%b","b":{}}}', True),
+        (b'{"op": "publish", "topic": "/t", "id": "x", "latch": false, "msg" : {"a": "%b"}}', True),
+        (b'{"op":"publish","msg":{"a":"%b"},"topic":"/t"}', False),
+        (b'{"op":"publish","topic":"/t","msg":{"a":"%b","msg":1}}', False),
+        (b'{"op":"publish","topic":"/t","msg":{"a":"%b\\n"}}', False),
+        (b'{"op":"publish","topic":"/t","msg":{"a":"%b"},"more":{"a":1}}', False),
+        (b'{"op":"publish","topic":"/t","msg":{"x":1},"msg":{"a":"%b"}}', False),
+        (b'{"op":"publish","topic":"/t","msg":{"x":1},"m\\u0073g":{"a":"%b"}}', False),
+        (b'{"op":"publish","topic":"/t","msg":{"a":"%b"},"m\\u0073g":{"x":1}}', False),
+        (b'{"topic":{},"op":"publish","msg":{"a":"%b"},"topic":"/t"}', False),
+        (b'{"op":"publish","topic":"/t","msg":{"a":"%b"}} ', False),
+        (b'{"op":"publish","topic":"/t","msg":{"a":"%b","b":NaN}}', False),
+        (b'{"op":"publish","topic":"/t","msg":{"a":"%b","b":1e999}}', False),
+    ],
+)
+def test_large_messages_are_cut_out_only_where_that_is_sure(raw: bytes, cut: bool) -> None:
+    raw %= b"x" * 1000
+    room = Room()
+    publisher, subscriber = room.enter(), room.enter()
+    publisher.advertise("/t")
+    subscriber.subscribe("/t")
+    publisher.send_raw(raw)
+    (payload,) = _raw(subscriber)
+    operation = json.loads(payload, parse_constant=lambda name: pytest.fail(f"{name} on the wire"))
+    expected = json.loads(raw, parse_constant=lambda _: None)["msg"]
+    assert operation["msg"] == {key: None if value == math.inf else value for key, value in expected.items()}
+    strict = b"NaN" not in raw and b"1e999" not in raw
+    assert (topics._cut_out(json.loads(raw), raw if strict else None) is not None) is cut
+
+
+def test_a_message_of_many_quotes_is_written_anew() -> None:
+    guest = Room().enter()
+    guest.advertise("/t")
+    guest.subscribe("/t")
+    guest.publish("/t", {"data": ["word"] * 1000})
+    assert guest.heard() == [{"data": ["word"] * 1000}]
+
+
+# --- what goes wrong is told to who wants it
+
+
+def test_who_asks_for_them_gets_status_messages() -> None:
+    room = Room()
+    guest = room.enter()
+    guest.send_raw(b"42")
+    guest.send(op="set_level", level="warning")
+    guest.send(op="fly", id="f1")
+    guest.send(op="publish", topic="/t", id=7, msg=1)
+    first, second = guest.read()
+    assert (first["op"], first["level"], first["id"]) == ("status", "error", "f1")
+    assert "fly" in first["msg"]
+    assert second["id"] == 7
+    guest.send(op="set_level", level="none")
+    guest.send(op="fly")
+    assert guest.read() == []
+    assert guest.client.refused == 4
+    room.check()
+
+
+def test_status_messages_do_not_pile_up() -> None:
+    room = Room()
+    guest = room.enter()
+    guest.send(op="set_level", level="error")
+    for _ in range(1000):
+        guest.send_raw(b"42")
+    room.check()
+    assert len(guest.read()) <= 20
+    assert not guest.client.doomed
+
+
+@pytest.mark.parametrize("ros_version", [1, 2])
+def test_refusals_are_told_on_rosout(ros_version: Any) -> None:
+    room = Room(ros_version=ros_version)
+    guest, listener = room.enter(), room.enter()
+    listener.subscribe("/rosout", type="rosgraph_msgs/Log" if ros_version == 1 else "rcl_interfaces/msg/Log")
+    guest.send(op="fly")
+    (log,) = listener.heard("/rosout")
+    assert "/client_1" in log["msg"]
+    assert "fly" in log["msg"]
+    stamp = log["stamp"] if ros_version == 2 else log["header"]["stamp"]
+    assert stamp == dict(
+        zip(
+            ("sec", "nanosec") if ros_version == 2 else ("secs", "nsecs"),
+            divmod(WALL_CLOCK, 10**9),
+            strict=True,
+        )
+    )
+    listener.subscribe("/rosout", id="wrong", type="a/B")
+    assert len(listener.heard("/rosout")) == 1
+    room.check()
+
+
+def test_what_cannot_be_told_on_rosout_ends_there(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setitem(sys.modules, "rosbags.typesys", None)
+    room = Room()
+    guest = room.enter()
+    guest.subscribe("/rosout", compression="cbor-raw")
+    with caplog.at_level(logging.WARNING):
+        guest.send(op="fly")
+    assert [operation["op"] for operation in guest.read()] == ["status"]
+    room.check()
+
+
+# --- quality of service
+
+
+def test_a_transient_local_publisher_latches_and_a_volatile_subscriber_is_not_greeted() -> None:
+    room = Room()
+    publisher, late, volatile = room.enter(), room.enter(), room.enter()
+    publisher.advertise("/t", qos={"durability": "transient_local", "depth": 5})
+    publisher.publish("/t", {"a": 1})
+    late.subscribe("/t", qos={"durability": "transient_local", "reliability": "best_effort"})
+    volatile.subscribe("/t", qos={"durability": "volatile"})
+    assert late.heard() == [{"a": 1}]
+    assert volatile.heard() == []
+
+
+@pytest.mark.parametrize(
+    ("wish", "length"),
+    [
+        ({"qos": {"depth": 3}}, 3),
+        ({"qos": {"depth": 3}, "queue_length": 5}, 5),
+        ({"qos": {"history": "keep_all"}}, 40),
+        ({"qos": {}}, 20),
+        ({"qos": {"depth": 10**6}}, 40),
+        ({"qos": {"lifespan": {"secs": 1, "nsecs": 0}, "deadline": "infinite"}}, 20),
+    ],
+)
+def test_depth_is_the_length_of_the_queue(wish: dict[str, Any], length: int) -> None:
+    room = Room(queue_length=20, longest_queue=40)
+    publisher, slow = room.enter(), room.enter()
+    publisher.advertise("/t")
+    slow.subscribe("/t", **wish)
+    for index in range(100):
+        publisher.publish("/t", {"i": index})
+    assert len(slow.heard()) == length
+
+
+# --- descriptions of types
+
+
+@pytest.mark.parametrize(("ros_version", "time"), [(1, "time"), (2, "builtin_interfaces/msg/Time")])
+def test_message_details(ros_version: Any, time: str) -> None:
+    guest = Room(ros_version=ros_version).enter()
+    definitions = guest.rosapi("message_details", type="sensor_msgs/LaserScan")["typedefs"]
+    by_type = {definition["type"]: definition for definition in definitions}
+    scan = definitions[0]
+    at = scan["fieldnames"].index("ranges")
+    assert (scan["fieldtypes"][at], scan["fieldarraylen"][at], scan["examples"][at]) == ("float32", 0, "[]")
+    header = by_type[scan["fieldtypes"][0]]
+    stamp = header["fieldnames"].index("stamp")
+    assert header["fieldtypes"][stamp] == time
+    assert by_type[time]["fieldnames"] == (["secs", "nsecs"] if ros_version == 1 else ["sec", "nanosec"])
+    for definition in definitions:
+        lengths = {len(definition[f"field{part}"]) for part in ("names", "types", "arraylen")}
+        assert lengths == {len(definition["examples"])}
+    array = guest.rosapi("message_details", type="sensor_msgs/Imu")["typedefs"][0]
+    assert 9 in array["fieldarraylen"]
+
+
+def test_topics_and_raw_types() -> None:
+    room = Room()
+    guest = room.enter()
+    guest.advertise("/known", "geometry_msgs/msg/PoseStamped")
+    guest.advertise("/unknown", "boat_msgs/Sensors")
+    answer = guest.rosapi("topics_and_raw_types")
+    texts = dict(zip(answer["topics"], answer["typedefs_full_text"], strict=True))
+    assert "MSG: std_msgs/Header" in texts["/known"]
+    assert texts["/unknown"] == ""
+    assert len(answer["types"]) == len(answer["topics"])
