@@ -1,0 +1,57 @@
+"""Where no container engine can run, that is said in a sentence; and counts as a failure where it must not."""
+
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+ENGINE = ROOT / "scripts" / "container-engine"
+
+# a root that may make no namespaces, as in most containers; for others nothing needs to be taken away
+POWERLESS = (
+    ["setpriv", "--bounding-set", "-sys_admin", "--inh-caps", "-sys_admin", "--"] if os.geteuid() == 0 else []
+)
+needs_setpriv = pytest.mark.skipif(
+    bool(POWERLESS) and not shutil.which("setpriv"), reason="setpriv is not installed"
+)
+
+
+def run(*command, **variables):
+    environment = {name: value for name, value in os.environ.items() if name != "CI"} | variables
+    return subprocess.run(
+        [*POWERLESS, *command],
+        env=environment,
+        capture_output=True,
+        check=False,
+        text=True,
+        timeout=60,
+        cwd=ROOT,
+    )
+
+
+@needs_setpriv
+def test_says_why_it_is_not_able():
+    done = run(ENGINE, "able")
+    assert done.returncode == 4
+    assert done.stderr.startswith("error: no container engine can run here: ")
+
+
+@needs_setpriv
+@pytest.mark.parametrize(
+    ("ci", "code", "last"), [("", 0, "0 passed, 0 failed"), ("true", 1, "0 passed, 1 failed")]
+)
+def test_not_verified_is_loud_and_fails_in_ci(ci, code, last):
+    done = run(ROOT / ".venv" / "bin" / "python", ROOT / "scripts" / "verify_containers.py", CI=ci)
+    assert done.returncode == code
+    assert "CONTAINERS WERE NOT VERIFIED" in done.stdout
+    assert done.stdout.splitlines()[-1] == last
+
+
+@pytest.mark.parametrize("arguments", [(), ("run",), ("fly",)])
+def test_usage(arguments):
+    done = subprocess.run([ENGINE, *arguments], capture_output=True, check=False, text=True, timeout=30)
+    assert done.returncode == 2
+    assert done.stderr.startswith("usage: scripts/container-engine")
