@@ -174,7 +174,7 @@ def _field(message: Any, path: str) -> object:
         if match is None:
             text = f"{path!r} is no path; expected one such as pose.position.x or ranges[3]"
             raise ModelError(text)
-        if not hasattr(value, match[1]):
+        if match[1].startswith("_") or match[1] not in getattr(value, "__dataclass_fields__", {}):
             text = f"the message has no field {match[1]!r} of {path!r}"
             raise ModelError(text)
         value = getattr(value, match[1])

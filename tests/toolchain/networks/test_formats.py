@@ -242,6 +242,7 @@ MISTAKES = [
     (*changed("dog.bif", '"dog problem"', '"dog problem'), 2, "'credit' stands where '{' is expected"),
     ("dog.bif", BIF + "probability ( ", 22, "the end of the file stands where a variable's name is expected"),
     ("dog.bif", BIF.rstrip()[:-3] + "\n", 21, "the end of the file stands where ';' is expected"),
+    ("dog.bif", BIF + '"x', 22, "opens a quote that is not closed"),
     ("dog.bif", "", None, "the file has no variables"),
     ("dog.bif", BIF.split("probability", 1)[0], None, "family-out has no table"),
     ("dog.bif", BIF.encode() + b"\xff", 22, "not UTF-8 text"),
@@ -257,7 +258,7 @@ MISTAKES = [
     (*changed("dog.xmlbif", "<NAME>light-on</NAME>", "<NAME>dog-out</NAME>"), 13, "'dog-out' is there twice"),
     (
         *changed("dog.xmlbif", "0.15 0.85", "0.15 0.8.5"),
-        17,
+        16,
         "'0.8.5' in the table of family-out is no number",
     ),
     (*changed("dog.xmlbif", "0.15 0.85", "0.15"), 16, "the table of family-out has 1 numbers, expected 2"),

@@ -1,0 +1,244 @@
+"""A prior that a variable selects (thesis 2.1.2), and one that the host writes: from the model to what the boards compute.
+
+model ──▶ deployment.toml, images ──▶ addresses of a frame ──▶ row of the prior's table, codes to write ──▶ posterior
+"""
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from machines.encode import decode_code
+from machines.parameters import PriorMode
+from machines.posterior import posterior
+from pcie_shim.programming_file import read_image
+from toolchain.address import to_address
+from toolchain.build import build_deployment
+from toolchain.deployment import Variable, WrittenPrior, load_deployment
+from toolchain.distribution import table, uniform
+from toolchain.errors import BuildError, DeploymentError, ModelError, ReadingError
+from toolchain.fusion import exact_posterior, fuse
+from toolchain.joint import JointDistribution
+from toolchain.model import Known, Model, PriorSelect, dimension
+from toolchain.options import BuildOptions, Scale
+from toolchain.quantise import quantise, written_prior
+from toolchain.symbol import IntegerType, LabelType, Symbol
+
+OPTIONS = BuildOptions(uri="ws://robot:9090", topic="/readings", type="std_msgs/Float64MultiArray")
+FINE = {"prob_bits": 14, "counter_bits": 16, "target_count": 20000}
+PRIORS = np.array([[0.7, 0.1, 0.1, 0.1], [0.1, 0.1, 0.1, 0.7], [0.0, 0.5, 0.5, 0.0]])
+HEARD = np.array([[0.9, 0.4, 0.4, 0.1], [0.1, 0.6, 0.6, 0.9]])
+
+
+def model(**fields):
+    known = (Known(name="heard", table=HEARD),)
+    return Model(name="rooms", searched=(dimension("room", size=4),), known=known, **fields)
+
+
+def selected(**fields):
+    return PriorSelect(name="time", table=PRIORS, on_missing="missing", **fields)
+
+
+def build(tmp_path, built_model, **options):
+    built = build_deployment(built_model, tmp_path, BuildOptions(**(vars_of(OPTIONS) | options)))
+    return load_deployment(tmp_path), built
+
+
+def vars_of(options):
+    return {name: getattr(options, name) for name in options.__dataclass_fields__}
+
+
+def on_boards(deployment, addresses, **written):
+    """What the boards of a deployment compute together, normalised as the host does it."""
+    sensors, row = deployment.machine_addresses(addresses)
+    parts = []
+    for at, board in enumerate(deployment.boards):
+        machine = read_image(deployment.image_path(at)).machine
+        lines = slice(board.line_offset, board.line_offset + board.lines)
+        codes = {"prior_codes": written["codes"][lines]} if "codes" in written else {}
+        prior = codes.get(
+            "prior_codes", machine.prior[row] if deployment.machine.prior_bits else machine.prior[0]
+        )
+        rows = [table_[address] for table_, address in zip(machine.tables, sensors, strict=True)]
+        parts.append(
+            np.prod([decode_code(each, machine.parameters.prob_bits) for each in (prior, *rows)], axis=0)
+        )
+        if at == 0 and len(deployment.boards) == 1:
+            counted = posterior(
+                machine, sensors, prior_address=row, target_count=deployment.machine.target_count, **codes
+            )
+            exact = parts[0] / parts[0].sum()
+            assert counted == pytest.approx(exact, abs=0.02)
+    whole = np.concatenate(parts)
+    return whole / whole.sum()
+
+
+@pytest.mark.parametrize("partitions", [1, 2])
+def test_the_selected_row_is_the_prior_of_the_frame(tmp_path, partitions):
+    deployment, _ = build(tmp_path, model(prior_select=selected()), partitions=partitions, **FINE)
+    assert deployment.machine.prior_bits == 2
+    assert [variable.name for variable in deployment.sensors] == ["heard"]
+    assert deployment.prior_select.name == "time"
+    for heard in (0, 1):
+        for time in (0, 1, 2):
+            found = on_boards(deployment, [heard, time])
+            assert found == pytest.approx(fuse(PRIORS[time], [HEARD[heard]]), abs=2e-3)
+            exact = exact_posterior(model(prior_select=selected()), [heard], prior_address=time)
+            assert found == pytest.approx(exact, abs=2e-3)
+
+
+def test_a_missing_selection_is_the_top_row_the_prior_without_it(tmp_path):
+    deployment, built = build(tmp_path, model(prior_select=selected()), **FINE)
+    assert deployment.machine_addresses([1, None]) == ((1,), 3)
+    found = on_boards(deployment, [1, None])
+    assert found == pytest.approx(fuse(PRIORS.mean(axis=0), [HEARD[1]]), abs=2e-3)
+    given = model(prior_select=selected(), prior=np.array([0.4, 0.3, 0.2, 0.1]))
+    assert quantise(given).prior[3].tolist() == [255, 192, 128, 64]
+    assert "Prior: selected by time, one of 3 rows" in built.report
+
+
+def test_rows_that_are_not_served_are_impossible():
+    few = model(prior_select=PriorSelect(name="time", table=PRIORS[:2], bits=3))
+    codes = quantise(few, scale=Scale.ADDRESS).prior
+    assert codes.shape == (8, 4)
+    assert not codes[2:7].any()
+    assert codes[[0, 1, 7]].max(axis=1).tolist() == [255, 255, 255]
+
+
+def test_a_question_selects_its_prior_by_a_variable():
+    time, room = Symbol("time", LabelType("day", "night")), Symbol("room", IntegerType(0, 3))
+    heard = Symbol("heard", LabelType("no", "yes"))
+    joint = JointDistribution(
+        "rooms",
+        (
+            table(time, [0.75, 0.25]),
+            table(room, PRIORS[:2].T, given=[time]),
+            table(heard, HEARD, given=[room]),
+        ),
+    )
+    asked = joint.ask(["room"], ["heard"], prior_select="time").model()
+    assert asked.prior_select.table == pytest.approx(PRIORS[:2])
+    assert asked.prior_distribution == pytest.approx(0.75 * PRIORS[0] + 0.25 * PRIORS[1])
+    as_column = joint.ask(["room"], ["heard", "time"]).model()
+    for address in (0, 1):
+        selecting = exact_posterior(asked, [1], prior_address=address)
+        assert selecting == pytest.approx(exact_posterior(as_column, [1, address]))
+    assert exact_posterior(asked, [1]) == pytest.approx(exact_posterior(as_column, [1, None]))
+    words = asked.prior_select.as_variable()
+    assert [to_address(words, each) for each in ("night", "day", 1, 0)] == [1, 0, 1, 0]
+
+
+def test_an_impossible_value_selects_the_plain_prior():
+    time, room = Symbol("time", IntegerType(0, 1)), Symbol("room", IntegerType(0, 3))
+    joint = JointDistribution("r", (table(time, [1, 0]), table(room, PRIORS[:2].T, given=[time])))
+    asked = joint.ask(["room"], prior_select="time").model()
+    assert asked.prior_select.table[1] == pytest.approx(PRIORS[0])
+
+
+@pytest.mark.parametrize("partitions", [1, 2])
+def test_a_written_prior_stands_in_the_place_of_the_models(tmp_path, partitions):
+    deployment, built = build(
+        tmp_path,
+        model(),
+        prior_mode=PriorMode.WRITTEN,
+        prior_path="prior.data",
+        partitions=partitions,
+        **FINE,
+    )
+    assert deployment.machine.prior_mode is PriorMode.WRITTEN
+    assert deployment.prior == WrittenPrior(path="prior.data")
+    assert "Prior: written every frame, from prior.data" in built.report
+    wish = [0.1, 0.2, 0.3, 0.4]
+    codes = written_prior(wish, lines=4, prob_bits=14)
+    found = on_boards(deployment, [1], codes=codes)
+    assert found == pytest.approx(fuse(np.array(wish), [HEARD[1]]), abs=2e-3)
+    assert on_boards(deployment, [1]) == pytest.approx(fuse(np.full(4, 0.25), [HEARD[1]]), abs=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("prior", "sentence"),
+    [
+        ([1, 2, 3], r"has shape \(3,\), expected one number for each of 4 lines"),
+        ([[1, 2, 3, 4]], "has shape"),
+        ([0, 0, 0, 0], "only zeros"),
+        ([1, 2, -3, 4], "negative"),
+        ([1, 2, float("nan"), 4], "NaN"),
+        ([1, 2, float("inf"), 4], "infinite"),
+        (["a", 2, 3, 4], "not an array of numbers"),
+        ([[1], [2, 3]], "not an array of numbers"),
+        (None, "has shape"),
+        ({}, "not an array of numbers"),
+    ],
+)
+def test_a_prior_that_cannot_be_written(prior, sentence):
+    with pytest.raises(ReadingError, match=sentence):
+        written_prior(prior, lines=4, prob_bits=8)
+
+
+def test_only_the_ratios_of_a_written_prior_count():
+    codes = written_prior([2e-300, 1e-300, 0, 5e-301], lines=4, prob_bits=8)
+    assert codes.tolist() == [255, 128, 0, 64]
+
+
+@pytest.mark.parametrize(
+    ("options", "fields", "sentence"),
+    [
+        ({"prior_path": "prior"}, {}, "add --prior-mode written"),
+        (
+            {"prior_mode": PriorMode.WRITTEN},
+            {"prior_select": selected()},
+            "selected by time, so it can't be written",
+        ),
+        ({"prior_mode": PriorMode.WRITTEN, "prior_path": ""}, {}, "--prior-path is ''"),
+    ],
+)
+def test_options_that_do_not_fit(tmp_path, options, fields, sentence):
+    with pytest.raises(BuildError, match=sentence):
+        build(tmp_path, model(**fields), **options)
+
+
+@pytest.mark.parametrize(
+    ("make", "sentence"),
+    [
+        (lambda: PriorSelect(name="a", table=PRIORS * 2), "P.S . a. of address 0 sums to 2"),
+        (lambda: PriorSelect(name="a", table=PRIORS, bits=1), "serves 3 values, but 1 bits hold 1"),
+        (lambda: PriorSelect(name="a", table=PRIORS[0]), "expected .values, lines."),
+        (lambda: model(prior_select=PriorSelect(name="a", table=np.full((2, 3), 1 / 3))), "has 3 lines"),
+        (lambda: model(prior_select=PriorSelect(name="heard", table=PRIORS)), "known variable 'heard' twice"),
+    ],
+)
+def test_refused_selections(make, sentence):
+    with pytest.raises(ModelError, match=sentence):
+        make()
+
+
+def test_a_deployment_whose_prior_does_not_agree_is_refused(tmp_path):
+    deployment, _ = build(tmp_path, model(prior_select=selected()))
+    fields = dict(deployment)
+    two = (*deployment.variables, Variable(name="other", kind="prior_select", bits=2, values=3))
+    for changes, sentence in (
+        ({"variables": two}, "time and other both select the prior"),
+        ({"variables": deployment.sensors}, "no variable selects it"),
+        ({"prior": WrittenPrior(path="p")}, "the machine's is a table"),
+    ):
+        with pytest.raises(ValidationError, match=sentence):
+            type(deployment)(**(fields | changes))
+    text = deployment.path.read_text()
+    deployment.path.write_text(text.replace('kind = "prior_select"', 'kind = "prior"'))
+    with pytest.raises(DeploymentError, match="is not a value it can have; did you mean 'prior_select'"):
+        load_deployment(tmp_path)
+
+
+def test_a_word_that_is_no_state_is_no_number(tmp_path):
+    variable = Variable(name="v", bits=2, values=2, states=("on", "off"))
+    assert to_address(variable, "off") == 1
+    with pytest.raises(ReadingError, match="'of' is a string, not a number"):
+        to_address(variable, "of")
+    with pytest.raises(ValidationError, match="v has 2 values, but 1 states are named"):
+        Variable(name="v", bits=2, values=2, states=("on",))
+
+
+def test_uniform_selection_is_no_selection():
+    time, room = Symbol("time", IntegerType(0, 1)), Symbol("room", IntegerType(0, 3))
+    joint = JointDistribution("r", (uniform(time), uniform(room)))
+    asked = joint.ask(["room"], prior_select="time").model()
+    assert asked.prior_select.table == pytest.approx(np.full((2, 4), 0.25))
