@@ -23,7 +23,7 @@ _STORES = {1: get_typestore(Stores.ROS1_NOETIC), 2: get_typestore(Stores.LATEST)
 _KNOWN = {
     "A": {"none", "png", "cbor", "cbor-raw"},
     "B": {"none", "png", "cbor", "cbor-raw"},
-    "R": {"none", "cbor", "cbor-raw"},
+    "R": {"none", "png", "cbor", "cbor-raw"},
 }
 #: Messages that B (and ROS 2 under R) keeps of a burst.
 DEPTH = 10
@@ -41,6 +41,7 @@ class Double(FakeRosbridge):
             refuses_null=True,
         )
         self.server = server
+        self.known = set(_KNOWN[server])
         self.fragment_sizes: dict[int, int] = {}
         self._raw_first: dict[str, int] = {}
         self._fragment_ids = itertools.count()
@@ -53,7 +54,7 @@ class Double(FakeRosbridge):
 
     async def _op_subscribe(self, client: _Client, op: dict[str, Any]) -> None:
         wanted = op.get("compression", "none")
-        if wanted not in _KNOWN[self.server]:
+        if wanted not in self.known:
             await self._complain(client, f"unsupported compression {wanted}")
             if self.server == "R":
                 return
@@ -87,7 +88,7 @@ class Double(FakeRosbridge):
     async def _deliver(self, client: _Client, topic: str, msg: dict[str, Any], form: str) -> int:
         operation: dict[str, Any] = {"op": "publish", "topic": topic, "msg": msg}
         if form == "png":
-            if self.server == "A":
+            if self.server in "AR":
                 await self._say_in_pieces(client, {"op": "png", "data": _picture(json.dumps(operation))})
                 return 1
             return 0  # B never delivers one

@@ -61,12 +61,17 @@ async def test_fragments_with_totals_that_are_no_whole_numbers(server, fragment_
         assert ros.unusable == 0
 
 
-async def test_pictures_come_from_a_and_never_from_b():
-    async with Double("A") as double, connect(double.uri) as ros:
-        subscription = ros.subscribe("/a", TYPE, compression="png")
+@pytest.mark.parametrize("server", ["A", "R"])
+@pytest.mark.parametrize("fragment_size", [None, 50])
+async def test_pictures(server, fragment_size):
+    async with Double(server) as double, connect(double.uri) as ros:
+        subscription = ros.subscribe("/a", TYPE, compression="png", fragment_size=fragment_size)
         await double.wait_for_op("subscribe")
         await double.publish("/a", MSG)
         assert (await subscription.next(PATIENCE)).msg == MSG
+
+
+async def test_a_picture_that_never_comes():
     async with Double("B") as double, connect(double.uri) as ros:
         subscription = ros.subscribe("/a", TYPE, compression="png")
         await double.wait_for_op("subscribe")
@@ -77,6 +82,7 @@ async def test_pictures_come_from_a_and_never_from_b():
 
 async def test_a_compression_that_the_server_refuses_is_told():
     async with Double("R") as double, connect(double.uri) as ros:
+        double.known.remove("png")
         subscription = ros.subscribe("/a", TYPE, compression="png")
         with pytest.raises(NoMessageError, match="the server said: unsupported compression png"):
             await subscription.next(0.5)
