@@ -32,6 +32,8 @@ _WORTH_CUTTING: Final = 512
 _KEY: Final = b'"msg"'
 #: Quotes in a message that is cut out, at most: to look at each of more takes as long as to write it.
 _QUOTES: Final = 200
+# Up to so many bytes, text is searched at once; beyond, it is mostly numbers, and looking from quote to quote is faster.
+_SHORT: Final = 4096
 
 
 class Topics:
@@ -102,7 +104,9 @@ class Topics:
                 operation_id(operation),
                 latch=flag(operation, "latch"),
             )
-        self.distribute(advertisement.topic, parsed, _cut_out(operation, raw), now)
+        topic = advertisement.topic
+        if topic.subscriptions or topic.latching:
+            self.distribute(topic, parsed, _cut_out(operation, raw), now)
 
     def distribute(self, topic: Topic, parsed: dict[str, Any], data: bytes | None, now: float) -> None:
         """Hand a message to all who hear its topic.
@@ -278,6 +282,9 @@ def _cut_out(operation: Operation, raw: bytes | None) -> bytes | None:
         return None
     if sum(type(value) is dict for value in operation.values()) != 1:
         return None
+    if len(raw) < _SHORT:
+        key = raw.find(_KEY)
+        return raw[raw.index(b"{", key) : -1] if key > 0 and raw.find(_KEY, key + 1) < 0 else None
     key = at = -1
     for _ in range(_QUOTES):  # one byte is looked for ten times as fast as five are
         at = raw.find(b'"', at + 1)
