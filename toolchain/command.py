@@ -203,7 +203,7 @@ def fit(
     floor: Annotated[
         float,
         typer.Option(help="normals: the least an outlier gets, relative to the peak; codes must hold it."),
-    ] = 0.01,
+    ] = 0.005,
     pseudo_count: Annotated[
         float, typer.Option(help="counts: readings that the Dirichlet prior of a cell is worth.")
     ] = 1.0,

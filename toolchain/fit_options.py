@@ -45,7 +45,7 @@ class FitOptions:
     method: FitMethod = FitMethod.NORMALS
     pool: tuple[str, ...] = ()
     bias: bool = False
-    floor: float = 0.01
+    floor: float = 0.005
     pseudo_count: float = 1.0
     prior: FitPrior = FitPrior.MODEL
     tolerance_s: float = 0.1

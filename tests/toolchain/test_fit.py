@@ -385,6 +385,8 @@ def test_the_command_fits_normals_and_a_model_loads_them(corridor):
         corridor,
         "-o",
         str(out),
+        "--floor",
+        "0",
         "--reading",
         "wall=wall_m",
         "--reading",
