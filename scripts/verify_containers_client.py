@@ -50,9 +50,9 @@ class Readings:
         """Keep what comes, until cancelled."""
         async for message in ros.subscribe(SENSORS_TOPIC, SENSORS_TYPE, queue_size=KEPT):
             fields: dict[str, Any] = dict(message.msg)
-            self._heard[stamp_ns(fields["header"]["stamp"])] = tuple(
-                int(fields[name]) for name in SENSOR_NAMES
-            )
+            stamp = stamp_ns(fields["header"]["stamp"])
+            assert stamp is not None
+            self._heard[stamp] = tuple(int(fields[name]) for name in SENSOR_NAMES)
             if len(self._heard) > KEPT:
                 self._heard.popitem(last=False)
             self._news.set()
@@ -110,8 +110,9 @@ class Bits:
         return ""
 
 
-async def check(uri: str, width: int, height: int, bits: int) -> None:
+async def check(uri: str, cells: tuple[int, int], bits: int) -> None:
     """Print a line of each result, for ever or until `bits` of them were computed anew."""
+    width, height = cells
     boat = model(width, height)
     reference = Bits(Path(os.environ["BM_DEPLOYMENT"])) if bits else None
     readings = Readings()
@@ -154,7 +155,7 @@ async def main() -> None:
     deadline = time.monotonic() + PATIENCE_S
     while True:
         try:
-            await check(arguments.uri, *arguments.cells, arguments.bits)
+            await check(arguments.uri, tuple(arguments.cells), arguments.bits)
         except BridgeError:
             if time.monotonic() > deadline:
                 raise

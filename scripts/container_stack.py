@@ -1,0 +1,412 @@
+"""The compose project on an engine of its own, for scripts/verify containers: brought up, asked, heard by a client."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import re
+import statistics
+import subprocess
+import threading
+import time
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Final, Self
+
+from processes import ROOT
+from verify_rosbridge import CheckError, expect
+
+OUT: Final = ROOT / "out" / "verify-containers"
+ENGINE: Final = ROOT / "scripts" / "container-engine"
+CLIENT: Final = ROOT / "scripts" / "verify_containers_client.py"
+
+UP_LIMIT, FLOW_LIMIT = 90.0, 60.0
+"""Seconds until all services are healthy, and until results flow."""
+MEAN_TV, LARGEST_TV = 0.06, 0.25
+"""Of results, against float64 fusion: 0.04 on average at a target count of 255, and what no draw of a frame reaches."""
+MAX_CYCLES: Final = 1 << 17
+"""A frame that ends there has seen so unlikely readings that its counts are few: no bound holds for it."""
+RESULTS_AGAIN: Final = 5
+"""Results in a row after which they flow again."""
+
+CORE: Final = ("master", "subscriber", "publisher", "pcie-app")
+BOARDS: Final = ("board0", "board1", "board2", "board3")
+BOAT: Final = ("hub", "boat-simulator", "boat-normaliser")
+VIEWER: Final = ("boat-viewer",)
+SERVICES: Final = (*CORE, *BOARDS, *BOAT, *VIEWER)
+
+
+class Engine:
+    """scripts/container-engine, up while the context lasts; ends with this process, however that ends."""
+
+    def __init__(self) -> None:
+        self._process: subprocess.Popen[str] | None = None
+        self.environment: dict[str, str] = {}
+        self.home = Path()
+
+    def __enter__(self) -> Self:
+        # the engine runs for as long as this process holds the other end of its standard input
+        self._process = subprocess.Popen(
+            [str(ENGINE), "run", "sh", "-c", "env && echo up && cat"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            if line == "up\n":
+                break
+            name, _, value = line.rstrip("\n").partition("=")
+            if name in {"DOCKER_HOST", "DOCKER_CONFIG", "PATH", "ROSBAYES_ENGINE_HOME"}:
+                self.environment[name] = value
+        else:
+            code = self._process.wait(60)
+            raise CheckError(
+                f"scripts/container-engine ended with exit code {code}; what it said stands above"
+            )
+        self.home = Path(self.environment["ROSBAYES_ENGINE_HOME"])
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._process is None:
+            return
+        assert self._process.stdin is not None
+        self._process.stdin.close()
+        try:
+            self._process.wait(60)
+        except subprocess.TimeoutExpired:
+            self._process.kill()  # whatever it started dies with it
+            self._process.wait(10)
+
+    def left_behind(self) -> list[str]:
+        """Processes, mounts and control groups that should have gone with it."""
+        left = []
+        for each in Path("/proc").iterdir():
+            with contextlib.suppress(OSError):
+                if (
+                    each.name.isdigit()
+                    and str(self.home / "engine").encode() in (each / "cmdline").read_bytes()
+                ):
+                    left.append(f"process {each.name}")
+        mounts = Path("/proc/mounts").read_text().splitlines()
+        left += [f"mount {line.split()[1]}" for line in mounts if str(self.home) in line]
+        for root, folders, _ in os.walk("/sys/fs/cgroup"):
+            left += [f"control group {root}/{name}" for name in folders if name == "rosbayes-engine"]
+        return left
+
+
+@dataclass(slots=True)
+class Result:
+    """One line of the client: when a result arrived (Unix time, s), and how far it is from float64."""
+
+    at: float
+    cycles: int
+    tv: float | None
+    wrong: str
+
+    @classmethod
+    def of(cls, told: dict[str, Any]) -> Self:
+        """A line, read."""
+        return cls(told["at"], told["cycles"], told.get("tv"), told.get("wrong", ""))
+
+
+class Client:
+    """verify_containers_client.py in a container that goes on until the context ends."""
+
+    def __init__(self, stack: Stack, uri: str, network: str, *flags: str) -> None:
+        self._stack = stack
+        self._name = "verify-client"
+        self._command = [*stack.client_command(network, "--name", self._name), uri, *flags]
+        self._process: subprocess.Popen[str] | None = None
+        self.results: list[Result] = []
+        self._news = threading.Condition()
+        self._log = (OUT / "client.log").open("a", buffering=1)
+
+    def __enter__(self) -> Self:
+        self._process = subprocess.Popen(
+            self._command,
+            env=self._stack.environment,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=self._log,
+            text=True,
+            start_new_session=True,
+        )
+        threading.Thread(target=self._read, args=(self._process,), daemon=True).start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._process is not None:
+            self._process.terminate()  # which docker passes on, even to a container that is only about to start
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self._process.wait(10)
+            self._process.kill()
+            self._process.wait(10)
+        self._stack.docker("rm", "--force", self._name, check=False)
+        self._log.close()
+
+    def _read(self, process: subprocess.Popen[str]) -> None:
+        assert process.stdout is not None
+        for line in process.stdout:
+            told = json.loads(line)
+            self._log.write(line)
+            if "at" in told:
+                with self._news:
+                    self.results.append(Result.of(told))
+                    self._news.notify_all()
+
+    def flowing(self, after: float, count: int = RESULTS_AGAIN, limit: float = FLOW_LIMIT) -> float:
+        """Wait for so many right results that arrived after a time; gives when the first of them did.
+
+        Raises:
+            CheckError: they don't come in time, or one is wrong.
+        """
+        with self._news:
+            came = self._news.wait_for(lambda: len(self._after(after)) >= count, limit)
+        results = self._after(after)
+        if not came:
+            last = (
+                f"the last one came {after - self.results[-1].at:.1f} s before"
+                if self.results
+                else "none ever came"
+            )
+            raise CheckError(
+                f"{len(results)} of {count} results came within {limit:g} s; {last if not results else ''}"
+            )
+        check_results(results)
+        return results[0].at
+
+    def silent(self, seconds: float, limit: float) -> None:
+        """Wait until no result has come for a while.
+
+        Raises:
+            CheckError: they go on coming.
+        """
+        deadline = time.time() + limit
+        while self.results and time.time() - self.results[-1].at < seconds:
+            expect(time.time() < deadline, f"results still come after {limit:g} s")
+            time.sleep(0.1)
+
+    def _after(self, after: float) -> list[Result]:
+        return [each for each in self.results if each.at > after]
+
+
+def check_results(results: list[Result]) -> str:
+    """Results are float64's but for the machine's own randomness; gives their figures in words.
+
+    Raises:
+        CheckError: they are not.
+    """
+    wrong = [each.wrong for each in results if each.wrong]
+    # who has just connected, or connected again, may have missed a reading whose result it hears
+    others = [each for each in wrong if each != "no reading has its stamp"]
+    expect(not others, f"a result is wrong: {others[:1]}")
+    expect(len(wrong) <= len(results) / 2, "of most results no reading was heard")
+    variations = [each.tv for each in results if each.tv is not None and each.cycles < MAX_CYCLES]
+    if not variations:
+        return "only frames that ran out of cycles"
+    mean, largest = statistics.fmean(variations), max(variations)
+    expect(largest <= LARGEST_TV, f"a result's total variation to float64 fusion is {largest:.3f}")
+    expect(
+        mean <= MEAN_TV or len(variations) < 20,
+        f"results' mean total variation to float64 fusion is {mean:.3f}",
+    )
+    ran_out = sum(each.cycles >= MAX_CYCLES for each in results)
+    return (
+        f"{len(variations)} results, total variation to float64 fusion {mean:.3f} on average, {largest:.3f} at most"
+        + (f"; {ran_out} that ran out of cycles" if ran_out else "")
+    )
+
+
+class Stack:
+    """The compose project, and the docker commands to treat it with."""
+
+    def __init__(self, engine: Engine, project: Path, only: str) -> None:
+        self.only = only
+        self.engine = engine
+        self.project = project
+        self.variables: dict[str, str] = {}
+        self.notes: list[str] = []
+
+    @property
+    def environment(self) -> dict[str, str]:
+        """Of docker's commands: the compose file's variables are those of the check, and no others."""
+        kept = {name: os.environ[name] for name in ("HOME", "LANG", "TMPDIR") if name in os.environ}
+        extra = {"COMPOSE_ANSI": "never", "COMPOSE_PROGRESS": "plain", "BUILDKIT_PROGRESS": "plain"}
+        return kept | extra | self.engine.environment | self.variables
+
+    def docker(self, *arguments: str, limit: float = 60, check: bool = True) -> str:
+        """Run docker and give what it prints.
+
+        Raises:
+            CheckError: it fails, or does not end in time.
+        """
+        what = f"docker {' '.join(arguments[:3])}"
+        with (OUT / "docker.log").open("a") as log:
+            log.write(f"--- {datetime.now(UTC):%H:%M:%S} docker {' '.join(arguments)}\n")
+            log.flush()
+            try:
+                done = subprocess.run(
+                    ["docker", *arguments],
+                    env=self.environment,
+                    cwd=self.project,
+                    stdin=subprocess.DEVNULL,
+                    capture_output=True,
+                    text=True,
+                    timeout=limit,
+                    check=False,
+                )
+            except subprocess.TimeoutExpired:
+                raise CheckError(f"{what} did not end within {limit:g} s") from None
+            log.write(done.stderr)
+        if check and done.returncode:
+            said = (done.stderr.strip() or done.stdout.strip()).splitlines()[-8:]
+            raise CheckError(
+                f"{what} ended with exit code {done.returncode}:\n      " + "\n      ".join(said)
+            )
+        return done.stdout
+
+    def compose(self, *arguments: str, limit: float = 60) -> str:
+        """Run docker compose."""
+        return self.docker("compose", *arguments, limit=limit)
+
+    def client_command(self, network: str, *options: str) -> list[str]:
+        """How a client's container is started; its URI and flags follow."""
+        volumes = ["--volume", f"{self.project / 'scripts' / CLIENT.name}:/client.py:ro"]
+        safe = ["--read-only", "--tmpfs", "/tmp", "--cap-drop", "ALL", "--init"]  # noqa: S108 - the container's own
+        return [
+            "docker",
+            "run",
+            "--rm",
+            *options,
+            "--network",
+            network,
+            *safe,
+            *volumes,
+            "rosbayes",
+            "python",
+            "/client.py",
+        ]
+
+    def up(self, services: tuple[str, ...] = SERVICES) -> float:
+        """Start it and wait until all of it is healthy; gives the seconds that it took.
+
+        Raises:
+            CheckError: it does not get healthy, or has other services than it should.
+        """
+        began = time.time()
+        self.compose("up", "--detach", "--wait", "--wait-timeout", str(int(UP_LIMIT)), limit=UP_LIMIT + 30)
+        took = time.time() - began
+        running = set(self.states())
+        expect(running == set(services), f"it runs {sorted(running)} instead of {sorted(services)}")
+        return took
+
+    def down(self) -> None:
+        """Take it away."""
+        self.variables.clear()
+        self.compose("down", "--volumes", "--remove-orphans", "--timeout", "5", limit=60)
+
+    def container(self, service: str) -> str:
+        """The name of a service's container."""
+        return f"rosbayes-{service}-1"
+
+    def inspect(self, *services: str) -> list[dict[str, Any]]:
+        """What the engine says of services' containers."""
+        told: list[dict[str, Any]] = json.loads(
+            self.docker("inspect", *(self.container(each) for each in services))
+        )
+        return told
+
+    def states(self) -> dict[str, dict[str, Any]]:
+        """State of all the project's containers, by service."""
+        ids = self.compose("ps", "--all", "--quiet").split()
+        told = json.loads(self.docker("inspect", *ids)) if ids else []
+        return {each["Config"]["Labels"]["com.docker.compose.service"]: each["State"] for each in told}
+
+    def healthy(self, limit: float = UP_LIMIT) -> None:
+        """Wait until all services are healthy.
+
+        Raises:
+            CheckError: one does not get so in time.
+        """
+        deadline = time.time() + limit
+        while True:
+            states = self.states()
+            ill = {
+                name: state
+                for name, state in states.items()
+                if state.get("Health", {}).get("Status") != "healthy"
+            }
+            if not ill:
+                return
+            if time.time() > deadline:
+                name, state = next(iter(ill.items()))
+                probes = state.get("Health", {}).get("Log") or [{"Output": "no probe"}]
+                raise CheckError(f"{name} is not healthy after {limit:g} s: {probes[-1]['Output'].strip()}")
+            time.sleep(0.25)
+
+    def ready(self) -> None:
+        """Ask every service at once, rather than wait for its next probe.
+
+        Raises:
+            CheckError: one is not ready.
+        """
+        for service in self.states():
+            self.docker("exec", self.container(service), "python", "-m", "services.ready", service)
+
+    def signal(self, service: str, name: str) -> None:
+        """Send a signal to the process inside: `docker kill` would count as somebody's wish, and nothing be restarted."""
+        self.docker("exec", self.container(service), "sh", "-c", f"kill -{name} -1")
+
+    def log(self, service: str, since: float) -> str:
+        """What a service, or a container outside the project, has said since a time."""
+        container = self.container(service) if service in SERVICES else service
+        done = subprocess.run(
+            ["docker", "logs", "--since", f"{since:.3f}", container],
+            env=self.environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            timeout=30,
+            check=False,
+        )
+        return done.stdout
+
+    def restarted(self, service: str, before: int, since: float, limit: float = 30) -> float:
+        """Wait until the engine has started a service anew; gives when.
+
+        Raises:
+            CheckError: it does not.
+        """
+        deadline = time.time() + limit
+        while True:
+            (told,) = self.inspect(service)
+            state = told["State"]
+            # the count rises before the start, and until then the old one's times stand there
+            if (
+                told["RestartCount"] > before
+                and state["Running"]
+                and not state["Restarting"]
+                and seconds(state["StartedAt"]) > since
+            ):
+                return seconds(state["StartedAt"])
+            expect(time.time() < deadline, f"{service} was not restarted within {limit:g} s")
+            time.sleep(0.1)
+
+    def restarts(self, service: str) -> int:
+        """How often the engine has restarted a service."""
+        return int(self.inspect(service)[0]["RestartCount"])
+
+    def save_logs(self, check: str) -> None:
+        """Keep all logs in the folder of results, as they are after a check."""
+        with contextlib.suppress(CheckError):
+            logs = self.compose("logs", "--timestamps", "--no-color", limit=30)
+            (OUT / f"{re.sub(r'[^A-Za-z0-9]+', '-', check)}.log").write_text(logs)
+
+
+def seconds(stamp: str) -> float:
+    """Unix time of the engine's way to write a time, which has nanoseconds."""
+    return datetime.fromisoformat(re.sub(r"(\.\d{1,6})\d*Z$", r"\1+00:00", stamp)).timestamp()
