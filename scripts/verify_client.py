@@ -1,0 +1,459 @@
+"""Every operation of the client on a real ROS 2 rosbridge server, then on the hub: see scripts/verify.
+
+The publisher and the subscriber are both ours, so what is checked is that a server that this project did not write
+takes what the client says and says what the client reads; the codecs are checked against cbor2 and rosbags.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import logging
+import math
+import os
+import signal
+import sys
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable
+from pathlib import Path
+from socket import socket
+from typing import Any
+
+import numpy as np
+import real_rosbridge
+from processes import ROOT, Process, run_script
+from verify_rosbridge import KINDS, SERVER_LIMIT, CheckError, Kind, Tally, expect
+
+from bridge import stamps
+from bridge.client import Message, Qos, Ros, State, connect
+from bridge.errors import BridgeError, EncodeError, GoalError, NoMessageError, ServiceError
+from bridge.protocol import Compression
+from bridge.serialised import MessageTypes
+
+LIMIT = 240.0
+"""Seconds after which the verification gives up, whatever it waits for."""
+PATIENCE = 10.0
+"""Seconds that anything may take that is to come."""
+SILENCE = 1.0
+"""Seconds after which what has not come is not to come."""
+ARRAY = "std_msgs/Float64MultiArray"
+OUT = ROOT / "out" / "verify-client"
+ULP = 1e-15
+"""The real server's JSON loses the last bit of some doubles."""
+
+
+class Stand:
+    """One server, and clients of it."""
+
+    def __init__(self, kind: Kind, port: int) -> None:
+        self.kind = kind
+        self.port = port
+        self.notes: list[str] = []
+        self._server: Process | None = None
+        self._started = 0
+        self._topics = 0
+
+    @property
+    def uri(self) -> str:
+        """Where it serves."""
+        return f"ws://127.0.0.1:{self.port}"
+
+    @property
+    def real(self) -> bool:
+        """Whether real ROS 2 is behind it."""
+        return self.kind is KINDS["real"]
+
+    def topic(self) -> str:
+        """A topic that nobody used before."""
+        self._topics += 1
+        return f"/verify/topic_{self._topics}"
+
+    async def start(self) -> None:
+        """Start the server, and wait until it serves.
+
+        Raises:
+            CheckError: it did not.
+        """
+        self._started += 1
+        log = OUT / f"{self.kind.name.replace(' ', '-')}-{self._started}.log"
+        self._server = Process(self.kind.name, log)
+        await self._server.start(*(word.replace("PORT", str(self.port)) for word in self.kind.command))
+        try:
+            async with asyncio.timeout(SERVER_LIMIT):
+                await self._server.line(self.kind.ready)
+        except TimeoutError:
+            raise CheckError(f"the {self.kind.name} did not serve within {SERVER_LIMIT:g} s") from None
+
+    async def stop(self, *, kill: bool = False) -> None:
+        """End the server, or kill it."""
+        if self._server is not None:
+            if kill:
+                os.kill(self._server.pid, signal.SIGKILL)
+            await self._server.end()
+            self._server = None
+
+    @contextlib.asynccontextmanager
+    async def clients(self, **options: Any) -> AsyncIterator[tuple[Ros, Ros]]:
+        """A subscriber and a publisher."""
+        async with connect(self.uri) as subscriber, connect(self.uri, **options) as publisher:
+            yield subscriber, publisher
+
+    async def passed(
+        self,
+        msg: dict[str, Any],
+        type_name: str = ARRAY,
+        *,
+        offer: Qos | None = None,
+        fragments_out: int | None = None,
+        **options: Any,
+    ) -> Message:
+        """What becomes of a message on its way through the server."""
+        topic = self.topic()
+        async with self.clients(fragment_size=fragments_out) as (subscriber, publisher):
+            subscription = subscriber.subscribe(topic, type_name, **options)
+            publication = await publisher.advertise(topic, type_name, qos=offer)
+            await settled(subscriber, publisher)
+            await publication.publish(msg)
+            message = await subscription.next(PATIENCE)
+            expect(subscriber.unusable == 0, f"{subscriber.unusable} messages could not be used")
+            return message
+
+
+async def settled(*clients: Ros) -> None:
+    """Wait until the server has done what was asked before, and ROS has told its network."""
+    for ros in clients:
+        with contextlib.suppress(ServiceError):
+            await ros.call("/rosapi/get_time", timeout=PATIENCE)
+    await asyncio.sleep(0.3)
+
+
+def same(found: Any, wanted: Any) -> None:
+    """Numbers are the same but for the last bit."""
+    expect(np.allclose(found, wanted, rtol=ULP, atol=0), f"{found} came of {wanted}")
+
+
+# The checks
+
+
+async def check_json(stand: Stand) -> None:
+    """Both forms of type names, lists and arrays."""
+    for type_name in (ARRAY, "std_msgs/msg/Float64MultiArray"):
+        same((await stand.passed({"data": [1, 2.5]}, type_name)).msg["data"], [1.0, 2.5])
+    values = np.random.default_rng(1).normal(size=1024)
+    for sent in (values, values[::-1], values.astype(">f8")):
+        message = await stand.passed({"data": sent}, arrays="numpy")
+        expect(isinstance(message.msg["data"], np.ndarray), "it is no array")
+        same(message.msg["data"], sent)
+
+
+async def check_cbor(stand: Stand) -> None:
+    """Typed arrays of every element, as lists and as arrays; bytes."""
+    values = np.random.default_rng(2).normal(size=1024)
+    kinds = {
+        "Float64": ("f8", values),
+        "Float32": ("f4", values.astype("f4")),
+        "Int8": ("i1", np.array([-128, 0, 127], "i1")),
+        "Int16": ("i2", np.array([-5, 5], "i2")),
+        "Int32": ("i4", np.array([-70000, 5], "i4")),
+        "Int64": ("i8", np.array([-(2**40), 5], "i8")),
+        "UInt8": ("u1", np.array([0, 7, 255], "u1")),
+        "UInt16": ("u2", np.array([0, 65535], "u2")),
+        "UInt32": ("u4", np.array([0, 2**32 - 1], "u4")),
+        "UInt64": ("u8", np.array([0, 2**50], "u8")),
+    }
+    for name, (dtype, sent) in kinds.items():
+        type_name = f"std_msgs/{name}MultiArray"
+        found = (await stand.passed({"data": sent}, type_name, compression="cbor", arrays="numpy")).msg[
+            "data"
+        ]
+        expect(isinstance(found, np.ndarray), f"{name}: {type(found).__name__} came, no array")
+        expect(found.dtype == np.dtype(dtype), f"{name}: its elements are {found.dtype}")
+        same(found, sent)
+    found = (await stand.passed({"data": values}, compression="cbor")).msg["data"]
+    expect(type(found) is list, "no list came")
+    same(found, values)
+    sent_bytes = {"data": b"\x00\x01\xff"}
+    found = (await stand.passed(sent_bytes, "std_msgs/UInt8MultiArray", compression="cbor")).msg["data"]
+    expect(found == b"\x00\x01\xff", f"{found!r} came")
+
+
+async def check_raw(stand: Stand) -> None:
+    """The serialised message, read by rosbags."""
+    types = MessageTypes()
+    values = np.random.default_rng(3).normal(size=100)
+    message = await stand.passed({"data": values}, compression="cbor-raw")
+    same(types.read(message.raw, ARRAY)["data"], values)
+    pose = {"header": stamps.header(1_500_000_000_123_456_789, "map"), "pose": {"position": {"x": 1.5}}}
+    message = await stand.passed(pose, "geometry_msgs/PoseStamped", compression="cbor-raw")
+    found = types.read(message.raw, "geometry_msgs/PoseStamped")
+    expect(stamps.header_stamp_ns(found) == 1_500_000_000_123_456_789, f"its header is {found['header']}")
+    expect(found["header"]["frame_id"] == "map", f"its header is {found['header']}")
+    expect(found["pose"]["position"]["x"] == 1.5, f"its pose is {found['pose']}")
+
+
+async def check_png(stand: Stand) -> None:
+    """Pictures."""
+    values = np.random.default_rng(4).normal(size=500)
+    same((await stand.passed({"data": values}, compression="png")).msg["data"], values)
+
+
+async def check_fragments(stand: Stand) -> None:
+    """Cut by the server, and cut by the client."""
+    text = "x\u00e4\U0001f600\n" * 500
+    for options in (
+        {"fragment_size": 100},
+        {"fragments_out": 100},
+        {"fragment_size": 50, "fragments_out": 50},
+    ):
+        found = (await stand.passed({"data": text}, "std_msgs/String", **options)).msg["data"]
+        expect(found == text, f"another text came with {options}")
+    values = np.random.default_rng(5).normal(size=500)
+    compressions: tuple[Compression, ...] = ("png", "cbor")
+    for compression in compressions:
+        message = await stand.passed({"data": values}, compression=compression, fragment_size=300)
+        same(message.msg["data"], values)
+
+
+async def check_qos(stand: Stand) -> None:
+    """What is asked is what ROS 2 does: a late reader gets what was kept, and a wish beyond the offer brings nothing."""
+    offer = Qos(reliability="best_effort", depth=5)
+    same((await stand.passed({"data": [1.5]}, offer=offer)).msg["data"], [1.5])
+    for wish in (
+        Qos(reliability="best_effort"),
+        Qos(history="keep_all"),
+        Qos(lifespan=2.5),
+        Qos(deadline=math.inf, lifespan=math.inf),
+    ):
+        same((await stand.passed({"data": [2.5]}, qos=wish)).msg["data"], [2.5])
+    topic = stand.topic()
+    kept = Qos(durability="transient_local", reliability="reliable", depth=3)
+    async with stand.clients() as (subscriber, publisher):
+        publication = await publisher.advertise(topic, ARRAY, qos=kept)
+        await settled(publisher)
+        for number in range(5):
+            await publication.publish({"data": [float(number)]})
+        await settled(publisher)
+        late = subscriber.subscribe(topic, ARRAY, qos=kept, queue_length=10)
+        if stand.real:
+            found = [(await late.next(PATIENCE)).msg["data"][0] for _ in range(3)]
+            expect(found == [2.0, 3.0, 4.0], f"a late reader got {found}")
+    if stand.real:
+        topic = stand.topic()
+        async with stand.clients() as (subscriber, publisher):
+            strict = subscriber.subscribe(topic, ARRAY, qos=Qos(reliability="reliable"))
+            publication = await publisher.advertise(topic, ARRAY, qos=Qos(reliability="best_effort"))
+            await settled(subscriber, publisher)
+            await publication.publish({"data": [1.5]})
+            try:
+                await strict.next(SILENCE)
+            except NoMessageError:
+                return
+            raise CheckError("a reliable reader heard a publisher that is not")
+
+
+async def check_latch(stand: Stand) -> None:
+    """A late reader gets the last message."""
+    topic = stand.topic()
+    async with stand.clients() as (subscriber, publisher):
+        publication = await publisher.advertise(topic, ARRAY, latch=True)
+        await settled(publisher)
+        await publication.publish({"data": [7.5]})
+        await settled(publisher)
+        same((await subscriber.subscribe(topic, ARRAY).next(PATIENCE)).msg["data"], [7.5])
+
+
+async def check_throttle(stand: Stand) -> None:
+    """One message in half a second, to one reader of two on the same topic."""
+    topic = stand.topic()
+    async with stand.clients() as (subscriber, publisher):
+        slow = subscriber.subscribe(topic, ARRAY, throttle_rate=60_000)
+        fast = subscriber.subscribe(topic, ARRAY, queue_length=100)
+        publication = await publisher.advertise(topic, ARRAY)
+        await settled(subscriber, publisher)
+        for number in range(5):
+            await publication.publish({"data": [float(number)]})
+            same((await fast.next(PATIENCE)).msg["data"], [float(number)])
+        same((await slow.next(PATIENCE)).msg["data"], [0.0])
+        try:
+            await slow.next(SILENCE)
+        except NoMessageError:
+            return
+        raise CheckError("a throttled reader got a second message")
+
+
+async def check_services(stand: Stand) -> None:
+    """Served and called, refused, not there."""
+    type_name = "rcl_interfaces/srv/ListParameters"
+
+    async def serve(args: dict[str, Any]) -> dict[str, Any]:
+        if args["depth"] == 99:
+            raise ServiceError("too deep")
+        return {"result": {"names": args["prefixes"], "prefixes": []}}
+
+    async with stand.clients() as (caller, server):
+        service = await server.advertise_service("/verify/list", type_name, serve)
+        await settled(server, caller)
+        for number in range(20):
+            answer = await caller.call("/verify/list", {"prefixes": [str(number)], "depth": 1}, PATIENCE)
+            expect(answer["result"]["names"] == [str(number)], f"it answered {answer}")
+        # ROS 2 keeps ten requests of a service, and loses what comes beyond at once.
+        answers = await asyncio.gather(
+            *(caller.call("/verify/list", {"prefixes": [str(n)], "depth": 1}, PATIENCE) for n in range(8))
+        )
+        names = [answer["result"]["names"] for answer in answers]
+        expect(names == [[str(n)] for n in range(8)], "answers went to the wrong calls")
+        try:
+            await caller.call("/verify/list", {"prefixes": [], "depth": 99}, timeout=2)
+        except BridgeError as error:
+            stand.notes.append(f"a refusal: {error}")
+        else:
+            raise CheckError("a refusal came as an answer")
+        await service.close()
+        try:
+            await caller.call("/verify/nowhere", timeout=PATIENCE)
+        except ServiceError as error:
+            stand.notes.append(f"a service that is not there: {error}")
+        else:
+            raise CheckError("a service that is not there answered")
+
+
+async def check_goal(stand: Stand) -> None:
+    """A goal for an action that nobody serves ends with a sentence."""
+    async with connect(stand.uri) as ros:
+        goal = await ros.send_goal("/verify/fly", "example_interfaces/action/Fibonacci", {"order": 3})
+        try:
+            await goal.result(PATIENCE)
+        except GoalError as error:
+            stand.notes.append(str(error))
+        else:
+            raise CheckError("it has a result")
+        expect([each async for each in goal] == [], "it has feedback")
+
+
+async def check_silence(stand: Stand) -> None:
+    """What the server says of a wrong type is in the error of the wait."""
+    topic = stand.topic()
+    async with stand.clients() as (subscriber, publisher):
+        await publisher.advertise(topic, ARRAY)
+        await settled(publisher)
+        subscription = subscriber.subscribe(topic, "std_msgs/String")
+        try:
+            await subscription.next(SILENCE)
+        except NoMessageError as error:
+            stand.notes.append(str(error))
+            expect(not stand.real or "type" in str(error), f"the reason is not told: {error}")
+        else:
+            raise CheckError("a message of another type came")
+
+
+async def check_nan(stand: Stand) -> None:
+    """What the server would drop without a word is refused here with its place."""
+    topic = stand.topic()
+    async with stand.clients() as (_subscriber, publisher):
+        publication = await publisher.advertise(topic, ARRAY)
+        try:
+            await publication.publish({"data": np.array([1.5, math.nan])})
+        except EncodeError as error:
+            expect("data[1]" in str(error), f"the place is not named: {error}")
+        else:
+            raise CheckError("a NaN left")
+
+
+async def check_restart(stand: Stand) -> None:
+    """A killed server: everything is restored, and the reader is told how long it was blind."""
+    topics = {form: stand.topic() for form in ("none", "cbor", "cbor-raw", "png")}
+    async with stand.clients() as (subscriber, publisher):
+        readers = {
+            form: subscriber.subscribe(topic, ARRAY, compression=form) for form, topic in topics.items()
+        }
+        writers = {form: await publisher.advertise(topic, ARRAY) for form, topic in topics.items()}
+        begun = time.monotonic()
+        await stand.stop(kill=True)
+        await subscriber.wait_for_state(State.RECONNECTING, PATIENCE)
+        await asyncio.sleep(0.5)
+        await stand.start()
+        for ros in (subscriber, publisher):
+            await ros.wait_for_state(State.CONNECTED, 2 * PATIENCE)
+        back = time.monotonic() - begun
+        await settled(subscriber, publisher)
+        for form, writer in writers.items():
+            await writer.publish({"data": [1.5]})
+            message = await readers[form].next(PATIENCE)
+            expect(
+                0.5 <= message.blind_seconds <= back + 1, f"{form}: blind for {message.blind_seconds:.2f} s"
+            )
+        stand.notes.append(
+            f"blind for {message.blind_seconds:.2f} s, {subscriber.reconnections} reconnection"
+        )
+
+
+CHECKS: tuple[tuple[str, Callable[[Stand], Awaitable[None]]], ...] = (
+    ("JSON, lists and arrays, type names of either ROS", check_json),
+    ("CBOR: typed arrays of ten kinds, bytes", check_cbor),
+    ("cbor-raw, read by rosbags", check_raw),
+    ("PNG", check_png),
+    ("fragments, both ways", check_fragments),
+    ("qualities of service", check_qos),
+    ("latch", check_latch),
+    ("throttle", check_throttle),
+    ("services, served and called", check_services),
+    ("a goal for an action that is not there", check_goal),
+    ("a wrong type", check_silence),
+    ("NaN", check_nan),
+    ("the server killed", check_restart),
+)
+
+
+async def verify(kinds: list[str]) -> int:
+    """All checks on each server."""
+    OUT.mkdir(parents=True, exist_ok=True)
+    logging.getLogger("bridge").setLevel(logging.CRITICAL)  # the checks say what matters
+    tally = Tally()
+    for name in kinds:
+        with socket() as free:
+            free.bind(("127.0.0.1", 0))
+            stand = Stand(KINDS[name], free.getsockname()[1])
+        try:
+            await stand.start()
+            for title, check in CHECKS:
+                started, why = time.monotonic(), None
+                stand.notes.clear()
+                try:
+                    await check(stand)
+                except (CheckError, BridgeError) as error:
+                    why = f"{type(error).__name__}: {error}"
+                tally.tell(
+                    f"{stand.kind.name}: {title}",
+                    started,
+                    why,
+                    "\n".join(f"    {note}" for note in stand.notes),
+                )
+        finally:
+            await stand.stop()
+    print(f"{tally.passed} passed, {tally.failed} failed")
+    return 1 if tally.failed else 0
+
+
+def main() -> int:
+    """Read the flags; with the real server, move into a network of its own first."""
+    parser = argparse.ArgumentParser(prog="scripts/verify client", description=__doc__.splitlines()[0])
+    parser.add_argument("--server", choices=["real", "hub", "both"], default="both", help="(both)")
+    server = parser.parse_args().server
+    kinds = ["real", "hub"] if server == "both" else [server]
+    if "real" in kinds and not real_rosbridge.network_is_alone():
+        try:
+            real_rosbridge.install()
+            alone = real_rosbridge.network_command()
+            real_rosbridge.become([*alone, sys.executable, str(Path(__file__).resolve()), "--server", server])
+        except real_rosbridge.RealServerError as error:
+            print(f"error: {error}", file=sys.stderr)
+            return 2
+        except KeyboardInterrupt:
+            print("interrupted (Ctrl-C)", file=sys.stderr)
+            return 130
+    return run_script(lambda: verify(kinds), LIMIT)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
