@@ -152,7 +152,8 @@ def wrapped_normal_table(
     upper = np.roll(lower, -1, axis=0)
     over = upper <= lower  # the bin opposite the mean, where the circle was cut open
     table = np.zeros_like(lower)
-    copies = math.ceil(_FARTHEST_COPY * float(np.max(sigma)) / turn - 0.5)
+    # The bin that was cut open reaches a step beyond half a turn.
+    copies = math.ceil((_FARTHEST_COPY * float(np.max(sigma)) + step) / turn - 0.5)
     for copy in range(-max(copies, 0), max(copies, 0) + 1):
         z_lower = (lower + copy * turn) / sigma
         z_upper = (np.where(over, upper + turn, upper) + copy * turn) / sigma

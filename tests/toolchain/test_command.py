@@ -86,6 +86,132 @@ def test_mistakes(case, arguments, sentence):
     assert not (case.parent / "out").exists()
 
 
+NETWORK = """
+variable rain { type discrete [ 2 ] { yes, no }; }
+variable sprinkler { type discrete [ 2 ] { on, off }; }
+variable grass { type discrete [ 2 ] { wet, dry }; }
+variable shoes { type discrete [ 2 ] { wet, dry }; }
+probability ( rain ) { table 0.2, 0.8; }
+probability ( sprinkler | rain ) { (yes) 0.01, 0.99; (no) 0.4, 0.6; }
+probability ( grass | sprinkler, rain ) { table 0.99 0.9 0.8 0.0 0.01 0.1 0.2 1.0; }
+probability ( shoes | grass ) { (wet) 0.7, 0.3; (dry) 0.1, 0.9; }
+"""
+
+
+@pytest.fixture
+def network(tmp_path):
+    path = tmp_path / "garden.bif"
+    path.write_text(NETWORK)
+    return path
+
+
+def test_a_network_with_a_question(network):
+    result = build(network, "--searched", "rain,sprinkler", "--known", "shoes", "--on-missing", "missing")
+    assert result.exit_code == 0, result.stderr
+    deployment = load_deployment(network.parent / "out")
+    assert deployment.name == "garden"
+    assert [(each.label, each.states) for each in deployment.searched] == [
+        ("rain", ("yes", "no")),
+        ("sprinkler", ("on", "off")),
+    ]
+    (shoes,) = deployment.variables
+    assert (shoes.states, shoes.on_missing, shoes.offset, shoes.step) == (("wet", "dry"), "missing", 0, 1)
+    assert "  shoes: 0 wet, 1 dry\n" in result.stdout
+    assert "  rain: 1 yes, 0 no\n" in result.stdout
+
+
+def test_a_network_with_a_fixed_and_a_selecting_variable(network):
+    question = [
+        "--searched",
+        "grass",
+        "--known",
+        "shoes",
+        "--given",
+        "sprinkler=on",
+        "--prior-select",
+        "rain",
+    ]
+    assert build(network, *question).exit_code == 0
+    deployment = load_deployment(network.parent / "out")
+    assert [(each.name, each.kind) for each in deployment.variables] == [
+        ("shoes", "sensor"),
+        ("rain", "prior_select"),
+    ]
+    assert deployment.machine.prior_bits == 2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        ([], "garden.bif is a network: say what is searched and known, such as --searched A --known B,C"),
+        (
+            ["--searched", "grass", "--known", "rain,sprinkler"],
+            "rain and sprinkler are not independent given grass: rain -> sprinkler joins them; leave rain",
+        ),
+        (["--searched", "gras"], "garden has no variable 'gras'; it has rain, sprinkler, grass, shoes"),
+        (["--searched", "rain,,grass"], "--searched rain,,grass: expected names with a comma between them"),
+        (
+            ["--searched", "rain", "--given", "grass"],
+            "--given grass: expected KEY=VALUE, such as --given smoke=yes",
+        ),
+        (["--searched", "rain", "--given", "grass=damp"], "grass is never 'damp'; expected wet, dry"),
+        (["--searched", "rain", "--set", "size=3"], "--set size: a network's file has no parameters"),
+        (["--searched", "rain", "--prior-path", "x"], "add --prior-mode written"),
+    ],
+)
+def test_questions_that_cannot_be_built(network, arguments, sentence):
+    result = build(network, *arguments)
+    assert result.exit_code == 2
+    assert sentence in result.stderr
+    assert not (network.parent / "out").exists()
+
+
+def test_a_question_to_a_folder(case):
+    result = build(case, "--searched", "s")
+    assert result.exit_code == 2
+    assert "--searched asks a network's file, but" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("option", "value"), [("--uri", "robot:9090"), ("--topic", "a b"), ("--type", "x"), ("--output", "/a b")]
+)
+def test_a_wrong_target_is_refused_before_the_model_is_read(case, option, value):
+    (case / "model.py").write_text("raise SystemExit('the model was read')")
+    target = list(TARGET)
+    if option in target:
+        target[target.index(option) + 1] = value
+    else:
+        target += [option, value]
+    result = build(case, target=target)
+    assert result.exit_code == 2
+    assert result.stderr.startswith(f"error: {option}: ")
+
+
+@pytest.mark.parametrize("command", [[], ["build"], ["fit"], ["new"]])
+def test_short_help(command):
+    result = CliRunner().invoke(app, [*command, "-h"])
+    assert result.exit_code == 0
+    assert "Usage: " in result.stdout
+
+
+def test_a_written_prior(case):
+    result = build(case, "--prior-mode", "written", "--prior-path", "prior.data")
+    assert result.exit_code == 0, result.stderr
+    assert load_deployment(case.parent / "out").prior.path == "prior.data"
+
+
+def test_a_question_is_a_model_too(case):
+    (case / "model.py").write_text(
+        "from toolchain.distribution import uniform\n"
+        "from toolchain.joint import JointDistribution\n"
+        "from toolchain.symbol import IntegerType, Symbol\n"
+        "def model():\n"
+        "    return JointDistribution('q', (uniform(Symbol('s', IntegerType(1, 6))),)).ask(['s'])\n"
+    )
+    assert build(case).exit_code == 0
+    assert load_deployment(case.parent / "out").searched[0].value(0) == 1
+
+
 def test_a_folder_without_a_model(tmp_path):
     result = build(tmp_path / "nowhere")
     assert result.exit_code == 2
@@ -121,7 +247,7 @@ def test_signals_end_it_with_their_code(case, number, code):
     finally:
         process.kill()
     assert process.returncode == code
-    assert f"error: ended by {number.name}; the deployment is not complete" in sentences
+    assert f"error: ended by {number.name}; what was asked for is not complete" in sentences
     assert "Traceback" not in sentences
 
 

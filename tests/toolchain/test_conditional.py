@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from toolchain.conditional import normal, wrapped_normal
@@ -31,6 +31,7 @@ def test_a_normal_is_the_integral_over_each_bin_with_tails_at_the_ends(mean, sig
 
 
 @given(MEANS, st.floats(0.05, 30), st.integers(1, 30), st.floats(-50, 50), st.floats(0.1, 3))
+@example(np.array([1.0]), 0.125, 2, 0.0, 1.5)  # the wide bin opposite the mean has its mass on the near side
 def test_a_wrapped_normal_is_the_sum_over_all_turns(mean, sigma, values, offset, step):
     known = wrapped_normal("B", mean=mean, sigma=sigma, values=values, offset=offset, step=step)
     turn = values * step
