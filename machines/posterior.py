@@ -30,21 +30,37 @@ def joint_posterior(
     """
     if len(counts) != len(cycles):
         raise MachineError(f"There are counts of {len(counts)} boards and cycles of {len(cycles)}.")
-    divisors = []
-    for board, (count, run) in enumerate(zip(counts, cycles, strict=True)):
-        if run <= 0 and np.any(count):
-            raise MachineError(f"Board {board} has counts, but ran {run} cycles.")
-        divisors.append(max(run, 1))
-    if not divisors:
+    if not counts:
         return None
-    together = np.concatenate(counts)
-    joint: npt.NDArray[np.float64]
-    if len(set(divisors)) == 1:
-        joint = together / divisors[0]
-    else:
-        joint = together / np.repeat(np.array(divisors, dtype=np.float64), [len(count) for count in counts])
+    return posterior_of_lines(np.concatenate(counts), [len(count) for count in counts], cycles)
+
+
+def posterior_of_lines(
+    counts: npt.NDArray[np.uint32], lines: Sequence[int], cycles: Sequence[int]
+) -> npt.NDArray[np.float64] | None:
+    """The same as `joint_posterior`, of counts that lie one after the other.
+
+    Args:
+        counts: uint32[all lines], board after board.
+        lines: Lines of each board.
+        cycles: Cycles that each board ran.
+
+    Returns:
+        float64[all lines] with the sum 1, or None where every count is 0.
+
+    Raises:
+        MachineError: A board has counts and ran no cycle.
+    """
+    if min(cycles) <= 0:
+        end = 0
+        for board, (own, run) in enumerate(zip(lines, cycles, strict=True)):
+            end += own
+            if run <= 0 and np.any(counts[end - own : end]):
+                raise MachineError(f"Board {board} has counts, but ran {run} cycles.")
+        cycles = [max(run, 1) for run in cycles]
+    joint: npt.NDArray[np.float64] = counts / np.repeat(np.array(cycles, dtype=np.float64), lines)
     total = float(joint.sum())
-    return joint / total if total > 0 else None
+    return np.divide(joint, total, out=joint) if total > 0 else None
 
 
 def posterior(

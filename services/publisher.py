@@ -14,8 +14,6 @@ from collections.abc import AsyncIterator
 from typing import Annotated, Any, Literal
 
 import msgspec
-import numpy as np
-import numpy.typing as npt
 import orjson
 import typer
 
@@ -31,8 +29,8 @@ from services.results import (
     FRAME_TOPIC,
     FRAME_TYPE,
     FrameReport,
+    Inferred,
     posterior_layout,
-    posterior_of,
     times_of,
 )
 from services.serving import MakeLink, deployment_for, endpoint_from, listening
@@ -146,48 +144,43 @@ class ResultTopics:
             publish: the result and its frame's times.
             look: wait until the result was seen on the wire, or the settings' time is over.
         """
-        posterior = posterior_of(publish.result)
+        inferred = Inferred(publish.result)
         if all(ros.state is not State.CONNECTED for ros, _ in self._outputs):
-            return _became_of(publish, posterior, "rosbridge away")
+            return _became_of(publish, inferred, "rosbridge away")
         try:
             for _, publication in self._outputs:
                 await publication.ready()
         except BridgeError as error:
-            return self._away(publish, posterior, error)
-        published = self.publish_or_say(publish, posterior)
-        if look and published.outcome == "published" and posterior is not None:
-            seen = await self._seen(posterior.tolist(), self._settings.seen_timeout)
+            return self._away(publish, inferred, error)
+        published = self.publish_or_say(publish, inferred)
+        if look and published.outcome == "published" and inferred.posterior is not None:
+            seen = await self._seen(inferred.posterior.tolist(), self._settings.seen_timeout)
             published = msgspec.structs.replace(published, seen=seen)
         return published
 
-    def publish_or_say(self, publish: Publish, posterior: npt.NDArray[np.float64] | None) -> Published:
+    def publish_or_say(self, publish: Publish, inferred: Inferred) -> Published:
         """Publish a frame's data and its posterior at once, or say that it could not be."""
         try:
-            return self._publish_now(publish, posterior)
+            return self._publish_now(publish, inferred)
         except BridgeError as error:
-            return self._away(publish, posterior, error)
+            return self._away(publish, inferred, error)
 
-    def _away(
-        self, publish: Publish, posterior: npt.NDArray[np.float64] | None, error: BridgeError
-    ) -> Published:
+    def _away(self, publish: Publish, inferred: Inferred, error: BridgeError) -> Published:
         get_logger(ROLE).warning(str(error), frame=publish.result.number)
-        return _became_of(publish, posterior, "rosbridge away")
+        return _became_of(publish, inferred, "rosbridge away")
 
-    def _publish_now(self, publish: Publish, posterior: npt.NDArray[np.float64] | None) -> Published:
+    def _publish_now(self, publish: Publish, inferred: Inferred) -> Published:
         started = time.monotonic_ns()
         times = times_of(publish, started, self._previous_out_ns)
+        posterior = inferred.posterior
         with self._outputs[0][0].together():
             if self._frames is not None:
-                self._frames.publish_nowait(
-                    self._report.message(
-                        publish, times, published=posterior is not None, sent_ns=time.time_ns()
-                    )
-                )
+                self._frames.publish_nowait(self._report.message(publish, inferred, times, time.time_ns()))
             if posterior is not None:
                 for _, publication in self._outputs:
                     publication.publish_nowait({"layout": self._layout, "data": posterior})
         self._previous_out_ns = time.monotonic_ns() - started
-        return _became_of(publish, posterior, "no posterior" if posterior is None else "published")
+        return _became_of(publish, inferred, "no posterior" if posterior is None else "published")
 
     async def publish_array(self, values: Any) -> None:
         """Publish probabilities (float64, one per line) on every output."""
@@ -195,14 +188,14 @@ class ResultTopics:
             await publication.publish({"layout": self._layout, "data": values})
 
 
-def _became_of(publish: Publish, posterior: npt.NDArray[np.float64] | None, outcome: str) -> Published:
-    best = int(posterior.argmax()) if posterior is not None else -1
+def _became_of(publish: Publish, inferred: Inferred, outcome: str) -> Published:
+    posterior = inferred.posterior
     return Published(
         number=publish.result.number,
         outcome=outcome,
         seen=None,
-        best_line=best,
-        best_probability=float(posterior[best]) if posterior is not None else 0.0,
+        best_line=inferred.best,
+        best_probability=float(posterior[inferred.best]) if posterior is not None else 0.0,
         cycles=max((board.cycles for board in publish.result.boards), default=0),
         total_ns=time.monotonic_ns() - publish.received_tick,
     )
@@ -256,7 +249,7 @@ class Publisher:
         elif isinstance(record, Publish):
             if not (self._once or self._busy or self._topics.must_wait):
                 # the usual case: nothing to wait for, and so no other task to wake
-                self._tell(self._topics.publish_or_say(record, posterior_of(record.result)))
+                self._tell(self._topics.publish_or_say(record, Inferred(record.result)))
                 return
             self._busy = True  # until the queue is empty again: results stay in order
             try:

@@ -12,7 +12,7 @@ import orjson
 
 from bridge.stamps import header
 from machines.bm1 import StopReason
-from machines.posterior import joint_posterior
+from machines.posterior import posterior_of_lines
 from services.records import FrameResult, Publish
 from toolchain.deployment import Deployment
 
@@ -47,19 +47,26 @@ def counts_of(result: FrameResult) -> list[npt.NDArray[np.uint32]]:
     return [np.frombuffer(board.counts, dtype="<u4") for board in result.boards]
 
 
-def totals_of(result: FrameResult) -> list[int]:
-    """The sum of each board's counts."""
-    words = [len(board.counts) // 4 for board in result.boards]
-    if not all(words):
-        return [int(counts.sum()) for counts in counts_of(result)]
-    together = np.frombuffer(b"".join([board.counts for board in result.boards]), dtype="<u4")
-    sums: list[int] = np.add.reduceat(together, [0, *accumulate(words[:-1])], dtype=np.uint64).tolist()
-    return sums
+class Inferred:
+    """What the counts of a result come to.
 
+    Attributes:
+        posterior: float64[all lines], the joint posterior; None when no line of any board counted.
+        totals: the sum of each board's counts.
+        best: the most probable line; -1 without a posterior.
+    """
 
-def posterior_of(result: FrameResult) -> npt.NDArray[np.float64] | None:
-    """The joint posterior over all lines, float64, or None when no line of any board counted."""
-    return joint_posterior(counts_of(result), [board.cycles for board in result.boards])
+    def __init__(self, result: FrameResult) -> None:
+        boards = result.boards
+        counts = np.frombuffer(b"".join([board.counts for board in boards]), dtype="<u4")
+        lines = [len(board.counts) // 4 for board in boards]
+        self.totals: list[int] = []
+        self.posterior: npt.NDArray[np.float64] | None = None
+        if lines and all(lines):
+            starts = [0, *accumulate(lines[:-1])]
+            self.totals = np.add.reduceat(counts, starts, dtype=np.uint64).tolist()
+            self.posterior = posterior_of_lines(counts, lines, [board.cycles for board in boards])
+        self.best = -1 if self.posterior is None else int(self.posterior.argmax())
 
 
 def posterior_layout(deployment: Deployment) -> dict[str, Any]:
@@ -128,17 +135,18 @@ class FrameReport:
             {"cycles": "%d", "counts_total": "%d", "reason": "%s"},
         )
 
-    def message(self, publish: Publish, times: Times, *, published: bool, sent_ns: int) -> dict[str, Any]:
+    def message(self, publish: Publish, inferred: Inferred, times: Times, sent_ns: int) -> dict[str, Any]:
         """The DiagnosticArray that precedes a result.
 
         Args:
             publish: the result, and its reading's stamps.
+            inferred: what its counts come to.
             times: where its time went.
-            published: whether it has a posterior.
             sent_ns: Unix time.
         """
         result = publish.result
-        totals = totals_of(result)
+        totals = inferred.totals
+        published = inferred.posterior is not None
         if published:
             overall = "posterior"
         elif all(board.reason == StopReason.IMPOSSIBLE for board in result.boards):
