@@ -11,7 +11,7 @@ from typing import Any
 
 import roslibpy
 
-PATIENCE = 10
+PATIENCE = 30
 
 
 def _topics(ros: roslibpy.Ros, other: roslibpy.Ros) -> dict[str, Any]:
@@ -45,7 +45,7 @@ def _latched(ros: roslibpy.Ros, other: roslibpy.Ros) -> Any:
 
 def _throttled(ros: roslibpy.Ros, other: roslibpy.Ros) -> Any:
     heard: queue.Queue[Any] = queue.Queue()
-    topic = roslibpy.Topic(other, "/fast", "std_msgs/Int32", throttle_rate=300, queue_length=1)
+    topic = roslibpy.Topic(other, "/fast", "std_msgs/Int32", throttle_rate=1000, queue_length=1)
     topic.subscribe(heard.put)
     _wait_for(lambda: other.get_topic_type("/fast"))
     publisher = roslibpy.Topic(ros, "/fast", "std_msgs/Int32")

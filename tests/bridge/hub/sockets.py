@@ -141,6 +141,14 @@ class Bare:
             (length,) = struct.unpack("!Q", await self.reader.readexactly(8))
         return first & 15, await self.reader.readexactly(length)
 
+    async def message(self) -> bytes:
+        """The next message's payload; pings may come between any two messages."""
+        async with asyncio.timeout(PATIENCE):
+            while True:
+                opcode, payload = await self.frame()
+                if opcode in {Opcode.TEXT, Opcode.BINARY}:
+                    return payload
+
     async def ended(self) -> bytes:
         """Wait until the hub ends the connection; what came before that."""
         async with asyncio.timeout(PATIENCE):

@@ -17,6 +17,8 @@ _NAMES = ["/t", "t", "/u", "/u", "/v", "v", "/w", "", "a b"]
 _TYPES = ["a/B", "a/msg/B", "a/B", "a/B", "a/C", "nonsense"]
 _IDS: list[Any] = [None, None, "one", "two", 3, 1.5]
 _SERVICES = ["/s", "s", "/r", "/q", "/nowhere", "/rosapi/set_param", "/rosapi/topics", "/rosapi/nodes"]
+_ACTIONS = ["/a", "a", "/b", "/nowhere"]
+_FORMS: list[Any] = ["none", "none", "png", "cbor", "cbor-raw", "bson", 7]
 _WILD: list[Any] = [None, True, -1, 1e300, 10**400, float("nan"), "", "x" * 2000, [], {}, [{"a": [1]}]]
 
 
@@ -34,10 +36,14 @@ def _operation(rng: random.Random) -> dict[str, Any]:
         + ["subscribe"] * 3
         + ["call_service"] * 4
         + ["advertise", "advertise", "unadvertise", "unsubscribe", "advertise_service", "advertise_service"]
-        + ["unadvertise_service", "service_response", "fly"]
+        + ["unadvertise_service", "service_response", "fly", "set_level", "unadvertise_action"]
+        + ["send_action_goal"] * 4
+        + ["advertise_action", "advertise_action", "cancel_action_goal", "action_feedback", "action_result"]
     )
     fields: dict[str, Any] = {"op": kind}
-    if "service" in kind:
+    if "action" in kind:
+        fields |= {"action": rng.choice(_ACTIONS)}
+    elif "service" in kind:
         fields |= {"service": service}
     else:
         fields |= {"topic": name}
@@ -52,6 +58,15 @@ def _operation(rng: random.Random) -> dict[str, Any]:
     if kind == "subscribe":
         fields["throttle_rate"] = rng.choice([0, 0, 50, 1000, 0.0])
         fields["queue_length"] = rng.choice([0, 1, 3, 100])
+        fields["compression"] = rng.choice(_FORMS)
+        fields["fragment_size"] = rng.choice([0, 0, 0, 10, 300])
+    if kind == "set_level":
+        fields["level"] = rng.choice(["error", "none", "louder"])
+    if kind == "advertise_action":
+        fields["type"] = rng.choice(["a/B", "a/action/B", "a/action/C"])
+    if kind == "send_action_goal":
+        fields["args"] = rng.choice([{}, {"a": "y" * 3000}])
+        fields["feedback"] = rng.random() < 0.7
     if kind == "call_service":
         fields["args"] = rng.choice(
             [{}, {"name": name, "value": rng.choice(["1", "[2]", "x"])}, {"a": "y" * 3000}]
@@ -68,12 +83,16 @@ class _Visitor:
     def __init__(self, room: Room) -> None:
         self.guest: Guest = room.enter()
         self.requests: list[str] = []
+        self.goals: list[str] = []
         self.calls: set[int] = set()
         self.answered: set[int] = set()
 
     def send(self, operation: dict[str, Any], call_number: int) -> None:
         service = operation.get("service")
-        if operation["op"] == "call_service" and isinstance(service, str) and service:
+        action = operation.get("action")
+        call = operation["op"] == "call_service" and isinstance(service, str) and service
+        goal = operation["op"] == "send_action_goal" and isinstance(action, str) and action
+        if call or goal:
             operation["id"] = call_number
             if len(json.dumps(operation)) <= self.guest.room.broker.limits.message_bytes:
                 self.calls.add(call_number)
@@ -84,13 +103,32 @@ class _Visitor:
             happened[operation["op"]] += 1
             if operation["op"] == "call_service":
                 self.requests.append(operation["id"])
-            elif operation["op"] == "service_response":
+            elif operation["op"] == "send_action_goal":
+                self.goals.append(operation["id"])
+            elif operation["op"] in {"cancel_action_goal", "fragment", "png", "status"}:
+                pass
+            elif operation["op"] == "action_feedback":
+                assert operation["id"] in self.calls - self.answered, "feedback after the end, or unasked"
+            elif operation["op"] in {"service_response", "action_result"}:
                 assert operation["result"] is True or isinstance(operation["values"], str)
                 happened["failure"] += not operation["result"]
                 assert operation["id"] in self.calls - self.answered, "answered twice, or never asked"
                 self.answered.add(operation["id"])
             else:
                 assert set(operation) == {"op", "topic", "msg"}
+
+    def work(self, rng: random.Random) -> None:
+        """Say how far a goal is, or end it."""
+        at = rng.randrange(len(self.goals))
+        ends = rng.random() < 0.5
+        self.guest.send(
+            op="action_result" if ends else "action_feedback",
+            id=self.goals.pop(at) if ends else self.goals[at],
+            action=rng.choice(_ACTIONS),
+            values=rng.choice([{}, {"a": 1}, "no", {"a": "x" * 3300}, None]),
+            result=rng.random() < 0.7,
+            status=rng.choice([4, 5, 6, 99]),
+        )
 
     def answer(self, rng: random.Random) -> None:
         self.guest.send(
@@ -110,6 +148,7 @@ def _live(seed: int, steps: int) -> Counter[str]:
         subscriptions_per_client=4,
         services_per_client=2,
         calls_per_client=3,
+        goals_per_client=3,
         message_bytes=3500,
         client_bytes=4000,
         latched_bytes=4000,
@@ -127,8 +166,10 @@ def _live(seed: int, steps: int) -> Counter[str]:
         )[0]
         if step == "operation":
             visitor.send(_operation(rng), number)
-        elif step == "answer" and visitor.requests:
+        elif step == "answer" and visitor.requests and (not visitor.goals or rng.random() < 0.5):
             visitor.answer(rng)
+        elif step == "answer" and visitor.goals:
+            visitor.work(rng)
         elif step == "read":
             visitor.read(happened)
         elif step == "read all":
@@ -154,9 +195,14 @@ def _live(seed: int, steps: int) -> Counter[str]:
 
 
 def _end(room: Room, visitors: list[_Visitor], happened: Counter[str]) -> None:
+    for visitor in visitors:
+        if visitor.guest.client.doomed:  # as whoever owns its socket would; goals that it never read fail now
+            visitor.guest.leave()
     for _ in range(2):
         for visitor in visitors:
             visitor.read(happened)
+            for key in visitor.goals:  # a goal has no time limit: who works on it ends it, or goes
+                visitor.guest.send(op="action_result", id=key, values={})
         room.pass_time(120)
     for visitor in visitors:
         visitor.read(happened)
@@ -167,6 +213,8 @@ def _end(room: Room, visitors: list[_Visitor], happened: Counter[str]) -> None:
     graph = room.broker.graph
     assert not graph.topics
     assert not graph.services
+    assert not graph.actions
+    assert not room.broker._actions.goals
     assert not room.broker._calls.waiting
     room.pass_time(120)
     assert not room.broker._delivery.throttled
@@ -184,4 +232,6 @@ def test_in_these_lives_everything_happens() -> None:
     for seed in range(20):
         happened += _live(seed, 400)
     expected = {"publish", "call_service", "service_response", "failure", "doomed", "lost", "latched", "held"}
+    expected |= {"send_action_goal", "cancel_action_goal", "action_feedback", "action_result"}
+    expected |= {"fragment", "png", "status"}
     assert {what for what in expected if happened[what] >= 5} == expected, happened

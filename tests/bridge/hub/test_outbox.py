@@ -163,6 +163,57 @@ def test_dropping_does_not_make_the_queue_longer() -> None:
     assert _drain(outbox) == [b"first", b"x"]
 
 
+# --- straight onto the wire
+
+
+def test_while_the_socket_takes_it_nothing_waits() -> None:
+    outbox, lane = Outbox(10), _lane(queue_length=1)
+    outbox.wire = []
+    for index in range(5):
+        outbox.offer(lane, b"%d" % index, 0)
+        outbox.put(b"answer of more than ten bytes")
+    assert outbox.wire == [
+        part for index in range(5) for part in (b"%d" % index, b"answer of more than ten bytes")
+    ]
+    assert outbox.empty
+    assert (outbox.size, lane.lost, outbox.overflowed) == (0, 0, False)
+
+
+def test_what_waits_already_keeps_its_place() -> None:
+    outbox, lane, cut = Outbox(1000), _lane(), _lane()
+    cut.fragment_size = 16
+    outbox.put(b"1")
+    outbox.wire = wire = []
+    outbox.offer(lane, b"2", 0)
+    outbox.put(b"3")
+    assert wire == []
+    assert _drain(outbox) == [b"1", b"2", b"3"]
+    outbox.offer(lane, b"4", 0)
+    outbox.offer(cut, b"{%b}" % (b"5" * 30), 0)
+    assert outbox.pop() is not None  # the first of its two fragments
+    outbox.offer(lane, b"6", 0)
+    outbox.put(b"7")
+    assert wire == [b"4"]
+    *rest, six, seven = _drain(outbox)
+    assert len(rest) == 1
+    assert (six, seven) == (b"6", b"7")
+    assert outbox.empty
+
+
+def test_a_throttle_holds_also_while_the_socket_takes_everything() -> None:
+    outbox, lane = Outbox(1000), _lane(throttle=1.0, queue_length=1)
+    outbox.wire = wire = []
+    for index in range(3):
+        assert outbox.passes(lane, index / 10)
+        outbox.offer(lane, b"%d" % index, index / 10)
+    assert wire == [b"0"]
+    outbox.release(1.0)
+    assert wire == [b"0", b"2"]
+    lane.queue_length = 0
+    assert not outbox.passes(lane, 1.5)
+    assert outbox.passes(lane, 2.0)
+
+
 @dataclass
 class _ModelLane:
     throttle: float

@@ -1,0 +1,196 @@
+"""Who may come in: tokens, TLS, and what is said to who may not."""
+
+import ssl
+import subprocess
+from pathlib import Path
+
+import pytest
+from websockets.asyncio.client import connect
+from websockets.exceptions import InvalidStatus
+
+from bridge.hub.door import Door, is_loopback, read_tokens, tls_context
+from bridge.hub.errors import HubError
+from tests.bridge.hub.sockets import PATIENCE, Bare, Ears, running_hub
+
+TOKEN = "correct-horse-battery-staple"
+OTHER = "another.token_of~the-same-hub"
+
+
+@pytest.fixture(scope="module")
+def certificate(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    folder = tmp_path_factory.mktemp("certificate")
+    files = folder / "cert.pem", folder / "key.pem"
+    subprocess.run(
+        [
+            *(
+                "openssl",
+                "req",
+                "-x509",
+                "-newkey",
+                "rsa:2048",
+                "-nodes",
+                "-days",
+                "1",
+                "-subj",
+                "/CN=localhost",
+            ),
+            *("-addext", "subjectAltName=DNS:localhost,IP:127.0.0.1"),
+            *("-out", str(files[0]), "-keyout", str(files[1])),
+        ],
+        check=True,
+        capture_output=True,
+        timeout=PATIENCE,
+    )
+    return files
+
+
+@pytest.mark.parametrize(
+    ("headers", "status"),
+    [
+        ([], 401),
+        ([f"Authorization: Bearer {TOKEN}"], 101),
+        ([f"Authorization: bearer   {OTHER} "], 101),
+        ([f"Authorization: Bearer {TOKEN}x"], 401),
+        ([f"Authorization: Bearer {TOKEN[:-1]}"], 401),
+        (["Authorization: Bearer "], 401),
+        (["Authorization: Bearer \xff\xfe"], 401),
+        ([f"Authorization: Basic {TOKEN}"], 401),
+        ([f"Authorization: {TOKEN}"], 401),
+        ([f"Authorization: Bearer {TOKEN}", f"Authorization: Bearer {TOKEN}"], 401),
+        ([f"Sec-WebSocket-Protocol: rosbridge, bearer.{OTHER}"], 101),
+        (["Sec-WebSocket-Protocol: rosbridge", f"Sec-WebSocket-Protocol: bearer.{TOKEN}"], 101),
+        (["Sec-WebSocket-Protocol: rosbridge, bearer.wrong"], 401),
+        (["Sec-WebSocket-Protocol: rosbridge, bearer."], 401),
+        (["Authorization: Bearer wrong", f"Sec-WebSocket-Protocol: rosbridge, bearer.{TOKEN}"], 101),
+        (["Authorization: Bearer wrong"], 401),
+        ([f"Authorization: Bearer {TOKEN}", "Origin: https://evil.example"], 403),
+    ],
+)
+async def test_a_token_opens_the_door(headers: list[str], status: int) -> None:
+    async with running_hub(door=Door(tokens=(TOKEN, OTHER))) as port:
+        bare = await Bare.connect(port, handshake=False)
+        answer = await bare.request(*headers)
+        assert f" {status} " in answer
+        bare.hang_up()
+
+
+async def test_a_browsers_token_is_not_sent_back() -> None:
+    async with (
+        running_hub(door=Door(tokens=(TOKEN,))) as port,
+        connect(f"ws://127.0.0.1:{port}", subprotocols=["rosbridge", f"bearer.{TOKEN}"]) as socket,  # type: ignore[list-item]  # NewType of str
+    ):
+        assert socket.subprotocol == "rosbridge"
+        assert socket.response is not None
+        assert TOKEN not in str(socket.response.headers)
+        await Ears(socket).settle()
+
+
+async def test_without_tokens_a_subprotocol_is_nobodys_business() -> None:
+    async with (
+        running_hub() as port,
+        connect(f"ws://127.0.0.1:{port}", subprotocols=["rosbridge"]) as socket,  # type: ignore[list-item]  # NewType of str
+    ):
+        assert socket.subprotocol == "rosbridge"
+        await Ears(socket).settle()
+
+
+async def test_tokens_are_in_no_log_and_no_answer(caplog: pytest.LogCaptureFixture) -> None:
+    door = Door(tokens=(TOKEN,))
+    assert TOKEN not in repr(door)
+    async with running_hub(door=door) as port:
+        guess = "guess-of-a-stranger"
+        with pytest.raises(InvalidStatus) as caught:
+            await connect(f"ws://127.0.0.1:{port}", additional_headers={"Authorization": f"Bearer {guess}"})
+        response = caught.value.response
+        assert response.headers["WWW-Authenticate"] == "Bearer"
+        assert b"token" in (response.body or b"")
+    for secret in (TOKEN, guess):
+        assert secret not in caplog.text
+        assert secret not in str(response.headers) + repr(response.body)
+    assert "401" in caplog.text
+
+
+@pytest.mark.parametrize(
+    "token", ["", "short", "x" * 1025, "with spaces in the middle", "ümlaut" * 5, "a/b" * 9]
+)
+def test_a_token_that_is_guessed_or_cannot_be_sent_is_refused(token: str) -> None:
+    with pytest.raises(HubError, match="token 2 ") as caught:
+        Door(tokens=(TOKEN, token))
+    assert caught.value.exit_code == 2
+    if token:
+        assert token not in str(caught.value)
+
+
+def test_tokens_are_read_from_a_file_that_nobody_else_reads(tmp_path: Path) -> None:
+    path = tmp_path / "tokens"
+    path.write_text(f"# robots\n{TOKEN}\n\n  {OTHER}  \n")
+    path.chmod(0o600)
+    assert read_tokens(path) == (TOKEN, OTHER)
+    path.chmod(0o640)
+    with pytest.raises(HubError, match="chmod 600"):
+        read_tokens(path)
+    path.chmod(0o600)
+    for content in (b"# none\n", b"\xff\xfe", b"x\n" * 1001):
+        path.write_bytes(content)
+        with pytest.raises(HubError, match="tokens"):
+            read_tokens(path)
+    with pytest.raises(HubError, match="No such file"):
+        read_tokens(tmp_path / "missing")
+
+
+async def test_tls_and_a_token(certificate: tuple[Path, Path]) -> None:
+    door = Door(tokens=(TOKEN,), tls=tls_context(*certificate))
+    trusting = ssl.create_default_context(cafile=str(certificate[0]))
+    async with running_hub(door=door) as port:
+        headers = {"Authorization": f"Bearer {TOKEN}"}
+        async with connect(f"wss://localhost:{port}", ssl=trusting, additional_headers=headers) as socket:
+            ears = Ears(socket)
+            await ears.send(op="subscribe", topic="/t", type="a/B")
+            for size in (0, 100, 100_000, 1_000_000):
+                await ears.send(op="publish", topic="/t", msg={"data": "x" * size})
+                assert (await ears.hear())["msg"] == {"data": "x" * size}
+        with pytest.raises(ssl.SSLCertVerificationError):
+            await connect(f"wss://localhost:{port}", additional_headers=headers)
+        plain = await Bare.connect(port, handshake=False)
+        plain.writer.write(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        assert b"101" not in await plain.ended()
+
+
+async def test_the_hub_ends_its_tls_connections(certificate: tuple[Path, Path]) -> None:
+    trusting = ssl.create_default_context(cafile=str(certificate[0]))
+    async with running_hub(door=Door(tls=tls_context(*certificate))) as port:
+        socket = await connect(f"wss://localhost:{port}", ssl=trusting)
+        await Ears(socket).settle()
+    assert await Ears(socket).closed() == 1001
+
+
+def test_what_is_no_certificate_is_one_sentence(certificate: tuple[Path, Path], tmp_path: Path) -> None:
+    nothing = tmp_path / "nothing.pem"
+    nothing.write_text("nothing")
+    for files in (
+        (nothing, certificate[1]),
+        (certificate[0], nothing),
+        (certificate[0], tmp_path / "missing"),
+    ):
+        with pytest.raises(HubError, match=r"\.pem|missing") as caught:
+            tls_context(*files)
+        assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("host", "loopback"),
+    [
+        ("127.0.0.1", True),
+        ("127.8.9.10", True),
+        ("::1", True),
+        ("localhost", True),
+        ("0.0.0.0", False),  # noqa: S104  # that this is not loopback is what is tested
+        ("::", False),
+        ("192.168.1.10", False),
+        ("robot.example", False),
+        ("localhost.example", False),
+        ("", False),
+    ],
+)
+def test_what_only_this_machine_reaches(host: str, loopback: bool) -> None:
+    assert is_loopback(host) is loopback

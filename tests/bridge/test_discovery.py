@@ -1,0 +1,123 @@
+"""Robots by name, on loopback only: whoever else is on the network neither hears nor disturbs these tests."""
+
+import os
+import sys
+from contextlib import AsyncExitStack
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from bridge import discovery
+from bridge.discovery import DiscoveryError, Robot, UnknownRobotError, announced, discover, resolve
+
+LOOPBACK = ("127.0.0.1",)
+#: No wait may take longer; answers come within fractions of a second where nothing else runs.
+PATIENCE = 30.0
+
+
+def _name(what: str) -> str:
+    """A name that no other run of these tests announces at the same time."""
+    return f"{what} {os.getpid()}"
+
+
+@pytest.mark.asyncio(loop_factories=["uvloop"])
+async def test_a_robot_that_is_announced_is_found_and_then_gone() -> None:
+    name = _name("Röbot")
+    with pytest.raises(UnknownRobotError, match=name):
+        await resolve(name, 0.5, interfaces=LOOPBACK)
+    async with announced(name, "127.0.0.1", 9099, ros_version=2, token=True, interfaces=LOOPBACK):
+        assert await resolve(name, PATIENCE, interfaces=LOOPBACK) == "ws://127.0.0.1:9099"
+        for _ in range(20):
+            found = [robot for robot in await discover(1.5, interfaces=LOOPBACK) if robot.name == name]
+            if found:
+                break
+        assert found == [Robot(name, "ws://127.0.0.1:9099", 2, token=True)]
+
+
+@pytest.mark.asyncio(loop_factories=["uvloop"])
+async def test_a_name_that_is_taken_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    name = _name("Twin")
+    async with AsyncExitStack() as stack:
+        monkeypatch.setattr(discovery, "_TAKEN_TIME", 0.5)
+        await stack.enter_async_context(announced(name, "127.0.0.1", 9099, interfaces=LOOPBACK))
+        monkeypatch.setattr(discovery, "_TAKEN_TIME", PATIENCE)
+        with pytest.raises(DiscoveryError, match=f"{name} already") as caught:
+            await stack.enter_async_context(announced(name, "127.0.0.1", 9100, interfaces=LOOPBACK))
+        assert caught.value.exit_code == 2
+
+
+@pytest.mark.parametrize("name", ["", "x" * 64, "ü" * 32, "a.b", "a\nb", "a\x1b[31mb"])
+async def test_what_cannot_be_a_name_is_refused(name: str) -> None:
+    with pytest.raises(DiscoveryError, match="cannot be the name"):
+        await resolve(name, 0.1, interfaces=LOOPBACK)
+    with pytest.raises(DiscoveryError, match="cannot be the name"):
+        async with announced(name, "127.0.0.1", 9099, interfaces=LOOPBACK):
+            pass
+
+
+async def test_without_zeroconf_one_sentence_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    for module in ("zeroconf", "zeroconf.asyncio"):
+        monkeypatch.setitem(sys.modules, module, None)
+    for attempt in (discover(0.1), resolve("Robot", 0.1)):
+        with pytest.raises(DiscoveryError, match=r"pip install 'rosbayes\[discover\]'") as caught:
+            await attempt
+        assert caught.value.exit_code == 2
+
+
+async def test_without_a_network_one_sentence_says_so() -> None:
+    with pytest.raises(DiscoveryError, match="no network"):
+        await discover(0.1, interfaces=("192.0.2.77",))
+
+
+def test_importing_this_imports_no_zeroconf() -> None:
+    import subprocess
+
+    code = "import sys, bridge.discovery, services.discover; sys.exit('zeroconf' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False, timeout=PATIENCE).returncode == 0
+
+
+def _announced(**properties: Any) -> Any:
+    """What zeroconf makes of an announcement."""
+    said: dict[str, Any] = {
+        "name": f"Robot.{discovery.SERVICE_TYPE}",
+        "port": 9090,
+        "server": "robot.local.",
+        "addresses": ["192.0.2.7"],
+    } | properties
+    addresses = said.pop("addresses")
+    txt = {key: said.pop(key) for key in ("path", "tls", "token", "ros") if key in said}
+    return SimpleNamespace(**said, decoded_properties=txt, parsed_addresses=lambda: addresses)
+
+
+@pytest.mark.parametrize(
+    ("said", "robot"),
+    [
+        ({}, Robot("Robot", "ws://192.0.2.7:9090")),
+        ({"ros": "1", "path": "/bridge"}, Robot("Robot", "ws://192.0.2.7:9090/bridge", 1)),
+        ({"ros": "7", "token": "1"}, Robot("Robot", "ws://192.0.2.7:9090", None, token=True)),
+        ({"tls": "1"}, Robot("Robot", "wss://robot.local:9090")),
+        ({"addresses": ["fd00::7", "192.0.2.7"]}, Robot("Robot", "ws://192.0.2.7:9090")),
+        ({"addresses": ["fd00::7"]}, Robot("Robot", "ws://[fd00::7]:9090")),
+        ({"addresses": []}, None),
+        ({"port": 0}, None),
+        ({"port": None}, None),
+        ({"path": "/a b"}, None),
+        ({"path": "/\x1b[31m"}, None),
+        ({"path": "@evil.example/"}, None),
+        ({"tls": "1", "server": "robot local"}, None),
+        ({"tls": "1", "server": None}, None),
+        ({"name": f"R\x1b[31m.{discovery.SERVICE_TYPE}"}, None),
+    ],
+)
+def test_what_the_network_says_is_checked(said: dict[str, Any], robot: Robot | None) -> None:
+    assert discovery._robot(_announced(**said)) == robot
+
+
+def test_the_addresses_that_are_announced() -> None:
+    assert discovery._addresses("192.0.2.7", None) == ["192.0.2.7"]
+    assert discovery._addresses("localhost", None) == ["127.0.0.1"]
+    assert discovery._addresses("::", LOOPBACK) == ["127.0.0.1"]
+    every = discovery._addresses("::", None)
+    assert every
+    assert every == ["127.0.0.1"] or "127.0.0.1" not in every
