@@ -1,66 +1,173 @@
-"""The guide's examples are programs: each is run as it stands, but for the server's address."""
+"""The guide's examples are programs: each is run as it stands against a hub, but for addresses and files."""
 
 import asyncio
+import contextlib
+import json
+import os
 import re
+import ssl
+import subprocess
 import sys
+from collections.abc import Awaitable, Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
+from websockets.asyncio.client import connect as plain_connect
 
-from bridge import handles, json_codec, protocol, session, websocket
-from tests.fake_rosbridge import FakeRosbridge
+from bridge import fragments, goals, handles, json_codec, protocol, session, websocket
+from bridge.client import connect
+from bridge.hub.door import Door
+from tests.bridge.hub.sockets import running_hub
 
 GUIDE = Path(__file__).parents[2] / "docs" / "bridge.md"
-EXAMPLES = re.findall(r"^```python\n(.*?)^```", GUIDE.read_text(), re.MULTILINE | re.DOTALL)
+EXAMPLES = dict(
+    re.findall(
+        r"^## ([^\n]+)\n(?:(?!^## ).)*?^```python\n(.*?)^```", GUIDE.read_text(), re.MULTILINE | re.DOTALL
+    )
+)
+TOKEN = "guide-test-token-0123456789"
+PATIENCE = 60.0
+
+Company = Callable[[str], Awaitable[None]]
 
 
-async def run(example: str, fake: FakeRosbridge) -> str:
+async def run(example: str, uri: str, company: Company | None = None, **environment: str) -> str:
+    """What an example prints while ``company`` plays the robot."""
     process = await asyncio.create_subprocess_exec(
         sys.executable,
         "-c",
-        example.replace("ws://127.0.0.1:9090", fake.uri),
+        example.replace("ws://127.0.0.1:9090", uri),
         stdout=asyncio.subprocess.PIPE,
         stderr=asyncio.subprocess.PIPE,
         cwd=GUIDE.parents[1],
+        env={**os.environ, **environment},
     )
-
-    async def play_the_boat() -> None:
-        await fake.wait_for_op("subscribe", topic="/boat/sensors", timeout=60)
-        await fake.publish("/boat/sensors", {"D1": 5})
-        await fake.publish("/boat/sensors", {"D1": 6, "last": True})
-
-    boat = asyncio.create_task(play_the_boat())
+    robot = asyncio.create_task(company(uri)) if company is not None else None
     try:
-        out, errors = await asyncio.wait_for(process.communicate(), 60)
+        out, errors = await asyncio.wait_for(process.communicate(), PATIENCE)
     finally:
-        boat.cancel()
         if process.returncode is None:
             process.kill()
+        if robot is not None:
+            robot.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await robot
     assert process.returncode == 0, errors.decode()
     return out.decode()
 
 
+def publishes(topic: str, type_name: str, *messages: dict[str, Any]) -> Company:
+    """Publishes these again and again, until the example has had enough."""
+
+    async def play(uri: str) -> None:
+        async with connect(uri) as ros:
+            publication = await ros.advertise(topic, type_name)
+            while True:
+                for message in messages:
+                    await publication.publish(message)
+                    await asyncio.sleep(0.05)
+
+    return play
+
+
+async def works_on_goals(uri: str) -> None:
+    async with plain_connect(uri) as socket:
+
+        async def say(**operation: Any) -> None:
+            await socket.send(json.dumps(operation))
+
+        await say(op="advertise_action", action="/fibonacci", type="example_interfaces/action/Fibonacci")
+        async for text in socket:
+            asked = json.loads(text)
+            if asked["op"] == "send_action_goal":
+                common = {"id": asked["id"], "action": "/fibonacci"}
+                await say(op="action_feedback", values={"sequence": [0, 1]}, **common)
+                await say(op="action_result", values={"sequence": [0, 1, 1]}, status=4, result=True, **common)
+
+
+boat = publishes("/boat/sensors", "boat_msgs/Sensors", {"D1": 5}, {"D1": 6, "last": True})
+laser = publishes("/scan", "sensor_msgs/LaserScan", {"header": {"frame_id": "laser"}, "ranges": [0.5, 1.5]})
+
+#: By heading: who plays the robot, and what is printed.
+PLAYED: dict[str, tuple[Company | None, str]] = {
+    "Subscribe": (boat, "'D1': 6"),
+    "Publish": (None, ""),
+    "Long arrays": (None, "0.5 float64"),
+    "Serialised messages": (laser, "laser [0.5 1.5]"),
+    "Services": (None, "{'sum': 3}\nservice /add at ws://"),
+    "Find a variable in messages": (
+        None,
+        "D1 (True, 7)\ny (True, 2.5)\npose.position.x (True, 1.5)\nranges[1] (True, 0.5)\ndata[2] (True, 3)\n",
+    ),
+    "Several robots": (boat, "two {'D1': 6, 'last': True}"),
+    "Quality of service (ROS 2)": (None, "{'data': 'here be dragons'}"),
+}
+ELSEWHERE = {"Actions (ROS 2)", "TLS, tokens, proxies"}
+
+
 @pytest.mark.asyncio(loop_factories=["asyncio"])
-@pytest.mark.parametrize(
-    ("number", "printed"),
-    [
-        (0, "'D1': 6"),
-        (1, ""),
-        (2, "{'sum': 3}\nservice /add at ws://"),
-        (3, "D1 (True, 7)\ny (True, 2.5)\npose.position.x (True, 1.5)\nranges[1] (True, 0.5)\n"),
-    ],
-)
-async def test_an_example_runs(number, printed):
-    async with FakeRosbridge() as fake:
-        assert printed in await run(EXAMPLES[number], fake)
-        if number == 1:
-            assert [op["msg"]["point"]["x"] for op in fake.ops("publish")] == [
-                0.1 * step for step in range(10)
-            ]
+@pytest.mark.parametrize("heading", PLAYED)
+async def test_an_example_runs(heading):
+    company, printed = PLAYED[heading]
+    async with running_hub(ros_version=2) as port:
+        assert printed in await run(EXAMPLES[heading], f"ws://127.0.0.1:{port}", company)
+
+
+@pytest.mark.asyncio(loop_factories=["asyncio"])
+async def test_what_is_published_is_heard():
+    async with running_hub(ros_version=2) as port, connect(f"ws://127.0.0.1:{port}") as ros:
+        poses = ros.subscribe("/pose", "geometry_msgs/PointStamped")
+        await ros.call("/rosapi/get_time", timeout=PATIENCE)
+        await run(EXAMPLES["Publish"], ros.uri)
+        heard = [(await poses.next(PATIENCE)).msg["point"]["x"] for _ in range(10)]
+        assert heard == [0.1 * step for step in range(10)]
+
+
+@pytest.mark.asyncio(loop_factories=["asyncio"])
+@pytest.mark.parametrize("served", [True, False])
+async def test_the_goal_of_the_guide(served):
+    async with running_hub(ros_version=2) as port:
+        uri = f"ws://127.0.0.1:{port}"
+        if not served:
+            assert "no result: action /fibonacci" in await run(EXAMPLES["Actions (ROS 2)"], uri)
+            return
+        async with connect(uri) as ros:
+            worker = asyncio.create_task(works_on_goals(uri))
+            async with asyncio.timeout(PATIENCE):
+                while "/fibonacci" not in (await ros.call("/rosapi/action_servers"))["action_servers"]:
+                    await asyncio.sleep(0.05)
+            out = await run(EXAMPLES["Actions (ROS 2)"], uri)
+            worker.cancel()
+        assert "so far: {'sequence': [0, 1]}" in out
+        assert "SUCCEEDED {'sequence': [0, 1, 1]}" in out
+
+
+@pytest.mark.asyncio(loop_factories=["asyncio"])
+async def test_the_door_of_the_guide(tmp_path):
+    certificate, key = tmp_path / "ca.pem", tmp_path / "key.pem"
+    subprocess.run(
+        [
+            *("openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes"),
+            *("-subj", "/CN=localhost", "-addext", "subjectAltName=DNS:localhost", "-days", "2"),
+            *("-keyout", str(key), "-out", str(certificate)),
+        ],
+        check=True,
+        capture_output=True,
+        timeout=60,
+    )
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.load_cert_chain(certificate, key)
+    example = EXAMPLES["TLS, tokens, proxies"].replace('"ca.pem"', repr(str(certificate)))
+    async with running_hub(door=Door(tokens=(TOKEN,), tls=context)) as port:
+        out = await run(example.replace("localhost:9443", f"localhost:{port}"), "-", ROBOT_TOKEN=TOKEN)
+    assert f"wss://localhost:{port} " in out
+    assert TOKEN not in out
 
 
 def test_no_example_is_left_out():
-    assert len(EXAMPLES) == 4
+    assert set(EXAMPLES) == set(PLAYED) | ELSEWHERE
+    assert len(EXAMPLES) == GUIDE.read_text().count("```python")
 
 
 @pytest.mark.parametrize(
@@ -71,7 +178,12 @@ def test_no_example_is_left_out():
         ("bytes that wait in the socket", f"{websocket.WRITE_LIMIT >> 10} KiB"),
         ("a message, both ways", f"{json_codec.MAX_SIZE >> 20} MiB"),
         ("objects and arrays within each other", str(json_codec.MAX_DEPTH)),
+        ("messages in fragments that are incomplete", str(fragments.MAX_SETS)),
+        ("fragments of one message", str(fragments.MAX_FRAGMENTS)),
+        ("waiting for a message's next fragment", f"{fragments.MAX_AGE:g} s"),
         ("calls that wait for answers", str(protocol.MAX_CALLS)),
+        ("goals under way", str(protocol.MAX_GOALS)),
+        ("feedback that waits in a goal", str(goals.FEEDBACK_QUEUE_SIZE)),
         ("requests to services of this client", str(protocol.MAX_REQUESTS)),
         ("the closing handshake", f"{websocket.CLOSE_TIMEOUT:g} s"),
         ("status messages kept", str(session.KEPT_STATUSES)),
