@@ -70,7 +70,7 @@ def serve_board(
     stop: StopSignal,
     misbehave: Misbehaviour | None = None,
     pin: bool = True,
-    on_ready: Callable[[], None] | None = None,
+    on_ready: Callable[[EmulatedBoard], None] | None = None,
 ) -> None:
     """Serve one emulated board, blank at first, until ``stop`` is set; its sockets' files are removed then.
 
@@ -83,7 +83,7 @@ def serve_board(
             compute for tenths of a millisecond, in which Linux does not spread over the cores what one
             host has woken: left to it, the boards of a mini-cluster compute one after the other. The thread also
             becomes one of computing (SCHED_BATCH), which does not interrupt others when it wakes.
-        on_ready: Called once both sockets listen.
+        on_ready: Called with the board once both sockets listen.
 
     Raises:
         EndpointError: The endpoint is wrong or taken.
@@ -103,7 +103,7 @@ def serve_board(
     try:
         server = _Server(registers, programming, index, stop, misbehave)
         if on_ready is not None:
-            on_ready()
+            on_ready(server.board)
         server.run()
     finally:
         remove_listener(where, registers)
@@ -209,7 +209,7 @@ class _Server:
         self._misbehave = misbehave
         self._starts = 0
         self._misbehaved = 0
-        self._board = EmulatedBoard()
+        self.board = EmulatedBoard()
         self._host: _Host | None = None
         self._loader: _Loader | None = None
         self._epoll = select.epoll()
@@ -217,7 +217,7 @@ class _Server:
             self._epoll.register(descriptor, _READABLE)
 
     def run(self) -> None:
-        board, epoll = self._board, self._epoll
+        board, epoll = self.board, self._epoll
         try:
             while True:
                 computing = board.running and not board.stuck
@@ -258,7 +258,7 @@ class _Server:
         if self._is_held():
             _turn_away(connection, "another host has it; one host drives a board at a time")
             return
-        self._host = host = _Host(connection, self._board.programmed)
+        self._host = host = _Host(connection, self.board.programmed)
         self._epoll.register(connection.fileno(), _READABLE)
         host.send(self._greeting(host.token))
         _LOG.info("board %d: a host opened it", self._index)
@@ -297,7 +297,7 @@ class _Server:
                 bar_size=register_map.BAR_SIZE,
                 board=self._index,
                 map_hash=map_hash,
-                image_hash=self._board.image_hash,
+                image_hash=self.board.image_hash,
                 token=token,
             )
         )
@@ -305,7 +305,7 @@ class _Server:
     def _access(self, frame: Frame) -> None:
         """Do what a frame of the host asks for."""
         operation, flags, sequence, address, count, payload = frame
-        board, host = self._board, self._host
+        board, host = self.board, self._host
         if host is None:
             return
         if host.programmed != board.programmed:
@@ -328,7 +328,7 @@ class _Server:
             raise FramingError(f"operation {operation} is no business of the register port")
 
     def _interrupt_if_done(self) -> None:
-        board, host = self._board, self._host
+        board, host = self.board, self._host
         if board.running or host is None or not board.interrupt_enabled:
             return
         host.interrupts = (host.interrupts + 1) & 0xFFFFFFFF
@@ -337,7 +337,7 @@ class _Server:
     def _drop_host(self) -> None:
         host, self._host = self._host, None
         if host is not None:
-            self._board.release()
+            self.board.release()
             self._epoll.unregister(host.socket.fileno())
             host.socket.close()
             _LOG.info("board %d: its host has gone", self._index)
@@ -419,7 +419,7 @@ class _Server:
             return
         operation, flags, sequence, address, count, payload = frame
         if operation == framing.READ:
-            words = self._board.read(address, count)
+            words = self.board.read(address, count)
             loader.send(framing.encode(framing.READ, framing.REPLY, sequence, address, count, words))
             return
         if operation != framing.PROGRAM:
@@ -455,8 +455,8 @@ class _Server:
         self._check_not_held(begin)
         if len(content) != begin.size or hashlib.sha256(content).digest() != begin.sha256:
             raise RefusedError(ErrorCode.BAD_IMAGE, "the bytes that came are not those that were announced")
-        self._board.load(content)
-        _LOG.info("board %d: programmed with image %s", self._index, self._board.image_hash)
+        self.board.load(content)
+        _LOG.info("board %d: programmed with image %s", self._index, self.board.image_hash)
 
     def _forget_silent_loader(self) -> None:
         if self._loader is not None and time.monotonic() - self._loader.heard > PROGRAMMING_SILENCE_S:

@@ -13,6 +13,7 @@ from typing import Annotated, NoReturn
 import typer
 
 from pcie_shim.board import StopSignal, serve_board
+from pcie_shim.emulated_board import EmulatedBoard
 from pcie_shim.endpoint import Endpoint
 from pcie_shim.misbehaviour import Misbehaviour
 from services import options
@@ -54,12 +55,17 @@ def serve_one(
 
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, end)
-    listening: list[str] = []
+    listening: list[EmulatedBoard] = []
 
     def tell() -> ProcessStatus:
-        state = "listening" if listening else "starting"
-        board = BoardStatus(index=index, endpoint=str(endpoint), state=state, restarts=restarts)
-        return ProcessStatus(ready=bool(listening), why=f"{state} at {endpoint}", boards=[board])
+        image = listening[0].image_hash if listening else ""
+        blank = not image.strip("0")
+        state = "starting" if not listening else "blank" if blank else "programmed"
+        board = BoardStatus(
+            index=index, endpoint=str(endpoint), state=state, image="" if blank else image, restarts=restarts
+        )
+        where = f"listening at {endpoint}, {state}" if listening else f"starting at {endpoint}"
+        return ProcessStatus(ready=bool(listening), why=where, boards=[board])
 
     with status_thread(directory, f"board{index}", tell):
         serve_board(
@@ -67,7 +73,7 @@ def serve_one(
             index=index,
             stop=stop,
             misbehave=misbehave,
-            on_ready=lambda: listening.append(str(endpoint)),
+            on_ready=listening.append,
         )
     return ended_by[0] if ended_by else 0
 

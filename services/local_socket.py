@@ -201,7 +201,7 @@ class BlockingRecordSocket:
             LocalSocketError: what came is no record.
         """
         try:
-            data = self._sock.recv(1 << 18)
+            data = self._sock.recv(1 << 16)
         except (BlockingIOError, InterruptedError):
             return []
         except OSError:

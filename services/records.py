@@ -34,7 +34,10 @@ class Ready(Record, tag="ready", frozen=True):
 
 
 class Notice(Record, tag="notice", frozen=True):
-    """A service to the master: something that the user should read, but that ends nothing."""
+    """A service to the master: something that the user should read, but that ends nothing.
+
+    With `--log-level debug` the master sends one to the subscriber for each frame, which carries the frame's number.
+    """
 
     level: str
     sentence: str

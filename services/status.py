@@ -253,7 +253,7 @@ def screen(stack: StackStatus) -> RenderableType:
         for board in boards:
             table.add_row(
                 str(board.index),
-                Text(_plain(board.state), "green" if board.state in {"programmed", "listening"} else "red"),
+                Text(_plain(board.state), "green" if board.state in {"programmed", "blank"} else "red"),
                 Text(_plain(board.image[:12])),
                 str(board.restarts),
                 "" if board.last_cycles is None else str(board.last_cycles),

@@ -71,7 +71,7 @@ class FrameCounts(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class BoardStatus(msgspec.Struct, frozen=True, kw_only=True):
-    """A board: `state` is blank, programmed, gone (pcie-app), or listening (the board itself)."""
+    """A board: `state` is starting, blank, programmed, or gone (as pcie-app sees it)."""
 
     index: int
     endpoint: str

@@ -101,7 +101,7 @@ class BoardProcess:
             index=index,
             stop=stop,
             misbehave=Misbehaviour.parse(misbehave) if misbehave else None,
-            on_ready=lambda: os.write(self._tell, b"r") and None,
+            on_ready=lambda _board: os.write(self._tell, b"r") and None,
         )
 
     def stop(self) -> int | None:

@@ -163,7 +163,7 @@ async def test_one_screen_has_services_boards_rates_and_losses(tmp_path):
     board = BoardStatus(
         index=1, endpoint="tcp://10.0.0.2:7000", state="programmed", image="ab" * 32, last_cycles=512
     )
-    own = BoardStatus(index=1, endpoint="tcp://10.0.0.2:7000", state="listening", restarts=3)
+    own = BoardStatus(index=1, endpoint="tcp://10.0.0.2:7000", state="blank", restarts=3)
     async with served(
         tmp_path,
         publisher=process(frames=FRAMES, connections=[ConnectionStatus("ws://robot:9090", "connected", 2)]),
