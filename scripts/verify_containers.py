@@ -165,6 +165,16 @@ def again(stack: Stack, client: Client, hurt: float, back: float) -> None:
     stack.notes.append(f"results again after {first - hurt:.1f} s, all healthy after {healthy:.1f} s")
 
 
+def kill_all(stack: Stack, client: Client) -> None:
+    """Everything dies within a second or two, in no order that anybody has chosen."""
+    before = {service: stack.restarts(service) for service in SERVICES}
+    at = time.time()
+    for service in SERVICES:
+        stack.signal(service, "KILL")
+    back = [stack.restarted(service, before[service], at) for service in SERVICES]
+    again(stack, client, at, max(back))
+
+
 def kill_mid_frame(stack: Stack, client: Client) -> None:
     """A board is held until a frame waits for it, and killed then: that frame is lost and said so."""
     before = stack.restarts("board1")
@@ -230,6 +240,7 @@ def check_faults(stack: Stack, tally: Tally) -> None:
         for service in (*CORE, "board0", "boat-simulator", "boat-normaliser", "boat-viewer", "hub")
     ]
     checks += [
+        ("all services killed", kill_all),
         ("a board killed mid-frame", kill_mid_frame),
         ("a board cut off its network and joined again", cut_off),
         ("subscriber and publisher cut off theirs", rosbridge_cut_off),
