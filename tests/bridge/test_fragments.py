@@ -198,10 +198,10 @@ values = st.one_of(
 )
 
 
-@settings(max_examples=300)
+@settings(max_examples=100)
 @given(
     st.lists(
-        st.fixed_dictionaries({"id": values, "data": values, "num": values, "total": values}), max_size=60
+        st.fixed_dictionaries({"id": values, "data": values, "num": values, "total": values}), max_size=40
     )
 )
 def test_nothing_makes_it_grow_or_fail_otherwise(fragments):

@@ -35,13 +35,13 @@ json_like = st.recursive(
 
 
 @pytest.mark.parametrize("target", TARGETS)
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(st.binary(max_size=400) | json_like)
 def test_any_input_is_taken(target, data):
     TARGETS[target](data)
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=200, deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 255), st.binary(max_size=24)), max_size=40))
 def test_any_sequence_keeps_the_cores_invariants(steps):
     TARGETS["core"](b"\x00" + b"".join(bytes([step]) + rest for step, rest in steps))
