@@ -1,15 +1,18 @@
 """The pages of documentation say what the code does: every key, every option, and an example that runs."""
 
 import re
+import shlex
 from pathlib import Path
 
 import pytest
 import typer
 from pydantic import BaseModel
+from typer.testing import CliRunner
 
 from toolchain.case_study import load_model
 from toolchain.command import app
 from toolchain.deployment import DeploymentFile
+from toolchain.errors import ModelError
 
 DOCS = Path(__file__).parents[2] / "docs"
 
@@ -58,3 +61,50 @@ def test_the_example_is_a_model(tmp_path):
     model = load_model(tmp_path, {"cells": "7"})
     assert model.lines == 7
     assert [known.name for known in model.known] == ["range", "door"]
+
+
+MODELS = (DOCS / "models.md").read_text()
+
+
+def test_every_option_of_the_fit():
+    command = typer.main.get_command(app).commands["fit"]
+    options = {name for each in command.params for name in each.opts if name.startswith("-")} - {"--help"}
+    described = documented(MODELS, "6. Learning the tables")
+    assert {key.split(" ")[0] for key in described} == options
+
+
+def blocks(language):
+    return re.findall(rf"```{language}\n(.*?)```", MODELS, re.DOTALL)
+
+
+def test_the_models_page_works_as_printed(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "build").mkdir()
+    for name, language in (("garden.bif", "bif"), ("walks.csv", "csv")):
+        (text,) = blocks(language)
+        (tmp_path / "build" / name).write_text(text)
+    commands = re.findall(r"^    (toolchain .*)$", MODELS, re.MULTILINE)
+    assert len(commands) == 6
+    for command in commands:
+        result = CliRunner().invoke(app, shlex.split(command)[1:])
+        assert result.exit_code == 0, f"{command}\n{result.stderr}"
+    text = (tmp_path / "mymodel" / "model.py").read_text()
+    text = text.replace("    return joint.ask(searched=[place], known=[distance, door])\n", "")
+    (hook,) = re.findall(r"^    (return with_fit.*)$", MODELS, re.MULTILINE)
+    text = text.replace("sigma: float = 0.3) -> Question:", "sigma: float = 0.3, fit: Path | None = None):")
+    (tmp_path / "mymodel" / "model.py").write_text(
+        "from pathlib import Path\nfrom toolchain.fitted import with_fit\n" + text + f"    {hook}\n"
+    )
+    fitted = load_model(tmp_path / "mymodel", {"fit": "build/walks.toml"})
+    assert fitted.known[0].normal.sigma.max() < 0.2
+
+
+def test_the_boiler_is_a_question_and_the_printed_refusal_is_said(tmp_path):
+    (example,) = blocks("python")
+    (tmp_path / "model.py").write_text(example)
+    model = load_model(tmp_path, {"gauge_sigma": "0.3"})
+    assert [dimension.label for dimension in model.searched] == ["pressure", "inside"]
+    (tmp_path / "model.py").write_text(example.replace("searched=[pressure, inside]", "searched=[pressure]"))
+    with pytest.raises(ModelError) as caught:
+        load_model(tmp_path, {})
+    assert f"error: {caught.value}\n" in MODELS
