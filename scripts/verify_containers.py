@@ -474,6 +474,9 @@ def verify(only: str) -> int:
             stack.save_logs("last")
             stack.variables.clear()
             stack.docker("compose", "down", "--volumes", "--remove-orphans", check=False)
+            # the next run builds faster with it, but run after run would fill the disk
+            stack.docker("image", "prune", "--force", check=False)
+            stack.docker("builder", "prune", "--force", "--keep-storage", "2GB", check=False)
             shutil.rmtree(project, ignore_errors=True)
     left = engine.left_behind()
     tally.tell("nothing is left behind", time.monotonic(), ", ".join(left) or None)
