@@ -1,0 +1,148 @@
+"""The commands hub and discover: what they refuse, what they print, and a robot's name in place of an address."""
+
+import asyncio
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from websockets.asyncio.client import connect
+
+from bridge.discovery import UnknownRobotError
+from services import settings
+from services.errors import SettingsError
+from services.settings import load_settings
+from services.supervision import own_command
+
+PATIENCE = 60
+EVERYWHERE = "0.0.0.0"  # noqa: S104  # the hub is to refuse it, or to want tokens
+HUB = own_command("hub")
+TOKEN = "correct-horse-battery-staple"
+
+
+def _run(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(arguments, capture_output=True, text=True, timeout=PATIENCE, check=False)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("--host", EVERYWHERE), "--tls-cert and --tls-key and --token-file, or --insecure"),
+        (("--host", "::"), "--insecure"),
+        (("--host", "robot.example"), "--insecure"),
+        (("--tls-cert", "cert.pem"), "--tls-key"),
+        (("--tls-cert", "missing.pem", "--tls-key", "missing.pem"), "missing.pem"),
+        (("--token-file", "missing.txt"), "missing.txt"),
+        (("--origin", "robot.example"), "--origin robot.example"),
+        (("--origin", "https://robot.example/page"), "expected for example"),
+        (("--host", "192.0.2.77", "--insecure"), "192.0.2.77"),
+        (("--announce", "a.b", "--port", "0"), "cannot be the name of a robot"),
+    ],
+)
+def test_what_the_hub_refuses_is_one_sentence(arguments: tuple[str, ...], said: str) -> None:
+    done = _run(*HUB, *arguments)
+    assert done.returncode == 2
+    assert said in done.stderr.splitlines()[-1]
+    assert "Traceback" not in done.stderr
+    assert done.stdout == ""
+
+
+async def test_a_hub_with_tokens_on_another_address(tmp_path: Path) -> None:
+    """All of it as a user would: a file of tokens, ROS 2, and an address that is not loopback's."""
+    tokens = tmp_path / "tokens"
+    tokens.write_text(TOKEN + "\n")
+    tokens.chmod(0o600)
+    arguments = [
+        "--host",
+        EVERYWHERE,
+        "--insecure",
+        "--port",
+        "0",
+        "--ros-version",
+        "2",
+        "--token-file",
+        str(tokens),
+    ]  # noqa: S104  # what is tested
+    hub = await asyncio.create_subprocess_exec(*HUB, *arguments, stderr=asyncio.subprocess.PIPE)
+    try:
+        assert hub.stderr is not None
+        line = (await asyncio.wait_for(hub.stderr.readline(), PATIENCE)).decode()
+        uri = line.split()[-1].replace(EVERYWHERE, "127.0.0.1")
+        async with connect(uri, additional_headers={"Authorization": f"Bearer {TOKEN}"}) as socket:
+            await socket.send(json.dumps({"op": "call_service", "service": "/rosapi/get_ros_version"}))
+            answer = json.loads(await asyncio.wait_for(socket.recv(), PATIENCE))
+            assert answer["values"]["version"] == 2
+        hub.terminate()
+        said = line + (await asyncio.wait_for(hub.stderr.read(), PATIENCE)).decode()
+        assert TOKEN not in said
+        assert await hub.wait() == 143
+    finally:
+        if hub.returncode is None:
+            hub.kill()
+            await hub.wait()
+
+
+def _discover(robots: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """The command with these robots on its network."""
+    code = f"""
+import sys
+import bridge.discovery
+from bridge.discovery import Robot
+async def found(timeout):
+    return {robots}
+bridge.discovery.discover = found
+sys.argv = ["discover", *{arguments!r}]
+from services.discover import main
+main()
+"""
+    return _run(sys.executable, "-c", code)
+
+
+def test_discover_lists_robots() -> None:
+    robots = (
+        "[Robot('Mr. [bold]', 'ws://192.0.2.7:9090', 1), Robot('Zoë', 'wss://zoe.local:9090', None, True)]"
+    )
+    done = _discover(robots)
+    assert done.returncode == 0
+    for shown in ("[bold]", "ws://192.0.2.7:9090", "Zoë", "wanted", "?"):
+        assert shown in done.stdout
+    lines = [json.loads(line) for line in _discover(robots, "--json").stdout.splitlines()]
+    assert lines[1] == {"name": "Zoë", "uri": "wss://zoe.local:9090", "ros_version": None, "token": True}
+
+
+def test_a_network_without_robots_is_one_sentence() -> None:
+    done = _discover("[]", "--timeout", "0.2", "--json")
+    assert done.returncode == 3
+    assert done.stdout == ""
+    assert "within 0.2 s" in done.stderr
+
+
+def test_a_robots_name_stands_for_its_uri(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def resolve(name: str) -> str:
+        if name != "Zoë":
+            raise UnknownRobotError(f"no robot called {name}")
+        return "ws://192.0.2.7:9090"
+
+    monkeypatch.setattr("bridge.discovery.resolve", resolve)
+    assert load_settings(uri="robot:Zoë").uri == "ws://192.0.2.7:9090"
+    with pytest.raises(UnknownRobotError, match="Adam"):
+        load_settings(uri="robot:Adam")
+    monkeypatch.setenv("BM_URI", "robot:Zoë")
+    assert load_settings(uri=None).uri == "ws://192.0.2.7:9090"
+    assert load_settings().uri == "robot:Zoë", "who takes no --uri asks for nobody"
+    assert load_settings(uri="ws://127.0.0.1:9090").uri == "ws://127.0.0.1:9090"
+
+
+async def test_a_robots_name_is_resolved_where_a_loop_runs_already(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def resolve(_name: str) -> str:
+        await asyncio.sleep(0)
+        return "ws://192.0.2.7:9090"
+
+    monkeypatch.setattr("bridge.discovery.resolve", resolve)
+    assert settings.load_settings(uri="robot:Zoë").uri == "ws://192.0.2.7:9090"
+
+
+def test_what_is_no_uri_is_refused() -> None:
+    with pytest.raises(SettingsError, match="robot:NAME"):
+        load_settings(uri="robots:Zoë")
