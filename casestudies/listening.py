@@ -23,6 +23,8 @@ from casestudies.results import (
 )
 
 _QUEUE_SIZE: Final = 256
+_DISORDER_NS: Final = 50_000_000
+"""So much later than its result a server may deliver the report that was published before it."""
 _PATIENCE_S: Final = 1.0
 """So long a result waits for a report or a truth that does not come."""
 
@@ -109,7 +111,9 @@ async def listen(
         truth_topic: of geometry_msgs/PoseStamped with the stamps of the readings; None for no truth.
         truth_tolerance_s: how much older than a frame's stamp a true pose may be, in seconds.
     """
-    listener = Listener(ros.uri, Pairing(truth_tolerance_ns=round(truth_tolerance_s * 1e9)))
+    listener = Listener(
+        ros.uri, Pairing(truth_tolerance_ns=round(truth_tolerance_s * 1e9), disorder_ns=_DISORDER_NS)
+    )
     taking: list[tuple[str, str, Callable[[Message], list[Instance]]]] = [
         (FRAME_TOPIC, FRAME_TYPE, listener.take_report),
         (RESULTS_TOPIC, RESULTS_TYPE, listener.take_posterior),

@@ -280,17 +280,20 @@ def read_truth(message: dict[str, Any], topic: str) -> Truth:
 class Pairing:
     """Puts reports, results and truths together, whatever order they are handed over in.
 
-    Each topic's own messages come in the order of their arrival; `heard_ns` tells the order across topics, so
-    that a result goes to the newest report that was heard before it. A frame waits for its truth until a
+    Each topic's own messages come in the order of their arrival, so the next result goes to the next report of a
+    published frame. `heard_ns` tells when one of the two was lost: a result goes to no report that was heard more
+    than `disorder_ns` after it, nor to one after which the next was heard that long before it. Servers keep the
+    order of a topic, but not all keep the order between topics. A frame waits for its truth until a
     newer truth or the next frame shows that it won't come. Without a truth of exactly its stamp a frame takes
     the newest older one, if it is not older than `truth_tolerance_ns`: messages without a header (an array
     of numbers) get their stamp only when they reach the host.
     """
 
-    def __init__(self, *, truth_tolerance_ns: int = 0) -> None:
+    def __init__(self, *, truth_tolerance_ns: int = 0, disorder_ns: int = 0) -> None:
         self.announced_only = 0
         """Reports whose result never came."""
         self._truth_tolerance_ns = truth_tolerance_ns
+        self._disorder_ns = disorder_ns
         self._reports: deque[FrameReport] = deque()
         self._posteriors: deque[Posterior] = deque()
         self._truths: deque[Truth] = deque(maxlen=_TRUTHS_KEPT)
@@ -335,9 +338,11 @@ class Pairing:
             if not self._posteriors or not self._reports:
                 return
             posterior = self._posteriors[0]
-            if self._reports[0].heard_ns > posterior.heard_ns:  # its own report was lost
+            if self._reports[0].heard_ns > posterior.heard_ns + self._disorder_ns:  # its own report was lost
                 self._untrue.append(Instance(report=None, posterior=self._posteriors.popleft()))
-            elif len(self._reports) > 1 and self._reports[1].heard_ns <= posterior.heard_ns:
+            elif (
+                len(self._reports) > 1 and self._reports[1].heard_ns + self._disorder_ns <= posterior.heard_ns
+            ):
                 self._reports.popleft()  # its result was lost
                 self.announced_only += 1
             else:

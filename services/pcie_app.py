@@ -12,6 +12,7 @@ import sys
 import time
 from collections.abc import Sequence
 
+import msgspec
 import orjson
 
 from machines.bm1 import StopReason
@@ -382,6 +383,26 @@ class PcieApp:
             self._send(Notice("info", f"board {board} is back, programmed"))
 
 
+class LineReading(msgspec.Struct):
+    """A reading as `subscriber --deployment` prints it."""
+
+    addresses: list[int | None]
+    stamp_ns: int | None = None
+
+
+def reading_from_line(line: bytes, number: int) -> LineReading:
+    """What one line of standard input says.
+
+    Raises:
+        InputLineError: it is no reading; says which line.
+    """
+    try:
+        return msgspec.json.decode(line, type=LineReading)
+    except (msgspec.MsgspecError, RecursionError) as error:
+        msg = f'line {number} of standard input is no reading ({error}); expected {{"addresses": [12, null, 7]}}'
+        raise InputLineError(msg) from error
+
+
 def compute_lines(boards: Boards, banks: int) -> int:
     """Alone: compute the readings that come on standard input, one JSON object a line.
 
@@ -392,21 +413,14 @@ def compute_lines(boards: Boards, banks: int) -> int:
     say(boards.open())
     try:
         for number, line in enumerate(sys.stdin.buffer, 1):
-            try:
-                reading = orjson.loads(line)
-                addresses = reading["addresses"]
-                frame = Frame(
-                    number, [None if each is None else int(each) for each in addresses], number % banks
-                )
-            except (ValueError, TypeError, KeyError) as error:
-                msg = (
-                    f'line {number} of standard input is no reading; expected {{"addresses": [12, null, 7]}}'
-                )
-                raise InputLineError(msg) from error
+            if not line.strip():
+                continue
+            reading = reading_from_line(line, number)
+            frame = Frame(number, reading.addresses, number % banks)
             result = result_record(number, boards.run(frame))
             printed = {
                 "number": number,
-                "stamp_ns": reading.get("stamp_ns"),
+                "stamp_ns": reading.stamp_ns,
                 "boards": [
                     {
                         "counts": counts.tolist(),

@@ -14,7 +14,7 @@ from collections.abc import AsyncIterator
 from typing import Annotated, Any, Literal
 
 import msgspec
-import orjson
+import numpy as np
 import typer
 
 from bridge.client import Publication, Ros, State, Subscription, connect
@@ -320,33 +320,44 @@ async def _lines() -> AsyncIterator[bytes]:
         yield line
 
 
+class _LineBoard(msgspec.Struct):
+    counts: list[Annotated[int, msgspec.Meta(ge=0, lt=1 << 32)]]
+    cycles: Annotated[int, msgspec.Meta(ge=0)]
+    reason: StopReason
+
+
+class _LineResult(msgspec.Struct):
+    number: int
+    boards: list[_LineBoard]
+    stamp_ns: int | None = None
+
+
+_Line = _LineResult | list[Annotated[float, msgspec.Meta(ge=0)]]  # its JSON knows no infinity
+
+
 def result_from_line(line: bytes, number: int, lines: int) -> tuple[FrameResult, int | None] | list[float]:
     """What one line of standard input says: `pcie-app`'s result with its reading's stamp, or an array of probabilities.
 
     Raises:
         InputLineError: neither; says which line.
     """
+    expected = f"expected a result of pcie-app or an array of {lines} probabilities"
     try:
-        value = orjson.loads(line)
-        if isinstance(value, list) and len(value) == lines:
-            return [float(each) for each in value]
-        boards = [
-            BoardOutcome(
-                b"".join(int(count).to_bytes(4, "little") for count in board["counts"]),
-                int(board["cycles"]),
-                StopReason(int(board["reason"])),
-            )
-            for board in value["boards"]
-        ]
-        if sum(len(board.counts) for board in boards) == 4 * lines:
-            stamp_ns = value.get("stamp_ns")
-            return FrameResult(int(value["number"]), boards, 0, 0, 0, 0), None if stamp_ns is None else int(
-                stamp_ns
-            )
-    except (ValueError, TypeError, KeyError, OverflowError):
-        pass
-    msg = f"line {number} of standard input is neither a result of pcie-app nor an array of {lines} probabilities"
-    raise InputLineError(msg)
+        value = msgspec.json.decode(line, type=_Line)
+    except (msgspec.MsgspecError, RecursionError) as error:
+        msg = f"line {number} of standard input is no result ({error}); {expected}"
+        raise InputLineError(msg) from error
+    found = len(value) if isinstance(value, list) else sum(len(board.counts) for board in value.boards)
+    if found != lines:
+        msg = f"line {number} of standard input has {found} values; {expected}"
+        raise InputLineError(msg)
+    if isinstance(value, list):
+        return value
+    boards = [
+        BoardOutcome(np.array(board.counts, dtype="<u4").tobytes(), board.cycles, board.reason)
+        for board in value.boards
+    ]
+    return FrameResult(value.number, boards, 0, 0, 0, 0), value.stamp_ns
 
 
 async def publish_lines(settings: Settings, deployment: Deployment) -> int:
@@ -355,16 +366,24 @@ async def publish_lines(settings: Settings, deployment: Deployment) -> int:
     async with topics.opened() as where:
         say(where)
         number = 0
+        outcomes: Counter[str] = Counter()
         async for line in _lines():
             number += 1
+            if not line.strip():
+                continue
             result = result_from_line(line, number, deployment.machine.lines)
             if isinstance(result, tuple):
                 now, tick = time.time_ns(), time.monotonic_ns()
                 counted, stamp_ns = result
-                await topics.publish(Publish(counted, stamp_ns or now, now, tick, tick, 0), look=False)
+                published = await topics.publish(
+                    Publish(counted, stamp_ns or now, now, tick, tick, 0), look=False
+                )
+                outcomes[published.outcome] += 1
             else:
                 await topics.publish_array(result)
-    say(f"{number} published")
+                outcomes["published"] += 1
+    others = ", ".join(f"{count} {outcome}" for outcome, count in outcomes.items() if outcome != "published")
+    say(f"{outcomes['published']} published{f'; not published: {others}' if others else ''}")
     return 0
 
 

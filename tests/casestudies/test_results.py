@@ -254,6 +254,17 @@ class TestPairing:
         assert told(pairing.add_posterior(result(2, 21))) == [(2, 2, None)]
         assert pairing.announced_only == 1
 
+    def test_a_server_that_swaps_a_report_and_its_result(self):
+        pairing = Pairing(disorder_ns=5)
+        heard = pairing.add_posterior(result(1, 10)) + pairing.add_report(report(1, 14))
+        heard += pairing.add_report(report(2, 20)) + pairing.add_posterior(result(2, 21))
+        heard += pairing.add_posterior(result(3, 30)) + pairing.add_report(report(3, 33))
+        assert told(heard) == [(1, 1, None), (2, 2, None), (3, 3, None)]
+        pairing.add_report(report(4, 40))  # its result is lost
+        pairing.add_report(report(5, 50))
+        assert told(pairing.add_posterior(result(5, 55))) == [(5, 5, None)]
+        assert pairing.announced_only == 1
+
     def test_results_without_any_report_come_out_at_the_end(self):
         pairing = Pairing()
         pairing.add_posterior(result(1, 11))
