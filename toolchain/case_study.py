@@ -40,7 +40,10 @@ def load_model(case: Path, settings: Mapping[str, str]) -> Model:
     path = Path(case) / FILE_NAME
     if not path.is_file():
         what = f"has no {FILE_NAME}" if Path(case).is_dir() else "is no folder"
-        message = f"{case} {what}; expected a case study's folder with a {FILE_NAME} that defines model()"
+        message = (
+            f"{case} {what}; expected a case study's folder with a {FILE_NAME} that defines model(), or a network's "
+            "file: .bif, .xmlbif, .uai or .net"
+        )
         raise ModelError(message)
     with _importing_from(path.parent.resolve()):
         function = _model_function(path)
