@@ -136,9 +136,7 @@ def check_confined(stack: Stack) -> None:
 
 def check_status(stack: Stack) -> None:
     """`status` shows the whole stack, all of it ready."""
-    told = json.loads(
-        stack.docker("exec", stack.container("master"), "python", "-m", "services.status", "--json")
-    )
+    told = json.loads(stack.docker("exec", stack.container("master"), "status", "--json"))
     shown = {each["name"] for each in told["processes"]}
     expect(shown == set(SERVICES), f"it shows {sorted(shown)}")
     expect(told["ready"], f"it says that the stack is not ready: {told['why']}")
