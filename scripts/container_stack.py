@@ -298,11 +298,26 @@ class Stack:
             CheckError: it does not get healthy, or has other services than it should.
         """
         began = time.time()
-        self.compose("up", "--detach", "--wait", "--wait-timeout", str(int(UP_LIMIT)), limit=UP_LIMIT + 30)
+        try:
+            self.compose(
+                "up", "--detach", "--wait", "--wait-timeout", str(int(UP_LIMIT)), limit=UP_LIMIT + 30
+            )
+        except CheckError as error:
+            raise CheckError(f"{error}{self.last_words()}") from None
         took = time.time() - began
         running = set(self.states())
         expect(running == set(services), f"it runs {sorted(running)} instead of {sorted(services)}")
         return took
+
+    def last_words(self) -> str:
+        """What the services that do not run, or are not healthy, said last."""
+        words = []
+        for service, state in self.states().items():
+            health = state.get("Health", {}).get("Status")
+            if state["ExitCode"] or state["Restarting"] or health == "unhealthy":
+                said = self.log(service, 0).strip().splitlines()[-2:]
+                words.append(f"\n      {service}: {' '.join(said)}")
+        return "".join(words)
 
     def down(self) -> None:
         """Take it away."""
