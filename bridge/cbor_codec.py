@@ -81,12 +81,6 @@ def decode(
     return message
 
 
-class _Bytes(bytes):
-    """The content of a typed array of bytes until all is read: no tag around it takes it for its own content."""
-
-    __slots__ = ()
-
-
 class _Tags(dict[int, _Decoder]):
     """What is made of each tag: typed arrays of those that stand here, nothing of all others."""
 
@@ -101,23 +95,21 @@ class _Tags(dict[int, _Decoder]):
 
 @lru_cache(maxsize=2)
 def _decoders(arrays: Arrays) -> _Tags:
-    make = _numpy_array if arrays == "numpy" else _list
+    make = _numpy_array if arrays == "numpy" else _plain_array
     return _Tags({tag: make(tag) for tag in TYPED_ARRAYS})
 
 
-def _list(tag: int) -> _Decoder:
+def _plain_array(tag: int) -> _Decoder:
     code = TYPED_ARRAYS[tag][1]
     size = array(code).itemsize
 
-    def make(value: object, _immutable: bool) -> list[int] | list[float] | bytes:
+    def make(value: object, _immutable: bool) -> "array[Any]":
         if type(value) is not bytes or len(value) % size:
             raise DecodeError(f"a typed array (tag {tag}) has no whole number of {size}-byte elements")
-        if code == "B":
-            return _Bytes(value)
-        numbers = array(code, value)
+        numbers = array(code, value)  # a list once all is read: no tag around it takes it for its own content
         if byteorder == "big":
             numbers.byteswap()
-        return numbers.tolist()
+        return numbers
 
     return make
 
@@ -160,8 +152,8 @@ def _check(message: dict[str, Any], arrays: Arrays, data: bytes) -> None:
             elif kind is bytes:
                 if from_bytes is not None:
                     container[key] = from_bytes(value, False)
-            elif kind is _Bytes:
-                container[key] = bytes(value)
+            elif kind is array:
+                container[key] = value.tobytes() if value.typecode == "B" else value.tolist()
             elif kind is cbor2.CBORSimpleValue or value is cbor2.undefined:
                 raise DecodeError(f"a message with a value that has no meaning arrived: {excerpt(data)}")
 
