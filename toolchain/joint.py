@@ -166,7 +166,8 @@ class Question:
                 impossible, or needs a table above the limit.
         """
         observed = [symbol.name for symbol in self.observed]
-        factors, terms = self._factors(observed)
+        active = [_without_idle(factor) for factor in self.joint.factors]
+        factors, terms = self._factors(active, observed)
         searched = [symbol.name for symbol in self.searched]
         sizes = {symbol.name: symbol.size for symbol in self.joint.symbols}
         lines = math.prod(symbol.size for symbol in self.searched)
@@ -179,7 +180,7 @@ class Question:
             raise ModelError(message)
         links = _Links(terms, factors, {*searched, *self.given})
         if links.joined(observed):
-            raise self._refusal(observed)
+            raise self._refusal(active, observed)
         own: dict[str, list[Term]] = {symbol.name: [] for symbol in self.observed}
         common: list[Term] = []
         for component in links.components():
@@ -193,17 +194,17 @@ class Question:
         common += [term for term in terms if set(term.scope) <= set(searched)]
         return self._fusion(own, product(common, searched, sizes).ravel(), sizes)
 
-    def _factors(self, observed: Sequence[str]) -> tuple[list[Factor], list[Term]]:
+    def _factors(self, active: Sequence[Factor], observed: Sequence[str]) -> tuple[list[Factor], list[Term]]:
         """Return what matters for some observed symbols, and the same as terms with what is given put in."""
         asked = {symbol.name for symbol in self.searched} | set(observed) | set(self.given)
-        factors = _relevant([_without_idle(factor) for factor in self.joint.factors], asked)
+        factors = _relevant(active, asked)
         terms = [
             reduced(Term(tuple(symbol.name for symbol in factor.scope), factor.table), self.given)
             for factor in factors
         ]
         return factors, terms
 
-    def _refusal(self, observed: Sequence[str]) -> ModelError:
+    def _refusal(self, active: Sequence[Factor], observed: Sequence[str]) -> ModelError:
         """Return why this is no naive fusion: two observed symbols, the shortest path between them, and a way out.
 
         Where not all are independent, some two are not, whatever the others do (d-separation has this property).
@@ -211,7 +212,7 @@ class Question:
         cut = {symbol.name for symbol in self.searched} | set(self.given)
         found: tuple[list[str], str] | None = None
         for one, other in combinations(observed, 2):
-            factors, terms = self._factors([one, other])
+            factors, terms = self._factors(active, [one, other])
             links = _Links(terms, factors, cut)
             path = links.path(one, other)
             if path and (found is None or len(path) < len(found[0])):
