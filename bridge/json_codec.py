@@ -156,11 +156,16 @@ def encode(
             or infinity with ``nonfinite="refuse"`` (its place is named), too deep or too large.
     """
     try:
-        data = orjson.dumps(message, _not_json, _OPTIONS)
+        try:
+            data = orjson.dumps(message, _not_json, _OPTIONS)
+        except TypeError as error:
+            if "native-endianness" not in str(error):
+                raise
+            data = orjson.dumps(_in_own_byte_order(message), _not_json, _OPTIONS)
     except TypeError as error:  # orjson.JSONEncodeError is a TypeError; default's own errors are its cause
-        if "native-endianness" not in str(error):
-            raise EncodeError(f"the message cannot be written as JSON: {error.__cause__ or error}") from None
-        data = orjson.dumps(_in_own_byte_order(message), _not_json, _OPTIONS)
+        raise EncodeError(f"the message cannot be written as JSON: {error.__cause__ or error}") from None
+    except RecursionError:
+        raise EncodeError(f"the message is nested deeper than {max_depth} levels") from None
     if len(data) > max_size:
         raise EncodeError(f"the message has {len(data)} bytes as JSON, at most {max_size} are sent")
     if nonfinite == "refuse" and _has_null(data):

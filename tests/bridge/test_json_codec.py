@@ -191,6 +191,8 @@ def test_arrays_of_any_layout(array):
 def test_arrays_of_what_json_has_not_got(array):
     with pytest.raises(EncodeError, match="cannot be written as JSON"):
         encode({"a": array})
+    with pytest.raises(EncodeError, match="cannot be written as JSON"):
+        encode({"other": np.arange(3, dtype=">f8"), "a": array})
 
 
 def test_a_nan_in_any_array_has_a_place():
@@ -260,7 +262,15 @@ def test_arrays_go_out_without_lists():
 
 @pytest.mark.parametrize(
     "message",
-    [{"a": memoryview(b"bytes")}, {"a": {1, 2}}, {"a": object()}, {1: 2}, {"a": 2**64}, {"a": "\ud800"}, {"a": 1j}],
+    [
+        {"a": memoryview(b"bytes")},
+        {"a": {1, 2}},
+        {"a": object()},
+        {1: 2},
+        {"a": 2**64},
+        {"a": "\ud800"},
+        {"a": 1j},
+    ],
     ids=str,
 )
 def test_what_cannot_be_json(message):
