@@ -1,6 +1,7 @@
 """Goals of ROS 2 actions as their sender holds them: feedback to be read, a result to be waited for, a way to cancel."""
 
 import asyncio
+import time
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -45,6 +46,7 @@ class Goal:
         self.action = action
         self.lost = 0
         self._session = session
+        self._sent = time.monotonic()
         self._feedback: deque[dict[str, Any]] = deque(maxlen=FEEDBACK_QUEUE_SIZE)
         self._reader: asyncio.Future[None] | None = None
         self._ended: asyncio.Future[GoalEnded] = asyncio.get_running_loop().create_future()
@@ -103,6 +105,7 @@ class Goal:
         except TimeoutError:
             raise NoAnswerError(
                 f"the goal of action {self.action} at {self._session.uri} did not end within {timeout:g} s"
+                f"{self._session.said_since(self._sent)}"
             ) from None
         if not ended.ok:
             raise GoalError(ended.values, f"{self.action} at {self._session.uri}")

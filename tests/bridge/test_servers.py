@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from bridge.client import connect
-from bridge.errors import NoMessageError, ServiceError
+from bridge.errors import NoAnswerError, NoMessageError, ServiceError
 from bridge.serialised import MessageTypes
 from tests.bridge.doubles import DEPTH, Double
 
@@ -149,6 +149,15 @@ async def test_no_operation_of_the_client_makes_a_server_deaf(server):
             await ros.call("/nothing", timeout=PATIENCE)
         assert not any(client.dead for client in double._clients)
         assert all(received.op is not None for received in double.received)
+
+
+async def test_a_server_without_actions_says_so_or_nothing():
+    """What is not known is silence on A, and a status from R."""
+    for server, said in (("A", "did not end within 0.3 s$"), ("R", "the server said: unknown operation")):
+        async with Double(server) as double, connect(double.uri) as ros:
+            goal = await ros.send_goal("/fly", "p/Fly")
+            with pytest.raises(NoAnswerError, match=said):
+                await goal.result(0.3)
 
 
 @pytest.mark.parametrize("server", ["A", "B"])
