@@ -161,7 +161,8 @@ async def announced(
 
     Args:
         name: the robot's, unique on the network.
-        host: the address that the server listens on; ``0.0.0.0`` and ``::`` are all of this machine's.
+        host: the address that the server listens on; ``0.0.0.0`` and ``::`` are all of this machine's. One of
+            loopback is announced to this machine alone.
         port: of the server.
         ros_version: which ROS it speaks for.
         tls: whether it wants TLS; its clients are sent to this machine's own name then, which its certificate
@@ -173,6 +174,9 @@ async def announced(
         DiscoveryError: ``zeroconf`` is not installed, there is no network, or another server has the name.
     """
     _check_name(name)
+    addresses = _addresses(host, interfaces)
+    if interfaces is None and all(ipaddress.ip_address(address).is_loopback for address in addresses):
+        interfaces = ("127.0.0.1",)  # nobody else on the network reaches it
     async with _zeroconf(interfaces) as zeroconf:
         from zeroconf.asyncio import AsyncServiceInfo
 
@@ -190,7 +194,7 @@ async def announced(
             port=port,
             properties=properties,
             server=f"{own_name}.local.",
-            parsed_addresses=_addresses(host, interfaces),
+            parsed_addresses=addresses,
         )
         await (await zeroconf.async_register_service(info, cooperating_responders=True))
         try:

@@ -63,7 +63,7 @@ async def test_a_hub_with_tokens_on_another_address(tmp_path: Path) -> None:
         "2",
         "--token-file",
         str(tokens),
-    ]  # noqa: S104  # what is tested
+    ]
     hub = await asyncio.create_subprocess_exec(*HUB, *arguments, stderr=asyncio.subprocess.PIPE)
     try:
         assert hub.stderr is not None

@@ -345,8 +345,9 @@ def test_what_a_throttle_drops_is_not_even_written(monkeypatch: pytest.MonkeyPat
         (b'{"op":"publish","topic":"/t","msg":{"a":"%b","b":1e999}}', False),
     ],
 )
-def test_large_messages_are_cut_out_only_where_that_is_sure(raw: bytes, cut: bool) -> None:
-    raw %= b"x" * 1000
+@pytest.mark.parametrize("size", [1000, 10_000])  # searched at once, or from quote to quote
+def test_large_messages_are_cut_out_only_where_that_is_sure(raw: bytes, cut: bool, size: int) -> None:
+    raw %= b"x" * size
     room = Room()
     publisher, subscriber = room.enter(), room.enter()
     publisher.advertise("/t")

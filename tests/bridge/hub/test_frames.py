@@ -29,6 +29,14 @@ def test_a_frame_is_found_wherever_it_begins(size: int, mask: bool, opcode: Opco
         assert frames.apply_mask(data[body : found.end], data[body - 4 : body]) == payload
 
 
+@pytest.mark.parametrize("opcode", [Opcode.PING, Opcode.PONG, Opcode.CLOSE])
+def test_control_frames_are_the_librarys(opcode: Opcode) -> None:
+    data = Frame(opcode, b"xx").serialize(mask=True)
+    assert frames.next_frame(data, 0) == (6, len(data), False)
+    assert not frames.next_frame(Frame(Opcode.TEXT, b"xx", fin=False).serialize(mask=True), 0).plain
+    assert not frames.next_frame(b"\xc1" + Frame(Opcode.TEXT, b"xx").serialize(mask=True)[1:], 0).plain
+
+
 @pytest.mark.parametrize("size", SIZES)
 def test_a_frame_whose_beginning_is_not_all_there_has_no_end(size: int) -> None:
     data = Frame(Opcode.TEXT, b"x" * size).serialize(mask=True)
