@@ -161,6 +161,9 @@ class BM1Kernel(Protocol):
                 changed then.
         """
 
+    def prepare(self) -> None:
+        """Do beforehand what else the first frames would take time for; changes no result. Resets the machine."""
+
     def reset(self) -> None:
         """Counters and cycles to 0, reason `NONE`, generators to the start of bank 0."""
 

@@ -32,6 +32,9 @@ KEPT_BYTES: Final = 64 * 2**20
 KEPT_CYCLES: Final = 2**17
 """Words of later cycles than this are never kept."""
 
+PREPARED_CYCLES: Final = 2**14
+"""So many of a frame's first cycles can have their words made beforehand."""
+
 _WORD_BITS: Final = 64
 _BLOCK_WORDS: Final = 8  # one register of AVX-512, two of AVX2, four of NEON
 _BLOCK_CYCLES: Final = _WORD_BITS * _BLOCK_WORDS
@@ -157,6 +160,14 @@ class FastBM1:
         """How many of a frame's first cycles, of every bank, have their words kept."""
         return self._kept_blocks * _BLOCK_CYCLES
 
+    def prepare(self) -> None:
+        """Make the words of every bank's first `PREPARED_CYCLES` cycles that are kept: a tenth of a second at most."""
+        blocks = min(self._kept_blocks, PREPARED_CYCLES // _BLOCK_CYCLES)
+        for bank in range(self._machine.parameters.rng_banks if blocks else 0):
+            self._restart(bank)
+            _fill_blocks(self._generators, self._store, self._frame, self._first_slot, blocks, self._period)
+        self.reset()
+
     def reset(self) -> None:
         """Counters and cycles to 0, reason `NONE`, generators to the start of bank 0."""
         self._live = 0
@@ -250,6 +261,7 @@ def warm_up() -> None:
     kernel = FastBM1(BM1Machine(parameters, np.full((1, 1), 128, dtype=np.uint16), ()))
     kernel.start(Start(addresses=(), target_count=2, max_cycles=2, run_until=1))
     kernel.resume(0)
+    kernel.prepare()
     _ = kernel.rng_state
 
 
@@ -515,6 +527,21 @@ def _show(generators: _Generators, frame: _Frame, clocks: int) -> None:
                 for word in range(_BLOCK_WORDS):
                     frame.inverted[column, bit, word] ^= generators.bits[bit, digit, value, word]
                 state >>= _4
+
+
+@_jit
+def _fill_blocks(
+    generators: _Generators, store: _Store, frame: _Frame, first_slot: int, blocks: int, period: int
+) -> None:
+    """Make the words of all codes for a bank's first blocks, from the states in `frame.starts`."""
+    for block in range(blocks):
+        words = store.words[first_slot + block]
+        filled = store.filled[first_slot + block]
+        _show(generators, frame, (block * _BLOCK_CYCLES) % period)
+        for row in range(filled.shape[0]):
+            if not filled[row]:
+                _fill(store.row_code[row], frame.inverted[store.row_column[row]], words, row * _BLOCK_WORDS)
+                filled[row] = True
 
 
 @_jit

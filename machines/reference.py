@@ -44,6 +44,10 @@ class ReferenceBM1:
         """The generators' states, a copy: uint64[columns], or uint64[lines, columns] if unshared."""
         return self._states.copy()
 
+    def prepare(self) -> None:
+        """There is nothing that could be done beforehand."""
+        self.reset()
+
     def reset(self) -> None:
         """Counters and cycles to 0, reason `NONE`, generators to the start of bank 0."""
         self._counts = np.zeros(self._machine.parameters.lines, dtype=np.uint32)

@@ -123,7 +123,8 @@ class EmulatedBoard:
     def load(self, content: bytes) -> None:
         """Program the board with the bytes of a programming file, as the loader sends them.
 
-        The machine runs for a few milliseconds, to measure its speed, and is reset.
+        The machine is prepared, which takes a tenth of a second, runs for a few milliseconds, to measure its speed, and
+        is reset.
 
         Raises:
             RefusedError: The machine runs, or the image is damaged or for another map.
@@ -133,6 +134,7 @@ class EmulatedBoard:
         try:
             image = image_from_bytes(content, "the image")
             kernel = self._make(image.machine)
+            kernel.prepare()
         except (ImageError, MachineError) as error:
             raise RefusedError(ErrorCode.BAD_IMAGE, str(error).rstrip(".")) from error
         self._kernel = kernel

@@ -123,6 +123,22 @@ def test_free_generators_keep_nothing():
     assert FastBM1(machine_of(rng_reset=RngReset.FREE)).kept_cycles == 0
 
 
+@pytest.mark.parametrize("reset", [RngReset.BANK, RngReset.FREE])
+def test_what_is_prepared_changes_nothing(reset):
+    machine = machine_of(zeros=0.1, rng_reset=reset, rng_banks=3)
+    prepared, fresh = FastBM1(machine), FastBM1(machine)
+    prepared.start(Start(addresses=(1, 2, 3), target_count=9, max_cycles=600))
+    prepared.prepare()
+    for bank in (0, 2, 1, 2):
+        start = Start(addresses=(bank, 2, 3), target_count=900, max_cycles=4000, bank=bank)
+        assert seen(prepared, prepared.start(start)) == seen(fresh, fresh.start(start))
+    if reset is RngReset.BANK:
+        blocks = fast.PREPARED_CYCLES // fast._BLOCK_CYCLES
+        for bank in range(3):
+            first = bank * prepared._kept_blocks
+            assert prepared._store.filled[first : first + blocks].all()
+
+
 def test_words_begin_at_a_cache_line():
     assert FastBM1(machine_of())._store.words.ctypes.data % 64 == 0
 

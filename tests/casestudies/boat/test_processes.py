@@ -238,6 +238,7 @@ async def test_a_viewer_says_which_results_never_came():
     async with FakeRosbridge() as fake, Process("viewer", "--uri", fake.uri, "--count", "1") as viewer:
         await fake.wait_for_op("subscribe", topic="/boat/true_pose", timeout=LIMIT)
         await fake.publish("/bm/frame", frame_message({"sec": 1, "nanosec": 0}, 1, published=True))
+        await asyncio.sleep(1)  # a report and a result as near as this do not belong together
         await say_result(fake, 2)
         code, out, err = await viewer.ended()
     assert code == 0
