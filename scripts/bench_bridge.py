@@ -20,7 +20,7 @@ from collections.abc import Awaitable, Callable, Iterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, NamedTuple, TypeVar, cast
 
 from conformance import install_roslib, install_roslibpy
 from processes import ROOT, Process, run_script
@@ -44,7 +44,8 @@ WINDOW = {SMALL: 400, LARGE: 100}
 COUNTS = {SMALL: (4000, 4000, 300), LARGE: (300, 600, 100)}
 """By values of a message: how many are published, received and sent round in a turn."""
 PER_SIZE = 40
-SERVER_MESSAGES = {"hub": 40_000, "Tornado double": 5_000}
+SERVER_MESSAGES = {"hub": 100_000, "Tornado double": 8_000}
+SERVER_TURNS = 5
 
 
 class Bare(asyncio.Protocol):
@@ -198,6 +199,13 @@ class Kind:
     forms: tuple[str, ...] = ("none", "cbor")
 
 
+class Rate(NamedTuple):
+    """Messages a second, and microseconds of the client's CPU for each."""
+
+    per_s: float
+    cpu_us: float
+
+
 class Child:
     """A client under measurement, in a process of its own."""
 
@@ -245,8 +253,8 @@ async def child_of(kind: Kind, uri: str) -> Any:
         await process.wait()
 
 
-async def published(child: Child, uri: str, topic: str, values: int, count: int) -> float:
-    """Messages a second that the client gets out."""
+async def published(child: Child, uri: str, topic: str, values: int, count: int) -> Rate:
+    """What the client gets out."""
     async with bare(uri) as counter:
         counter.send(frame({"op": "subscribe", "topic": topic, "type": TYPE, "queue_length": 1000}))
         await settled(counter)
@@ -260,12 +268,12 @@ async def published(child: Child, uri: str, topic: str, values: int, count: int)
         started = time.perf_counter()
         child.tell(do="publish", topic=topic, values=values, count=count)
         ended = await soon(last, f"the last message that {child.kind.name} published")
-        await child.answer()
-        return float(counter.count / (ended - started))
+        cpu = (await child.answer())["cpu_s"]
+        return Rate(float(counter.count / (ended - started)), 1e6 * cpu / count)
 
 
-async def received(child: Child, uri: str, topic: str, values: int, count: int, form: str) -> float:
-    """Messages a second that the client takes in."""
+async def received(child: Child, uri: str, topic: str, values: int, count: int, form: str) -> Rate:
+    """What the client takes in."""
     async with bare(uri) as publisher:
         publisher.send(frame({"op": "advertise", "topic": topic, "type": TYPE}))
         publisher.send(frame({"op": "subscribe", "topic": f"{topic}/heard", "type": TYPE}))
@@ -286,8 +294,8 @@ async def received(child: Child, uri: str, topic: str, values: int, count: int, 
         )
         started = time.perf_counter()
         send_until(WINDOW[values])
-        await child.answer()
-        return count / (time.perf_counter() - started)
+        cpu = (await child.answer())["cpu_s"]
+        return Rate(count / (time.perf_counter() - started), 1e6 * cpu / count)
 
 
 async def round_trips(child: Child, topic: str, values: int, count: int, form: str) -> list[float]:
@@ -357,7 +365,7 @@ async def bench(arguments: argparse.Namespace) -> int:
                 "hub": (await hub.line(r"ws://\S+"))[0],
                 "Tornado double": (await tornado.line(r"ws://\S+"))[0],
             }
-            for _ in range(TURNS):
+            for _ in range(SERVER_TURNS):
                 for name, uri in uris.items():
                     found.servers.setdefault(name, []).append(await server_rate(uri, SERVER_MESSAGES[name]))
             await tornado.end()
@@ -380,8 +388,8 @@ class Figures:
     """All that was measured, by client, form and number of values."""
 
     servers: dict[str, list[float]] = field(default_factory=dict)
-    published: dict[tuple[str, int], list[float]] = field(default_factory=dict)
-    received: dict[tuple[str, str, int], list[float]] = field(default_factory=dict)
+    published: dict[tuple[str, int], list[Rate]] = field(default_factory=dict)
+    received: dict[tuple[str, str, int], list[Rate]] = field(default_factory=dict)
     times: dict[tuple[str, str, int], list[float]] = field(default_factory=dict)
     by_size: dict[tuple[str, str], dict[int, list[float]]] = field(default_factory=dict)
     codec: dict[str, float] = field(default_factory=dict)
@@ -394,8 +402,10 @@ class Figures:
                 "client": name,
                 "form": form,
                 "values": values,
-                "published_per_s": median(self.published[name, values]) if form == "none" else None,
-                "received_per_s": median(rates),
+                "published_per_s": middle(self.published[name, values]).per_s if form == "none" else None,
+                "published_cpu_us": middle(self.published[name, values]).cpu_us if form == "none" else None,
+                "received_per_s": middle(rates).per_s,
+                "received_cpu_us": middle(rates).cpu_us,
                 "round_trip_us": median(self.times[name, form, values]),
                 "round_trip_p99_us": sorted(self.times[name, form, values])[
                     int(0.99 * len(self.times[name, form, values]))
@@ -429,15 +439,30 @@ class Figures:
         )
         found = {}
         for values in (SMALL, LARGE):
-            out = max(median(self.published[name, values]) for name in theirs)
-            into = max(median(self.received[name, "none", values]) for name in theirs)
+            out, into = (
+                [middle(rates) for rates in their]
+                for their in (
+                    [self.published[name, values] for name in theirs],
+                    [self.received[name, "none", values] for name in theirs],
+                )
+            )
             trip = min(median(self.times[name, "none", values]) for name in theirs)
-            found[f"published, {values} values"] = median(self.published["ours", values]) / out
-            found[f"received, {values} values"] = median(self.received["ours", "none", values]) / into
-            found[f"round trip, {values} values"] = median(self.times["ours", "none", values]) / trip
-            found[f"received as CBOR, {values} values"] = median(self.received["ours", "cbor", values]) / into
-            found[f"round trip as CBOR, {values} values"] = median(self.times["ours", "cbor", values]) / trip
+            ours = middle(self.published["ours", values])
+            found[f"published, {values} values"] = ours.per_s / max(rate.per_s for rate in out)
+            found[f"CPU of publishing, {values} values"] = ours.cpu_us / min(rate.cpu_us for rate in out)
+            for form, word in (("none", ""), ("cbor", " as CBOR")):
+                ours = middle(self.received["ours", form, values])
+                found[f"received{word}, {values} values"] = ours.per_s / max(rate.per_s for rate in into)
+                found[f"CPU of receiving{word}, {values} values"] = ours.cpu_us / min(
+                    rate.cpu_us for rate in into
+                )
+                found[f"round trip{word}, {values} values"] = median(self.times["ours", form, values]) / trip
         return found
+
+
+def middle(rates: list[Rate]) -> Rate:
+    """The medians of both figures."""
+    return Rate(*map(statistics.median, zip(*rates, strict=True)))
 
 
 async def measure_clients(clients: list[Kind], uri: str, found: Figures) -> None:
@@ -474,17 +499,28 @@ def show(summary: dict[str, Any]) -> None:
         servers.add_row(name, f"{rate:,.0f}")
     out.print(servers)
     table = Table(title="clients on the hub (float64 values in a message; medians)")
-    for column in ("client", "form", "values", "published/s", "received/s", "round trip us", "99 % us"):
+    columns = (
+        "client",
+        "form",
+        "values",
+        "published/s",
+        "CPU us",
+        "received/s",
+        "CPU us",
+        "round trip us",
+        "99 % us",
+    )
+    for column in columns:
         table.add_column(column, justify="left" if column in {"client", "form"} else "right")
     for row in sorted(summary["clients"], key=lambda row: row["values"]):
         form = "CBOR" if row["form"] == "cbor" else "JSON"
-        rate = "" if row["published_per_s"] is None else f"{row['published_per_s']:,.0f}"
-        figures = (
-            f"{row['received_per_s']:,.0f}",
-            f"{row['round_trip_us']:,.0f}",
-            f"{row['round_trip_p99_us']:,.0f}",
+        out_figures = (
+            f"{row[key]:{style}}" if row[key] is not None else ""
+            for key, style in (("published_per_s", ",.0f"), ("published_cpu_us", ".1f"))
         )
-        table.add_row(row["client"], form, str(row["values"]), rate, *figures)
+        figures = f"{row['received_per_s']:,.0f}", f"{row['received_cpu_us']:.1f}"
+        times = f"{row['round_trip_us']:,.0f}", f"{row['round_trip_p99_us']:,.0f}"
+        table.add_row(row["client"], form, str(row["values"]), *out_figures, *figures, *times)
     out.print(table)
     ratios = Table(title="ratios (ours to the better of roslibpy's transports, where nothing else is said)")
     ratios.add_column("of what")

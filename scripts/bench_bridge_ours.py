@@ -16,8 +16,6 @@ from bridge.client import Ros, connect
 PATIENCE = 60
 TYPE = "std_msgs/Float64MultiArray"
 ACK_EVERY = 50
-#: Messages that leave together where they are published as fast as it goes.
-TOGETHER = 50
 
 
 def message_of(count: int) -> dict[str, Any]:
@@ -45,12 +43,15 @@ async def receive(ros: Ros, topic: str, count: int, compression: Any) -> dict[st
     )
     await ros.call("/rosapi/get_time")
     tell("ready")
-    total = 0.0
-    for seen in range(1, count + 1):
-        message = await listener.next(PATIENCE)
-        total += message.msg["data"][-1]
-        if seen % ACK_EVERY == 0:
-            await acks.publish({"data": [seen]})
+    total, seen = 0.0, 0
+    async with asyncio.timeout(PATIENCE):
+        async for message in listener:
+            total += message.msg["data"][-1]
+            seen += 1
+            if seen % ACK_EVERY == 0:
+                await acks.publish({"data": [seen]})
+            if seen == count:
+                break
     return {"sum": float(total)}
 
 
@@ -84,8 +85,9 @@ async def main() -> None:
     async with connect(sys.argv[1]) as ros:
         tell("connected")
         while line := await lines.readline():
-            command = json.loads(line)
-            tell(await do[command.pop("do")](ros, **command))
+            command, cpu = json.loads(line), time.process_time()
+            answer = await do[command.pop("do")](ros, **command)
+            tell(answer | {"cpu_s": time.process_time() - cpu})
 
 
 if __name__ == "__main__":

@@ -71,6 +71,9 @@ const commands = {
 tell("connected");
 for await (const line of createInterface({ input: process.stdin })) {
   const command = JSON.parse(line);
-  tell(await commands[command.do](command));
+  const before = process.cpuUsage();
+  const answer = await commands[command.do](command);
+  const { user, system } = process.cpuUsage(before);
+  tell({ ...answer, cpu_s: (user + system) / 1e6 });
 }
 process.exit(0);

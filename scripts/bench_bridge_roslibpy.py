@@ -87,8 +87,9 @@ def main() -> None:
     tell("connected")
     do = {"publish": publish, "receive": receive, "round_trip": round_trip}
     for line in sys.stdin:
-        command = json.loads(line)
-        tell(do[command.pop("do")](ros, **command))
+        command, cpu = json.loads(line), time.process_time()
+        answer = do[command.pop("do")](ros, **command)
+        tell(answer | {"cpu_s": time.process_time() - cpu})
     ros.terminate()
 
 
