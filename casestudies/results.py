@@ -282,7 +282,7 @@ class Pairing:
 
     Each topic's own messages come in the order of their arrival, so the next result goes to the next report of a
     published frame. `heard_ns` tells when one of the two was lost: a result goes to no report that was heard more
-    than `disorder_ns` after it, nor to one after which the next was heard that long before it. Servers keep the
+    than `disorder_ns` after it, nor to one that was heard as long before it if the next one was not. Servers keep the
     order of a topic, but not all keep the order between topics. A frame waits for its truth until a
     newer truth or the next frame shows that it won't come. Without a truth of exactly its stamp a frame takes
     the newest older one, if it is not older than `truth_tolerance_ns`: messages without a header (an array
@@ -340,15 +340,21 @@ class Pairing:
             posterior = self._posteriors[0]
             if self._reports[0].heard_ns > posterior.heard_ns + self._disorder_ns:  # its own report was lost
                 self._untrue.append(Instance(report=None, posterior=self._posteriors.popleft()))
-            elif (
-                len(self._reports) > 1 and self._reports[1].heard_ns + self._disorder_ns <= posterior.heard_ns
-            ):
+            elif len(self._reports) > 1 and self._belongs_to_a_later(posterior):
                 self._reports.popleft()  # its result was lost
                 self.announced_only += 1
             else:
                 self._untrue.append(
                     Instance(report=self._reports.popleft(), posterior=self._posteriors.popleft())
                 )
+
+    def _belongs_to_a_later(self, posterior: Posterior) -> bool:
+        """Whether a result came too late to be the first report's, and not too early to be the next one's."""
+        first, second = self._reports[0], self._reports[1]
+        return (
+            first.heard_ns + self._disorder_ns < posterior.heard_ns
+            and second.heard_ns <= posterior.heard_ns + self._disorder_ns
+        )
 
     def _resolve(self) -> list[Instance]:
         ready: list[Instance] = []
