@@ -20,6 +20,8 @@ from bridge.errors import DecodeError
 from bridge.json_codec import MAX_SIZE
 
 _SIGNATURE: Final = b"\x89PNG\r\n\x1a\n"
+#: Of deflate: the least. A mebibyte of numbers takes 12 ms and not 74, and is a fourteenth longer.
+_EFFORT: Final = 1
 #: Bytes of a pixel by colour type.
 _CHANNELS: Final = {0: 1, 2: 3, 4: 2, 6: 4}
 
@@ -87,7 +89,7 @@ def encode(message: bytes) -> str:
     header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
     picture = _SIGNATURE + b"".join(
         _chunk(kind, content)
-        for kind, content in ((b"IHDR", header), (b"IDAT", zlib.compress(lines)), (b"IEND", b""))
+        for kind, content in ((b"IHDR", header), (b"IDAT", zlib.compress(lines, _EFFORT)), (b"IEND", b""))
     )
     return base64.b64encode(picture).decode()
 
