@@ -98,6 +98,7 @@ class WebSocket(ClientConnection):
         )
         self.opened = False
         self.first_bytes = b""
+        self._early: list[Frame] = []
         self._on_message = on_message
         self._on_lost = on_lost
         self._interval = ping_interval
@@ -124,6 +125,9 @@ class WebSocket(ClientConnection):
         self.opened = True
         self._last_heard = self.loop.time()
         self._schedule(self._interval)
+        for event in self._early:  # what came in one piece with the handshake
+            self.process_event(event)
+        self._early.clear()
 
     def send_now(self, data: bytes) -> None:
         """Hand one text message to the socket (or to its buffer, without limit: see ``paused`` and ``drain``)."""
@@ -173,8 +177,11 @@ class WebSocket(ClientConnection):
 
     def process_event(self, event: Event) -> None:
         """Take one event of the WebSocket protocol: hand a whole message over, leave the rest to the library."""
-        if not self.opened or not isinstance(event, Frame) or event.opcode not in DATA_OPCODES:
+        if not isinstance(event, Frame) or event.opcode not in DATA_OPCODES:
             super().process_event(event)
+            return
+        if not self.opened:
+            self._early.append(event)
             return
         if self._begun is None and event.fin:
             self._on_message(bytes(event.data))

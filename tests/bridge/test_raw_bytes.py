@@ -40,7 +40,7 @@ def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @contextlib.asynccontextmanager
-async def says(data: bytes) -> AsyncIterator[tuple[int, asyncio.Event]]:
+async def says(data: bytes, at_once: bytes = b"") -> AsyncIterator[tuple[int, asyncio.Event]]:
     """A server that does the handshake, says this once it may, and reads on: its port, and when it may."""
     go = asyncio.Event()
 
@@ -51,7 +51,7 @@ async def says(data: bytes) -> AsyncIterator[tuple[int, asyncio.Event]]:
             accept = base64.b64encode(hashlib.sha1(key + _GUID, usedforsecurity=False).digest())
             writer.write(
                 b"HTTP/1.1 101 Switching Protocols\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
-                b"Sec-WebSocket-Accept: " + accept + b"\r\n\r\n"
+                b"Sec-WebSocket-Accept: " + accept + b"\r\n\r\n" + at_once
             )
             await go.wait()
             writer.write(data)
@@ -112,6 +112,15 @@ FRAMES = [
 async def test_each_frame_alone_and_before_a_message(number):
     for data in (FRAMES[number], FRAMES[number] + FRAMES[0], FRAMES[5] + FRAMES[number] + FRAMES[6]):
         await hears(data)
+
+
+async def test_what_comes_in_one_piece_with_the_handshake_is_heard():
+    status = frame(1, b'{"op":"status","level":"error","msg":"welcome"}')
+    again = frame(1, b'{"op":"st', fin=False) + frame(0, b'atus","msg":"again"}')
+    async with says(b"", status + again) as (port, go):
+        go.set()
+        async with connect(f"ws://127.0.0.1:{port}") as ros:
+            assert [said.text for said in ros.statuses] == ["welcome", "again"]
 
 
 @pytest.mark.asyncio(loop_factories=["asyncio"])
