@@ -15,7 +15,7 @@ from bridge.fields import Field
 from bridge.stamps import header_stamp_ns
 from services.errors import OverflowedQueueError, VariableError
 from toolchain.address import to_address
-from toolchain.deployment import Deployment, Variable
+from toolchain.deployment import Deployment, MachineSection, Variable, WrittenPrior
 from toolchain.errors import ReadingError
 
 QUEUE_ALL_DEPTH = 256
@@ -29,12 +29,16 @@ Item = TypeVar("Item")
 
 @dataclass(frozen=True, slots=True)
 class CompleteReading:
-    """One address per sensor column (None: missing), with the newest stamp or receipt of its messages."""
+    """One address per variable (None: missing), with the newest stamp or receipt of its messages.
+
+    `prior_codes` is a written prior, two bytes a line; empty where the machine's own stands.
+    """
 
     addresses: list[int | None]
     stamp_ns: int
     received_ns: int
     received_tick: int
+    prior_codes: bytes = b""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,15 +47,18 @@ class _Message:
     received_ns: int
     received_tick: int
     addresses: tuple[int | None, ...]
+    prior_codes: bytes
 
 
 class _SourceReader:
-    """Takes the variables of one topic out of its messages."""
+    """Takes the variables of one topic, and the prior where it comes from there, out of its messages."""
 
-    def __init__(self, variables: Sequence[Variable], topic: str) -> None:
+    def __init__(self, variables: Sequence[Variable], topic: str, prior: _PriorReader | None) -> None:
         self._fields = [(variable, Field(variable.path or variable.name)) for variable in variables]
+        self._prior = prior
         self._topic = topic
         self.optional = all(variable.on_missing == "missing" for variable in variables)
+        self.needs_prior = prior is not None and not prior.optional
 
     def read(self, message: dict[str, Any]) -> tuple[int | None, ...]:
         addresses: list[int | None] = []
@@ -65,6 +72,35 @@ class _SourceReader:
                 sentence = f"{self._topic}: {error}"
                 raise VariableError(sentence) from error
         return tuple(addresses)
+
+    def prior(self, message: dict[str, Any]) -> bytes:
+        if self._prior is None:
+            return b""
+        try:
+            return self._prior.read(message)
+        except (BridgeError, ReadingError) as error:
+            sentence = f"{self._topic}: {error}"
+            raise VariableError(sentence) from error
+
+
+class _PriorReader:
+    """Takes a written prior out of a message, as codes."""
+
+    def __init__(self, prior: WrittenPrior, machine: MachineSection) -> None:
+        self._field = Field(prior.path)
+        self.optional = prior.on_missing == "model"
+        self._machine = machine
+
+    def read(self, message: dict[str, Any]) -> bytes:
+        from toolchain.quantise import written_prior
+
+        present, value = self._field.value(message)
+        if not present or value is None:
+            if self.optional:
+                return b""
+            raise self._field.missing(message)
+        codes = written_prior(value, lines=self._machine.lines, prob_bits=self._machine.prob_bits)
+        return codes.astype("<u2").tobytes()
 
 
 class FrameAssembler:
@@ -82,12 +118,19 @@ class FrameAssembler:
             for source in range(count)
         ]
         self._readers = [
-            _SourceReader([deployment.variables[at] for at in columns], deployment.sources[source].topic)
+            _SourceReader(
+                [deployment.variables[at] for at in columns],
+                deployment.sources[source].topic,
+                _PriorReader(deployment.prior, deployment.machine)
+                if deployment.prior is not None and deployment.prior.source == source
+                else None,
+            )
             for source, columns in enumerate(self._columns)
         ]
         everything_optional = all(reader.optional for reader in self._readers)
         self._needed = [
-            bool(columns) and (not reader.optional or (everything_optional and count == 1))
+            reader.needs_prior
+            or (bool(columns) and (not reader.optional or (everything_optional and count == 1)))
             for columns, reader in zip(self._columns, self._readers, strict=True)
         ]
         self._width = len(deployment.variables)
@@ -115,9 +158,12 @@ class FrameAssembler:
             received_ns,
             received_tick,
             self._readers[source].read(message),
+            self._readers[source].prior(message),
         )
         if len(self._fresh) == 1:
-            return CompleteReading(list(taken.addresses), taken.stamp_ns, received_ns, received_tick)
+            return CompleteReading(
+                list(taken.addresses), taken.stamp_ns, received_ns, received_tick, taken.prior_codes
+            )
         queue = self._fresh[source]
         if len(queue) == UNPAIRED_DEPTH:
             queue.popleft()
@@ -136,7 +182,9 @@ class FrameAssembler:
             elif self._needed[source]:
                 return None
         addresses: list[int | None] = [None] * self._width
+        prior_codes = b""
         for source, message in chosen.items():
+            prior_codes = prior_codes or message.prior_codes
             for column, address in zip(self._columns[source], message.addresses, strict=True):
                 addresses[column] = address
             queue = self._fresh[source]
@@ -146,7 +194,7 @@ class FrameAssembler:
                 self.unpaired += 1
         latest = max(chosen.values(), key=lambda each: each.stamp_ns)
         last = max(chosen.values(), key=lambda each: each.received_tick)
-        return CompleteReading(addresses, latest.stamp_ns, last.received_ns, last.received_tick)
+        return CompleteReading(addresses, latest.stamp_ns, last.received_ns, last.received_tick, prior_codes)
 
 
 class WaitingFrames(Generic[Item]):

@@ -586,7 +586,12 @@ class Master:
             return
         reading, arrived = waiting
         self._number += 1
-        frame = Frame(self._number, reading.addresses, self._number % self._deployment.machine.rng_banks)
+        frame = Frame(
+            self._number,
+            reading.addresses,
+            self._number % self._deployment.machine.rng_banks,
+            reading.prior_codes,
+        )
         self._computing = (frame, reading, arrived, time.monotonic_ns())
         app.protocol.send(frame)
         if self._follows:

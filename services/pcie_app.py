@@ -11,8 +11,10 @@ import socket
 import sys
 import time
 from collections.abc import Sequence
+from typing import Annotated
 
 import msgspec
+import numpy as np
 import orjson
 
 from machines.bm1 import StopReason
@@ -57,7 +59,9 @@ class Boards:
 
     def __init__(self, settings: Settings, deployment: Deployment, endpoints: Sequence[Endpoint]) -> None:
         self._settings = settings
+        self._deployment = deployment
         self._machine = deployment.machine
+        self._selects = deployment.prior_select is not None
         self._images: list[Image] = [
             read_image(deployment.image_path(at)) for at in range(len(deployment.boards))
         ]
@@ -145,8 +149,14 @@ class Boards:
 
     def _input(self, frame: Frame) -> FrameInput:
         machine = self._machine
+        sensors, row = tuple(frame.addresses), 0
+        if self._selects and len(sensors) == len(self._deployment.variables):
+            sensors, row = self._deployment.machine_addresses(sensors)
+        prior = np.frombuffer(frame.prior_codes, "<u2") if frame.prior_codes else None
         return FrameInput(
-            addresses=tuple(frame.addresses),
+            addresses=sensors,
+            prior_address=row,
+            prior_codes=prior,
             target_count=machine.target_count,
             max_cycles=machine.max_cycles,
             bank=frame.bank,
@@ -388,6 +398,7 @@ class LineReading(msgspec.Struct):
 
     addresses: list[int | None]
     stamp_ns: int | None = None
+    prior_codes: list[Annotated[int, msgspec.Meta(ge=0, lt=1 << 16)]] = []
 
 
 def reading_from_line(line: bytes, number: int) -> LineReading:
@@ -416,7 +427,8 @@ def compute_lines(boards: Boards, banks: int) -> int:
             if not line.strip():
                 continue
             reading = reading_from_line(line, number)
-            frame = Frame(number, reading.addresses, number % banks)
+            codes = np.array(reading.prior_codes, "<u2").tobytes()
+            frame = Frame(number, reading.addresses, number % banks, codes)
             result = result_record(number, boards.run(frame))
             printed = {
                 "number": number,

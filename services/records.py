@@ -63,6 +63,7 @@ class Reading(Record, tag="reading", frozen=True):
     sent_tick: int
     addresses: list[int | None]
     passed_over: int
+    prior_codes: bytes = b""
 
 
 class Unusable(Record, tag="unusable", frozen=True):
@@ -78,6 +79,7 @@ class Frame(Record, tag="frame", frozen=True):
     number: int
     addresses: list[int | None]
     bank: int
+    prior_codes: bytes = b""
 
 
 class BoardOutcome(Record, tag="board", frozen=True):

@@ -239,6 +239,7 @@ def _reading_record(reading: CompleteReading, passed_over: int) -> Reading:
         sent_tick=time.monotonic_ns(),
         addresses=reading.addresses,
         passed_over=passed_over,
+        prior_codes=reading.prior_codes,
     )
 
 
@@ -294,7 +295,11 @@ async def print_addresses(settings: Settings, deployment: Deployment, count: int
                 reading = assembler.take(at, message.msg, message.received_ns, message.received_monotonic_ns)
                 if reading is not None and (count is None or printed < count):
                     printed += 1
-                    _print({"stamp_ns": reading.stamp_ns, "addresses": reading.addresses})
+                    printed_prior = list(memoryview(reading.prior_codes).cast("H"))
+                    _print(
+                        {"stamp_ns": reading.stamp_ns, "addresses": reading.addresses}
+                        | ({"prior_codes": printed_prior} if printed_prior else {})
+                    )
 
         followers = [
             asyncio.ensure_future(follow(at, source)) for at, source in enumerate(deployment.sources)

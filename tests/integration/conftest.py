@@ -136,6 +136,7 @@ class Robot:
         self.frames: list[dict] = []
         self.order: list[str] = []
         self._tasks: list[asyncio.Task] = []
+        self._publishing: asyncio.Task | None = None
         self._socket = None
 
     async def __aenter__(self):
@@ -186,7 +187,13 @@ class Robot:
                         await self.connect()
                 await asyncio.sleep(1 / rate)
 
-        self._tasks.append(asyncio.ensure_future(publish()))
+        self._publishing = asyncio.ensure_future(publish())
+        self._tasks.append(self._publishing)
+
+    async def stop_publishing(self) -> None:
+        """Publish no more in the background, and hear the results of what was published."""
+        self._publishing.cancel()
+        await asyncio.sleep(0.5)
 
     async def have(self, count: int, timeout: float = 25) -> None:
         """Wait until so many results have come."""

@@ -1,0 +1,112 @@
+"""Priors end to end: selected by a variable of the message, or written with every frame (thesis 2.1.2).
+
+message ──▶ subscriber ──▶ master ──▶ pcie-app ──▶ PRIOR_SELECT or PRIOR_CODES of two boards ──▶ posterior on the wire
+"""
+
+import json
+import subprocess
+import textwrap
+
+import numpy as np
+import pytest
+
+from tests.integration.conftest import BIN, Robot
+
+PRIORS = np.array([[0.7, 0.1, 0.1, 0.1], [0.1, 0.1, 0.1, 0.7]])
+HEARD = np.array([[0.9, 0.4, 0.4, 0.1], [0.1, 0.6, 0.6, 0.9]])
+FINE = ("--prob-bits", "14", "--counter-bits", "16", "--target-count", "20000")
+
+
+def exact(prior, heard):
+    joint = np.asarray(prior) * HEARD[heard]
+    return joint / joint.sum()
+
+
+def built(folder, *, select, options=()):
+    """A deployment of four rooms, one thing heard, and a prior that is selected or not."""
+    folder.mkdir()
+    selection = f"PriorSelect(name='time', table=np.array({PRIORS.tolist()}))" if select else "None"
+    (folder / "model.py").write_text(
+        textwrap.dedent(f"""
+            import numpy as np
+            from toolchain.model import Known, Model, PriorSelect, dimension
+
+            def model():
+                return Model(
+                    name="rooms",
+                    searched=(dimension("room", size=4),),
+                    known=(Known(name="heard", table=np.array({HEARD.tolist()})),),
+                    prior_select={selection},
+                )
+            """)
+    )
+    subprocess.run(
+        [
+            *(BIN / "toolchain", "build", folder, "-o", folder / "built", "--partitions", "2", *FINE),
+            *("--uri", "ws://127.0.0.1:9090", "--topic", "/boat/sensors", "--type", "boat_msgs/Sensors"),
+            *options,
+        ],
+        check=True,
+        capture_output=True,
+        timeout=60,
+    )
+    return folder / "built"
+
+
+async def posteriors(stage, deployment, messages, *flags):
+    """What is published for each message in turn."""
+    _, uri = await stage.hub()
+    master = stage.start("master", "--loop", *flags, "-d", str(deployment), "--uri", uri)
+    async with Robot(uri) as robot:
+        await master.says("pcie-app: 2 boards")
+        await master.says("publisher: publishing")
+        await robot.keep_publishing(**messages[0])
+        await robot.have(1)
+        await robot.stop_publishing()
+        found = []
+        for message in messages:
+            before = len(robot.results)
+            await robot.publish(**message)
+            await robot.have(before + 1)
+            found.append(robot.results[-1]["data"])
+        return found, master
+
+
+@pytest.mark.parametrize("flags", [(), ("--fused",)])
+async def test_a_variable_selects_the_prior(stage, tmp_path, flags):
+    deployment = built(tmp_path / "rooms", select=True)
+    messages = [{"heard": heard, "time": time} for heard in (0, 1) for time in (0, 1)]
+    found, _ = await posteriors(stage, deployment, messages, *flags)
+    for message, posterior in zip(messages, found, strict=True):
+        assert posterior == pytest.approx(exact(PRIORS[message["time"]], message["heard"]), abs=0.02)
+
+
+async def test_a_prior_is_written_with_every_frame(stage, tmp_path):
+    deployment = built(
+        tmp_path / "rooms", select=False, options=("--prior-mode", "written", "--prior-path", "belief")
+    )
+    beliefs = [[1, 1, 1, 1], [4, 2, 1, 1], [0, 0, 3, 1]]
+    messages = [{"heard": heard, "belief": belief} for belief in beliefs for heard in (0, 1)]
+    found, master = await posteriors(stage, deployment, messages)
+    for message, posterior in zip(messages, found, strict=True):
+        assert posterior == pytest.approx(exact(message["belief"], message["heard"]), abs=0.02)
+    assert "unusable" not in master.err
+
+
+async def test_a_belief_that_is_none_is_said_and_skipped(stage, tmp_path):
+    deployment = built(
+        tmp_path / "rooms", select=False, options=("--prior-mode", "written", "--prior-path", "belief")
+    )
+    _, uri = await stage.hub()
+    async with Robot(uri) as robot:
+        await robot.keep_publishing(heard=1, belief=[1, 2, 3])
+        master = stage.start("master", "--once", "-d", str(deployment), "--uri", uri)
+        assert await master.end() == 4
+        assert "expected one number for each of 4 lines" in master.err.splitlines()[-1]
+
+
+def test_alone_the_boards_take_what_the_subscriber_prints(tmp_path):
+    from services.pcie_app import reading_from_line
+
+    line = json.dumps({"addresses": [1], "stamp_ns": 5, "prior_codes": [9, 2]}).encode()
+    assert reading_from_line(line, 1).prior_codes == [9, 2]
