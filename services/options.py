@@ -13,7 +13,7 @@ Deployment = Annotated[
 ]
 Uri = Annotated[
     str | None,
-    typer.Option("--uri", help="rosbridge server, instead of the deployment's.", metavar="ws://HOST:PORT"),
+    typer.Option("--uri", help="rosbridge server, instead of the deployment's.", metavar="ws://HOST:PORT|robot:NAME"),
 ]
 Listen = Annotated[
     str | None,
