@@ -1,0 +1,335 @@
+"""The resource estimator beside a synthesis, and the synthesised text beside the reference machine: scripts/verify resources.
+
+small machines --> toolchain.rtl (Verilog) --> Icarus Verilog --> counts, cycles, reasons, states: the reference's, to the bit?
+                                          └--> yosys synth_intel_alm --> ALUTs, registers: what toolchain.resources says?
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from machines.bm1 import BM1Machine, Start, StopReason
+from machines.parameters import BM1Parameters, PriorMode, RngKind, RngReset
+from machines.reference import ReferenceBM1
+from toolchain import rtl
+from toolchain.resources import Alms, logic_of
+
+LIMIT_S = 240.0
+"""For one run of a tool."""
+TOLERANCE = 0.15
+"""How far an estimate may be from the synthesis, of ALUTs, of ALMs and of registers."""
+ADDRESS_BITS = 4
+
+
+@dataclass(frozen=True)
+class Case:
+    """A small machine; `seed` makes its tables and frames."""
+
+    parameters: BM1Parameters
+    seed: int
+    calibrated: bool = False
+
+    @property
+    def name(self) -> str:
+        """Lines x sensors, and what is not the default."""
+        p = self.parameters
+        return (
+            f"{p.lines}x{p.sensors}, codes {p.prob_bits}, counters {p.counter_bits}, {p.rng}"
+            + ("" if p.shared else " a cell")
+            + f", {p.steps_per_clock} steps, {p.rng_banks} banks"
+            + (", free" if p.rng_reset is RngReset.FREE else "")
+            + (", written prior" if p.prior_mode is PriorMode.WRITTEN else "")
+        )
+
+
+def case(lines: int, sensors: int, seed: int, *, calibrated: bool = False, **others: object) -> Case:
+    """A machine of these sizes."""
+    bits = (ADDRESS_BITS,) * sensors
+    return Case(BM1Parameters(lines=lines, sensor_bits=bits, **others), seed, calibrated)  # type: ignore[arg-type]  # keyword arguments by name
+
+
+SIMULATED = (
+    case(4, 2, 1),
+    case(8, 3, 2),
+    case(16, 4, 3),
+    case(5, 1, 4, prob_bits=4, counter_bits=4, rng=RngKind.LFSR8, rng_banks=1),
+    case(6, 3, 5, prob_bits=12, rng=RngKind.LFSR16, steps_per_clock=1, prior_bits=2),
+    case(4, 2, 6, rng=RngKind.LFSR24, rng_reset=RngReset.FREE),
+    case(4, 2, 7, shared=False, rng_banks=3),
+    case(4, 2, 8, prior_mode=PriorMode.WRITTEN),
+)
+SYNTHESISED = (
+    case(4, 2, 1, calibrated=True),
+    case(8, 3, 2, calibrated=True),
+    case(16, 4, 3, calibrated=True),
+    case(12, 5, 4),
+    case(24, 2, 5, prob_bits=6),
+    case(10, 3, 6, prob_bits=10, counter_bits=12),
+    case(6, 4, 7, rng=RngKind.LFSR24, rng_banks=8),
+    case(20, 2, 8, counter_bits=20, rng_banks=1),
+    case(6, 3, 9, shared=False, rng_banks=1, rng=RngKind.LFSR16),
+    case(40, 3, 10),
+)
+
+
+def machine_of(case: Case) -> BM1Machine:
+    """The case's machine, with random tables, a fifth of their codes 0 or all-ones."""
+    parameters = case.parameters
+    random = np.random.default_rng(case.seed)
+
+    def codes(rows: int) -> np.ndarray[tuple[int, int], np.dtype[np.uint16]]:
+        table = random.integers(1, parameters.ones_code, (rows, parameters.lines)).astype(np.uint16)
+        kind = random.random(table.shape)
+        table[kind < 0.05] = 0
+        table[kind > 0.85] = parameters.ones_code
+        return table
+
+    tables = [codes(1 << bits) for bits in parameters.sensor_bits]
+    for table in tables:
+        table[1] = 0  # an address on which no line can count
+        table[-1] = parameters.ones_code
+    return BM1Machine(parameters, codes(parameters.prior_addresses), tuple(tables))
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a machine shows at the end of a slice."""
+
+    reason: StopReason
+    cycles: int
+    counts: tuple[int, ...]
+    states: tuple[int, ...]
+
+
+def frames_of(case: Case) -> list[tuple[Start, int]]:
+    """Frames that end in every way, each with the cycle that a resume goes on to (0: none, -1: to the end)."""
+    parameters = case.parameters
+    random = np.random.default_rng(case.seed + 1000)
+    addresses = [
+        tuple(random.choice([0, *range(2, 1 << bits)]).item() for bits in parameters.sensor_bits)
+        for _ in range(4)
+    ]
+    written = parameters.prior_mode is PriorMode.WRITTEN
+    rows = [
+        random.integers(0, parameters.ones_code + 1, parameters.lines).astype(np.uint16) for _ in range(6)
+    ]
+
+    def start(at: int, where: tuple[int, ...], target: int, limit: int, until: int = 0) -> Start:
+        return Start(
+            addresses=where,
+            prior_address=at % parameters.prior_addresses,
+            prior_codes=rows[at] if written and at else None,
+            target_count=min(target, parameters.target_count_max),
+            max_cycles=limit,
+            bank=at % parameters.rng_banks,
+            run_until=until,
+        )
+
+    missing = tuple((1 << bits) - 1 for bits in parameters.sensor_bits)
+    return [
+        (start(0, addresses[0], 200, 64), 0),
+        (start(1, addresses[1], 5, 400), 0),
+        (start(2, addresses[2], 255, 100, until=31), 57),
+        (start(3, (1, *addresses[3][1:]), 9, 50), 0),
+        (start(4, missing, 30, 300), 0),
+        (start(5, addresses[3], 3, 200, until=64), -1),
+    ]
+
+
+def reference(machine: BM1Machine, frames: Sequence[tuple[Start, int]]) -> list[Outcome]:
+    """What the reference machine shows."""
+    kernel = ReferenceBM1(machine)
+    outcomes = []
+    for start, further in frames:
+        kernel.start(start)
+        if further and kernel.reason is StopReason.SLICE:
+            kernel.resume(max(further, 0))
+        outcomes.append(
+            Outcome(
+                kernel.reason,
+                kernel.cycles,
+                tuple(kernel.counts.tolist()),
+                tuple(kernel.rng_state.ravel().tolist()),
+            )
+        )
+    return outcomes
+
+
+def testbench(machine: BM1Machine, frames: Sequence[tuple[Start, int]]) -> str:
+    """A bench that writes the registers as a host does, and prints what comes out."""
+    parameters = machine.parameters
+    generators = parameters.columns * (1 if parameters.shared else parameters.lines)
+    steps = []
+    for start, further in frames:
+        writes = {
+            rtl.TARGET: start.target_count,
+            rtl.MAX_CYCLES: start.max_cycles,
+            rtl.MAX_CYCLES + 1: 0,
+            rtl.RUN_UNTIL: start.run_until,
+            rtl.RUN_UNTIL + 1: 0,
+            rtl.BANK: start.bank,
+            rtl.PRIOR_ADDRESS: start.prior_address,
+            **{rtl.SENSORS + at: address for at, address in enumerate(start.addresses)},
+        }
+        if parameters.prior_mode is PriorMode.WRITTEN:
+            prior = machine.prior[0] if start.prior_codes is None else start.prior_codes
+            first = rtl.SENSORS + parameters.sensors
+            writes |= {first + line: code for line, code in enumerate(prior.tolist())}
+        steps += [f"put({address}, {value});" for address, value in writes.items()]
+        steps += [f"put({rtl.CONTROL}, 1);", "finish;"]
+        if further:
+            steps += [
+                f"if (reason == 3) begin put({rtl.RUN_UNTIL}, {max(further, 0)}); put({rtl.CONTROL}, 2); finish; end"
+            ]
+        states = " ".join(f'$write(" %0d", dut.random_{at});' for at in range(generators))
+        steps += [
+            '$write("%0d %0d", reason, cycles);',
+            f"for (i = 0; i < {parameters.lines}; i = i + 1) begin",
+            '  read_address = i; @(negedge clk); $write(" %0d", read_data); end',
+            states,
+            '$display("");',
+        ]
+    body = "\n    ".join(steps)
+    return f"""
+module bench;
+  reg clk = 0, reset = 1, write = 0; reg [31:0] write_data = 0; reg [31:0] read_address = 0, write_address = 0;
+  wire [31:0] read_data; wire [63:0] cycles; wire [2:0] reason; wire done; integer i;
+  always #1 clk = ~clk;
+  bm1 dut (.clk(clk), .reset(reset), .write(write), .write_address(write_address), .write_data(write_data),
+    .read_address(read_address), .read_data(read_data), .cycles(cycles), .reason(reason), .done(done));
+  task put(input [31:0] address, input [31:0] value);
+    begin write = 1; write_address = address; write_data = value; @(negedge clk); write = 0; end
+  endtask
+  task finish; begin @(negedge clk); while (!done) @(negedge clk); end endtask
+  initial begin
+    repeat (3) @(negedge clk); reset = 0;
+    {body}
+    $finish;
+  end
+  initial begin #200000 $display("late"); $finish; end
+endmodule
+"""
+
+
+def simulated(case: Case, folder: Path) -> list[Outcome]:
+    """What the text shows in Icarus Verilog."""
+    machine, frames = machine_of(case), frames_of(case)
+    text = folder / "bm1.v"
+    text.write_text(rtl.verilog(machine, tables=True) + testbench(machine, frames))
+    run(["iverilog", "-g2005", "-Wno-portbind", "-s", "bench", "-o", str(folder / "bm1.vvp"), str(text)])
+    printed = run(["vvp", "-n", str(folder / "bm1.vvp")]).splitlines()
+    lines = case.parameters.lines
+    outcomes = []
+    for line in printed:
+        if not line[:1].isdigit():
+            sys.exit(f"error: the simulation of {case.name} said {line!r}")
+        reason, cycles, *rest = map(int, line.split())
+        outcomes.append(Outcome(StopReason(reason), cycles, tuple(rest[:lines]), tuple(rest[lines:])))
+    return outcomes
+
+
+def synthesised(case: Case, folder: Path) -> Alms:
+    """What yosys makes of the text, its tables left out."""
+    text = folder / "bm1.v"
+    text.write_text(rtl.verilog(machine_of(case), tables=False))
+    stat = folder / "stat.json"
+    script = f"read_verilog {text}; synth_intel_alm -top bm1 -family cyclonev -noiopad -noclkbuf; tee -o {stat} stat -json"
+    run(["yosys", "-q", "-p", script])
+    cells = json.loads(stat.read_text())["modules"]["\\bm1"]["num_cells_by_type"]
+    cells = {name.removeprefix("MISTRAL_"): count for name, count in cells.items()}
+    return Alms(
+        luts=sum(cells.get(f"ALUT{inputs}", 0) for inputs in range(2, 5)) + cells.get("NOT", 0),
+        luts5=cells.get("ALUT5", 0),
+        luts6=cells.get("ALUT6", 0),
+        sums=cells.get("ALUT_ARITH", 0),
+        registers=cells.get("FF", 0),
+    )
+
+
+def run(command: list[str]) -> str:
+    """Run a tool and return what it printed; a failure ends the script with its last words."""
+    try:
+        done = subprocess.run(command, check=True, capture_output=True, text=True, timeout=LIMIT_S)
+    except subprocess.TimeoutExpired:
+        sys.exit(f"error: {command[0]} did not end within {LIMIT_S:.0f} s")
+    except subprocess.CalledProcessError as error:
+        sys.exit(f"error: {command[0]} failed: {(error.stderr or error.stdout).strip()[-400:]}")
+    return done.stdout
+
+
+def compare(cases: Sequence[Case], folder: Path, console: Console) -> tuple[int, int]:
+    """Print estimate and synthesis of each machine side by side; passed and failed."""
+    table = Table(title="Estimate / synthesis, tables left out (* calibrated on)", title_justify="left")
+    for heading in ("machine", "ALUTs", "ALMs", "registers", "s"):
+        table.add_column(heading, justify="left" if heading == "machine" else "right")
+    passed = failed = 0
+    for each in cases:
+        began = time.monotonic()
+        found = synthesised(each, folder)
+        said = logic_of(
+            each.parameters, interface_words=each.parameters.lines, word_bits=each.parameters.counter_bits
+        )
+        row, good = [], True
+        for ours, theirs in (
+            (said.aluts, found.aluts),
+            (said.alms, found.alms),
+            (said.registers, found.registers),
+        ):
+            good &= abs(ours - theirs) <= TOLERANCE * theirs
+            row.append(f"{ours:.0f} / {theirs:.0f} ({ours / theirs - 1:+.0%})")
+        passed, failed = passed + good, failed + (not good)
+        name = f"{'*' if each.calibrated else ''}{each.name}" + ("" if good else "  FAIL")
+        table.add_row(name, *row, f"{time.monotonic() - began:.0f}")
+        console.print(f"synthesised {each.name}", style="dim")
+    Console().print(table)
+    return passed, failed
+
+
+def main() -> int:
+    """Simulate, then synthesise; exit 1 if anything differs."""
+    parser = argparse.ArgumentParser(prog="scripts/verify resources", description=__doc__.splitlines()[0])
+    parser.add_argument(
+        "--simulate-only", action="store_true", help="leave the synthesis out (no yosys needed)"
+    )
+    arguments = parser.parse_args()
+    wanted = ["iverilog"] if arguments.simulate_only else ["iverilog", "yosys"]
+    absent = [tool for tool in wanted if shutil.which(tool) is None]
+    if absent:
+        print(
+            f"error: {' and '.join(absent)} not found; Debian: apt-get install iverilog yosys",
+            file=sys.stderr,
+        )
+        return 2
+    passed = failed = 0
+    with tempfile.TemporaryDirectory(prefix="rosbayes-resources-") as where:
+        folder = Path(where)
+        for each in SIMULATED:
+            ours, theirs = reference(machine_of(each), frames_of(each)), simulated(each, folder)
+            good = ours == theirs
+            passed, failed = passed + good, failed + (not good)
+            ends = ", ".join(f"{outcome.reason.name.lower()} {outcome.cycles}" for outcome in ours)
+            print(
+                f"{'ok  ' if good else 'FAIL'}  simulated as the reference: {each.name}: {ends}", flush=True
+            )
+        if not arguments.simulate_only:
+            more = compare(SYNTHESISED, folder, Console(stderr=True))
+            passed, failed = passed + more[0], failed + more[1]
+    print(f"{passed} passed, {failed} failed")
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
