@@ -15,13 +15,3 @@ class DataFileError(CaseStudyError):
 
 class OutputError(CaseStudyError):
     """Pictures or numbers that cannot be written: no matplotlib, or a folder that refuses."""
-
-
-class BadResultError(CaseStudyError):
-    """A message on a result topic that is no result of the machine."""
-
-
-class NoResultError(CaseStudyError):
-    """No result came in time."""
-
-    exit_code: ClassVar[int] = 3

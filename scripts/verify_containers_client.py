@@ -25,7 +25,7 @@ from casestudies.boat.geometry import SENSOR_NAMES
 from casestudies.boat.messages import SENSORS_TOPIC, SENSORS_TYPE
 from casestudies.boat.model import model
 from casestudies.listening import listen
-from casestudies.results import Instance
+from casestudies.truths import Instance
 from machines.bm1 import Start
 from machines.posterior import joint_posterior
 from machines.reference import ReferenceBM1
@@ -107,7 +107,7 @@ class Bits:
             counts.append(kernel.counts)
             cycles.append(kernel.cycles)
         ours = joint_posterior(counts, cycles)
-        if ours is None or not np.array_equal(ours, np.asarray(posterior.values)):
+        if ours is None or not np.array_equal(ours, np.asarray(posterior.probabilities)):
             return "the posterior is not that of these counts"
         return ""
 
@@ -138,11 +138,11 @@ async def check(uri: str, cells: tuple[int, int], bits: int) -> None:
             }
             if addresses is None:
                 line["wrong"] = "no reading has its stamp"
-            elif len(posterior.values) != width * height:
-                line["wrong"] = f"it has {len(posterior.values)} lines, not {width * height}"
+            elif len(posterior.probabilities) != width * height:
+                line["wrong"] = f"it has {len(posterior.probabilities)} lines, not {width * height}"
             else:
                 exact = exact_posterior(boat, addresses)
-                line["tv"] = round(float(0.5 * np.abs(np.asarray(posterior.values) - exact).sum()), 4)
+                line["tv"] = round(float(0.5 * np.abs(np.asarray(posterior.probabilities) - exact).sum()), 4)
                 if reference is not None and (wrong := reference.wrong(instance, addresses)):
                     line["wrong"] = wrong
             print(json.dumps(line), flush=True)

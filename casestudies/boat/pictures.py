@@ -6,11 +6,12 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
 
+from bridge.results import Posterior
 from casestudies.boat.geometry import BEACONS, map_grid
 from casestudies.boat.shares import Part, StageShare
 from casestudies.errors import OutputError
 from casestudies.grid import Grid
-from casestudies.results import Instance, Posterior, Truth
+from casestudies.truths import Instance, Truth
 
 POSITIONS_SHOWN: Final = 4
 """As many as the thesis shows."""
@@ -69,7 +70,7 @@ def draw_positions(path: Path, instances: Sequence[Instance], *, route: Sequence
     down = math.ceil(len(instances) / across)
     figure = figure_class(figsize=(5.6 * across + 0.9, 2.95 * down + 0.75), layout="constrained")
     axes = figure.subplots(down, 2 * across, squeeze=False)
-    scale = max(max(_posterior_of(instance).values) for instance in instances)
+    scale = max(_posterior_of(instance).probability for instance in instances)
     image = None
     for number, instance in enumerate(instances):
         row, pair = divmod(number, across)
@@ -189,7 +190,7 @@ def _draw_posterior(axes: Any, grid: Grid, instance: Instance, scale: float, num
     if instance.report is not None and instance.report.number is not None:
         title += f", frame {instance.report.number}"
     _map_axes(axes, grid, title)
-    rows = [posterior.values[row * width : (row + 1) * width] for row in range(height)]
+    rows = [posterior.probabilities[row * width : (row + 1) * width] for row in range(height)]
     image = axes.imshow(
         rows,
         origin="lower",
@@ -212,7 +213,7 @@ def _draw_posterior(axes: Any, grid: Grid, instance: Instance, scale: float, num
             zorder=4,
             label="true position",
         )
-    mean_x, mean_y = grid.mean(posterior.values)
+    mean_x, mean_y = grid.mean(posterior.probabilities)
     outline = [withStroke(linewidth=3.2, foreground="black")]
     axes.plot(
         [mean_x],

@@ -6,7 +6,7 @@ from enum import StrEnum
 from statistics import fmean
 from typing import Final
 
-from casestudies.results import Instance
+from casestudies.truths import Instance
 
 
 class Part(StrEnum):
@@ -36,13 +36,17 @@ def _reported(field: str) -> Callable[[Instance], float | None]:
     return time_of
 
 
+def _rosbridge_out(instance: Instance) -> float | None:
+    return instance.posterior.rosbridge_out_us if instance.posterior else None
+
+
 _STAGES: Final[tuple[tuple[str, Part, Callable[[Instance], float | None]], ...]] = (
     ("rosbridge in", Part.ROSBRIDGE, _reported("rosbridge_in")),
     ("local hops", Part.HOST, _reported("local_hops")),
     ("register writes", Part.REGISTERS, _reported("register_writes")),
     ("computing", Part.COMPUTING, _reported("compute")),
     ("register reads", Part.REGISTERS, _reported("reads")),
-    ("rosbridge out", Part.ROSBRIDGE, lambda instance: instance.rosbridge_out_us),
+    ("rosbridge out", Part.ROSBRIDGE, _rosbridge_out),
 )
 
 

@@ -12,15 +12,16 @@ from typing import TYPE_CHECKING, Annotated, Final, Self
 
 import typer
 
+from bridge.errors import NoResultError
 from casestudies.boat.messages import TRUE_POSE_TOPIC
-from casestudies.errors import CaseStudyError, NoResultError, OutputError
+from casestudies.errors import CaseStudyError, OutputError
 from casestudies.running import command, fail, make_app, run, say
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
     from casestudies.boat.shares import StageShare
-    from casestudies.results import Instance, Truth
+    from casestudies.truths import Instance, Truth
 
 POSITIONS_PICTURE: Final = "figure-4.4.png"
 SHARES_PICTURE: Final = "figure-4.5.png"
@@ -73,10 +74,10 @@ def line_of(instance: "Instance") -> Line:
     true_cell = None if instance.truth is None else grid.cell(instance.truth.x, instance.truth.y)
     mean = None
     if instance.posterior is not None:
-        x, y = grid.mean(instance.posterior.values)
+        x, y = grid.mean(instance.posterior.probabilities)
         mean = (x - grid.x_low) / grid.cell_width - 0.5, (y - grid.y_low) / grid.cell_height - 0.5
     report = instance.report
-    latency_us = instance.latency_us
+    latency_us = instance.posterior.latency_us if instance.posterior else None
     return Line(
         frame=report.number if report else None,
         true_cell=true_cell,

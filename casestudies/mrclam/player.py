@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from casestudies.errors import BadResultError, CaseStudyError, NoResultError, OutputError
+from bridge.errors import BadResultError, NoResultError
+from casestudies.errors import CaseStudyError, OutputError
 from casestudies.mrclam.recording import (
     MAP_FRAME,
     SIGHTINGS_MSG,
@@ -31,8 +32,9 @@ from casestudies.running import command, fail, make_app, run, say
 if TYPE_CHECKING:
     from bridge.client import Publication
     from bridge.protocol import RosVersion
+    from bridge.results import Posterior
     from casestudies.listening import Listener
-    from casestudies.results import Instance, Posterior
+    from casestudies.truths import Instance
 
 LOST_DISTANCE: Final = 9.0
 """What a frame without a result counts as, in metres: the width of the area."""
@@ -63,7 +65,7 @@ class PlayedFrame:
                 "is wanted: is this the deployment of casestudies/mrclam?"
             )
         height, width = self.posterior.sizes
-        return area_grid(width, height).mean(self.posterior.values)
+        return area_grid(width, height).mean(self.posterior.probabilities)
 
     def distance(self) -> float:
         """How far the estimate is from the reference position, in metres; `LOST_DISTANCE` without one."""

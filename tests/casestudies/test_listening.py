@@ -5,7 +5,7 @@ import asyncio
 import pytest
 
 from bridge.client import connect
-from casestudies.errors import BadResultError, NoResultError
+from bridge.errors import BadResultError, NoResultError
 from casestudies.listening import listen
 from tests.casestudies.pretend_stack import certain, frame_message, posterior_message
 from tests.fake_rosbridge import FakeRosbridge
@@ -39,7 +39,7 @@ async def test_frames_come_with_their_posterior_and_truth(heard):
     assert [i.report.number for i in instances] == [1, 2, 3]
     assert [i.truth.x for i in instances] == [1, 2, 3]
     assert [i.posterior is None for i in instances] == [False, True, False]
-    assert [i.posterior.values.index(1.0) for i in instances[::2]] == [1, 3]
+    assert [i.posterior.probabilities.index(1.0) for i in instances[::2]] == [1, 3]
     assert [truth.x for truth in listener.route] == [1, 2, 3]
 
 
@@ -73,7 +73,7 @@ async def test_a_result_without_a_report_is_handed_out_too(heard):
     async with asyncio.timeout(10):
         instance = await listener.next(1000)
     assert instance.report is None
-    assert instance.posterior.values.index(1.0) == 7
+    assert instance.posterior.probabilities.index(1.0) == 7
 
 
 async def test_silence_is_named(heard):

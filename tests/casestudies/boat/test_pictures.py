@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
+from bridge.results import FrameReport, Posterior, StageTimes
 from casestudies.boat.pictures import draw_positions, draw_shares, far_apart, posterior_grid
 from casestudies.boat.shares import Part, stage_shares
 from casestudies.errors import OutputError
-from casestudies.results import FrameReport, Instance, Posterior, StageTimes, Truth
+from casestudies.truths import Instance, Truth
 
 VIRIDIS_LOW, VIRIDIS_HIGH = (0.267, 0.005, 0.329), (0.993, 0.906, 0.144)
 TRUTH_COLOUR = (1.0, 0.302, 0.302)
@@ -21,18 +22,17 @@ def instance(number, x=0.0, y=0.0, *, cell=None, truth=True, width=32, height=32
         values[cell] = 1.0
     else:
         values = [1 / len(values)] * len(values)
-    return Instance(
-        report=FrameReport(
-            stamp_ns=number,
-            heard_ns=number,
-            outcome="",
-            number=number,
-            sent_ns=0,
-            stages=StageTimes(**stages),
-        ),
-        posterior=Posterior(values=tuple(values), labels=("y", "x"), sizes=(height, width), heard_ns=500_000),
-        truth=Truth(stamp_ns=number, x=x, y=y) if truth else None,
+    report = FrameReport(
+        stamp_ns=number, heard_ns=number, outcome="", number=number, sent_ns=0, stages=StageTimes(**stages)
     )
+    posterior = Posterior(
+        probabilities=tuple(values),
+        labels=("y", "x"),
+        sizes=(height, width),
+        heard_ns=500_000,
+        report=report,
+    )
+    return Instance(heard=posterior, truth=Truth(stamp_ns=number, x=x, y=y) if truth else None)
 
 
 def pixels_of(path, colour):
@@ -82,7 +82,7 @@ class TestPositions:
         assert not len(pixels_of(tmp_path / "x.png", TRUTH_COLOUR))
 
     def test_a_posterior_that_is_no_map(self):
-        line = Posterior(values=(0.5, 0.5), labels=("x",), sizes=(2,), heard_ns=0)
+        line = Posterior(probabilities=(0.5, 0.5), labels=("x",), sizes=(2,), heard_ns=0)
         with pytest.raises(OutputError, match="two dimensions"):
             posterior_grid(line)
 
@@ -107,7 +107,7 @@ class TestFarApart:
         assert [i.report.number for i in chosen][::3] == [0, 9]
 
     def test_frames_without_a_posterior_are_not_chosen(self):
-        assert far_apart([Instance(report=None, posterior=None)]) == ()
+        assert far_apart([Instance(heard=FrameReport(stamp_ns=1, heard_ns=1, outcome=""))]) == ()
 
     def test_equal_places_are_not_chosen_twice(self):
         chosen = far_apart([instance(n) for n in range(6)])

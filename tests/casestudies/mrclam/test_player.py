@@ -10,11 +10,10 @@ import sys
 
 import pytest
 
-from bridge.errors import BridgeError
-from casestudies.errors import BadResultError, NoResultError
+from bridge.errors import BadResultError, BridgeError, NoResultError
+from bridge.results import Posterior
 from casestudies.mrclam.player import LOST_DISTANCE, PlayedFrame, median_distance, play
 from casestudies.mrclam.recording import SIGHTINGS_TOPIC, RecordedFrame, Sighting, area_grid
-from casestudies.results import Posterior
 from tests.casestudies.pretend_stack import PretendStack, certain
 from tests.fake_rosbridge import FakeRosbridge
 
@@ -118,7 +117,7 @@ async def test_no_server():
 
 
 def test_the_median_counts_frames_without_a_result():
-    result = Posterior(values=tuple(certain(40)), labels=("y", "x"), sizes=(32, 32), heard_ns=0)
+    result = Posterior(probabilities=tuple(certain(40)), labels=("y", "x"), sizes=(32, 32), heard_ns=0)
     good = PlayedFrame(frame=FRAMES[0], posterior=result, cycles=1, outcome="")
     lost = PlayedFrame(frame=FRAMES[0], posterior=None, cycles=None, outcome="")
     assert median_distance([good, lost, lost]) == LOST_DISTANCE
@@ -126,7 +125,7 @@ def test_the_median_counts_frames_without_a_result():
 
 
 def test_a_posterior_of_something_else():
-    result = Posterior(values=(0.5, 0.5), labels=("x",), sizes=(2,), heard_ns=0)
+    result = Posterior(probabilities=(0.5, 0.5), labels=("x",), sizes=(2,), heard_ns=0)
     with pytest.raises(BadResultError, match=r"deployment of casestudies/mrclam"):
         PlayedFrame(frame=FRAMES[0], posterior=result, cycles=1, outcome="").estimate()
 

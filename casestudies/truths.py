@@ -1,0 +1,150 @@
+"""True positions, and which of them belongs to which frame.
+
+No connection is in here. A posterior's report has the stamp of its reading, which the true pose of a simulator carries
+too.
+"""
+
+from collections import deque
+from dataclasses import dataclass
+from typing import Annotated, Any, Final
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, FiniteFloat, ValidationError
+
+from bridge.errors import BadResultError
+from bridge.results import FrameReport, Heard, Posterior
+from bridge.stamps import stamp_ns
+
+TRUTH_TYPE: Final = "geometry_msgs/PoseStamped"
+
+_TRUTHS_KEPT = 4096
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Truth:
+    """A true position, in the map's units."""
+
+    stamp_ns: int
+    x: float
+    y: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Instance:
+    """A frame: what was heard of it, and its truth.
+
+    `truth` is None where no true pose belongs to the stamp. `truth_age_ns` is how much older than the frame's stamp
+    the true pose is: 0 where the stamps are equal.
+    """
+
+    heard: Heard
+    truth: Truth | None = None
+    truth_age_ns: int = 0
+
+    @property
+    def posterior(self) -> Posterior | None:
+        """None for a frame without one."""
+        return self.heard if isinstance(self.heard, Posterior) else None
+
+    @property
+    def report(self) -> FrameReport | None:
+        """None for a posterior that no `/bm/frame` announced."""
+        return self.heard.report if isinstance(self.heard, Posterior) else self.heard
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="ignore", frozen=True)
+
+
+class _Header(_Part):
+    stamp: Annotated[int, BeforeValidator(stamp_ns)]
+
+
+class _Point(_Part):
+    x: FiniteFloat
+    y: FiniteFloat
+
+
+class _Pose(_Part):
+    position: _Point
+
+
+class _PoseStamped(_Part):
+    header: _Header
+    pose: _Pose
+
+
+def read_truth(message: dict[str, Any], topic: str) -> Truth:
+    """A geometry_msgs/PoseStamped as a true position.
+
+    Raises:
+        BadResultError: it has no stamp or no position.
+    """
+    try:
+        pose = _PoseStamped.model_validate(message)
+    except ValidationError as error:
+        place = ".".join(str(step) for step in error.errors()[0]["loc"])
+        raise BadResultError(
+            f"a message on {topic} is not the {TRUTH_TYPE} of a simulator ({place or 'the message'} is wrong)"
+        ) from None
+    return Truth(stamp_ns=pose.header.stamp, x=pose.pose.position.x, y=pose.pose.position.y)
+
+
+class Truths:
+    """Gives frames their true positions, whatever order they are handed over in.
+
+    A frame waits for its truth until a newer truth or the next frame shows that it won't come. Without a truth of
+    exactly its stamp a frame takes the newest older one, if it is not older than `tolerance_ns`: messages without a
+    header (an array of numbers) get their stamp only when they reach the host.
+    """
+
+    def __init__(self, *, tolerance_ns: int = 0) -> None:
+        self._tolerance_ns = tolerance_ns
+        self._truths: deque[Truth] = deque(maxlen=_TRUTHS_KEPT)
+        self._untrue: deque[Instance] = deque()  # frames that still wait for their true pose
+
+    @property
+    def waits(self) -> bool:
+        """Whether there is a frame that waits for its truth."""
+        return bool(self._untrue)
+
+    def add_frame(self, heard: Heard) -> list[Instance]:
+        """Take what was heard of a frame; returns the instances that are complete now."""
+        self._untrue.append(Instance(heard=heard))
+        return self._resolve()
+
+    def add_truth(self, truth: Truth) -> list[Instance]:
+        """Take a true position; returns the instances that are complete now."""
+        self._truths.append(truth)
+        return self._resolve()
+
+    def flush(self) -> list[Instance]:
+        """The frames that still wait for a truth: nothing more will come."""
+        ended = [self._with_truth(instance) for instance in self._untrue]
+        self._untrue.clear()
+        return ended
+
+    def _resolve(self) -> list[Instance]:
+        ready: list[Instance] = []
+        while self._untrue:
+            report = self._untrue[0].report
+            waits = (
+                report is not None
+                and len(self._untrue) == 1
+                and bool(self._truths)
+                and self._truths[-1].stamp_ns < report.stamp_ns
+            )
+            if waits:
+                break
+            ready.append(self._with_truth(self._untrue.popleft()))
+        return ready
+
+    def _with_truth(self, instance: Instance) -> Instance:
+        if instance.report is None:
+            return instance
+        for truth in reversed(self._truths):
+            age_ns = instance.report.stamp_ns - truth.stamp_ns
+            if age_ns >= 0:
+                if age_ns > self._tolerance_ns:
+                    break
+                return Instance(heard=instance.heard, truth=truth, truth_age_ns=age_ns)
+        return instance

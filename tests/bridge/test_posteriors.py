@@ -1,0 +1,309 @@
+"""Hearing a stack's posteriors: in order, over losses, in time, with or without asyncio.
+
+fake server  ->  /bm/frame, /BMresults  ->  posteriors(), listen()
+"""
+
+import asyncio
+import contextlib
+import subprocess
+import sys
+import threading
+
+import pytest
+
+from bridge.client import connect
+from bridge.errors import (
+    BadResultError,
+    ConcurrentReadError,
+    DisconnectedError,
+    NoResultError,
+    OptionError,
+    UnreachableError,
+)
+from bridge.posteriors import listen, posteriors
+from bridge.results import FrameReport
+from tests.fake_rosbridge import FakeRosbridge
+
+PATIENCE = 30.0
+
+
+def report(number, *, published=True, deployment="boat"):
+    values = {"number": number, "cycles": 800, "published": str(published).lower(), "compute_us": 12.5}
+    return {
+        "header": {"stamp": {"sec": number, "nanosec": 0}},
+        "status": [
+            {
+                "message": "posterior" if published else "no posterior: impossible",
+                "hardware_id": deployment,
+                "values": [{"key": key, "value": str(value)} for key, value in values.items()],
+            }
+        ],
+    }
+
+
+def result(*data):
+    dims = [{"label": "y", "size": 2, "stride": 4}, {"label": "x", "size": 2, "stride": 2}]
+    return {"layout": {"dim": dims, "data_offset": 0}, "data": [value / sum(data) for value in data]}
+
+
+async def say(fake, number, *data, **about):
+    published = bool(data)
+    await fake.publish("/bm/frame", report(number, published=published, **about))
+    if published:
+        await fake.publish("/BMresults", result(*data))
+
+
+@contextlib.asynccontextmanager
+async def hearing(**options):
+    async with FakeRosbridge() as fake, connect(fake.uri) as ros, posteriors(ros, **options) as heard:
+        await fake.wait_for_op("subscribe", topic=options.get("topic", "/BMresults"))
+        yield fake, heard
+
+
+async def test_each_posterior_has_its_frames_data():
+    async with hearing() as (fake, heard):
+        for number in range(1, 4):
+            await say(fake, number, *[1] * number, *[0] * (4 - number))
+        numbers = []
+        async with asyncio.timeout(PATIENCE):
+            async for posterior in heard:
+                numbers.append(posterior.number)
+                assert posterior.values.shape == (2, 2)
+                assert posterior.stamp_ns == posterior.number * 10**9
+                assert (posterior.cycles, posterior.stages.compute) == (800, 12.5)
+                assert posterior.at(y=0, x=0) == 1 / posterior.number
+                if len(numbers) == 3:
+                    break
+        assert numbers == [1, 2, 3]
+        assert (heard.lost, heard.without_posterior, heard.announced_only) == (0, 0, 0)
+
+
+async def test_frames_without_a_posterior_are_passed_over_or_told():
+    async with hearing() as (fake, heard):
+        await say(fake, 1)
+        await say(fake, 2, 0, 0, 0, 1)
+        await say(fake, 3)
+        assert (await heard.next(PATIENCE)).number == 2
+        assert heard.without_posterior == 1
+        frame = await heard.next_frame(PATIENCE)
+        assert isinstance(frame, FrameReport)
+        assert (frame.number, frame.outcome) == (3, "no posterior: impossible")
+
+
+async def test_a_posterior_without_a_report_comes_too():
+    async with hearing() as (fake, heard):
+        await fake.publish("/BMresults", result(0, 1, 0, 0))
+        posterior = await heard.next(PATIENCE)
+        assert posterior.number is None
+        assert posterior.best() == {"y": 0, "x": 1}
+
+
+async def test_other_topics():
+    async with hearing(topic="/here", frame_topic="/frames") as (fake, heard):
+        await fake.publish("/frames", report(5))
+        await fake.publish("/here", result(1, 0, 0, 0))
+        assert (await heard.next(PATIENCE)).number == 5
+
+
+async def test_frames_of_another_stack_are_passed_over():
+    async with hearing(deployment="boat") as (fake, heard):
+        await fake.publish("/bm/frame", report(70, deployment="car"))
+        await fake.publish("/bm/frame", report(71, deployment="car"))
+        await say(fake, 1, 1, 0, 0, 0)
+        assert (await heard.next(PATIENCE)).number == 1
+
+
+async def test_silence_is_named():
+    async with hearing() as (fake, heard):
+        with pytest.raises(NoResultError, match=f"/bm/frame and /BMresults from {fake.uri} within 0.1 s: is"):
+            await heard.next(0.1)
+        await fake.vanish()
+        with pytest.raises(NoResultError, match="within 2 s: the connection is reconnecting"):
+            await heard.next(2)
+
+
+@pytest.mark.parametrize("topic", ["/bm/frame", "/BMresults"])
+async def test_nonsense_is_said_once_and_in_its_place(topic):
+    async with hearing() as (fake, heard):
+        await say(fake, 1, 1, 0, 0, 0)
+        assert (await heard.next(PATIENCE)).number == 1
+        await fake.publish(topic, {"data": "nonsense"})
+        with pytest.raises(BadResultError, match=f"a message on {topic} is not"):
+            await heard.next(PATIENCE)
+        await say(fake, 2, 1, 0, 0, 0)
+        assert (await heard.next(PATIENCE)).number == 2
+
+
+async def test_a_slow_reader_loses_the_oldest():
+    async with hearing(queue_size=2) as (fake, heard):
+        for number in range(1, 11):
+            await say(fake, number, 1, 0, 0, 0)
+        async with asyncio.timeout(PATIENCE):
+            while heard.lost < 8:
+                await asyncio.sleep(0.01)
+        assert [(await heard.next(PATIENCE)).number for _ in range(2)] == [9, 10]
+
+
+async def test_after_a_reconnection_it_goes_on():
+    async with hearing() as (fake, heard):
+        await say(fake, 1, 1, 0, 0, 0)
+        assert (await heard.next(PATIENCE)).number == 1
+        await fake.vanish()
+        await fake.come_back()
+        await fake.wait_for_op("subscribe", topic="/BMresults", count=2, timeout=PATIENCE)
+        await say(fake, 2, 1, 0, 0, 0)
+        assert (await heard.next(PATIENCE)).number == 2
+        assert heard.blind_seconds > 0
+
+
+async def test_closing_ends_the_iteration_after_what_waits():
+    async with FakeRosbridge() as fake, connect(fake.uri) as ros:
+        heard = posteriors(ros)
+        await fake.wait_for_op("subscribe", topic="/BMresults")
+        await fake.publish("/BMresults", result(1, 0, 0, 0))  # its report never comes
+        async with asyncio.timeout(PATIENCE):
+            while not heard._pairing.waits:
+                await asyncio.sleep(0.01)
+        await heard.close()
+        assert [posterior.number async for posterior in heard] == [None]
+        with pytest.raises(DisconnectedError, match="subscription of /BMresults is closed"):
+            await heard.next(1)
+        await fake.wait_for_op("unsubscribe", topic="/bm/frame")
+
+
+async def test_closing_the_client_ends_it_too():
+    async with FakeRosbridge() as fake, connect(fake.uri) as ros:
+        heard = posteriors(ros)
+        await fake.wait_for_op("subscribe", topic="/BMresults")
+        reading = asyncio.create_task(heard.next(None))
+        await asyncio.sleep(0)
+        await ros.close()
+        with pytest.raises(DisconnectedError):
+            await asyncio.wait_for(reading, PATIENCE)
+
+
+async def test_two_readers_are_one_too_many():
+    async with hearing() as (_fake, heard):
+        first = asyncio.create_task(heard.next(PATIENCE))
+        await asyncio.sleep(0)
+        with pytest.raises(ConcurrentReadError):
+            await heard.next(1)
+        first.cancel()
+
+
+async def test_a_queue_needs_room():
+    async with FakeRosbridge() as fake, connect(fake.uri) as ros:
+        with pytest.raises(OptionError, match="queue_size of /BMresults must be at least 1"):
+            posteriors(ros, queue_size=0)
+
+
+class Calling:
+    """`listen` in a thread of its own, while this one plays the stack."""
+
+    def __init__(self, fake):
+        self.fake = fake
+        self.server = fake.uri
+
+    async def __call__(self, function, frames=3, **options):
+        heard_before = len(self.fake.ops("subscribe", topic="/BMresults"))
+
+        async def play():
+            await self.fake.wait_for_op(
+                "subscribe", topic="/BMresults", count=heard_before + 1, timeout=PATIENCE
+            )
+            for number in range(1, frames + 1):
+                await say(self.fake, number, 1, 0, 0, 0)
+
+        playing = asyncio.create_task(play())
+        try:
+            async with asyncio.timeout(PATIENCE):
+                return await asyncio.to_thread(listen, self.server, function, **options)
+        finally:
+            await playing
+
+
+@pytest.fixture
+async def calling():
+    async with FakeRosbridge() as fake:
+        yield Calling(fake)
+    assert not [thread for thread in threading.enumerate() if thread.name == "posteriors"]
+
+
+async def test_a_function_gets_each_in_the_callers_thread(calling):
+    got = []
+    threads = set()
+
+    def function(posterior):
+        got.append(posterior.number)
+        threads.add(threading.current_thread().name)
+
+    assert await calling(function, count=3) == 3
+    assert got == [1, 2, 3]
+    assert "posteriors" not in threads
+
+
+async def test_returning_false_ends_it(calling):
+    assert await calling(lambda posterior: posterior.number < 2) == 2
+
+
+async def test_returning_nothing_or_zero_does_not(calling):
+    assert await calling(lambda posterior: 0 if posterior.number == 1 else None, count=2) == 2
+
+
+async def test_what_the_function_raises_is_raised(calling):
+    with pytest.raises(ZeroDivisionError):
+        await calling(lambda posterior: 1 / 0)
+
+
+async def test_silence_ends_it(calling):
+    with pytest.raises(NoResultError, match="within 0.2 s"):
+        await calling(lambda posterior: None, frames=0, first_timeout=0.2)
+    with pytest.raises(NoResultError, match="within 0.3 s"):
+        await calling(lambda posterior: None, frames=1, timeout=0.3)
+
+
+async def test_more_can_be_said_of_the_connection(calling):
+    calling.server = connect(calling.fake.uri, connect_timeout=5)
+    assert await calling(lambda posterior: None, count=1) == 1
+
+
+async def test_no_server():
+    with pytest.raises(UnreachableError):
+        await asyncio.to_thread(listen, "ws://127.0.0.1:1", print)
+
+
+CTRL_C = """
+import os, signal, sys
+from bridge.posteriors import listen
+def function(posterior):
+    print("got", posterior.number, flush=True)
+    if "{when}" == "inside":
+        signal.raise_signal(signal.SIGINT)
+print("ended after", listen("{uri}", function), flush=True)
+"""
+
+
+@pytest.mark.parametrize("when", ["inside", "waiting"])
+async def test_ctrl_c_is_an_end_like_any_other(when):
+    async with FakeRosbridge() as fake:
+        process = await asyncio.create_subprocess_exec(
+            sys.executable, "-c", CTRL_C.format(when=when, uri=fake.uri), stdout=asyncio.subprocess.PIPE
+        )
+        try:
+            await fake.wait_for_op("subscribe", topic="/BMresults", timeout=PATIENCE)
+            await say(fake, 1, 1, 0, 0, 0)
+            assert process.stdout is not None
+            async with asyncio.timeout(PATIENCE):
+                assert await process.stdout.readline() == b"got 1\n"
+                if when == "waiting":
+                    process.send_signal(2)
+                assert await process.stdout.readline() == b"ended after 1\n"
+                assert await process.wait() == 0
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                process.kill()
+
+
+def test_numpy_is_not_imported_before_it_is_wanted():
+    code = "import sys, bridge.posteriors; sys.exit('numpy' in sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=PATIENCE)
