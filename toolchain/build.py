@@ -31,8 +31,10 @@ from toolchain.deployment import (
     write_deployment,
 )
 from toolchain.errors import BuildError
+from toolchain.output_files import memory_files, quartus_files, write_files
 from toolchain.partition import Block, partition_lines
 from toolchain.quantise import Quantised, quantise
+from toolchain.rng_table import random_table
 
 if TYPE_CHECKING:
     from toolchain.model import Model
@@ -74,22 +76,7 @@ def build_deployment(model: Model, directory: Path, options: BuildOptions) -> Bu
     _check_prior(model, options)
     interface, interface_reason = _interface(model, blocks, options.interface)
     try:
-        parameters = BM1Parameters(
-            lines=model.lines,
-            sensor_bits=tuple(known.bits for known in model.known),
-            prob_bits=options.prob_bits,
-            prior_bits=0 if model.prior_select is None else model.prior_select.bits,
-            prior_mode=options.prior_mode,
-            counter_bits=options.counter_bits,
-            rng=options.rng,
-            rng_banks=options.rng_banks,
-            rng_reset=options.rng_reset,
-        )
-        if parameters.rng is RngKind.TABLE:
-            message = (
-                "rng = table plays a table of random numbers, which this toolchain doesn't make: use an LFSR"
-            )
-            raise BuildError(message)
+        parameters = machine_parameters(model, options)
         quantised = quantise(model, prob_bits=options.prob_bits, scale=options.scale)
         images = _images(model, quantised, parameters, blocks, interface, options)
     except (MachineError, PcieShimError) as reason:
@@ -102,6 +89,27 @@ def build_deployment(model: Model, directory: Path, options: BuildOptions) -> Bu
     except OSError as reason:
         raise _not_writable(written.directory / REPORT_NAME, reason) from None
     return Built(deployment=written, quantised=quantised, report=report)
+
+
+def machine_parameters(model: Model, options: BuildOptions) -> BM1Parameters:
+    """Return the parameters of the whole model's machine, before it is split over boards.
+
+    Raises:
+        machines.errors.ParameterError: No such machine can be built.
+    """
+    return BM1Parameters(
+        lines=model.lines,
+        sensor_bits=tuple(known.bits for known in model.known),
+        prob_bits=options.prob_bits,
+        prior_bits=0 if model.prior_select is None else model.prior_select.bits,
+        prior_mode=options.prior_mode,
+        counter_bits=options.counter_bits,
+        rng=options.rng,
+        shared=options.shared,
+        steps_per_clock=options.steps_per_clock,
+        rng_banks=options.rng_banks,
+        rng_reset=options.rng_reset,
+    )
 
 
 def build_date(model_file: Path) -> str:
@@ -184,13 +192,17 @@ def _images(
     options: BuildOptions,
 ) -> tuple[Image, ...]:
     identity = model_hash(model, quantised, parameters)
+    table = options.rng_table
+    if table is None and parameters.rng is RngKind.TABLE:
+        table = random_table(parameters.prob_bits)
     images = []
     for index, block in enumerate(blocks):
         lines = slice(block.offset, block.end)
         machine = BM1Machine(
             replace(parameters, lines=block.lines),
             np.ascontiguousarray(quantised.prior[:, lines]),
-            tuple(np.ascontiguousarray(table[:, lines]) for table in quantised.tables),
+            tuple(np.ascontiguousarray(codes[:, lines]) for codes in quantised.tables),
+            table,
         )
         images.append(
             Image(
@@ -309,6 +321,8 @@ def _write(directory: Path, deployment: Deployment, images: tuple[Image, ...]) -
             write_image(directory / board.image, image)
     except PcieShimError as reason:
         raise BuildError(str(reason)) from reason
+    write_files(directory, memory_files(deployment, images))
+    write_files(directory, quartus_files(deployment, images))
     return write_deployment(directory, deployment)
 
 

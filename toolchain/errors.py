@@ -17,6 +17,10 @@ class NetworkFileError(ModelError):
     """A network's file that can't be read: damaged, hostile, or of another kind; says the file and the line."""
 
 
+class MifError(ToolchainError):
+    """A memory's file that can't be read: no MIF, or words that don't fit; says the file and the line."""
+
+
 class BuildError(ToolchainError):
     """A build that cannot be done: options that don't fit, or a folder that can't be written."""
 

@@ -4,9 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import TYPE_CHECKING
 
 from machines.parameters import PriorMode, RngKind, RngReset
 from toolchain.deployment import Queue, Stop
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 
 class Scale(StrEnum):
@@ -18,6 +23,17 @@ class Scale(StrEnum):
     """A column's whole table."""
     NONE = "none"
     """Nothing: the raw probabilities."""
+
+
+class SensorMode(StrEnum):
+    """What a cell's address is."""
+
+    COLUMN = "column"
+    """The reading of its column's sensor."""
+    CELL = "cell"
+    """A reading of its own."""
+    THRESHOLD = "threshold"
+    """A code of its own, which the host writes."""
 
 
 class OnMissing(StrEnum):
@@ -51,6 +67,9 @@ class BuildOptions:
         max_cycles: The cycles after which a machine stops anyway.
         stop: Whether boards stop together after slices, or each at its own overflow.
         rng: Kind of the random number generators.
+        rng_table: uint32[length], the numbers that `rng = table` plays; None to make them.
+        shared: One generator a column, shared by its lines; else one a cell.
+        steps_per_clock: Steps of a generator between two cycles; 0 for as many as give fresh bits.
         rng_banks: Sets of seeds.
         rng_reset: Whether a frame restarts the generators.
         queue: What happens to frames that come faster than they are computed.
@@ -73,6 +92,9 @@ class BuildOptions:
     max_cycles: int = 2**17
     stop: Stop = Stop.SLICES
     rng: RngKind = RngKind.LFSR32
+    rng_table: NDArray[np.uint32] | None = None
+    shared: bool = True
+    steps_per_clock: int = 0
     rng_banks: int = 16
     rng_reset: RngReset = RngReset.BANK
     queue: Queue = Queue.LATEST

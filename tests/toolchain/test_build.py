@@ -63,7 +63,17 @@ def test_the_same_input_gives_the_same_bytes_anywhere(tmp_path):
     assert set(contents(tmp_path / "one")) == {
         "deployment.toml",
         "report.txt",
+        "bm1.qpf",
+        "bm1.tcl",
+        "bm_arch/bm1_parameters.vhd",
+        "bm_arch/Memory_MIFs/rng_seeds.mif",
         *(f"boards/board{i}.bm" for i in range(3)),
+        *(f"bm1_board{i}.qsf" for i in range(3)),
+        *(
+            f"bm_arch/Memory_MIFs/board{i}_{what}.mif"
+            for i in range(3)
+            for what in ("prior", "column1", "column2")
+        ),
     }
 
 
@@ -129,7 +139,7 @@ def test_the_interface_grows_with_the_model_and_says_so(tmp_path):
         ({"interface": (65, 100)}, "larger than the register map's 64x4096"),
         ({"prob_bits": 17}, "prob_bits is 17"),
         ({"prob_bits": 8, "rng": RngKind.LFSR8}, "lfsr8 is too narrow"),
-        ({"rng": RngKind.TABLE}, "which this toolchain doesn't make"),
+        ({"rng_table": np.arange(4, dtype=np.uint32)}, "rng = lfsr32 plays none"),
         ({"target_count": 256}, "target_count = 256 does not fit counters of 8 bits; expected 1 to 255"),
         ({"target_count": 0}, "--target-count is 0, expected greater than or equal to 1"),
         ({"max_cycles": 0}, "--max-cycles is 0"),

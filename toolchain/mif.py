@@ -1,0 +1,276 @@
+"""Memory initialisation files (MIF), the text in which an FPGA's memories get their contents (thesis 3.2).
+
+Written in one canonical form, an entry a line in hexadecimal; read in every form that Quartus knows: five
+radices, runs (`A : D0 D1;`), ranges (`[A0..A1] : D;`) and both kinds of comments.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, NoReturn
+
+from toolchain.errors import MifError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+    from pathlib import Path
+
+MOST_BYTES: Final = 1 << 30
+"""Larger files are not read."""
+
+MOST_WORDS: Final = 1 << 24
+"""A deeper memory is not read: a few bytes could claim any depth."""
+
+MOST_WIDTH: Final = 1 << 20
+"""Bits of the widest word that is read: 4096 lines with the widest codes have 65,536."""
+
+_BASES: Final = {"BIN": 2, "OCT": 8, "DEC": 10, "UNS": 10, "HEX": 16}
+_DECIMAL_DIGITS: Final = 4000  # Python refuses to read longer decimal numbers, whose time is quadratic
+
+_TOKEN: Final = re.compile(
+    r"(?P<newline>\n)|(?P<space>[^\S\n]+)|(?P<comment>--[^\n]*|%[^%]*%)|(?P<dots>\.\.)|(?P<sign>[=:;\[\]])"
+    r"|(?P<word>[A-Za-z0-9_]+|[+-][0-9]+)|(?P<other>.)",
+    re.DOTALL,
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Mif:
+    """A memory's contents.
+
+    Attributes:
+        width: Bits of a word.
+        words: Every word, from address 0; what a file leaves out is 0, as in Quartus.
+    """
+
+    width: int
+    words: tuple[int, ...]
+
+    def __post_init__(self) -> None:
+        """Refuse words that no memory of this width holds.
+
+        Raises:
+            MifError: The memory has no words or no width, or a word has more bits.
+        """
+        if not self.words or self.width < 1:
+            message = f"a memory of {len(self.words)} words of {self.width} bits holds nothing"
+            raise MifError(message)
+        for address, word in enumerate(self.words):
+            if word < 0 or word.bit_length() > self.width:
+                message = f"the word at address {address} doesn't fit {self.width} bits"
+                raise MifError(message)
+
+
+def mif_lines(width: int, depth: int, words: Iterable[int], comments: Iterable[str] = ()) -> Iterator[str]:
+    """Yield a file in its canonical form, a line at a time: everything in hexadecimal, an entry a line.
+
+    Args:
+        width: Bits of a word.
+        depth: How many words there are.
+        words: Every word, from address 0; 0 <= word < 2**width.
+        comments: Lines to put at the head; what is not printable ASCII is escaped.
+    """
+    for comment in comments:
+        yield f"-- {printable(comment)}\n"
+    yield f"WIDTH={width};\nDEPTH={depth};\nADDRESS_RADIX=HEX;\nDATA_RADIX=HEX;\nCONTENT BEGIN\n"
+    address_digits, digits = len(f"{depth - 1:X}"), -(-width // 4)
+    for address, word in enumerate(words):
+        yield f"{address:0{address_digits}X} : {word:0{digits}X};\n"
+    yield "END;\n"
+
+
+def mif_text(mif: Mif, comments: Iterable[str] = ()) -> str:
+    """Return a memory's file in its canonical form."""
+    return "".join(mif_lines(mif.width, len(mif.words), mif.words, comments))
+
+
+def printable(text: str) -> str:
+    """Return a name as it may stand in a comment of any tool: one line of printable ASCII."""
+    return text.encode("unicode_escape").decode("ascii")
+
+
+def read_mif(path: Path) -> Mif:
+    """Read a memory's contents from a file, in whichever form it has.
+
+    Raises:
+        MifError: The file can't be read, or is no MIF; says where and what was expected.
+    """
+    try:
+        with path.open("rb") as file:
+            data = file.read(MOST_BYTES + 1)
+    except OSError as reason:
+        message = f"{path}: {reason.strerror or reason}"
+        raise MifError(message) from None
+    if len(data) > MOST_BYTES:
+        message = f"{path} is larger than {MOST_BYTES} bytes: no memory of this project"
+        raise MifError(message)
+    return parse_mif(data.decode("latin-1"), str(path))
+
+
+def parse_mif(text: str, name: str = "the MIF") -> Mif:
+    """Return the memory's contents that a file's text says.
+
+    Args:
+        text: The text.
+        name: What errors call it.
+
+    Raises:
+        MifError: The text is no MIF; says the line and what was expected.
+    """
+    return _Reader(text, name).read()
+
+
+class _Reader:
+    """Reads token by token; `_kind` and `_word` are the token at hand, `_line` is its line."""
+
+    def __init__(self, text: str, name: str) -> None:
+        self._name = name
+        self._line = 1
+        self._tokens = self._tokenise(text)
+        self._kind = self._word = ""
+        self._next()
+
+    def read(self) -> Mif:
+        width, depth, address_base, data_radix = self._header()
+        words: list[int | None] = [None] * depth
+        while not self._at("END"):
+            self._entry(words, width, address_base, data_radix)
+        self._next()
+        if self._kind:  # the semicolon after END is often left out at the end of a file
+            self._expect(";")
+        if self._kind:
+            self._refuse("the end of the file after END;")
+        return Mif(width, tuple(word or 0 for word in words))
+
+    def _header(self) -> tuple[int, int, int, str]:
+        sizes: dict[str, int] = {}
+        radices = {"ADDRESS_RADIX": "HEX", "DATA_RADIX": "HEX"}
+        seen: set[str] = set()
+        while not self._at("CONTENT"):
+            key = self._word.upper()
+            if key not in {"WIDTH", "DEPTH", *radices}:
+                self._refuse("WIDTH, DEPTH, ADDRESS_RADIX, DATA_RADIX or CONTENT BEGIN")
+            if key in seen:
+                self._fail(f"{key} is given twice")
+            seen.add(key)
+            self._next()
+            self._expect("=")
+            if key in radices:
+                if self._word.upper() not in _BASES:
+                    self._refuse(f"one of {', '.join(_BASES)}")
+                radices[key] = self._word.upper()
+            else:
+                sizes[key] = self._number("DEC", f"a number for {key}")
+                most = MOST_WIDTH if key == "WIDTH" else MOST_WORDS
+                if not 1 <= sizes[key] <= most:
+                    self._fail(f"{key} is {sizes[key]}, expected 1 to {most}")
+            self._next()
+            self._expect(";")
+        for key in ("WIDTH", "DEPTH"):
+            if key not in sizes:
+                self._fail(f"{key} is missing before CONTENT")
+        self._next()
+        if not self._at("BEGIN"):
+            self._refuse("BEGIN after CONTENT")
+        self._next()
+        return sizes["WIDTH"], sizes["DEPTH"], _BASES[radices["ADDRESS_RADIX"]], radices["DATA_RADIX"]
+
+    def _entry(self, words: list[int | None], width: int, address_base: int, data_radix: str) -> None:
+        line = self._line
+        first = last = None
+        if self._word == "[":
+            self._next()
+            first = self._address(address_base, len(words))
+            if self._kind != "dots":
+                self._refuse("'..' between the ends of a range")
+            self._next()
+            last = self._address(address_base, len(words))
+            if last < first:
+                self._fail(f"the range ends at address {last}, before it begins at {first}")
+            self._expect("]")
+        else:
+            first = self._address(address_base, len(words))
+        self._expect(":")
+        values: list[int] = []
+        while self._word != ";":
+            values.append(self._data(width, data_radix))
+            if len(values) > len(words):
+                self._fail(f"the entry of line {line} has more words than the memory, which has {len(words)}")
+        if not values:
+            self._refuse("a word after ':'")
+        end = first + len(values) - 1 if last is None else last
+        if end >= len(words):
+            self._fail(
+                f"the entry of line {line} goes on to address {end}, but the last one is {len(words) - 1}"
+            )
+        for place, address in enumerate(range(first, end + 1)):
+            if words[address] is not None:
+                self._fail(f"address {address} is given twice, the second time by the entry of line {line}")
+            # the words of a range are repeated until it is full
+            words[address] = values[place % len(values)]
+        self._next()
+
+    def _address(self, base: int, depth: int) -> int:
+        radix = next(radix for radix, each in _BASES.items() if each == base)
+        address = self._number(radix, "an address or END;")
+        if not 0 <= address < depth:
+            self._fail(f"address {address} is outside the memory, whose last one is {depth - 1}")
+        self._next()
+        return address
+
+    def _data(self, width: int, radix: str) -> int:
+        word = self._number(radix, "a word or ';'")
+        low = -(1 << (width - 1)) if radix == "DEC" else 0
+        if not low <= word < 1 << width:
+            self._fail(f"the word {_short(self._word)} ({radix}) doesn't fit {width} bits")
+        self._next()
+        return word % (1 << width)
+
+    def _number(self, radix: str, expected: str) -> int:
+        base = _BASES[radix]
+        if self._kind != "word" or (self._word[0] in "+-" and radix != "DEC") or "_" in self._word:
+            self._refuse(expected)
+        if base == 10 and len(self._word) > _DECIMAL_DIGITS:
+            self._fail(f"a decimal number of {len(self._word)} digits is too long; write wide words in HEX")
+        try:
+            return int(self._word, base)
+        except ValueError:
+            self._refuse(f"{expected}, in {radix}")
+
+    def _tokenise(self, text: str) -> Iterator[tuple[str, str]]:
+        for match in _TOKEN.finditer(text):
+            kind = match.lastgroup
+            if kind == "newline":
+                self._line += 1
+            elif kind == "comment":
+                self._line += match[0].count("\n")
+            elif kind == "other":
+                if match[0] == "%":
+                    self._fail("a comment begins with % and never ends")
+                self._fail(f"{match[0]!r} means nothing here")
+            elif kind is not None and kind != "space":
+                yield kind, match[0]
+
+    def _next(self) -> None:
+        self._kind, self._word = next(self._tokens, ("", ""))
+
+    def _at(self, keyword: str) -> bool:
+        return self._word.upper() == keyword
+
+    def _expect(self, sign: str) -> None:
+        if self._word != sign:
+            self._refuse(f"'{sign}'")
+        self._next()
+
+    def _refuse(self, expected: str) -> NoReturn:
+        found = repr(_short(self._word)) if self._kind else "the end of the file"
+        self._fail(f"expected {expected}, found {found}")
+
+    def _fail(self, what: str) -> NoReturn:
+        message = f"{self._name}, line {self._line}: {what}"
+        raise MifError(message)
+
+
+def _short(word: str) -> str:
+    return word if len(word) <= 40 else word[:40] + "..."
