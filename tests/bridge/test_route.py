@@ -392,13 +392,62 @@ def test_a_proxy_that_is_none(proxy):
         connect("ws://robot:9090", proxy=proxy)
 
 
-async def test_socks_without_its_package():
-    pytest.importorskip("asyncio")
-    try:
-        import python_socks  # noqa: F401  # whether it is there
-    except ImportError:
-        with pytest.raises(OptionError, match="needs the package python-socks"):
-            await connect("ws://robot:9090", proxy="socks5h://127.0.0.1:1").__aenter__()
-    else:
-        with pytest.raises(UnreachableError, match="proxy socks5h"):
-            await connect("ws://robot:9090", proxy="socks5h://127.0.0.1:1").__aenter__()
+class SocksProxy(ConnectProxy):
+    """A SOCKS 5 proxy (RFC 1928) that wants a name and a password (RFC 1929)."""
+
+    async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        with contextlib.suppress(ConnectionError, asyncio.IncompleteReadError):
+            _, methods = await reader.readexactly(2)
+            await reader.readexactly(methods)
+            writer.write(b"\x05\x02")
+            _, length = await reader.readexactly(2)
+            name = await reader.readexactly(length)
+            password = await reader.readexactly((await reader.readexactly(1))[0])
+            known = (name, password) == (b"user", b"s3cret")
+            writer.write(b"\x01\x00" if known else b"\x01\x01")
+            if known:
+                head = await reader.readexactly(4)
+                assert head == b"\x05\x01\x00\x03", "CONNECT, by the server's name"
+                host = await reader.readexactly((await reader.readexactly(1))[0])
+                port = int.from_bytes(await reader.readexactly(2), "big")
+                self.asked.append(host + b":%d" % port)
+                there, back = await asyncio.open_connection(host.decode(), port)
+                writer.write(b"\x05\x00\x00\x01" + bytes(6))
+                await asyncio.gather(self._pass(reader, back), self._pass(there, writer))
+        writer.close()
+
+
+@pytest.mark.parametrize("secure", [False, True])
+async def test_through_socks(certificates, secure):
+    context = server_context(certificates) if secure else None
+    options = {"ca_file": certificates / "ca.pem"} if secure else {}
+    proxy = SocksProxy()
+    async with (
+        door(context, wants=f"Bearer {TOKEN}") as server,
+        await asyncio.start_server(proxy.serve, "127.0.0.1", 0) as listening,
+    ):
+        port = listening.sockets[0].getsockname()[1]
+        uri = f"{'wss' if secure else 'ws'}://localhost:{server.port}"
+        async with connect(
+            uri, proxy=f"socks5h://user:s3cret@127.0.0.1:{port}", token=TOKEN, **options
+        ) as ros:
+            assert ros.state is State.CONNECTED
+            assert "s3cret" not in repr(ros._session._route)
+        assert proxy.asked == [f"localhost:{server.port}".encode()]
+        with pytest.raises(UnreachableError, match="proxy socks5h") as caught:
+            await connect(uri, proxy=f"socks5h://user:wr0ng@127.0.0.1:{port}", token=TOKEN).__aenter__()
+        assert "wr0ng" not in str(caught.value)
+
+
+async def test_socks_that_is_not_there(unused_tcp_port):
+    with pytest.raises(UnreachableError, match="proxy socks5h"):
+        await connect("ws://robot:9090", proxy=f"socks5h://127.0.0.1:{unused_tcp_port}").__aenter__()
+
+
+async def test_socks_without_its_package(monkeypatch):
+    async def missing(*_: object) -> None:
+        raise ImportError  # what websockets puts there when it finds no python-socks
+
+    monkeypatch.setattr("bridge.route.connect_socks_proxy", missing)
+    with pytest.raises(OptionError, match="needs the package python-socks"):
+        await connect("ws://robot:9090", proxy="socks5h://127.0.0.1:1").__aenter__()
