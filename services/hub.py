@@ -12,12 +12,13 @@ from typing import Annotated, Literal
 import typer
 
 from bridge.hub.door import Door, is_loopback, read_tokens, tls_context
+from bridge.hub.graph import Graph
 from bridge.hub.server import serve_hub
 from services.command_line import ends_well, make_app, run_async
 from services.errors import SettingsError
 from services.logs import say
 from services.settings import load_settings
-from services.status_socket import ProcessStatus, status_served
+from services.status_socket import HubStatus, ProcessStatus, status_served
 from services.supervision import end_with_parent
 
 app = make_app(
@@ -72,6 +73,7 @@ def hub(
     logging.basicConfig(level=logging.WARNING, stream=sys.stderr, format="hub: %(message)s")
 
     listening: list[str] = []
+    graphs: list[Graph] = []
 
     def ready(at: int) -> None:
         shown = f"[{host}]" if ":" in host else host
@@ -79,7 +81,13 @@ def hub(
         say(f"hub: {listening[0]}")
 
     def tell() -> ProcessStatus:
-        return ProcessStatus(ready=bool(listening), why=listening[0] if listening else "not listening yet")
+        graph = graphs[0] if graphs else None
+        counts = (
+            None if graph is None else HubStatus(len(graph.clients), len(graph.topics), len(graph.services))
+        )
+        return ProcessStatus(
+            ready=bool(listening), why=listening[0] if listening else "not listening yet", hub=counts
+        )
 
     ros: Literal[1, 2] = 2 if ros_version == "2" else 1
 
@@ -90,7 +98,17 @@ def hub(
             ready(at)
             listens.set_result(at)
 
-        work = [serve_hub(host, port, door=door, ros_version=ros, on_ready=on_ready, stop=asyncio.Event())]
+        work = [
+            serve_hub(
+                host,
+                port,
+                door=door,
+                ros_version=ros,
+                on_ready=on_ready,
+                on_graph=graphs.append,
+                stop=asyncio.Event(),
+            )
+        ]
         if announce is not None:
             work.append(_announce(announce, host, listens, ros, door))
         async with status_served(load_settings().run_directory, "hub", tell):

@@ -100,6 +100,7 @@ class Peer:
         self.closed = asyncio.Event()
         self.reason: Exception | None = None
         self.since = 0.0
+        self.missed = False
 
 
 class Master:
@@ -468,7 +469,9 @@ class Master:
             if self._once:
                 msg = f"{peer.role} at {peer.where} closed the connection"
                 raise ChildDiedError(msg)
-            self._log.warning(f"{peer.role} at {peer.where} is gone; waiting for it")
+            if not peer.missed:  # a killed process may take one connection more before its socket is gone
+                self._log.warning(f"{peer.role} at {peer.where} is gone; waiting for it")
+            peer.missed = True
             return
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(child.ended(), self._settings.stop_timeout)
@@ -509,6 +512,7 @@ class Master:
         if not peer.greeted:
             check_hello(record, peer.role, self._deployment.hash, f"{peer.role} at {peer.where}")
             peer.greeted = True
+            peer.missed = False
             return
         match record:
             case Ready():

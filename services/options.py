@@ -13,7 +13,9 @@ Deployment = Annotated[
 ]
 Uri = Annotated[
     str | None,
-    typer.Option("--uri", help="rosbridge server, instead of the deployment's.", metavar="ws://HOST:PORT|robot:NAME"),
+    typer.Option(
+        "--uri", help="rosbridge server, instead of the deployment's.", metavar="ws://HOST:PORT|robot:NAME"
+    ),
 ]
 Listen = Annotated[
     str | None,

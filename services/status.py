@@ -245,6 +245,12 @@ def screen(stack: StackStatus) -> RenderableType:
             )
         parts.extend([Text(""), table])
 
+    parts.extend(
+        Text(f"\n{_plain(process.name)}: {hub.clients} clients, {hub.topics} topics, {hub.services} services")
+        for process in stack.processes
+        if (hub := process.hub) is not None
+    )
+
     boards = _boards(stack)
     if boards:
         table = Table(box=None, pad_edge=False)

@@ -28,7 +28,7 @@ from bridge.hub.definitions import RosVersion
 from bridge.hub.door import Door, choose_subprotocol
 from bridge.hub.errors import HubError
 from bridge.hub.frames import apply_mask, header, next_frame
-from bridge.hub.graph import Client
+from bridge.hub.graph import Client, Graph
 from bridge.hub.limits import HubLimits
 
 log = logging.getLogger(__name__)
@@ -59,6 +59,7 @@ async def serve_hub(
     door: Door | None = None,
     ros_version: RosVersion = 1,
     on_ready: Callable[[int], None] | None = None,
+    on_graph: Callable[[Graph], None] | None = None,
     stop: asyncio.Event,
 ) -> None:
     """Serve rosbridge until ``stop`` is set, then close every connection (1001) and return.
@@ -72,6 +73,7 @@ async def serve_hub(
             of this machine.
         ros_version: which ROS it plays.
         on_ready: called with the port once clients can connect.
+        on_graph: called before with who and what there is; to be looked at, not changed.
         stop: set it to end.
 
     Raises:
@@ -99,6 +101,8 @@ async def serve_hub(
         ) from None
     try:
         hub.sweep()
+        if on_graph is not None:
+            on_graph(hub.broker.graph)
         if on_ready is not None:
             on_ready(server.sockets[0].getsockname()[1])
         await stop.wait()

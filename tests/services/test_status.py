@@ -17,6 +17,7 @@ from services.status_socket import (
     BoardStatus,
     ConnectionStatus,
     FrameCounts,
+    HubStatus,
     PeerStatus,
     ProcessStatus,
     status_served,
@@ -169,9 +170,11 @@ async def test_one_screen_has_services_boards_rates_and_losses(tmp_path):
         publisher=process(frames=FRAMES, connections=[ConnectionStatus("ws://robot:9090", "connected", 2)]),
         pcie_app=process(boards=[board]),
         board1=process(boards=[own]),
+        hub=process(hub=HubStatus(3, 5, 7)),
     ):
         text = shown(await status.ask_stack(tmp_path))
     for words in (
+        "hub: 3 clients, 5 topics, 7 services",
         "100, 0.2 s ago",
         "19 passed over",
         "ws://robot:9090",
