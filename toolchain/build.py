@@ -31,6 +31,7 @@ from toolchain.deployment import (
     write_deployment,
 )
 from toolchain.errors import BuildError
+from toolchain.options import SensorMode
 from toolchain.output_files import memory_files, quartus_files, write_files
 from toolchain.partition import Block, partition_lines
 from toolchain.quantise import Quantised, quantise
@@ -268,7 +269,7 @@ def _deployment(
 
 
 def check_options(options: BuildOptions) -> None:
-    """Refuse a URI, topic or type that is none, before anything is computed.
+    """Refuse a URI, topic or type that is none, and a machine that there isn't yet, before anything is computed.
 
     Raises:
         BuildError: Names the option and what it is to be.
@@ -278,6 +279,17 @@ def check_options(options: BuildOptions) -> None:
         Output(topic=options.output)
     except ValidationError as reason:
         raise _refused_option(reason) from None
+    if options.sensor_mode is not SensorMode.COLUMN:
+        message = (
+            f"--sensor-mode {options.sensor_mode}: this version's machines have one sensor a column, none of a cell's "
+            "own; use --sensor-mode column"
+        )
+        raise BuildError(message)
+    if options.replicas != 1:
+        message = (
+            f"--replicas {options.replicas}: this version's boards hold one machine each; use --replicas 1"
+        )
+        raise BuildError(message)
 
 
 def _check_prior(model: Model, options: BuildOptions) -> None:

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
 import typer
 
+from machines.parameters import ADDRESS_BITS_MAX, RngKind
 from toolchain.build import REPORT_NAME, build_date, build_deployment, check_options
 from toolchain.case_study import FILE_NAME, load_model
 from toolchain.deployment import parse_interface
 from toolchain.errors import BuildError
 from toolchain.networks import is_network, read_network
+from toolchain.rng_table import read_table
 from toolchain.settings import key_values
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
     from pathlib import Path
 
     from toolchain.model import Model
@@ -53,13 +55,25 @@ class NetworkQuestion:
         return [flag for flag, value in said.items() if value]
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Unread:
+    """What of a model and its machine is still as the user wrote it.
+
+    Attributes:
+        settings: `KEY=VALUE` each, for the model's parameters.
+        bits: `NAME=BITS` each.
+        interface: `20x1200`.
+        rng_table: A MIF of random numbers.
+    """
+
+    settings: tuple[str, ...] = ()
+    bits: tuple[str, ...] = ()
+    interface: str | None = None
+    rng_table: Path | None = None
+
+
 def run_build(
-    path: Path,
-    directory: Path,
-    settings: Sequence[str],
-    question: NetworkQuestion,
-    options: BuildOptions,
-    interface: str | None,
+    path: Path, directory: Path, question: NetworkQuestion, options: BuildOptions, unread: Unread
 ) -> None:
     """Build a deployment, telling on stderr what is done and on stdout what was built.
 
@@ -67,20 +81,72 @@ def run_build(
         ToolchainError: Anything that is wrong with the model or the options.
     """
     check_options(options)
-    if interface is not None:
+    options = read_options(options, unread)
+    typer.echo(f"Reading {model_file(path)}", err=True)
+    model = read_model(path, question, unread)
+    typer.echo(f"Quantising {model.name} and writing its images", err=True)
+    built = build_deployment(model, directory, replace(options, build_date=build_date(model_file(path))))
+    typer.echo(built.report, nl=False)
+    typer.echo(f"Wrote {built.deployment.path} and {directory / REPORT_NAME}", err=True)
+
+
+def read_options(options: BuildOptions, unread: Unread) -> BuildOptions:
+    """Return the options with the interface and the random numbers that a user named.
+
+    Raises:
+        BuildError: No interface, or random numbers for generators that play none.
+        MifError: The file of random numbers can't be read.
+    """
+    if unread.interface is not None:
         try:
-            options = replace(options, interface=parse_interface(interface))
+            options = replace(options, interface=parse_interface(unread.interface))
         except ValueError as reason:
             message = f"--interface: {reason}"
             raise BuildError(message) from None
-    values = key_values(settings)
-    file = path if is_network(path) else path / FILE_NAME
-    typer.echo(f"Reading {file}", err=True)
+    if unread.rng_table is not None:
+        if options.rng is not RngKind.TABLE:
+            message = f"--rng-table is what --rng table plays, but this is --rng {options.rng}"
+            raise BuildError(message)
+        options = replace(options, rng_table=read_table(unread.rng_table))
+    return options
+
+
+def model_file(path: Path) -> Path:
+    """Return the file that a model is read from: a network's own, or a folder's `model.py`."""
+    return path if is_network(path) else path / FILE_NAME
+
+
+def read_model(path: Path, question: NetworkQuestion, unread: Unread) -> Model:
+    """Return a user's model, its columns as wide as asked for.
+
+    Raises:
+        ModelError: The model has a mistake, or a column can't be so wide.
+        BuildError: Flags that don't fit the model.
+    """
+    values = key_values(unread.settings)
     model = network_model(path, question, values) if is_network(path) else _case_model(path, question, values)
-    typer.echo(f"Quantising {model.name} and writing its images", err=True)
-    built = build_deployment(model, directory, replace(options, build_date=build_date(file)))
-    typer.echo(built.report, nl=False)
-    typer.echo(f"Wrote {built.deployment.path} and {directory / REPORT_NAME}", err=True)
+    return _with_bits(model, key_values(unread.bits, "--bits", "range=8"))
+
+
+def _with_bits(model: Model, bits: dict[str, str]) -> Model:
+    names = [variable.name for variable in model.variables]
+    widths: dict[str, int] = {}
+    for name, text in bits.items():
+        if name not in names:
+            message = (
+                f"--bits {name}={text}: the model has no such variable; it has {', '.join(names) or 'none'}"
+            )
+            raise BuildError(message)
+        if not re.fullmatch(r"\d{1,3}", text, re.ASCII) or not 1 <= int(text) <= ADDRESS_BITS_MAX:
+            message = f"--bits {name}={text}: expected 1 to {ADDRESS_BITS_MAX} bits"
+            raise BuildError(message)
+        widths[name] = int(text)
+    select = model.prior_select
+    return replace(
+        model,
+        known=tuple(replace(known, bits=widths.get(known.name, known.bits)) for known in model.known),
+        prior_select=None if select is None else replace(select, bits=widths.get(select.name, select.bits)),
+    )
 
 
 def network_model(path: Path, question: NetworkQuestion, settings: dict[str, str]) -> Model:

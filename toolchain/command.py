@@ -11,10 +11,11 @@ import typer
 
 # NumPy and what needs it are imported where they are used: --help answers at once.
 from machines.parameters import PriorMode, RngKind, RngReset
+from toolchain import flags
 from toolchain.deployment import Queue, Stop
 from toolchain.errors import ToolchainError
 from toolchain.fit_options import FitMethod, FitOptions, FitPrior
-from toolchain.options import BuildOptions, OnMissing, Scale
+from toolchain.options import BuildOptions, OnMissing, Scale, SensorMode
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -31,74 +32,41 @@ def toolchain() -> None:
 
 @app.command()
 def build(
-    model: Annotated[
-        Path,
-        typer.Argument(
-            help="Folder that holds model.py, or a network: .bif, .xmlbif, .uai, .net.", metavar="MODEL"
-        ),
-    ],
+    model: flags.ModelPath,
     directory: Annotated[
         Path, typer.Option("--output-dir", "-o", help="Folder of the deployment.", metavar="DIR")
     ],
     uri: Annotated[str, typer.Option(help="rosbridge server with the readings, ws://host:port.")],
     topic: Annotated[str, typer.Option(help="Topic with the readings.")],
     message_type: Annotated[str, typer.Option("--type", help="That topic's type, package/Name.")],
-    settings: Annotated[
-        list[str] | None,
-        typer.Option("--set", help="A parameter of the model; repeat for more.", metavar="KEY=VALUE"),
-    ] = None,
-    searched: Annotated[
-        str, typer.Option(help="Of a network: the variables that are searched, A,B.", metavar="NAMES")
-    ] = "",
-    known: Annotated[
-        str,
-        typer.Option(help="Of a network: those with readings, in the order of the columns.", metavar="NAMES"),
-    ] = "",
-    given: Annotated[
-        list[str] | None,
-        typer.Option(help="Of a network: what always has this state; repeat for more.", metavar="NAME=STATE"),
-    ] = None,
-    prior_select: Annotated[
-        str,
-        typer.Option(help="Of a network: the variable with readings that selects the prior.", metavar="NAME"),
-    ] = "",
-    on_missing: Annotated[
-        OnMissing, typer.Option(help="Of a network: what an absent reading is.")
-    ] = OnMissing.ERROR,
+    settings: flags.Settings = None,
+    searched: flags.Searched = "",
+    known: flags.KnownNames = "",
+    given: flags.Given = None,
+    prior_select: flags.PriorSelectName = "",
+    on_missing: flags.OnMissingFlag = OnMissing.ERROR,
     output: Annotated[str, typer.Option(help="Topic for the posteriors.")] = "/BMresults",
-    partitions: Annotated[int, typer.Option(help="Boards to split the lines over.")] = 1,
-    interface: Annotated[
-        str | None,
-        typer.Option(
-            help="Inputs x results of a board's registers; default 20x1200, or the model's size if larger.",
-            metavar="INPUTSxRESULTS",
-        ),
-    ] = None,
-    scale: Annotated[
-        Scale, typer.Option(help="What is divided by its maximum before quantising.")
-    ] = Scale.ADDRESS,
-    prob_bits: Annotated[int, typer.Option(help="Bits of a code, 1 to 16.")] = 8,
-    prior_mode: Annotated[
-        PriorMode, typer.Option(help="table: the prior is in the images; written: the host writes it.")
-    ] = PriorMode.TABLE,
+    partitions: flags.Partitions = 1,
+    interface: flags.Interface = None,
+    scale: flags.ScaleFlag = Scale.ADDRESS,
+    prob_bits: flags.ProbBits = 8,
+    bits: flags.Bits = None,
+    prior_mode: flags.PriorModeFlag = PriorMode.TABLE,
     prior_path: Annotated[
         str | None, typer.Option(help="Where in the message a written prior is.", metavar="PATH")
     ] = None,
-    counter_bits: Annotated[int, typer.Option(help="Bits of a line's counter, 1 to 32.")] = 8,
-    target_count: Annotated[
-        int | None, typer.Option(help="Count that stops a machine; default the counters' largest.")
-    ] = None,
-    max_cycles: Annotated[int, typer.Option(help="Cycles after which a machine stops anyway.")] = 2**17,
-    stop: Annotated[
-        Stop, typer.Option(help="slices: all boards soon after the first overflow; own: each at its own.")
-    ] = Stop.SLICES,
-    rng: Annotated[
-        RngKind, typer.Option(help="Random number generators; ideal exists emulated only.")
-    ] = RngKind.LFSR32,
-    rng_banks: Annotated[int, typer.Option(help="Sets of seeds, used in turn.")] = 16,
-    rng_reset: Annotated[
-        RngReset, typer.Option(help="bank: a frame restarts the generators; free: never (the thesis).")
-    ] = RngReset.BANK,
+    counter_bits: flags.CounterBits = 8,
+    target_count: flags.TargetCount = None,
+    max_cycles: flags.MaxCycles = 2**17,
+    stop: flags.StopFlag = Stop.SLICES,
+    rng: flags.Rng = RngKind.LFSR32,
+    rng_table: flags.RngTable = None,
+    rng_banks: flags.RngBanks = 16,
+    rng_reset: flags.RngResetFlag = RngReset.BANK,
+    shared: flags.Shared = True,
+    steps_per_clock: flags.StepsPerClock = 0,
+    sensor_mode: flags.SensorModeFlag = SensorMode.COLUMN,
+    replicas: flags.Replicas = 1,
     queue: Annotated[
         Queue, typer.Option(help="Frames that come too fast: the newest counts, or all in order.")
     ] = Queue.LATEST,
@@ -106,14 +74,14 @@ def build(
         float, typer.Option(help="Seconds within which readings from several topics belong together.")
     ] = 0.05,
 ) -> None:
-    """Build a deployment: programming files for the boards, deployment.toml and a report.
+    """Build a deployment: programming files for the boards, deployment.toml, a report, and a hardware project.
 
     For example `toolchain build casestudies/boat -o build/boat --partitions 4 --uri ws://localhost:9090
     --topic /boat/sensors --type boat_msgs/Sensors`, or of a network `toolchain build asia.bif --searched bronc
     --known smoke,dysp -o build/asia --uri ws://localhost:9090 --topic /patient --type clinic_msgs/Patient`
     """
     with _one_sentence():
-        from toolchain.build_command import NetworkQuestion, run_build
+        from toolchain.build_command import NetworkQuestion, Unread, run_build
 
         options = BuildOptions(
             uri=uri,
@@ -132,6 +100,10 @@ def build(
             rng=rng,
             rng_banks=rng_banks,
             rng_reset=rng_reset,
+            shared=shared,
+            steps_per_clock=steps_per_clock,
+            sensor_mode=sensor_mode,
+            replicas=replicas,
             queue=queue,
             tolerance_s=tolerance,
         )
@@ -142,7 +114,10 @@ def build(
             prior_select=prior_select,
             on_missing=on_missing.value,
         )
-        run_build(model, directory, settings or [], question, options, interface)
+        unread = Unread(
+            settings=tuple(settings or ()), bits=tuple(bits or ()), interface=interface, rng_table=rng_table
+        )
+        run_build(model, directory, question, options, unread)
 
 
 @app.command()

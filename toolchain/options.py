@@ -70,6 +70,8 @@ class BuildOptions:
         rng_table: uint32[length], the numbers that `rng = table` plays; None to make them.
         shared: One generator a column, shared by its lines; else one a cell.
         steps_per_clock: Steps of a generator between two cycles; 0 for as many as give fresh bits.
+        sensor_mode: What a cell's address is; only `column` can be built.
+        replicas: Machines on a board; only 1 can be built.
         rng_banks: Sets of seeds.
         rng_reset: Whether a frame restarts the generators.
         queue: What happens to frames that come faster than they are computed.
@@ -95,6 +97,8 @@ class BuildOptions:
     rng_table: NDArray[np.uint32] | None = None
     shared: bool = True
     steps_per_clock: int = 0
+    sensor_mode: SensorMode = SensorMode.COLUMN
+    replicas: int = 1
     rng_banks: int = 16
     rng_reset: RngReset = RngReset.BANK
     queue: Queue = Queue.LATEST

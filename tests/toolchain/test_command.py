@@ -10,8 +10,10 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from pcie_shim.programming_file import read_image
 from toolchain.command import app
 from toolchain.deployment import load_deployment
+from toolchain.mif import read_mif
 
 MODEL = """
 import numpy as np
@@ -74,6 +76,24 @@ def test_same_input_same_bytes_though_time_passes(case):
         (["--interface", "20"], "error: --interface: '20' is no interface; expected inputs x results"),
         (["--interface", "1x3"], "error: the model is larger than the interface 1x3"),
         (["--prob-bits", "99"], "error: prob_bits is 99"),
+        (["--bits", "K"], "error: --bits K: expected KEY=VALUE, such as --bits range=8\n"),
+        (["--bits", "L=3"], "error: --bits L=3: the model has no such variable; it has K\n"),
+        (["--bits", "K=17"], "error: --bits K=17: expected 1 to 16 bits\n"),
+        (["--bits", "K=1"], "error: variable 'K': K serves 2 values, but 1 bits hold 1 beside the address"),
+        (["--steps-per-clock", "257"], "error: steps_per_clock is 257"),
+        (
+            ["--rng-table", "a.mif"],
+            "error: --rng-table is what --rng table plays, but this is --rng lfsr32\n",
+        ),
+        (["--rng", "table", "--rng-table", "/no.mif"], "error: /no.mif: No such file or directory\n"),
+        (
+            ["--sensor-mode", "cell"],
+            "error: --sensor-mode cell: this version's machines have one sensor a column, none of a cell's own; use",
+        ),
+        (
+            ["--replicas", "2"],
+            "error: --replicas 2: this version's boards hold one machine each; use --replicas 1",
+        ),
     ],
 )
 def test_mistakes(case, arguments, sentence):
@@ -84,6 +104,26 @@ def test_mistakes(case, arguments, sentence):
     assert result.stdout == ""
     assert "Traceback" not in result.stderr
     assert not (case.parent / "out").exists()
+
+
+def test_machine_options(case):
+    table = case.parent / "random.mif"
+    table.write_text("WIDTH=4; DEPTH=3; CONTENT BEGIN 0 : 1 F 7; END;")
+    result = build(
+        case,
+        *("--rng", "table", "--rng-table", str(table), "--per-cell", "--steps-per-clock", "2"),
+        *("--prob-bits", "3", "--bits", "K=4"),
+    )
+    assert result.exit_code == 0, result.stderr
+    deployment = load_deployment(case.parent / "out")
+    machine = deployment.machine
+    assert (machine.rng, machine.shared, machine.steps_per_clock) == ("table", False, 2)
+    assert deployment.variables[0].bits == 4
+    parameters = read_image(deployment.image_path(0)).machine.parameters
+    assert (parameters.sensor_bits, parameters.shared, parameters.steps_per_clock) == ((4,), False, 2)
+    assert read_image(deployment.image_path(0)).machine.rng_table.tolist() == [1, 15, 7]
+    # the memory holds what cells compare with: as many bits as a code
+    assert read_mif(case.parent / "out/bm_arch/Memory_MIFs/rng_table.mif").words == (1, 7, 7)
 
 
 NETWORK = """

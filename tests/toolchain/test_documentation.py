@@ -49,7 +49,10 @@ def test_every_key_of_the_deployment(heading, keys):
 def test_every_option_of_the_build():
     build = typer.main.get_command(app).commands["build"]
     options = {
-        name for each in build.params for name in each.opts if name.startswith("-") and each.name != "help"
+        name
+        for each in build.params
+        for name in (*each.opts, *each.secondary_opts)
+        if name.startswith("-") and each.name != "help"
     }
     described = documented((DOCS / "toolchain.md").read_text(), "Options")
     assert {key.split(" ")[0] for key in described} == options
