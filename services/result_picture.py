@@ -1,0 +1,163 @@
+"""A posterior as text for a terminal: bars over one dimension, a heat map over two, in colour or without."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+from rich.console import Console
+from rich.text import Text
+
+from bridge.results import Posterior
+from toolchain.deployment import Deployment, Dimension
+
+ROWS: Final = 32
+"""Lines of a picture at most; finer posteriors are drawn in blocks of cells."""
+WIDTH: Final = 160
+"""Characters across at most, however wide the terminal is."""
+_SHADES: Final = " .:-=+*#%@"
+_COLOURS: Final = (
+    *((68, 1, 84), (72, 36, 117), (64, 67, 135), (52, 94, 141), (41, 120, 142), (32, 144, 140)),
+    *((34, 167, 132), (68, 190, 112), (121, 209, 81), (189, 222, 38), (253, 231, 36)),
+)
+"""Viridis in eleven steps."""
+_LABEL: Final = 24
+
+
+@dataclass(frozen=True, slots=True)
+class Axis:
+    """A dimension of a posterior, and what its indices stand for where a deployment says it."""
+
+    label: str
+    size: int
+    dimension: Dimension | None = None
+
+    @property
+    def has_states(self) -> bool:
+        """Whether its cells have names instead of values."""
+        return self.dimension is not None and bool(self.dimension.states)
+
+    def value(self, index: float) -> float | str:
+        """What stands at an index: a value in its unit, a state's name, or the index itself."""
+        if self.dimension is None:
+            return index
+        if self.dimension.states:
+            return self.dimension.states[round(index)]
+        return self.dimension.value(index)
+
+    def shown(self, index: float) -> str:
+        """The same as text for a terminal."""
+        value = self.value(index)
+        return printable(value) if isinstance(value, str) else f"{value:.6g}"
+
+
+def axes_of(posterior: Posterior, deployment: Deployment | None) -> list[Axis]:
+    """The dimensions of a posterior that came over the wire.
+
+    Raises:
+        ValueError: it is none of the deployment's.
+    """
+    if deployment is None:
+        return [Axis(label, size) for label, size in zip(posterior.labels, posterior.sizes, strict=True)]
+    ours = [(dimension.label, dimension.size) for dimension in deployment.searched]
+    theirs = list(zip(posterior.labels, posterior.sizes, strict=True))
+    if ours != theirs:
+        msg = f"the posterior that came has {_grid(theirs)}, but the deployment of {deployment.directory} has {_grid(ours)}"
+        raise ValueError(msg)
+    return [Axis(dimension.label, dimension.size, dimension) for dimension in deployment.searched]
+
+
+def printable(text: str) -> str:
+    """What came over the wire, safe for a terminal and not too long."""
+    text = text if len(text) <= _LABEL else text[: _LABEL - 3] + "..."
+    return text if text.isprintable() else repr(text)
+
+
+def in_colour(console: Console) -> bool:
+    """Whether a console shows colours, and nobody asked for none (NO_COLOR)."""
+    return console.color_system is not None and not console.no_color
+
+
+def picture(posterior: Posterior, axes: list[Axis], *, width: int, colour: bool) -> Text:
+    """Draw a posterior.
+
+    Args:
+        posterior: of three dimensions or more the two largest are drawn, the others summed out.
+        axes: of it, in its order.
+        width: characters across.
+        colour: whether cells are coloured; else they are characters from " " to "@".
+    """
+    width = min(width, WIDTH)
+    if len(axes) == 1:
+        return _bars(posterior.values, axes[0], width, colour)
+    largest = sorted(sorted(range(len(axes)), key=lambda at: -axes[at].size)[:2])
+    down, across = (axes[at] for at in largest)
+    text = _heat(posterior.marginal(down.label, across.label), down, across, width, colour)
+    if summed := [printable(axis.label) for at, axis in enumerate(axes) if at not in largest]:
+        text.append(f"\nsummed over {', '.join(summed)}")
+    return text
+
+
+def _bars(values: npt.NDArray[np.float64], axis: Axis, width: int, colour: bool) -> Text:
+    step = -(-axis.size // ROWS)
+    blocks = _blocks(values, step, 0)
+    names = [_range(axis, at * step, min((at + 1) * step, axis.size) - 1) for at in range(len(blocks))]
+    wide = max(map(len, names))
+    room = max(width - wide - 10, 10)
+    text = Text(no_wrap=True, overflow="crop")
+    text.append(printable(axis.label))
+    for name, value in zip(names, blocks, strict=True):
+        share = float(value / blocks.max())
+        bar = round(share * room)
+        text.append(f"\n{name:>{wide}} ")
+        text.append(" " * bar if colour else "#" * bar, style=_style(share) if colour else "")
+        text.append(f" {value:.3g}")
+    return text
+
+
+def _heat(values: npt.NDArray[np.float64], down: Axis, across: Axis, width: int, colour: bool) -> Text:
+    ends = [down.shown(0), down.shown(down.size - 1)]
+    margin = max(*map(len, ends), len(printable(down.label))) + 1
+    columns = max((width - margin - 2) // 2, 4)
+    down_step, across_step = -(-down.size // ROWS), -(-across.size // columns)
+    blocks = _blocks(_blocks(values, down_step, 0), across_step, 1)
+    text = Text(no_wrap=True, overflow="crop")
+    text.append(f"{printable(down.label):>{margin - 1}}\n")
+    last = len(blocks) - 1
+    for row in range(last, -1, -1):  # the first row is below, as on a map
+        name = ends[1] if row == last else ends[0] if row == 0 else ""
+        text.append(f"{name:>{margin - 1}} |")
+        for value in blocks[row]:
+            share = float(value / blocks.max())
+            if colour:
+                text.append("  ", style=_style(share))
+            else:
+                text.append(_SHADES[min(int(share * len(_SHADES)), len(_SHADES) - 1)] * 2)
+        text.append("|\n")
+    first, end = across.shown(0), across.shown(across.size - 1)
+    between = max(2 * blocks.shape[1] - len(first) - len(end), 1)
+    middle = f" {printable(across.label)} ".center(between, " ")
+    text.append(f"{'':>{margin}} {first}{middle}{end}")
+    if down_step > 1 or across_step > 1:
+        text.append(f"\neach mark is a block of {down_step} x {across_step} cells")
+    return text
+
+
+def _blocks(values: npt.NDArray[np.float64], step: int, axis: int) -> npt.NDArray[np.float64]:
+    """Sums over blocks of so many cells along an axis; the last block may have fewer."""
+    return np.add.reduceat(values, np.arange(0, values.shape[axis], step), axis=axis)
+
+
+def _range(axis: Axis, first: int, last: int) -> str:
+    return axis.shown(first) if first == last else f"{axis.shown(first)} to {axis.shown(last)}"
+
+
+def _style(share: float) -> str:
+    red, green, blue = _COLOURS[round(share * (len(_COLOURS) - 1))]
+    return f"on rgb({red},{green},{blue})"
+
+
+def _grid(dimensions: list[tuple[str, Any]]) -> str:
+    return " x ".join(f"{printable(label)} {size}" for label, size in dimensions)

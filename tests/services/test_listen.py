@@ -1,0 +1,264 @@
+"""What the command `listen` says, draws and saves of a posterior that came."""
+
+import csv
+import json
+import os
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rich.console import Console
+
+from bridge.results import FrameReport, Posterior
+from services import result_file
+from services.errors import SettingsError
+from services.listen import line
+from services.result_file import open_result_file, record
+from services.result_picture import ROWS, Axis, axes_of, in_colour, picture
+from toolchain.deployment import Board, Deployment, Dimension, MachineSection, Source
+
+HASH = "0" * 64
+
+
+def deployment(*searched: Dimension) -> Deployment:
+    lines = 1
+    for dimension in searched:
+        lines *= dimension.size
+    return Deployment(
+        name="test",
+        source=[Source(uri="ws://robot:9090", topic="/t", type="a/B")],
+        searched=list(searched),
+        machine=MachineSection(lines=lines),
+        board=[Board(image="boards/board0.bm", image_hash=HASH, line_offset=0, lines=lines)],
+    )
+
+
+GRID = deployment(
+    Dimension(label="y", size=2, offset=0.5, step=2.0), Dimension(label="x", size=3, offset=-1, step=0.25)
+)
+ROOMS = deployment(Dimension(label="room", size=3, states=("kitchen", "hall", "attic")))
+
+
+def made(values, *labels, number=7):
+    values = np.asarray(values, float)
+    report = number and FrameReport(
+        stamp_ns=5, heard_ns=0, outcome="posterior", number=number, cycles=812, received_ns=1_000_000
+    )
+    return Posterior(
+        probabilities=tuple((values / values.sum()).ravel().tolist()),
+        labels=labels,
+        sizes=values.shape,
+        heard_ns=4_210_000,
+        report=report or None,
+    )
+
+
+EMPTY = FrameReport(stamp_ns=9, heard_ns=0, outcome="no posterior: impossible", number=8, published=False)
+
+
+class TestLine:
+    def test_indices_where_nobody_says_what_they_stand_for(self):
+        posterior = made([[0, 0, 1], [1, 0, 2]], "y", "x")
+        assert line(posterior, axes_of(posterior, None)) == (
+            "frame 7: y 1, x 2 with 0.5; mean y 0.75, x 1.5; 812 cycles; 3.21 ms"
+        )
+
+    def test_values_in_their_units(self):
+        posterior = made([[0, 0, 1], [1, 0, 2]], "y", "x")
+        assert "y 2.5, x -0.5 with 0.5; mean y 2, x -0.625;" in line(posterior, axes_of(posterior, GRID))
+
+    def test_states_have_names_and_no_mean(self):
+        posterior = made([1, 3, 0], "room", number=None)
+        assert line(posterior, axes_of(posterior, ROOMS)) == "frame -: room hall with 0.75"
+
+    def test_a_frame_without_a_posterior(self):
+        assert line(EMPTY, []) == "frame 8: no posterior: impossible"
+
+    def test_what_came_over_the_wire_does_not_reach_the_terminal(self):
+        evil = "\x1b]0;owned\x07"
+        posterior = made([1, 3], evil)
+        axes = axes_of(posterior, None)
+        drawn = picture(posterior, axes, width=80, colour=False).plain
+        bad = FrameReport(stamp_ns=9, heard_ns=0, outcome=evil, number=8, published=False)
+        assert "\x1b" not in line(posterior, axes) + drawn + line(bad, [])
+        assert len(line(made([1, 3], "x" * 500), axes_of(made([1, 3], "x" * 500), None))) < 200
+
+    def test_a_posterior_of_another_deployment(self):
+        with pytest.raises(
+            ValueError, match=r"that came has y 2 x x 2, but the deployment of .* has y 2 x x 3"
+        ):
+            axes_of(made([[1, 0], [0, 0]], "y", "x"), GRID)
+
+
+class TestPicture:
+    def test_bars(self):
+        posterior = made([1, 3, 0], "room")
+        rows = picture(posterior, axes_of(posterior, ROOMS), width=37, colour=False).plain.splitlines()
+        assert rows[0] == "room"
+        assert [row.split() for row in rows[1:]] == [
+            ["kitchen", "#" * 7, "0.25"],
+            ["hall", "#" * 20, "0.75"],
+            ["attic", "0"],
+        ]
+
+    def test_a_map_has_its_first_row_below(self):
+        posterior = made([[0, 0, 4], [1, 0, 2]], "y", "x")
+        rows = picture(posterior, axes_of(posterior, GRID), width=60, colour=False).plain.splitlines()
+        assert rows[:3] == ["  y", "2.5 |::  ++|", "0.5 |    @@|"]
+        assert rows[3].split() == ["-1", "x", "-0.5"]
+
+    def test_in_colour_cells_are_coloured(self):
+        posterior = made([[0, 1], [0, 0]], "y", "x")
+        text = picture(posterior, axes_of(posterior, None), width=60, colour=True)
+        colours = [str(span.style) for span in text.spans]
+        dark, bright = "on rgb(68,1,84)", "on rgb(253,231,36)"
+        assert colours == [dark, dark, dark, bright]
+
+    def test_more_than_two_dimensions(self):
+        values = np.zeros((3, 2, 4))
+        values[1, :, 2] = 1
+        posterior = made(values, "a", "b", "c")
+        rows = picture(posterior, axes_of(posterior, None), width=60, colour=False).plain.splitlines()
+        assert rows[0].strip() == "a"
+        assert rows[2] == "  |    @@  |"
+        assert rows[-1] == "summed over b"
+
+    @given(st.integers(1, 400), st.integers(1, 400), st.integers(20, 500))
+    def test_any_size_fits(self, height, width, room):
+        posterior = made(np.ones((height, width)), "y", "x")
+        rows = picture(posterior, axes_of(posterior, None), width=room, colour=False).plain.splitlines()
+        assert len(rows) <= ROWS + 4
+        assert max(len(row) for row in rows if "|" in row) <= max(min(room, 160), 20)
+        assert sum(row.count("@") for row in rows) > 0
+
+    @given(st.integers(1, 1000), st.integers(30, 200))
+    def test_any_number_of_bars_fits(self, size, room):
+        posterior = made(np.ones(size), "x")
+        rows = picture(posterior, axes_of(posterior, None), width=room, colour=False).plain.splitlines()
+        assert len(rows) <= ROWS + 1
+        assert max(map(len, rows)) <= room + 10
+
+    def test_nobody_is_shown_colours_who_wants_none(self, monkeypatch):
+        options = {"force_terminal": True, "color_system": "truecolor"}
+        assert in_colour(Console(**options))
+        assert not in_colour(Console(file=open(os.devnull, "w")))  # noqa: SIM115, PTH123
+        monkeypatch.setenv("NO_COLOR", "1")
+        assert not in_colour(Console(**options))
+
+
+def save(path, *heard, deployment=GRID):
+    file = open_result_file(path)
+    for each in heard:
+        file.add(each, axes_of(each, deployment) if isinstance(each, Posterior) else [])
+    file.close()
+
+
+A, B = made([[0, 0, 4], [1, 0, 3]], "y", "x"), made([[1, 0, 0], [0, 0, 1]], "y", "x", number=9)
+
+
+class TestFiles:
+    def test_json_lines(self, tmp_path):
+        path = tmp_path / "out.jsonl"
+        save(path, A, EMPTY)
+        save(path, B)  # another day
+        first, empty, last = map(json.loads, path.read_text().splitlines())
+        assert first == {
+            "frame": 7,
+            "stamp_ns": 5,
+            "cycles": 812,
+            "latency_us": 3210.0,
+            "probability": 0.5,
+            "best": {"y": 0, "x": 2},
+            "mean": {"y": 0.5, "x": 1.75},
+            "best_value": {"y": 0.5, "x": -0.5},
+            "mean_value": {"y": 1.5, "x": -0.5625},
+            "labels": ["y", "x"],
+            "sizes": [2, 3],
+            "probabilities": [0, 0, 0.5, 0.125, 0, 0.375],
+        }
+        assert empty == {"frame": 8, "stamp_ns": 9, "cycles": None, "outcome": "no posterior: impossible"}
+        assert last["frame"] == 9
+
+    def test_without_a_deployment_there_are_no_values(self):
+        assert "best_value" not in record(A, axes_of(A, None))
+
+    def test_states(self):
+        posterior = made([1, 3, 0], "room")
+        said = record(posterior, axes_of(posterior, ROOMS))
+        assert (said["best_value"], said["mean_value"]) == ({"room": "hall"}, {})
+
+    def test_csv(self, tmp_path):
+        path = tmp_path / "out.csv"
+        save(path, A, EMPTY)
+        save(path, B)
+        first, last = csv.DictReader(path.open())
+        assert first["frame"] == "7"
+        assert (first["y"], first["x"], first["probability"]) == ("0.5", "-0.5", "0.5")
+        assert (first["y=0 x=2"], first["y=1 x=2"]) == ("0.5", "0.375")
+        assert last["frame"] == "9"
+
+    def test_csv_of_another_model(self, tmp_path):
+        path = tmp_path / "out.csv"
+        save(path, A)
+        with pytest.raises(SettingsError, match="has columns of another posterior; give another name"):
+            save(path, made([1, 0], "x"), deployment=None)
+        assert len(path.read_text().splitlines()) == 2
+
+    def test_archive(self, tmp_path):
+        path = tmp_path / "out.npz"
+        save(path, A, EMPTY, B)
+        with np.load(path) as there:
+            assert there["probabilities"].shape == (2, 2, 3)
+            np.testing.assert_array_equal(there["probabilities"][0], A.values)
+            assert there["frame"].tolist() == [7, 9]
+            assert there["latency_us"].tolist() == [3210.0, 3210.0]
+            assert there["labels"].tolist() == ["y", "x"]
+            assert there["axis0"].tolist() == [0.5, 2.5]
+            assert there["axis1"].tolist() == [-1, -0.75, -0.5]
+        assert [each.name for each in tmp_path.iterdir()] == ["out.npz"]
+
+    def test_an_archive_is_whole_before_its_end(self, tmp_path, monkeypatch):
+        monkeypatch.setattr(result_file, "_EVERY", 0.0)
+        path = tmp_path / "out.npz"
+        file = open_result_file(path)
+        file.add(A, axes_of(A, None))
+        with np.load(path) as there:
+            assert there["probabilities"].shape == (1, 2, 3)
+
+    def test_an_archive_has_a_limit_and_one_form(self, tmp_path, monkeypatch):
+        monkeypatch.setattr(result_file, "MOST_NUMBERS", 12)
+        file = open_result_file(tmp_path / "out.npz")
+        file.add(A, axes_of(A, None))
+        with pytest.raises(SettingsError, match="another form"):
+            file.add(made([1, 0], "x"), [Axis("x", 2)])
+        file.add(B, axes_of(B, None))
+        with pytest.raises(SettingsError, match="it is full with 2 posteriors"):
+            file.add(A, axes_of(A, None))
+        file.close()
+        with np.load(tmp_path / "out.npz") as there:
+            assert len(there["frame"]) == 2
+
+    def test_a_frame_whose_report_was_lost(self, tmp_path):
+        lost = made([[1, 0, 0], [0, 0, 1]], "y", "x", number=None)
+        save(tmp_path / "out.npz", lost)
+        save(tmp_path / "out.csv", lost)
+        with np.load(tmp_path / "out.npz") as there:
+            assert there["frame"].tolist() == [-1]
+            assert np.isnan(there["latency_us"]).all()
+        assert next(csv.DictReader((tmp_path / "out.csv").open()))["frame"] == ""
+
+    @pytest.mark.parametrize("name", ["out.txt", "out", "out.jsonl.gz"])
+    def test_another_ending(self, tmp_path, name):
+        with pytest.raises(SettingsError, match=r"must end with \.jsonl, \.csv, \.npz"):
+            open_result_file(tmp_path / name)
+
+    @pytest.mark.parametrize("name", ["out.jsonl", "out.csv", "out.npz"])
+    def test_no_such_folder(self, tmp_path, name):
+        with pytest.raises(SettingsError, match="it cannot be written"):
+            open_result_file(tmp_path / "none" / name)
+
+    def test_half_a_line_is_not_added_to(self, tmp_path):
+        (tmp_path / "out.jsonl").write_text('{"frame": 1')
+        with pytest.raises(SettingsError, match="its last line has no end"):
+            open_result_file(tmp_path / "out.jsonl")
