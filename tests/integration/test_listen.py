@@ -1,0 +1,234 @@
+"""The command `listen`, and the programs of README and guide, as their users run them.
+
+pretend stack (bridge's client)  ->  hub (a process)  ->  listen, or a user's program (a process)
+"""
+
+import asyncio
+import contextlib
+import itertools
+import json
+import re
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from bridge.client import connect
+from bridge.errors import BridgeError
+from bridge.stamps import stamp
+from tests.casestudies.pretend_stack import frame_message
+from tests.integration.conftest import BIN, ROOT, Running
+
+PATIENCE = 60
+
+
+def programs(page: str) -> list[str]:
+    """The page's Python that hears posteriors."""
+    blocks = re.findall(r"^```python\n(.*?)^```", (ROOT / page).read_text(), re.MULTILINE | re.DOTALL)
+    return [block for block in blocks if "from bridge.posteriors import" in block]
+
+
+GUIDE = programs("docs/listening.md")
+
+
+def result(number: int) -> dict:
+    """On the boat's 8 x 8 cells, three quarters in one of them."""
+    data = [0.25 / 63] * 64
+    data[number % 64] = 0.75
+    dims = [{"label": "y", "size": 8, "stride": 64}, {"label": "x", "size": 8, "stride": 8}]
+    return {"layout": {"dim": dims, "data_offset": 0}, "data": data}
+
+
+async def publish_for_ever(uri: str, rate: float = 40) -> None:
+    """Every fifth frame has no posterior; a lost hub is waited for."""
+    async with connect(uri) as ros:
+        frames = await ros.advertise("/bm/frame", "diagnostic_msgs/DiagnosticArray")
+        results = await ros.advertise("/BMresults", "std_msgs/Float64MultiArray")
+        for number in itertools.count(1):
+            published = number % 5 != 0
+            with contextlib.suppress(BridgeError):
+                await frames.publish(frame_message(stamp(time.time_ns(), 2), number, published=published))
+                if published:
+                    await results.publish(result(number))
+            await asyncio.sleep(1 / rate)
+
+
+@pytest.fixture
+async def stack(stage):
+    """The hub and its address; the stack publishes until the test is over."""
+    hub, uri = await stage.hub()
+    playing = asyncio.create_task(publish_for_ever(uri))
+    yield hub, uri
+    playing.cancel()
+    with contextlib.suppress(asyncio.CancelledError):
+        await playing
+
+
+async def printed(running: Running, lines: int) -> list[str]:
+    """Wait for so many lines on its standard output."""
+    deadline = time.monotonic() + PATIENCE
+    while (out := running.out).count("\n") < lines:
+        assert running.process.poll() is None, f"it ended: {running.err}"
+        assert time.monotonic() < deadline, f"it printed {out!r}"
+        await asyncio.sleep(0.02)
+    return out.splitlines()
+
+
+async def test_lines_in_the_deployments_units(stage, stack, boat):
+    _, uri = stack
+    listen = stage.start("listen", "-d", str(boat), "--uri", uri, "--count", "6")
+    assert await listen.end() == 0
+    lines = listen.out.splitlines()
+    without = [line for line in lines if "impossible on every board" in line]
+    assert len(lines) - len(without) == 6
+    pattern = r"frame \d+: y [-\d.]+, x [-\d.]+ with 0.75; mean y [-\d.]+, x [-\d.]+; \d+ cycles; [\d.]+ ms"
+    assert all(re.fullmatch(pattern, line) for line in lines if line not in without), lines
+    assert f"listening on /BMresults at {uri}" in listen.err
+
+
+async def test_json_and_a_file_at_once(stage, stack, tmp_path):
+    _, uri = stack
+    path = tmp_path / "out.jsonl"
+    listen = stage.start("listen", "--uri", uri, "--count", "3", "--json", "--save", str(path))
+    assert await listen.end() == 0
+    assert listen.out == path.read_text()
+    posteriors = [each for each in map(json.loads, listen.out.splitlines()) if "probabilities" in each]
+    assert len(posteriors) == 3
+    for each in posteriors:
+        assert each["probability"] == 0.75 == each["probabilities"][each["frame"] % 64]
+        assert each["best"] == dict(zip("yx", divmod(each["frame"] % 64, 8), strict=True))
+
+
+async def test_pictures_without_colour(stage, stack, boat):
+    _, uri = stack
+    listen = stage.start("listen", "-d", str(boat), "--uri", uri, "--plot", "--count", "2")
+    assert await listen.end() == 0
+    assert "\x1b" not in listen.out
+    assert listen.out.count("@@") == 2
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize("name", ["out.npz", "out.csv"])
+async def test_what_ends_it_loses_nothing(stage, stack, tmp_path, number, code, name):
+    _, uri = stack
+    path = tmp_path / name
+    listen = stage.start("listen", "--uri", uri, "--save", str(path))
+    await printed(listen, 8)
+    listen.send(number)
+    assert await listen.end() == code
+    shown = [int(frame) for frame in re.findall(r"^frame (\d+): y", listen.out, re.MULTILINE)]
+    if name.endswith("npz"):
+        with np.load(path) as saved:
+            frames = saved["frame"].tolist()
+            assert (saved["probabilities"].max(axis=(1, 2)) == 0.75).all()
+    else:
+        frames = [int(row.split(",")[0]) for row in path.read_text().splitlines()[1:]]
+    assert frames == shown
+
+
+async def test_a_lost_server_is_waited_for(stage, stack):
+    hub, uri = stack
+    listen = stage.start("listen", "--uri", uri)
+    before = len(await printed(listen, 3))
+    hub.send(signal.SIGKILL)
+    await hub.end()
+    await listen.says(r"is gone \(.*\); waiting for it")
+    await stage.hub(int(uri.rsplit(":", 1)[1]))
+    await listen.says("is connected again")
+    await printed(listen, before + 5)
+    listen.send(signal.SIGINT)
+    assert await listen.end() == 130
+
+
+def test_what_cannot_be(boat, tmp_path):
+    def ends(*flags: str) -> tuple[int, str]:
+        ended = subprocess.run(
+            [str(BIN / "listen"), *flags], check=False, capture_output=True, text=True, timeout=PATIENCE
+        )
+        return ended.returncode, ended.stderr.splitlines()[-1]
+
+    assert ends("--uri", "ws://127.0.0.1:1")[0] == 3
+    code, said = ends()
+    assert code == 2
+    assert "give --uri ws://HOST:PORT, or --deployment DIR" in said
+    code, said = ends("--uri", "ws://127.0.0.1:1", "--plot", "--json")
+    assert code == 2
+    assert "--json and --plot" in said
+    code, said = ends("--uri", "ws://127.0.0.1:1", "--save", str(tmp_path / "out.txt"))
+    assert code == 2
+    assert ".jsonl, .csv, .npz" in said
+
+
+async def test_silence_and_another_model(stage, boat):
+    _, uri = await stage.hub()
+    listen = stage.start("listen", "--uri", uri, "--first-data-timeout", "0.5")
+    assert await listen.end() == 3
+    assert "is the master running, and do readings reach it?" in listen.err
+    other = stage.start("listen", "-d", str(boat), "--uri", uri)
+    await other.says("listening on")
+    async with connect(uri) as ros:
+        results = await ros.advertise("/BMresults", "std_msgs/Float64MultiArray")
+        message = {"layout": {"dim": [{"label": "x", "size": 2, "stride": 2}]}, "data": [0.5, 0.5]}
+        while other.process.poll() is None:
+            await results.publish(message)
+            await asyncio.sleep(0.05)
+    assert await other.end() == 2
+    assert "the posterior that came has x 2, but the deployment of" in other.err
+
+
+def program(text: str, uri: str) -> list[str]:
+    changed = text.replace("ws://robot:9090", uri).replace("ws://127.0.0.1:9090", uri)
+    assert changed.count(uri) == 1
+    return [sys.executable, "-u", "-c", changed]
+
+
+async def test_the_readmes_ten_lines(stack, tmp_path):
+    _, uri = stack
+    (text,) = programs("README.md")
+    assert len(text.splitlines()) <= 10
+    process = await asyncio.create_subprocess_exec(
+        *program(text, uri), stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE, cwd=ROOT
+    )
+    assert process.stdout is not None
+    try:
+        async with asyncio.timeout(PATIENCE):
+            said = [(await process.stdout.readline()).decode() for _ in range(9)]
+            process.send_signal(signal.SIGINT)
+            _, errors = await process.communicate()
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            process.kill()
+    assert (process.returncode, errors) == (0, b"")
+    number, best = said[0].split(" ", 1)
+    y, x = divmod(int(number) % 64, 8)
+    assert best == f"{{'y': {y}, 'x': {x}}} 0.75\n"
+    assert said[1] == "(8, 8) ('y', 'x')\n"
+    assert f"}} {800 + int(number)} " in said[2]
+
+
+@pytest.mark.parametrize("text", GUIDE, ids=["function", "asyncio"])
+async def test_the_guides_programs(stage, text):
+    _, uri = await stage.hub()
+    process = await asyncio.create_subprocess_exec(
+        *program(text, uri), stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE, cwd=ROOT
+    )
+    try:
+        async with asyncio.timeout(PATIENCE), connect(uri) as ros:
+            while not (await ros.call("/rosapi/subscribers", {"topic": "/BMresults"}))["subscribers"]:
+                await asyncio.sleep(0.05)
+            playing = asyncio.create_task(publish_for_ever(uri))
+            out, errors = await process.communicate()
+            playing.cancel()
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            process.kill()
+    assert (process.returncode, errors) == (0, b""), errors.decode()
+    assert "posteriors\n" in out.decode() or "too slow: 0\n" in out.decode()
+    assert out.decode().startswith("1 ")
+
+
+def test_every_program_of_the_guide_is_run():
+    assert len(GUIDE) == (ROOT / "docs/listening.md").read_text().count("```python") == 2
