@@ -24,6 +24,9 @@ QUEUE_ALL_DEPTH = 256
 UNPAIRED_DEPTH = 64
 """Messages kept per topic while those of the other topics are awaited."""
 
+TELLING = 8
+"""Messages of every topic without a pair after which it is said how far apart they are."""
+
 Item = TypeVar("Item")
 
 
@@ -136,6 +139,9 @@ class FrameAssembler:
         self._width = len(deployment.variables)
         self._tolerance_ns = int(deployment.tolerance_s * 1e9)
         self._fresh: list[deque[_Message]] = [deque() for _ in range(count)]
+        self._topics = [source.topic for source in deployment.sources]
+        self._newest: list[tuple[int, bool]] = [(0, True)] * count  # stamp, and whether a header had it
+        self._waited = [0] * count  # messages since the last pair
         self.unpaired = 0
 
     def take(
@@ -164,6 +170,8 @@ class FrameAssembler:
             return CompleteReading(
                 list(taken.addresses), taken.stamp_ns, received_ns, received_tick, taken.prior_codes
             )
+        self._newest[source] = taken.stamp_ns, stamp is not None
+        self._waited[source] += 1
         queue = self._fresh[source]
         if len(queue) == UNPAIRED_DEPTH:
             queue.popleft()
@@ -192,9 +200,30 @@ class FrameAssembler:
                 if queue.popleft() is message:
                     break
                 self.unpaired += 1
+        self._waited = [0] * len(self._waited)
         latest = max(chosen.values(), key=lambda each: each.stamp_ns)
         last = max(chosen.values(), key=lambda each: each.received_tick)
         return CompleteReading(addresses, latest.stamp_ns, last.received_ns, last.received_tick, prior_codes)
+
+    def needs(self, source: int) -> bool:
+        """Whether no frame is complete without a message of this source."""
+        return self._needed[source]
+
+    def too_far_apart(self) -> str:
+        """Why nothing is paired although messages come on all topics that are needed; empty where it is, or may be yet."""
+        needed = [source for source, needed in enumerate(self._needed) if needed]
+        if len(needed) < 2 or any(self._waited[source] < TELLING for source in needed):
+            return ""
+        oldest = min(needed, key=lambda source: self._newest[source][0])
+        newest = max(needed, key=lambda source: self._newest[source][0])
+        apart_s = (self._newest[newest][0] - self._newest[oldest][0]) / 1e9
+        bare = [self._topics[source] for source in needed if not self._newest[source][1]]
+        receipts = f" ({' and '.join(bare)} without a header, so by receipt)" if bare else ""
+        return (
+            f"messages come on all topics but make no frame: the newest of {self._topics[oldest]} is {apart_s:.3g} s older than "
+            f"that of {self._topics[newest]}{receipts}, and the tolerance is {self._tolerance_ns / 1e9:g} s; "
+            "set the clocks, or build with a larger --tolerance"
+        )
 
 
 class WaitingFrames(Generic[Item]):

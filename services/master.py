@@ -562,6 +562,7 @@ class Master:
             return
         self._received += 1
         self._losses["passed over"] += reading.passed_over
+        self._losses["unpaired"] += reading.unpaired
         try:
             self._waiting.put((reading, time.monotonic_ns()))
         except ServiceError as error:

@@ -54,7 +54,7 @@ class Reading(Record, tag="reading", frozen=True):
     """Subscriber to master: one complete set of addresses, in the order of the machine's columns.
 
     `addresses` holds None for a missing reading; `passed_over` counts the readings that the
-    subscriber lost since the last one it sent.
+    subscriber lost since the last one it sent, `unpaired` the messages whose partners on other topics did not come.
     """
 
     stamp_ns: int
@@ -63,6 +63,7 @@ class Reading(Record, tag="reading", frozen=True):
     sent_tick: int
     addresses: list[int | None]
     passed_over: int
+    unpaired: int = 0
     prior_codes: bytes = b""
 
 

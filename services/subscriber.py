@@ -79,6 +79,8 @@ class Subscriber:
         self._rosbridges: dict[str, Ros] = {}
         self._received = self._completed = self._unusable = self._passed_over_before = 0
         self._last_tick = 0
+        self._told_apart = False
+        self._unpaired_before = 0
 
     def _take(self, record: AnyRecord) -> None:
         if isinstance(record, Begin):
@@ -97,7 +99,8 @@ class Subscriber:
         if not why and self._begun.is_set() and self._link.has_master and (age is None or age > limit):
             topics = " and ".join(source.topic for source in self._deployment.sources)
             since = "yet" if age is None else f"for {age:.0f} s"
-            why = f"no complete reading {since}: waiting for messages on {topics}"
+            apart = self._assembler.too_far_apart() or f"waiting for messages on {topics}"
+            why = f"no complete reading {since}: {apart}"
         return ProcessStatus(
             ready=not why,
             why=why or f"connected to {', '.join(self._rosbridges)}",
@@ -182,7 +185,11 @@ class Subscriber:
 
     async def _follow(self, ros: Ros, at: int, source: Source) -> None:
         subscription = ros.subscribe(
-            source.topic, source.type, queue_length=0 if self._queue_all else 1, queue_size=_RECEIVED_QUEUE
+            source.topic,
+            source.type,
+            queue_length=0 if self._queue_all else 1,
+            queue_size=_RECEIVED_QUEUE,
+            compression=source.compression,
         )
         timeout = self._settings.first_data_timeout
         first = True
@@ -192,7 +199,7 @@ class Subscriber:
             try:
                 message = await subscription.next(timeout=timeout)
             except NoMessageError as error:
-                if first and ros.state is State.CONNECTED:
+                if first and ros.state is State.CONNECTED and self._assembler.needs(at):
                     raise
                 self._link.notice("warning", str(error))
                 continue
@@ -217,13 +224,20 @@ class Subscriber:
             self._link.send(Unusable(cause, str(error)))
             return
         if reading is None:
+            apart = self._assembler.too_far_apart()
+            if apart and not self._told_apart:
+                self._link.notice("warning", apart)
+            self._told_apart = self._told_apart or bool(apart)
             return
+        self._told_apart = False
         self._last_tick = reading.received_tick
         if self._link.backlog > _BACKLOG_LIMIT and not self._queue_all:
             self._passed_over += 1
             return
-        if self._link.send(_reading_record(reading, self._passed_over)):
+        unpaired = self._assembler.unpaired
+        if self._link.send(_reading_record(reading, self._passed_over, unpaired - self._unpaired_before)):
             self._completed += 1
+            self._unpaired_before = unpaired
             self._passed_over_before += self._passed_over
             self._passed_over = 0
             self._once = (
@@ -231,7 +245,7 @@ class Subscriber:
             )
 
 
-def _reading_record(reading: CompleteReading, passed_over: int) -> Reading:
+def _reading_record(reading: CompleteReading, passed_over: int, unpaired: int) -> Reading:
     return Reading(
         stamp_ns=reading.stamp_ns,
         received_ns=reading.received_ns,
@@ -239,6 +253,7 @@ def _reading_record(reading: CompleteReading, passed_over: int) -> Reading:
         sent_tick=time.monotonic_ns(),
         addresses=reading.addresses,
         passed_over=passed_over,
+        unpaired=unpaired,
         prior_codes=reading.prior_codes,
     )
 
@@ -277,19 +292,20 @@ async def print_addresses(settings: Settings, deployment: Deployment, count: int
         NoMessageError: no message in time.
         VariableError: a variable is missing or unusable.
     """
-    if len({settings.uri or source.uri for source in deployment.sources}) > 1:
-        msg = "alone, the subscriber reads from one rosbridge server; this deployment names several: use --listen with a master"
-        raise SettingsError(msg)
     assembler = FrameAssembler(deployment)
-    uri = settings.uri or deployment.sources[0].uri
     printed = 0
-    async with connect(
-        uri, connect_timeout=settings.connect_timeout, ros_version=settings.ros_version
-    ) as ros:
+    async with contextlib.AsyncExitStack() as stack:
+        by_uri: dict[str, Ros] = {}
+        for uri in {settings.uri or source.uri: None for source in deployment.sources}:
+            by_uri[uri] = await stack.enter_async_context(
+                connect(uri, connect_timeout=settings.connect_timeout, ros_version=settings.ros_version)
+            )
 
         async def follow(at: int, source: Source) -> None:
             nonlocal printed
-            subscription = ros.subscribe(source.topic, source.type, queue_size=_RECEIVED_QUEUE)
+            subscription = by_uri[settings.uri or source.uri].subscribe(
+                source.topic, source.type, queue_size=_RECEIVED_QUEUE, compression=source.compression
+            )
             while count is None or printed < count:
                 message = await subscription.next(timeout=settings.first_data_timeout)
                 reading = assembler.take(at, message.msg, message.received_ns, message.received_monotonic_ns)

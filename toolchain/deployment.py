@@ -124,6 +124,7 @@ class Source(_Section):
     uri: WebSocketUri
     topic: Topic
     type: MessageType
+    compression: Literal["none", "cbor"] = Field(default="none", exclude_if=lambda way: way == "none")
 
 
 class Variable(_Section):
@@ -396,12 +397,12 @@ def parse_interface(text: str) -> tuple[int, int]:
 
 
 def deployment_hash(deployment: DeploymentFile) -> str:
-    """Return the SHA-256 (hexadecimal) of all that follows from the model: all but URIs and endpoints."""
+    """Return the SHA-256 (hexadecimal) of all that follows from the model: all but URIs, endpoints and compression."""
     content = deployment.model_dump(
         mode="json",
         exclude={
             "hash": True,
-            "sources": {"__all__": {"uri"}},
+            "sources": {"__all__": {"uri", "compression"}},
             "boards": {"__all__": {"endpoint"}},
             "outputs": {"__all__": {"uri"}},
         },

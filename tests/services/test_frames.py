@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from services.errors import OverflowedQueueError, VariableError
-from services.frames import QUEUE_ALL_DEPTH, UNPAIRED_DEPTH, FrameAssembler, WaitingFrames
+from services.frames import QUEUE_ALL_DEPTH, TELLING, UNPAIRED_DEPTH, FrameAssembler, WaitingFrames
 from toolchain.deployment import Board, Deployment, Dimension, MachineSection, Source, Variable
 
 HASH = "0" * 64
@@ -87,6 +87,42 @@ def test_an_endless_topic_without_partner_stays_bounded():
     for at in range(UNPAIRED_DEPTH + 10):
         assert frames.take(0, stamped(at, D1=1), 1, 1) is None
     assert frames.unpaired == 10
+
+
+def far_apart(ms, count=TELLING, **second):
+    frames = FrameAssembler(deployment(variable("D1"), variable("D2", source=1), sources=2))
+    for at in range(count):
+        frames.take(0, stamped(10 * at, D1=1), 1, 1)
+        frames.take(1, stamped(10 * at - ms, D2=1) | second, 10**12, 1)
+    return frames
+
+
+def test_stamps_that_never_meet_are_said():
+    assert not far_apart(2000, TELLING - 1).too_far_apart()
+    frames = far_apart(2000)
+    assert frames.too_far_apart() == (
+        "messages come on all topics but make no frame: the newest of /t1 is 2 s older than that of /t0, "
+        "and the tolerance is 0.05 s; set the clocks, or build with a larger --tolerance"
+    )
+    assert frames.take(1, stamped(10 * TELLING, D2=1), 1, 1) is not None
+    assert not frames.too_far_apart()
+
+
+def test_who_has_no_header_is_said_too():
+    assert "(/t1 without a header, so by receipt)" in far_apart(0, header={}).too_far_apart()
+
+
+def test_a_topic_that_is_silent_is_not_said_to_be_apart():
+    frames = FrameAssembler(deployment(variable("D1"), variable("D2", source=1), sources=2))
+    for at in range(100):
+        frames.take(0, stamped(10 * at, D1=1), 1, 1)
+    assert not frames.too_far_apart()
+
+
+def test_which_topics_are_needed():
+    optional = variable("D2", source=1, on_missing="missing")
+    frames = FrameAssembler(deployment(variable("D1"), optional, sources=2))
+    assert (frames.needs(0), frames.needs(1)) == (True, False)
 
 
 @given(st.lists(st.tuples(st.integers(0, 1), st.integers(0, 400)), max_size=80))
