@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Final
 from machines.parameters import BM1Parameters, PriorMode, RngKind, RngReset
 from toolchain.errors import BuildError
 from toolchain.partition import partition_lines
+from toolchain.rng_table import LENGTH
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -37,6 +38,9 @@ BLOCK_SHAPES: Final = ((512, 40), (1024, 20), (2048, 10), (4096, 5), (8192, 2), 
 
 SOFT_PCIE_ELEMENTS: Final = (8_000, 30_000)
 """Logic elements that a PCIe controller made of logic takes, by its configuration (thesis 2.3)."""
+
+PLACE_BITS: Final = (LENGTH - 1).bit_length()
+"""Bits of a place in a table of random numbers."""
 
 ELEMENTS_PER_ALM: Final = 2.65
 """Logic elements that the vendor counts for an ALM."""
@@ -197,9 +201,10 @@ def logic_of(parameters: BM1Parameters, *, interface_words: int, word_bits: int 
         raise BuildError(message)
     cells = p.lines * p.columns
     generators = p.columns if p.shared else cells
-    # A table that all columns play: a place in it for each generator instead of a state.
-    state = p.rng.lfsr_bits or WORD_BITS
-    steps = p.steps_per_clock if p.rng.lfsr_bits else 1
+    # Where a table is played, a generator is a place in it, which counts up.
+    state = p.rng.lfsr_bits or PLACE_BITS
+    steps = p.steps_per_clock if p.rng.lfsr_bits else 0
+    places = 0 if p.rng.lfsr_bits else generators * state
     seeds = p.rng_banks if p.rng_banks > 1 and p.rng_reset is RngReset.BANK else 0
     bank_bits = max((p.rng_banks - 1).bit_length(), 1)
     inputs = max(p.prior_bits, 1) + sum(p.sensor_bits)
@@ -214,6 +219,7 @@ def logic_of(parameters: BM1Parameters, *, interface_words: int, word_bits: int 
                 (generators * state, _STATE_BIT),
                 (generators * steps, _STEP),
                 (generators * state * seeds, _SEED_BIT),
+                sums=places,
                 registers=generators * state,
             ),
             _part("readout", (results, _RESULT_BIT), registers=results + word_bits),
@@ -245,7 +251,7 @@ class Estimate:
         logic: Its logic, part by part.
         tables: How its tables lie in memory blocks.
         table_bits: Bits of all tables.
-        blocks: M20Ks that hold tables.
+        blocks: M20Ks that hold tables, of random numbers too.
         logic_tables: Tables for which there was no block left, so that they lie in memory LABs.
         mlabs: Memory LABs that those take.
         table_alms: ALMs that those and their multiplexers take.
@@ -294,6 +300,8 @@ class Estimate:
     def why_not(self) -> str:
         """What there is too little of, as a clause; nothing where it fits."""
         usable = self.device.usable
+        if self.blocks > usable * self.device.blocks:
+            return f"it takes {self.blocks:,} memory blocks, and there are {self.device.blocks:,}"
         if self.alm_share > usable:
             return f"it takes {self.alms:,.0f} ALMs, and {usable * self.device.alms:,.0f} of {self.device.alms:,} can be used"
         if self.mlab_share > 1:
@@ -352,7 +360,14 @@ def _table_bits(parameters: BM1Parameters) -> list[int]:
 def _place(parameters: BM1Parameters, device: Device, tables: Tables) -> tuple[int, int, int, float]:
     """Put tables into memory blocks, the largest first, and the others into memory LABs."""
     width, room = parameters.prob_bits, math.floor(device.usable * device.blocks)
-    blocks = logic_tables = mlabs = 0
+    logic_tables = mlabs = 0
+    # Two generators read one copy of a table of random numbers, through a port each.
+    copies = (
+        0
+        if parameters.rng.lfsr_bits
+        else math.ceil(parameters.columns * (1 if parameters.shared else parameters.lines) / 2)
+    )
+    blocks = copies * _blocks(LENGTH, width)
     alms = 0.0
     for bits in sorted(_table_bits(parameters), reverse=True):
         if tables is Tables.COLUMN:
@@ -363,7 +378,7 @@ def _place(parameters: BM1Parameters, device: Device, tables: Tables) -> tuple[i
         else:
             wide, each = width, parameters.lines
             own = _blocks(1 << bits, wide)
-            count = min(parameters.lines, (room - blocks) // own)
+            count = min(parameters.lines, max(0, room - blocks) // own)
         blocks += count * own
         left = each - count
         deep = math.ceil((1 << bits) / MLAB_SHAPE[0])

@@ -1,0 +1,180 @@
+"""A deployment's boards in this process, stopped as the host stops them: what a frame costs before anything is built."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from machines.bm1 import BM1Machine, Start, StopReason
+from machines.kernel import make_kernel
+from machines.parameters import COUNTER_BITS_MAX, BM1Parameters
+from machines.posterior import joint_posterior
+from toolchain.deployment import Stop
+from toolchain.errors import BuildError
+from toolchain.partition import partition_lines
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+SHORTEST_SLICE: Final = 256
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameRun:
+    """What the boards counted in one frame.
+
+    Attributes:
+        counts: uint32[lines] of each board.
+        cycles: Of each board.
+        reasons: Why each stopped.
+    """
+
+    counts: tuple[NDArray[np.uint32], ...]
+    cycles: tuple[int, ...]
+    reasons: tuple[StopReason, ...]
+
+    @property
+    def length(self) -> int:
+        """Cycles of the board that ran longest: what the frame takes."""
+        return max(self.cycles)
+
+    @property
+    def posterior(self) -> NDArray[np.float64] | None:
+        """float64[all lines] with the sum 1, or None where nothing was counted."""
+        return joint_posterior(self.counts, self.cycles)
+
+
+class EmulatedBoards:
+    """Boards of one machine, its lines split over them.
+
+    Args:
+        machines: Each board's machine, in the order of the model's lines.
+        target_count: The count that stops a board.
+        max_cycles: The cycle at which it stops anyway.
+        stop: Whether boards stop together after slices, or each at its own overflow.
+
+    Raises:
+        BuildError: The target does not fit the counters, or there is no cycle to run.
+    """
+
+    def __init__(
+        self, machines: Sequence[BM1Machine], *, target_count: int, max_cycles: int, stop: Stop
+    ) -> None:
+        highest = machines[0].parameters.target_count_max
+        if not 1 <= target_count <= highest:
+            bits = machines[0].parameters.counter_bits
+            message = f"a target count of {target_count} does not fit counters of {bits} bits: expected 1 to {highest}"
+            raise BuildError(message)
+        if max_cycles < 1:
+            message = f"max_cycles is {max_cycles}, expected 1 or more"
+            raise BuildError(message)
+        self.machines = tuple(machines)
+        self.target_count = target_count
+        self.max_cycles = max_cycles
+        self.stop = stop
+        # Counters that never stop a run of a given length; the target is what stops a frame, so its bits are the same.
+        self._kernels = [make_kernel(_wide(machine)) for machine in machines]
+
+    @property
+    def parameters(self) -> BM1Parameters:
+        """Those of the first board: all but the number of lines are the same on every board."""
+        return self.machines[0].parameters
+
+    @property
+    def lines(self) -> int:
+        """Lines of all boards."""
+        return sum(machine.parameters.lines for machine in self.machines)
+
+    def run(self, addresses: tuple[int, ...], prior_address: int, bank: int) -> FrameRun:
+        """Run a frame as the host does: slices that end at 256 * 2^k, until a board overflows; or each board by itself."""
+        end = first_slice(self.target_count) if self.stop is Stop.SLICES else 0
+        if end >= self.max_cycles:
+            end = 0
+        start = Start(
+            addresses=addresses,
+            prior_address=prior_address,
+            target_count=self.target_count,
+            max_cycles=self.max_cycles,
+            bank=bank,
+            run_until=end,
+        )
+        reasons = [kernel.start(start) for kernel in self._kernels]
+        while StopReason.SLICE in reasons and StopReason.OVERFLOW not in reasons:
+            end = 2 * end if 2 * end < self.max_cycles else 0
+            reasons = [
+                kernel.resume(end) if reason is StopReason.SLICE else reason
+                for kernel, reason in zip(self._kernels, reasons, strict=True)
+            ]
+        return self._shown()
+
+    def run_for(self, addresses: tuple[int, ...], prior_address: int, bank: int, cycles: int) -> FrameRun:
+        """Run every board that can count for this many cycles, whatever it counts."""
+        start = Start(
+            addresses=addresses,
+            prior_address=prior_address,
+            target_count=2**COUNTER_BITS_MAX - 1,
+            max_cycles=cycles,
+            bank=bank,
+        )
+        for kernel in self._kernels:
+            kernel.start(start)
+        return self._shown()
+
+    def _shown(self) -> FrameRun:
+        return FrameRun(
+            tuple(kernel.counts for kernel in self._kernels),
+            tuple(kernel.cycles for kernel in self._kernels),
+            tuple(kernel.reason for kernel in self._kernels),
+        )
+
+
+def first_slice(target_count: int) -> int:
+    """Return the cycle at which a frame's first slice ends: 256 * 2^k, the first that is twice the target or more."""
+    end = SHORTEST_SLICE
+    while end < 2 * target_count:
+        end *= 2
+    return end
+
+
+def split(machine: BM1Machine, boards: int) -> tuple[BM1Machine, ...]:
+    """Return the boards' parts of a whole machine, as a build splits it.
+
+    Raises:
+        BuildError: More boards than lines.
+    """
+    return tuple(
+        BM1Machine(
+            replace(machine.parameters, lines=block.lines),
+            np.ascontiguousarray(machine.prior[:, block.offset : block.end]),
+            tuple(np.ascontiguousarray(table[:, block.offset : block.end]) for table in machine.tables),
+            machine.rng_table,
+        )
+        for block in partition_lines(machine.parameters.lines, boards)
+    )
+
+
+def joined(machines: Sequence[BM1Machine]) -> BM1Machine:
+    """Return the whole machine that boards are parts of."""
+    first = machines[0]
+    return BM1Machine(
+        replace(first.parameters, lines=sum(machine.parameters.lines for machine in machines)),
+        np.hstack([machine.prior for machine in machines]),
+        tuple(
+            np.hstack([machine.tables[column] for machine in machines])
+            for column in range(first.parameters.sensors)
+        ),
+        first.rng_table,
+    )
+
+
+def _wide(machine: BM1Machine) -> BM1Machine:
+    return BM1Machine(
+        replace(machine.parameters, counter_bits=COUNTER_BITS_MAX),
+        machine.prior,
+        machine.tables,
+        machine.rng_table,
+    )
