@@ -28,6 +28,7 @@ from toolchain.deployment import (
     Output,
     Source,
     WrittenPrior,
+    deployment_hash,
     write_deployment,
 )
 from toolchain.errors import BuildError
@@ -51,15 +52,23 @@ _FLAGS: Final = {"tolerance_s": "--tolerance", "path": "--prior-path"}
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Built:
-    """A deployment that was written, and what there is to say about it."""
+    """A deployment, what its boards are programmed with, and what there is to say about it.
+
+    Attributes:
+        deployment: What `deployment.toml` says.
+        images: One per board.
+        quantised: The codes before they were split over boards, and what was lost.
+        report: What `report.txt` says.
+    """
 
     deployment: Deployment
+    images: tuple[Image, ...]
     quantised: Quantised
     report: str
 
 
 def build_deployment(model: Model, directory: Path, options: BuildOptions) -> Built:
-    """Write a model's deployment: `deployment.toml`, an image per board, and a report.
+    """Write a model's deployment: `deployment.toml`, an image per board, a report, and the hardware project.
 
     The same model and options give the same bytes.
 
@@ -72,10 +81,25 @@ def build_deployment(model: Model, directory: Path, options: BuildOptions) -> Bu
         BuildError: Options that don't fit each other, the model or the register map, or a folder that can't be
             written.
     """
+    built = assemble(model, options)
+    written = _write(Path(directory), built.deployment, built.images)
+    try:
+        (written.directory / REPORT_NAME).write_text(built.report, encoding="utf-8")
+    except OSError as reason:
+        raise _not_writable(written.directory / REPORT_NAME, reason) from None
+    return replace(built, deployment=written)
+
+
+def assemble(model: Model, options: BuildOptions) -> Built:
+    """Return a model's deployment without writing anything.
+
+    Raises:
+        BuildError: Options that don't fit each other, the model or the register map.
+    """
     check_options(options)
     blocks = partition_lines(model.lines, options.partitions)
     _check_prior(model, options)
-    interface, interface_reason = _interface(model, blocks, options.interface)
+    interface, interface_reason = board_interface(model, blocks, options.interface)
     try:
         parameters = machine_parameters(model, options)
         quantised = quantise(model, prob_bits=options.prob_bits, scale=options.scale)
@@ -83,13 +107,13 @@ def build_deployment(model: Model, directory: Path, options: BuildOptions) -> Bu
     except (MachineError, PcieShimError) as reason:
         raise BuildError(str(reason)) from reason
     deployment = _deployment(model, parameters, images, blocks, interface, options)
-    written = _write(Path(directory), deployment, images)
-    report = _report(model, written, quantised, interface_reason, options)
-    try:
-        (written.directory / REPORT_NAME).write_text(report, encoding="utf-8")
-    except OSError as reason:
-        raise _not_writable(written.directory / REPORT_NAME, reason) from None
-    return Built(deployment=written, quantised=quantised, report=report)
+    deployment = deployment.model_copy(update={"hash": deployment_hash(deployment)})
+    return Built(
+        deployment=deployment,
+        images=images,
+        quantised=quantised,
+        report=build_report(model, deployment, quantised, interface_reason),
+    )
 
 
 def machine_parameters(model: Model, options: BuildOptions) -> BM1Parameters:
@@ -130,10 +154,14 @@ def build_date(model_file: Path) -> str:
         raise BuildError(message) from None
 
 
-def _interface(
+def board_interface(
     model: Model, blocks: tuple[Block, ...], given: tuple[int, int] | None
 ) -> tuple[tuple[int, int], str]:
-    """Return the boards' inputs and results, and a clause that says why where they are not the default."""
+    """Return the boards' inputs and results, and a clause that says why where they are not the default.
+
+    Raises:
+        BuildError: The model is larger than the interface, or the interface than the register map.
+    """
     sensors, lines = len(model.known), max(block.lines for block in blocks)
     room = (register_map.SENSORS_WORDS, register_map.RESULTS_WORDS)
     if sensors > room[0] or lines > room[1]:
@@ -240,6 +268,7 @@ def _deployment(
                 lines=model.lines,
                 interface=f"{interface[0]}x{interface[1]}",
                 prob_bits=parameters.prob_bits,
+                scale=options.scale.value,
                 prior_bits=parameters.prior_bits,
                 prior_mode=parameters.prior_mode,
                 counter_bits=parameters.counter_bits,
@@ -265,7 +294,7 @@ def _deployment(
             outputs=(Output(topic=options.output),),
         )
     except ValidationError as reason:
-        raise _refused_option(reason) from None
+        raise refused_option(reason) from None
 
 
 def check_options(options: BuildOptions) -> None:
@@ -278,7 +307,7 @@ def check_options(options: BuildOptions) -> None:
         Source(uri=options.uri, topic=options.topic, type=options.type)
         Output(topic=options.output)
     except ValidationError as reason:
-        raise _refused_option(reason) from None
+        raise refused_option(reason) from None
     if options.sensor_mode is not SensorMode.COLUMN:
         message = (
             f"--sensor-mode {options.sensor_mode}: this version's machines have one sensor a column, none of a cell's "
@@ -305,7 +334,7 @@ def _check_prior(model: Model, options: BuildOptions) -> None:
         raise BuildError(message)
 
 
-def _refused_option(reason: ValidationError) -> BuildError:
+def refused_option(reason: ValidationError) -> BuildError:
     """Return a refusal by pydantic as a sentence about the option it came from."""
     detail = reason.errors()[0]
     key = str(detail["loc"][0]) if detail["loc"] else ""
@@ -342,15 +371,15 @@ def _not_writable(path: Path, reason: OSError) -> BuildError:
     return BuildError(f"{path} can't be written: {reason.strerror or reason}; choose another folder with -o")
 
 
-def _report(
-    model: Model, deployment: Deployment, quantised: Quantised, interface_reason: str, options: BuildOptions
+def build_report(
+    model: Model, deployment: Deployment, quantised: Quantised, interface_reason: str = ""
 ) -> str:
     """Return what was built and what was lost, in plain sentences; no dates or paths: same input, same bytes."""
     machine, source = deployment.machine, deployment.sources[0]
     grid = " x ".join(f"{d.label} {d.size}" for d in model.searched)
     names = ", ".join(known.name for known in model.known)
     machine_sentence = (
-        f"Machine: BM1, codes of {machine.prob_bits} bits (scale = {options.scale}), counters of "
+        f"Machine: BM1, codes of {machine.prob_bits} bits (scale = {machine.scale}), counters of "
         f"{machine.counter_bits} bits, stops at a count of {machine.target_count} or after {machine.max_cycles} "
         f"cycles, stop = {machine.stop}; {machine.rng} with {machine.rng_banks} banks, rng_reset = "
         f"{machine.rng_reset}, {machine.steps_per_clock} steps a clock."

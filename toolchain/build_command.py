@@ -164,8 +164,8 @@ def network_model(path: Path, question: NetworkQuestion, settings: dict[str, str
         raise BuildError(message)
     joint = read_network(path, on_missing=question.on_missing)
     return joint.ask(
-        _names("--searched", question.searched),
-        _names("--known", question.known),
+        names_in("--searched", question.searched),
+        names_in("--known", question.known),
         given=key_values(question.given, "--given", "smoke=yes"),
         prior_select=question.prior_select or None,
     ).model()
@@ -180,7 +180,12 @@ def _case_model(path: Path, question: NetworkQuestion, settings: dict[str, str])
     return load_model(path, settings)
 
 
-def _names(flag: str, text: str) -> list[str]:
+def names_in(flag: str, text: str) -> list[str]:
+    """Return the names in `A,B,C`.
+
+    Raises:
+        BuildError: An empty one.
+    """
     names = [name.strip() for name in text.split(",")] if text else []
     if not all(names):
         message = f"{flag} {text}: expected names with a comma between them, such as {flag} A,B"

@@ -1,8 +1,6 @@
 """The `toolchain` command (thesis 3.4): its flags; each subcommand's work is in a module of its own."""
 
 import signal
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 from typing import Annotated
@@ -11,11 +9,11 @@ import typer
 
 # NumPy and what needs it are imported where they are used: --help answers at once.
 from machines.parameters import PriorMode, RngKind, RngReset
-from toolchain import flags
+from toolchain import flags, regenerate_command
 from toolchain.deployment import Queue, Stop
-from toolchain.errors import ToolchainError
 from toolchain.fit_options import FitMethod, FitOptions, FitPrior
 from toolchain.options import BuildOptions, OnMissing, Scale, SensorMode
+from toolchain.refusals import one_sentence
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -23,6 +21,9 @@ app = typer.Typer(
     rich_markup_mode="markdown",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
+
+
+app.add_typer(regenerate_command.app, name="regenerate")
 
 
 @app.callback()
@@ -80,7 +81,7 @@ def build(
     --topic /boat/sensors --type boat_msgs/Sensors`, or of a network `toolchain build asia.bif --searched bronc
     --known smoke,dysp -o build/asia --uri ws://localhost:9090 --topic /patient --type clinic_msgs/Patient`
     """
-    with _one_sentence():
+    with one_sentence():
         from toolchain.build_command import NetworkQuestion, Unread, run_build
 
         options = BuildOptions(
@@ -128,7 +129,7 @@ def new(
 
     For example `toolchain new mymodel`; it prints how to go on.
     """
-    with _one_sentence():
+    with one_sentence():
         from toolchain.new import new_model
 
         typer.echo(new_model(name), nl=False)
@@ -201,7 +202,7 @@ def fit(
     --truth y=ref_y_m --truth x=ref_x_m --reading 'range_*=range_*_m' --reading 'bearing_*=bearing_*_rad'
     --pool 'range_*' --pool 'bearing_*' --check DATA/ds1_robot5.csv`
     """
-    with _one_sentence():
+    with one_sentence():
         from toolchain.fit_command import run_fit
 
         options = FitOptions(
@@ -228,13 +229,3 @@ def main() -> None:
 def _end(number: int, _frame: FrameType | None) -> None:
     typer.echo(f"error: ended by {signal.Signals(number).name}; what was asked for is not complete", err=True)
     raise SystemExit(128 + number)
-
-
-@contextmanager
-def _one_sentence() -> Iterator[None]:
-    """Turn what the toolchain refuses into one sentence and its exit code."""
-    try:
-        yield
-    except ToolchainError as error:
-        typer.echo(f"error: {error}", err=True)
-        raise typer.Exit(error.exit_code) from None

@@ -185,6 +185,9 @@ class MachineSection(_Section):
     lines: int = Field(ge=1)
     interface: str = "20x1200"
     prob_bits: int = Field(default=8, ge=1, le=16)
+    scale: Literal["address", "column", "none"] = Field(
+        default="address", exclude_if=lambda scale: scale == "address"
+    )
     prior_bits: int = Field(default=0, ge=0, le=16)
     prior_mode: Choice[PriorMode] = PriorMode.TABLE
     counter_bits: int = Field(default=8, ge=1, le=32)
@@ -410,13 +413,14 @@ def deployment_hash(deployment: DeploymentFile) -> str:
     return hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
 
-def load_deployment(directory: Path, *, images: bool = True) -> Deployment:
+def load_deployment(directory: Path, *, images: bool = True, edited: bool = False) -> Deployment:
     """Read and check a deployment.
 
     Args:
         directory: The folder that `toolchain build` wrote.
         images: Whether to read the boards' images too and compare their hashes; a process that drives no
             boards may leave it out, and starts without NumPy.
+        edited: Whether `deployment.toml` may have been edited, so that its hash is not that of what it says.
 
     Raises:
         DeploymentError: Not there, not TOML, a wrong key or value (file, line, nearest right name).
@@ -440,11 +444,11 @@ def load_deployment(directory: Path, *, images: bool = True) -> Deployment:
         raise DeploymentVersionError(message)
     file = validate(DeploymentFile, tables, text, path, DeploymentError)
     computed = deployment_hash(file)
-    if computed != file.hash:
+    if computed != file.hash and not edited:
         message = (
             f"{path} is not as it was built: its hash is {computed[:16]}, "
-            f"it says {file.hash[:16] or 'nothing'}; only URIs and endpoints may be edited: build it again "
-            "with 'toolchain build'"
+            f"it says {file.hash[:16] or 'nothing'}; only URIs and endpoints may be edited: "
+            "build it again with 'toolchain build', or keep the edit with 'toolchain regenerate deployment'"
         )
         raise DamagedDeploymentError(message)
     deployment = Deployment(**dict(file), directory=directory)

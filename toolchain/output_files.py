@@ -8,9 +8,11 @@ from contextlib import suppress
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import partial
+from itertools import zip_longest
 from typing import TYPE_CHECKING, Final
 
 from machines.parameters import RngKind
+from pcie_shim.programming_file import image_bytes
 from toolchain.errors import BuildError
 from toolchain.memories import FOLDER as MEMORIES_FOLDER
 from toolchain.memories import memories
@@ -19,11 +21,12 @@ from toolchain.vhdl_parameters import FILE as PARAMETERS_FILE
 from toolchain.vhdl_parameters import parameters_vhd
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Sequence
     from pathlib import Path
 
     from pcie_shim.programming_file import Image
     from toolchain.deployment import Deployment
+    from toolchain.memories import Memory
 
 
 class Change(StrEnum):
@@ -44,23 +47,26 @@ class OutputFiles:
         own: Paths that are this part's: those of them that are not in `contents` are removed.
     """
 
-    contents: dict[str, Callable[[], Iterable[str]]]
+    contents: dict[str, Callable[[], Iterable[bytes]]]
     own: re.Pattern[str]
 
 
 _MEMORIES: Final = re.compile(
     rf"{re.escape(PARAMETERS_FILE)}|{re.escape(MEMORIES_FOLDER)}/(board\d+_(prior|column\d+|rng_seeds)|rng_(seeds|table))\.mif"
 )
+_COMMENT: Final = re.compile(rb"(--|#).*", re.DOTALL)
+_LONGEST_LINE: Final = 1 << 20
+_IMAGES: Final = re.compile(r"boards/board\d+\.bm")
 _PROJECT: Final = re.compile(rf"{PROJECT}\.(qpf|tcl)|{PROJECT}_board\d+\.qsf")
 
 
 def memory_files(deployment: Deployment, images: Sequence[Image]) -> OutputFiles:
     """Return `bm1_parameters.vhd` and the MIFs (thesis 3.2)."""
-    contents: dict[str, Callable[[], Iterable[str]]] = {
-        PARAMETERS_FILE: lambda: [parameters_vhd(deployment, images)]
+    contents: dict[str, Callable[[], Iterable[bytes]]] = {
+        PARAMETERS_FILE: lambda: [parameters_vhd(deployment, images).encode()]
     }
     for memory in memories(deployment, images):
-        contents[f"{MEMORIES_FOLDER}/{memory.name}"] = memory.lines
+        contents[f"{MEMORIES_FOLDER}/{memory.name}"] = partial(_encoded, memory)
     return OutputFiles(contents, _MEMORIES)
 
 
@@ -69,10 +75,23 @@ def quartus_files(deployment: Deployment, images: Sequence[Image]) -> OutputFile
     if deployment.machine.rng is RngKind.IDEAL:
         return OutputFiles({}, _PROJECT)
     mifs = [f"{MEMORIES_FOLDER}/{memory.name}" for memory in memories(deployment, images)]
-    contents: dict[str, Callable[[], Iterable[str]]] = {}
+    contents: dict[str, Callable[[], Iterable[bytes]]] = {}
     for name, text in project_files(deployment, mifs).items():
-        contents[name] = partial(iter, [text])
+        contents[name] = partial(iter, [text.encode()])
     return OutputFiles(contents, _PROJECT)
+
+
+def image_files(deployment: Deployment, images: Sequence[Image]) -> OutputFiles:
+    """Return the boards' programming files."""
+    contents: dict[str, Callable[[], Iterable[bytes]]] = {
+        board.image: partial(_image, image) for board, image in zip(deployment.boards, images, strict=True)
+    }
+    return OutputFiles(contents, _IMAGES)
+
+
+def text_file(name: str, text: str) -> OutputFiles:
+    """Return one file of text."""
+    return OutputFiles({name: partial(iter, [text.encode()])}, re.compile(re.escape(name)))
 
 
 def write_files(directory: Path, files: OutputFiles) -> list[tuple[str, Change]]:
@@ -95,14 +114,14 @@ def write_files(directory: Path, files: OutputFiles) -> list[tuple[str, Change]]
 
 
 def compare_files(directory: Path, files: OutputFiles) -> list[tuple[str, Change]]:
-    """Return what `write_files` would do, without doing it; files that would not change are left out."""
+    """Return what `write_files` would do, without doing it; files that differ in comments alone are unchanged."""
     changes: dict[str, Change] = {}
     for name, pieces in files.contents.items():
         path = directory / name
         if not path.is_file():
             changes[name] = Change.NEW
-        elif not _same_text(path, pieces()):
-            changes[name] = Change.CHANGED
+        else:
+            changes[name] = Change.UNCHANGED if _says_the_same(path, pieces()) else Change.CHANGED
     for name in _existing(directory, files.own):
         if name not in files.contents:
             changes[name] = Change.REMOVED
@@ -110,7 +129,12 @@ def compare_files(directory: Path, files: OutputFiles) -> list[tuple[str, Change
 
 
 def _existing(directory: Path, own: re.Pattern[str]) -> list[str]:
-    folders = [directory, directory / PARAMETERS_FILE.partition("/")[0], directory / MEMORIES_FOLDER]
+    folders = [
+        directory,
+        directory / "boards",
+        directory / PARAMETERS_FILE.partition("/")[0],
+        directory / MEMORIES_FOLDER,
+    ]
     names = [
         path.relative_to(directory).as_posix()
         for folder in folders
@@ -120,12 +144,11 @@ def _existing(directory: Path, own: re.Pattern[str]) -> list[str]:
     return sorted(name for name in names if own.fullmatch(name))
 
 
-def _write(path: Path, pieces: Callable[[], Iterable[str]]) -> Change:
+def _write(path: Path, pieces: Callable[[], Iterable[bytes]]) -> Change:
     part = path.with_name(path.name + ".part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        # newline and encoding are said: the same bytes on any system and in any locale
-        with part.open("w", encoding="ascii", newline="\n") as file:
+        with part.open("wb") as file:
             file.writelines(pieces())
         there = path.is_file()
         if there and filecmp.cmp(path, part, shallow=False):
@@ -146,16 +169,29 @@ def _remove(path: Path) -> None:
         raise _not_writable(path, reason) from None
 
 
-def _same_text(path: Path, pieces: Iterable[str]) -> bool:
+def _says_the_same(path: Path, pieces: Iterable[bytes]) -> bool:
+    """Compare a file with what it should be, line by line but for comments and empty lines."""
+    expected = (line for piece in pieces for line in piece.splitlines())
     try:
         with path.open("rb") as file:
-            for piece in pieces:
-                expected = piece.encode("ascii")
-                if file.read(len(expected)) != expected:
-                    return False
-            return not file.read(1)
+            # a line that is much too long is read in parts, which then differ from what they should be
+            found = iter(partial(file.readline, _LONGEST_LINE), b"")
+            pairs = zip_longest(filter(None, map(_plain, found)), filter(None, map(_plain, expected)))
+            return all(one == other for one, other in pairs)
     except OSError:
         return False
+
+
+def _plain(line: bytes) -> bytes:
+    return _COMMENT.sub(b"", line).strip()
+
+
+def _encoded(memory: Memory) -> Iterator[bytes]:
+    return (line.encode() for line in memory.lines())
+
+
+def _image(image: Image) -> Iterator[bytes]:
+    yield image_bytes(image)
 
 
 def _not_writable(path: Path, reason: OSError) -> BuildError:

@@ -1,0 +1,249 @@
+"""One part of a deployment is redone: that part follows, the rest stays to the byte, and every file is accounted for."""
+
+import shutil
+
+import pytest
+from typer.testing import CliRunner
+
+from pcie_shim.programming_file import read_image
+from toolchain.command import app
+from toolchain.deployment import load_deployment
+from toolchain.errors import DamagedDeploymentError
+
+MODEL = """
+import numpy as np
+from toolchain.conditional import normal
+from toolchain.model import Model, cell_centres, interval
+
+def model(sigma: float = 1.0, values: int = 12, cells: int = 8, swapped: bool = False, other: str = "D2"):
+    place = interval("x", 0, 10, cells=cells)
+    (x,) = cell_centres(place)
+    known = [normal("D1", mean=x, sigma=sigma, values=values, floor=0.05, path="data[0]"),
+             normal(other, mean=10 - x, sigma=2.0, values=12, floor=0.05, path="data[1]")]
+    return Model(name="small", searched=(place,), known=tuple(known[::-1] if swapped else known))
+"""
+TARGET = ["--uri", "ws://robot:9090", "--topic", "/readings", "--type", "std_msgs/Float64MultiArray"]
+
+
+@pytest.fixture
+def case(tmp_path):
+    folder = tmp_path / "case"
+    folder.mkdir()
+    (folder / "model.py").write_text(MODEL)
+    return folder
+
+
+@pytest.fixture
+def built(case):
+    out = case.parent / "out"
+    options = ["--partitions", "2", "--scale", "column", "--bits", "D1=6", "--prob-bits", "7"]
+    result = CliRunner().invoke(app, ["build", str(case), "-o", str(out), *TARGET, *options])
+    assert result.exit_code == 0, result.stderr
+    return out
+
+
+def regenerate(part, built, *arguments, code=0):
+    result = CliRunner().invoke(app, ["regenerate", part, str(built), *map(str, arguments)])
+    assert result.exit_code == code, result.output
+    return result
+
+
+def contents(folder):
+    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+def changes(result):
+    return {
+        line.split()[1]: line.split()[0] for line in result.stdout.splitlines() if not line.startswith(" ")
+    }
+
+
+def test_memories_from_the_images(built):
+    before = contents(built)
+    folder = built / "bm_arch" / "Memory_MIFs"
+    (folder / "board1_prior.mif").unlink()
+    (folder / "board0_column1.mif").write_text("something else")
+    (folder / "board7_column9.mif").write_text("from another build")
+    (folder / "notes.txt").write_text("the user's")
+    times = {path: path.stat().st_mtime_ns for path in folder.iterdir()}
+    found = changes(regenerate("memories", built))
+    prefix = "bm_arch/Memory_MIFs/"
+    assert {name: change for name, change in found.items() if change != "unchanged"} == {
+        prefix + "board1_prior.mif": "new",
+        prefix + "board0_column1.mif": "changed",
+        prefix + "board7_column9.mif": "removed",
+    }
+    assert set(found) == {name for name in before if name.startswith("bm_arch")} | {
+        prefix + "board7_column9.mif"
+    }
+    assert contents(built) == before | {prefix + "notes.txt": b"the user's"}
+    unchanged = folder / "board0_prior.mif"
+    assert unchanged.stat().st_mtime_ns == times[unchanged]
+
+
+def test_memories_from_the_model(case, built):
+    """The tables are new, what a user has set in deployment.toml stays, and it is as if built so at once."""
+    regenerate("deployment", built, "--topic", "/elsewhere", "--path", "D1=data[7]")
+    path = built / "deployment.toml"
+    text = path.read_text().replace("ws://robot:9090", "ws://other:1")
+    path.write_text(text.replace('endpoint = ""', 'endpoint = "tcp://board:1"', 1))
+    result = regenerate("memories", built, "--model", case, "--set", "sigma=0.5")
+    found = changes(result)
+    assert found["boards/board0.bm"] == found["deployment.toml"] == found["report.txt"] == "changed"
+    assert found["bm_arch/Memory_MIFs/board0_column1.mif"] == "changed"
+    assert found["bm_arch/Memory_MIFs/board0_column2.mif"] == "unchanged"
+    assert "+image_hash = " in result.stdout
+    deployment = load_deployment(built)
+    assert deployment.sources[0].topic == "/elsewhere"
+    assert deployment.sources[0].uri == "ws://other:1"
+    assert [board.endpoint for board in deployment.boards] == ["tcp://board:1", ""]
+    assert [variable.path for variable in deployment.variables] == ["data[7]", "data[1]"]
+    assert [variable.bits for variable in deployment.variables] == [6, 4]
+    once = case.parent / "once"
+    options = ["--partitions", "2", "--scale", "column", "--bits", "D1=6", "--prob-bits", "7"]
+    CliRunner().invoke(app, ["build", str(case), "-o", str(once), *TARGET, *options, "--set", "sigma=0.5"])
+    same = contents(once)
+    for name in ("deployment.toml", "report.txt"):
+        del same[name]
+    assert {name: content for name, content in contents(built).items() if name in same} == same
+
+
+def test_a_wrong_order_of_columns_is_mended_in_the_model(case, built):
+    regenerate("memories", built, "--model", case, "--set", "swapped=true")
+    deployment = load_deployment(built)
+    assert [(each.name, each.path, each.bits) for each in deployment.variables] == [
+        ("D2", "data[1]", 4),
+        ("D1", "data[0]", 6),
+    ]
+
+
+def test_a_wrong_order_of_readings_is_mended_without_touching_the_rest(built):
+    before = contents(built)
+    result = regenerate("deployment", built, "--order", "D2,D1")
+    assert changes(result) == {"deployment.toml": "changed"}
+    assert '-name = "D1"' in result.stdout
+    after = contents(built)
+    assert {name for name in before if before[name] != after[name]} == {"deployment.toml"}
+    deployment = load_deployment(built)
+    # a column keeps its table and its widths; the reading that it gets is another one
+    assert [(each.name, each.path, each.bits) for each in deployment.variables] == [
+        ("D2", "data[1]", 6),
+        ("D1", "data[0]", 4),
+    ]
+    regenerate("deployment", built, "--order", "D1,D2")
+    assert contents(built) == before
+
+
+def test_every_edit_of_the_deployment(built):
+    regenerate(
+        "deployment",
+        built,
+        *("--uri", "wss://a:1", "--topic", "/b", "--type", "c/D", "--output", "/e", "--path", "D2=f.g"),
+        *("--target-count", 9, "--max-cycles", 99, "--stop", "own", "--queue", "all", "--tolerance", 0.5),
+    )
+    deployment = load_deployment(built)
+    source, machine = deployment.sources[0], deployment.machine
+    assert (source.uri, source.topic, source.type) == ("wss://a:1", "/b", "c/D")
+    assert (deployment.outputs[0].topic, deployment.variables[1].path) == ("/e", "f.g")
+    assert (machine.target_count, machine.max_cycles, machine.stop) == (9, 99, "own")
+    assert (deployment.queue, deployment.tolerance_s) == ("all", 0.5)
+
+
+def test_an_edit_by_hand_is_kept_where_the_images_agree(built):
+    path = built / "deployment.toml"
+    path.write_text(path.read_text().replace("max_cycles = 131072", "max_cycles = 7"))
+    with pytest.raises(DamagedDeploymentError, match="toolchain regenerate deployment"):
+        load_deployment(built)
+    regenerate("deployment", built)
+    assert load_deployment(built).machine.max_cycles == 7
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "sentence"),
+    [
+        ("bits = 6", "bits = 5", "says bits of D1 = 5, but boards/board0.bm was built with 6: set it back"),
+        ("prob_bits = 7", "prob_bits = 6", "says prob_bits = 6, but boards/board0.bm was built with 7"),
+        ('interface = "20x1200"', 'interface = "20x1201"', "says interface = 20x1201"),
+        ("steps_per_clock = 8", "steps_per_clock = 1", "says steps_per_clock = 1, but"),
+        ("boards/board0.bm", "boards/board1.bm", "is another board's or another build's image"),
+        ("kind = ", "knid = ", "unknown key 'knid'"),
+    ],
+)
+def test_an_edit_by_hand_that_the_images_contradict(built, old, new, sentence):
+    path = built / "deployment.toml"
+    path.write_text(path.read_text().replace(old, new, 1))
+    before = contents(built)
+    assert sentence in regenerate("deployment", built, code=2).stderr
+    assert contents(built) == before
+
+
+def test_the_project(built):
+    before = contents(built)
+    (built / "bm1.qpf").unlink()
+    (built / "bm1_board5.qsf").touch()
+    assert changes(regenerate("project", built)) == {
+        "bm1.qpf": "new",
+        "bm1.tcl": "unchanged",
+        "bm1_board0.qsf": "unchanged",
+        "bm1_board1.qsf": "unchanged",
+        "bm1_board5.qsf": "removed",
+    }
+    assert contents(built) == before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (
+            ["deployment", "--order", "D1"],
+            "--order D1: expected each of D1, D2 once, in the order of the columns",
+        ),
+        (["deployment", "--order", "D1,D1"], "--order D1,D1: expected each of D1, D2 once"),
+        (["deployment", "--path", "D3=x"], "--path D3=x: there is no such variable; there are D1, D2"),
+        (["deployment", "--path", "D3"], "--path D3: expected KEY=VALUE, such as --path range=data[0]"),
+        (["deployment", "--uri", "robot"], "--uri: 'robot' is no WebSocket URI"),
+        (["deployment", "--output", "a b"], "--output: 'a b' is no topic name"),
+        (["deployment", "--target-count", "256"], "target_count = 256 does not fit counters of 8 bits"),
+        (["deployment", "--tolerance", "-1"], "--tolerance is -1.0, expected greater than or equal to 0"),
+        (["memories", "--set", "sigma=1"], "--set belongs to a model: add --model"),
+        (["memories", "--searched", "x"], "--searched belongs to a model: add --model"),
+        (
+            ["memories", "--model", "{case}", "--set", "cells=9"],
+            "searches x (9), but the deployment x (8): this is",
+        ),
+        (
+            ["memories", "--model", "{case}", "--set", "other=D3"],
+            "knows D1, D3, but the deployment D1, D2: this",
+        ),
+        (
+            ["memories", "--model", "{case}", "--set", "values=99"],
+            "variable 'D1': D1 serves 99 values, but 6 bits",
+        ),
+        (["memories", "--model", "{case}/none"], "none is no folder"),
+    ],
+)
+def test_mistakes_change_nothing(case, built, arguments, sentence):
+    before = contents(built)
+    part, *rest = (argument.format(case=case) for argument in arguments)
+    result = regenerate(part, built, *rest, code=2)
+    assert sentence in result.stderr
+    assert result.stderr.startswith("error: ")
+    assert contents(built) == before
+
+
+@pytest.mark.parametrize("part", ["memories", "project", "deployment"])
+def test_no_deployment_or_a_damaged_one(built, part):
+    image = built / "boards" / "board1.bm"
+    image.write_bytes(image.read_bytes()[:-1] + b"x")
+    assert "board1.bm is damaged" in regenerate(part, built, code=2).stderr
+    shutil.rmtree(built)
+    assert "holds no deployment" in regenerate(part, built, code=2).stderr
+
+
+def test_an_emulated_machine_has_no_project(case):
+    out = case.parent / "out"
+    CliRunner().invoke(app, ["build", str(case), "-o", str(out), *TARGET, "--rng", "ideal"])
+    result = regenerate("project", out)
+    assert result.stdout == ""
+    assert "there is no project" in result.stderr
+    assert read_image(out / "boards" / "board0.bm").machine.parameters.rng == "ideal"
