@@ -261,8 +261,8 @@ def _deployment(
             name=model.name,
             queue=options.queue,
             tolerance_s=options.tolerance_s,
-            sources=(Source(uri=options.uri, topic=options.topic, type=options.type),),
-            variables=model.variables,
+            sources=_sources(options),
+            variables=model.variables if options.sources is None else options.sources.place(model.variables),
             searched=model.searched,
             machine=MachineSection(
                 lines=model.lines,
@@ -281,7 +281,7 @@ def _deployment(
                 max_cycles=options.max_cycles,
                 stop=options.stop,
             ),
-            prior=None if options.prior_path is None else WrittenPrior(path=options.prior_path),
+            prior=_written_prior(options),
             boards=tuple(
                 Board(
                     image=f"boards/board{index}.bm",
@@ -297,6 +297,18 @@ def _deployment(
         raise refused_option(reason) from None
 
 
+def _sources(options: BuildOptions) -> tuple[Source, ...]:
+    if options.sources is not None:
+        return options.sources.sources
+    return (Source(uri=options.uri, topic=options.topic, type=options.type),)
+
+
+def _written_prior(options: BuildOptions) -> WrittenPrior | None:
+    if options.sources is not None:
+        return options.sources.prior
+    return None if options.prior_path is None else WrittenPrior(path=options.prior_path)
+
+
 def check_options(options: BuildOptions) -> None:
     """Refuse a URI, topic or type that is none, and a machine that there isn't yet, before anything is computed.
 
@@ -304,7 +316,7 @@ def check_options(options: BuildOptions) -> None:
         BuildError: Names the option and what it is to be.
     """
     try:
-        Source(uri=options.uri, topic=options.topic, type=options.type)
+        _sources(options)
         Output(topic=options.output)
     except ValidationError as reason:
         raise refused_option(reason) from None
@@ -323,8 +335,9 @@ def check_options(options: BuildOptions) -> None:
 
 def _check_prior(model: Model, options: BuildOptions) -> None:
     if options.prior_mode is PriorMode.TABLE:
-        if options.prior_path is not None:
-            message = "--prior-path says where a written prior comes from: add --prior-mode written"
+        if _written_prior(options) is not None:
+            flag = "--prior-path" if options.sources is None else f"{options.sources.path}"
+            message = f"{flag} says where a written prior comes from: add --prior-mode written"
             raise BuildError(message)
     elif model.prior_select is not None:
         message = (
@@ -375,7 +388,7 @@ def build_report(
     model: Model, deployment: Deployment, quantised: Quantised, interface_reason: str = ""
 ) -> str:
     """Return what was built and what was lost, in plain sentences; no dates or paths: same input, same bytes."""
-    machine, source = deployment.machine, deployment.sources[0]
+    machine = deployment.machine
     grid = " x ".join(f"{d.label} {d.size}" for d in model.searched)
     names = ", ".join(known.name for known in model.known)
     machine_sentence = (
@@ -401,11 +414,26 @@ def build_report(
         + _loss_table(quantised),
     ]
     paragraphs += [f"Warning: {warning}" for warning in quantised.warnings]
-    paragraphs.append(
-        f"Readings come from {source.uri}, topic {source.topic} ({source.type}); posteriors go to "
-        f"{deployment.outputs[0].topic}. Deployment {deployment.hash[:16]}."
-    )
+    paragraphs.append(f"{_topics_sentence(deployment)} Deployment {deployment.hash[:16]}.")
     return "\n\n".join(paragraphs) + "\n"
+
+
+def _topics_sentence(deployment: Deployment) -> str:
+    """Say where readings come from (of several topics, which variables) and where posteriors go."""
+    output = deployment.outputs[0]
+    places = [f"{source.uri}, topic {source.topic} ({source.type})" for source in deployment.sources]
+    if len(places) == 1:
+        return f"Readings come from {places[0]}; posteriors go to {output.topic}."
+    for at, place in enumerate(places):
+        names = [variable.name for variable in deployment.variables if variable.source == at]
+        if deployment.prior is not None and deployment.prior.source == at:
+            names.append("the prior")
+        places[at] = f"\n  {place}: {', '.join(names)}"
+    return (
+        f"Readings come from {len(places)} topics, together where their stamps are within "
+        f"{deployment.tolerance_s:g} s:{''.join(places)}\n"
+        f"Posteriors go to {output.topic} on {deployment.output_uri(output)}."
+    )
 
 
 def _state_paragraph(model: Model) -> list[str]:

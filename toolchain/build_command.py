@@ -16,6 +16,7 @@ from toolchain.errors import BuildError
 from toolchain.networks import is_network, read_network
 from toolchain.rng_table import read_table
 from toolchain.settings import key_values
+from toolchain.sources import read_sources
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -64,12 +65,14 @@ class Unread:
         bits: `NAME=BITS` each.
         interface: `20x1200`.
         rng_table: A MIF of random numbers.
+        sources: A file that says which variable comes from which topic.
     """
 
     settings: tuple[str, ...] = ()
     bits: tuple[str, ...] = ()
     interface: str | None = None
     rng_table: Path | None = None
+    sources: Path | None = None
 
 
 def run_build(
@@ -80,6 +83,7 @@ def run_build(
     Raises:
         ToolchainError: Anything that is wrong with the model or the options.
     """
+    options = with_sources(options, unread.sources)
     check_options(options)
     options = read_options(options, unread)
     typer.echo(f"Reading {model_file(path)}", err=True)
@@ -88,6 +92,31 @@ def run_build(
     built = build_deployment(model, directory, replace(options, build_date=build_date(model_file(path))))
     typer.echo(built.report, nl=False)
     typer.echo(f"Wrote {built.deployment.path} and {directory / REPORT_NAME}", err=True)
+
+
+def with_sources(options: BuildOptions, path: Path | None) -> BuildOptions:
+    """Return the options with the file that says which variable comes from which topic, where there is one.
+
+    Raises:
+        BuildError: A mistake in the file, flags that say the same, or neither the file nor all flags.
+    """
+    said = {"--uri": options.uri, "--topic": options.topic, "--type": options.type}
+    if path is None:
+        missing = [flag for flag, value in said.items() if not value]
+        if missing:
+            message = (
+                f"{missing[0]} is missing: say where readings come from, with --uri, --topic and --type, or with "
+                "--sources FILE where they come from several topics"
+            )
+            raise BuildError(message)
+        return options
+    for flag, value in (*said.items(), ("--prior-path", options.prior_path)):
+        if value and flag != "--uri":
+            message = (
+                f"{flag} {value}: the file of --sources says that for each of its topics; leave it out here"
+            )
+            raise BuildError(message)
+    return replace(options, sources=read_sources(path, options.uri or None))
 
 
 def read_options(options: BuildOptions, unread: Unread) -> BuildOptions:

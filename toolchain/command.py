@@ -9,7 +9,7 @@ import typer
 
 # NumPy and what needs it are imported where they are used: --help answers at once.
 from machines.parameters import PriorMode, RngKind, RngReset
-from toolchain import flags, regenerate_command
+from toolchain import design_command, flags, regenerate_command
 from toolchain.deployment import Queue, Stop
 from toolchain.fit_options import FitMethod, FitOptions, FitPrior
 from toolchain.options import BuildOptions, OnMissing, Scale, SensorMode
@@ -24,6 +24,7 @@ app = typer.Typer(
 
 
 app.add_typer(regenerate_command.app, name="regenerate")
+app.add_typer(design_command.app)
 
 
 @app.callback()
@@ -37,9 +38,20 @@ def build(
     directory: Annotated[
         Path, typer.Option("--output-dir", "-o", help="Folder of the deployment.", metavar="DIR")
     ],
-    uri: Annotated[str, typer.Option(help="rosbridge server with the readings, ws://host:port.")],
-    topic: Annotated[str, typer.Option(help="Topic with the readings.")],
-    message_type: Annotated[str, typer.Option("--type", help="That topic's type, package/Name.")],
+    uri: Annotated[
+        str | None, typer.Option(help="rosbridge server with the readings, ws://host:port.")
+    ] = None,
+    topic: Annotated[str | None, typer.Option(help="Topic with the readings.")] = None,
+    message_type: Annotated[
+        str | None, typer.Option("--type", help="That topic's type, package/Name.")
+    ] = None,
+    sources: Annotated[
+        Path | None,
+        typer.Option(
+            help="Instead of topic and type: a TOML file with several topics, of one server or more.",
+            metavar="FILE",
+        ),
+    ] = None,
     settings: flags.Settings = None,
     searched: flags.Searched = "",
     known: flags.KnownNames = "",
@@ -48,6 +60,7 @@ def build(
     on_missing: flags.OnMissingFlag = OnMissing.ERROR,
     output: Annotated[str, typer.Option(help="Topic for the posteriors.")] = "/BMresults",
     partitions: flags.Partitions = 1,
+    device: flags.DeviceFlag = None,
     interface: flags.Interface = None,
     scale: flags.ScaleFlag = Scale.ADDRESS,
     prob_bits: flags.ProbBits = 8,
@@ -85,9 +98,9 @@ def build(
         from toolchain.build_command import NetworkQuestion, Unread, run_build
 
         options = BuildOptions(
-            uri=uri,
-            topic=topic,
-            type=message_type,
+            uri=uri or "",
+            topic=topic or "",
+            type=message_type or "",
             output=output,
             partitions=partitions,
             scale=scale,
@@ -116,7 +129,11 @@ def build(
             on_missing=on_missing.value,
         )
         unread = Unread(
-            settings=tuple(settings or ()), bits=tuple(bits or ()), interface=interface, rng_table=rng_table
+            settings=tuple(settings or ()),
+            bits=tuple(bits or ()),
+            interface=interface,
+            rng_table=rng_table,
+            sources=sources,
         )
         run_build(model, directory, question, options, unread)
 

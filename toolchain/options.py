@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from toolchain.sources import SourcesFile
+
 
 class Scale(StrEnum):
     """What is divided by its maximum before quantising."""
@@ -76,6 +78,7 @@ class BuildOptions:
         rng_reset: Whether a frame restarts the generators.
         queue: What happens to frames that come faster than they are computed.
         tolerance_s: Within what time readings from several topics belong together, seconds.
+        sources: Several topics and which variable comes from which, instead of `uri`, `topic` and `type`; or None.
         build_date: When it was built, ISO 8601; the images' manifests say it, their hashes don't cover it.
     """
 
@@ -103,4 +106,5 @@ class BuildOptions:
     rng_reset: RngReset = RngReset.BANK
     queue: Queue = Queue.LATEST
     tolerance_s: float = 0.05
+    sources: SourcesFile | None = None
     build_date: str = ""
