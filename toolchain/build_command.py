@@ -8,12 +8,21 @@ from typing import TYPE_CHECKING, Literal
 
 import typer
 
+from machines.errors import MachineError
 from machines.parameters import ADDRESS_BITS_MAX, RngKind
-from toolchain.build import REPORT_NAME, build_date, build_deployment, check_options
+from toolchain.build import (
+    DEFAULT_INTERFACE,
+    REPORT_NAME,
+    build_date,
+    build_deployment,
+    check_options,
+    machine_parameters,
+)
 from toolchain.case_study import FILE_NAME, load_model
 from toolchain.deployment import parse_interface
 from toolchain.errors import BuildError
 from toolchain.networks import is_network, read_network
+from toolchain.resources import boards_needed, device_named
 from toolchain.rng_table import read_table
 from toolchain.settings import key_values
 from toolchain.sources import read_sources
@@ -66,6 +75,7 @@ class Unread:
         interface: `20x1200`.
         rng_table: A MIF of random numbers.
         sources: A file that says which variable comes from which topic.
+        device: What a board has; then as many boards are taken as the lines need.
     """
 
     settings: tuple[str, ...] = ()
@@ -73,6 +83,7 @@ class Unread:
     interface: str | None = None
     rng_table: Path | None = None
     sources: Path | None = None
+    device: str | None = None
 
 
 def run_build(
@@ -88,10 +99,29 @@ def run_build(
     options = read_options(options, unread)
     typer.echo(f"Reading {model_file(path)}", err=True)
     model = read_model(path, question, unread)
+    options = on_device(options, model, unread.device)
     typer.echo(f"Quantising {model.name} and writing its images", err=True)
     built = build_deployment(model, directory, replace(options, build_date=build_date(model_file(path))))
     typer.echo(built.report, nl=False)
     typer.echo(f"Wrote {built.deployment.path} and {directory / REPORT_NAME}", err=True)
+
+
+def on_device(options: BuildOptions, model: Model, name: str | None) -> BuildOptions:
+    """Return the options with as many boards as a device's size asks for, or more that were asked for; says why.
+
+    Raises:
+        BuildError: No such device, no such machine, or one of which not even a line fits.
+    """
+    if name is None:
+        return options
+    device = device_named(name)
+    try:
+        parameters = machine_parameters(model, options)
+    except MachineError as reason:
+        raise BuildError(str(reason)) from None
+    count, why = boards_needed(parameters, device, interface=options.interface or DEFAULT_INTERFACE)
+    typer.echo(why, err=True)
+    return replace(options, partitions=max(count, options.partitions))
 
 
 def with_sources(options: BuildOptions, path: Path | None) -> BuildOptions:

@@ -134,6 +134,7 @@ def build(
             interface=interface,
             rng_table=rng_table,
             sources=sources,
+            device=device,
         )
         run_build(model, directory, question, options, unread)
 

@@ -35,6 +35,13 @@ PriorSelectName: TypeAlias = Annotated[
 OnMissingFlag: TypeAlias = Annotated[OnMissing, typer.Option(help="Of a network: what an absent reading is.")]
 
 Partitions: TypeAlias = Annotated[int, typer.Option(help="Boards to split the lines over.")]
+DeviceFlag: TypeAlias = Annotated[
+    str | None,
+    typer.Option(
+        help="What a board has, proce-v-d8: as many boards are taken as the lines need, and it says why.",
+        metavar="NAME",
+    ),
+]
 Interface: TypeAlias = Annotated[
     str | None,
     typer.Option(
