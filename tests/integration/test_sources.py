@@ -1,0 +1,229 @@
+"""One model whose variables come from four topics of two servers, by real processes.
+
+robot one: /range (Range), /cells (UInt8MultiArray, base64, no header)  ->  hub 1  ->  subscriber, master  ->  hub 1
+robot two: /scan (LaserScan, CBOR), /imu (Imu)                          ->  hub 2  ->      "
+"""
+
+import asyncio
+import contextlib
+import json
+import signal
+import subprocess
+import time
+
+import numpy as np
+import pytest
+
+from bridge.client import connect
+from bridge.errors import BridgeError
+from bridge.posteriors import posteriors
+from bridge.stamps import header
+from tests.fake_rosbridge import FakeRosbridge
+from tests.integration.conftest import BIN
+
+PATIENCE = 60
+MODEL = """
+import numpy as np
+from toolchain.model import Known, Model, dimension
+
+def known(name, step, values, offset=0.0):
+    likely = np.full((values, 4), 0.2 / (values - 1))
+    likely[2 * np.arange(4), np.arange(4)] = 0.8  # reading number 2 s in place s
+    return Known(name=name, table=likely, step=step, offset=offset)
+
+def model():
+    return Model(name="corridor", searched=(dimension("s", size=4),), known=(
+        known("near", 0.5, 8), known("left", 0.25, 8), known("ahead", 1.0, 8),
+        known("turn", 0.5, 8, offset=-2.0), known("cell", 1.0, 8)))
+"""
+SOURCES = """
+[[source]]
+uri = "{one}"
+topic = "/range"
+type = "sensor_msgs/Range"
+variables = {{ near = "range" }}
+
+[[source]]
+uri = "{two}"
+topic = "/scan"
+type = "sensor_msgs/LaserScan"
+compression = "cbor"
+variables = {{ left = "ranges[90]", ahead = "ranges[0]" }}
+
+[[source]]
+uri = "{two}"
+topic = "/imu"
+type = "sensor_msgs/Imu"
+variables = {{ turn = "angular_velocity.z" }}
+
+[[source]]
+uri = "{one}"
+topic = "/cells"
+type = "std_msgs/UInt8MultiArray"
+variables = {{ cell = "data[2]" }}
+"""
+ADDRESSES = [4, 4, 4, 4, 4]
+"""What a robot in place 2 reads, in the order of the columns."""
+
+
+class Robots:
+    """Publish what is read in place 2 on all four topics; a hub that goes away is waited for.
+
+    Attributes:
+        late_s: How far the clock of the second robot is behind, seconds.
+    """
+
+    def __init__(self, one: str, two: str) -> None:
+        self.uris = (one, two)
+        self.late_s = 0.0
+        self._tasks: list[asyncio.Task[None]] = []
+
+    async def __aenter__(self):
+        self._tasks = [asyncio.create_task(self._first()), asyncio.create_task(self._second())]
+        return self
+
+    async def __aexit__(self, *_):
+        for task in self._tasks:
+            task.cancel()
+        for ended in await asyncio.gather(*self._tasks, return_exceptions=True):
+            assert isinstance(ended, asyncio.CancelledError), ended
+
+    def _header(self, late_s: float = 0.0) -> dict:
+        return header(time.time_ns() - round(late_s * 1e9), "robot", 2)
+
+    async def _first(self) -> None:
+        async with connect(self.uris[0], ros_version="2") as ros:
+            ranges = await ros.advertise("/range", "sensor_msgs/Range")
+            cells = await ros.advertise("/cells", "std_msgs/UInt8MultiArray")
+            while True:
+                with contextlib.suppress(BridgeError):
+                    await ranges.publish({"header": self._header(), "max_range": 4.0, "range": 2.0})
+                    await cells.publish({"layout": {"dim": []}, "data": bytes([9, 9, 4])})
+                await asyncio.sleep(0.05)
+
+    async def _second(self) -> None:
+        beams = np.full(360, np.float32(7))
+        beams[0], beams[90] = 4.0, 1.0
+        async with connect(self.uris[1], ros_version="2") as ros:
+            scans = await ros.advertise("/scan", "sensor_msgs/LaserScan")
+            imus = await ros.advertise("/imu", "sensor_msgs/Imu")
+            while True:
+                turn = {"x": 9.0, "y": 9.0, "z": 0.0}
+                with contextlib.suppress(BridgeError):
+                    await scans.publish({"header": self._header(self.late_s), "ranges": beams})
+                    await imus.publish(
+                        {
+                            "header": self._header(self.late_s),
+                            "angular_velocity": turn,
+                            "linear_acceleration": {"x": 1.0, "y": 1.0, "z": 9.8},
+                        }
+                    )
+                await asyncio.sleep(0.05)
+
+
+@pytest.fixture
+async def robots(stage):
+    (_, one), (_, two) = await stage.hub(), await stage.hub()
+    async with Robots(one, two) as robots:
+        yield robots
+
+
+@pytest.fixture
+def deployment(stage, robots):
+    case = stage.where / "corridor"
+    case.mkdir()
+    (case / "model.py").write_text(MODEL)
+    sources = stage.where / "sources.toml"
+    one, two = robots.uris
+    sources.write_text(SOURCES.format(one=one, two=two))
+    subprocess.run(
+        [
+            *(str(BIN / "toolchain"), "build", str(case), "-o", str(stage.where / "out")),
+            *("--sources", str(sources), "--tolerance", "0.5"),
+        ],
+        check=True,
+        capture_output=True,
+        timeout=PATIENCE,
+    )
+    return stage.where / "out"
+
+
+async def test_the_subscriber_alone(stage, deployment):
+    subscriber = stage.start("subscriber", "-d", str(deployment), "--count", "3")
+    assert await subscriber.end() == 0
+    printed = [json.loads(line) for line in subscriber.out.splitlines()]
+    assert [each["addresses"] for each in printed] == [ADDRESSES] * 3
+
+
+async def test_a_topic_may_come_as_cbor(stage, deployment):
+    async with FakeRosbridge() as server:
+        stage.start("subscriber", "-d", str(deployment), "--uri", server.uri)
+        for topic, asked in (("/scan", "cbor"), ("/imu", None)):
+            await server.wait_for_op("subscribe", topic=topic, timeout=PATIENCE)
+            (operation,) = server.ops("subscribe", topic=topic)
+            assert operation.get("compression") == asked
+
+
+async def test_once(stage, deployment, robots):
+    async with connect(robots.uris[0]) as ros, posteriors(ros) as heard:
+        master = stage.start("master", "--once", "-d", str(deployment))
+        posterior = await heard.next(PATIENCE)
+        assert posterior.best() == {"s": 2}
+        assert posterior.probability > 0.9
+        assert abs(posterior.stamp_ns - time.time_ns()) < 10e9
+        assert await master.end() == 0
+
+
+async def test_clocks_that_disagree_are_named_and_what_is_unpaired_is_counted(stage, deployment, robots):
+    robots.late_s = 5.0
+    async with connect(robots.uris[0]) as ros, posteriors(ros) as heard:
+        master = stage.start("master", "--loop", "--count", "3", "-d", str(deployment))
+        await master.says(
+            r"messages come on all topics but make no frame: the newest of /(scan|imu) is \S+ s older than that of "
+            r"/(range|cells) \(/cells without a header, so by receipt\), and the tolerance is 0.5 s"
+        )
+        await asyncio.sleep(4)  # 64 messages of each topic are kept
+        robots.late_s = 0.0
+        assert [(await heard.next(PATIENCE)).best() for _ in range(3)] == [{"s": 2}] * 3
+        assert await master.end() == 0
+    assert "3 results published" in master.err
+    unpaired = int(master.err.rsplit(" unpaired", 1)[0].rsplit(None, 1)[1])
+    assert unpaired > 20
+
+
+async def test_one_server_may_go_and_come(stage, deployment, robots):
+    async with connect(robots.uris[0]) as ros, posteriors(ros) as heard:
+        master = stage.start("master", "--loop", "-d", str(deployment))
+        await heard.next(PATIENCE)
+        port = int(robots.uris[1].rsplit(":", 1)[1])
+        (second,) = (hub for hub in stage.running if hub.name == "hub" and f":{port}" in hub.err)
+        second.send(signal.SIGKILL)
+        await second.end()
+        await master.says(rf"rosbridge at ws://127.0.0.1:{port} is gone")
+        while True:  # what was under way
+            with contextlib.suppress(BridgeError):
+                await heard.next(1.0)
+                continue
+            break
+        await stage.hub(port)
+        await master.says(rf"rosbridge at ws://127.0.0.1:{port} is connected again")
+        for _ in range(3):
+            assert (await heard.next(PATIENCE)).best() == {"s": 2}
+        master.send(signal.SIGINT)
+        assert await master.end() == 130
+    assert "make no frame" not in master.err
+    await stage.nothing_left("hub")
+
+
+async def test_a_beam_that_is_not_there(stage, deployment):
+    path = deployment / "deployment.toml"
+    assert "ranges[90]" in path.read_text()
+    sources = stage.where / "sources.toml"
+    sources.write_text(sources.read_text().replace("ranges[90]", "ranges[360]"))
+    case = stage.where / "corridor"
+    command = [str(BIN / "toolchain"), "build", str(case), "-o", str(deployment), "--sources", str(sources)]
+    subprocess.run(command, check=True, capture_output=True, timeout=PATIENCE)
+    master = stage.start("master", "--once", "-d", str(deployment))
+    assert await master.end() == 4
+    said = master.err.splitlines()[-1]
+    assert "/scan: the message has no field 'ranges[360]': 'ranges' has 360 elements" in said

@@ -1,0 +1,241 @@
+"""A sources file: which variable comes from which topic, and every mistake in it as a sentence with its line."""
+
+import re
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from typer.testing import CliRunner
+
+from bridge.errors import PathError
+from bridge.fields import parse_path
+from toolchain.command import app
+from toolchain.deployment import Variable, deployment_hash, load_deployment, write_deployment
+from toolchain.errors import BuildError
+from toolchain.sources import _PATH, read_sources
+
+MODEL = """
+import numpy as np
+from toolchain.model import Known, Model, dimension
+
+def model(path: str = ""):
+    table = np.full((4, 4), 0.25)
+    return Model(name="tiny", searched=(dimension("s", size=4),),
+                 known=tuple(Known(name=name, table=table, path=path) for name in ("near", "left", "turn")))
+"""
+FILE = """\
+[[source]]
+topic = "/range"
+type = "sensor_msgs/Range"
+variables = { near = "range" }
+
+[[source]]
+uri = "ws://two:9090"
+topic = "/scan"
+type = "sensor_msgs/LaserScan"
+compression = "cbor"
+variables = { left = "ranges[3]" }
+
+[[source]]
+uri = "ws://two:9090"
+topic = "/imu"
+type = "sensor_msgs/Imu"
+"""
+VARIABLES = tuple(Variable(name=name, bits=3, values=4) for name in ("near", "left", "turn"))
+
+
+@pytest.fixture
+def written(tmp_path):
+    def write(text):
+        path = tmp_path / "sources.toml"
+        path.write_text(text)
+        return path
+
+    return write
+
+
+def build(tmp_path, *flags):
+    case = tmp_path / "case"
+    case.mkdir(exist_ok=True)
+    (case / "model.py").write_text(MODEL)
+    return CliRunner().invoke(app, ["build", str(case), "-o", str(tmp_path / "out"), *flags])
+
+
+def test_a_build_from_several_topics(tmp_path, written):
+    path = str(written(FILE))
+    result = build(
+        tmp_path, "--sources", path, "--uri", "ws://one:9090", "--tolerance", "0.2", "--set", "path=a.b"
+    )
+    assert result.exit_code == 0, result.stderr
+    deployment = load_deployment(tmp_path / "out")
+    assert [(each.uri, each.topic, each.compression) for each in deployment.sources] == [
+        ("ws://one:9090", "/range", "none"),
+        ("ws://two:9090", "/scan", "cbor"),
+        ("ws://two:9090", "/imu", "none"),
+    ]
+    places = [(each.name, each.source, each.path) for each in deployment.variables]
+    assert places == [("near", 0, "range"), ("left", 1, "ranges[3]"), ("turn", 2, "a.b")]
+    assert deployment.tolerance_s == 0.2
+    assert "Readings come from 3 topics, together where their stamps are within 0.2 s:\n" in result.stdout
+    assert "  ws://two:9090, topic /scan (sensor_msgs/LaserScan): left\n" in result.stdout
+    assert "Posteriors go to /BMresults on ws://one:9090." in result.stdout
+
+
+def test_where_and_how_it_comes_may_be_edited(tmp_path, written):
+    assert build(tmp_path, "--sources", str(written(FILE)), "--uri", "ws://one:9090").exit_code == 0
+    path = tmp_path / "out" / "deployment.toml"
+    assert path.read_text().count("compression") == 1
+    path.write_text(path.read_text().replace('"cbor"', '"none"').replace("ws://two", "ws://three"))
+    assert {each.compression for each in load_deployment(tmp_path / "out").sources} == {"none"}
+
+
+def test_a_source_without_compression_has_the_hash_that_it_always_had(tmp_path):
+    result = build(tmp_path, "--uri", "ws://one:9090", "--topic", "/t", "--type", "a/B")
+    assert result.exit_code == 0
+    deployment = load_deployment(tmp_path / "out")
+    assert "compression" not in (tmp_path / "out" / "deployment.toml").read_text()
+    source = deployment.sources[0].model_copy(update={"compression": "cbor"})
+    asked = deployment.model_copy(update={"sources": (source,)})
+    assert deployment_hash(asked) == deployment.hash
+    assert write_deployment(tmp_path, asked).sources[0].compression == "cbor"
+
+
+def test_a_prior_of_one_of_them(tmp_path, written):
+    text = FILE.replace('type = "sensor_msgs/Imu"', 'type = "a/B"\nprior = "data"')
+    flags = ("--sources", str(written(text)), "--uri", "ws://one:9090")
+    assert build(tmp_path, *flags, "--prior-mode", "written").exit_code == 0
+    prior = load_deployment(tmp_path / "out").prior
+    assert (prior.source, prior.path) == (2, "data")
+    refused = build(tmp_path, *flags)
+    assert refused.exit_code == 2
+    assert "says where a written prior comes from: add --prior-mode written" in refused.stderr
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        (
+            "near = ",
+            "naer = ",
+            "line 4: in [[source]] 1: the model has no variable 'naer'; did you mean 'near'?",
+        ),
+        (
+            "near = ",
+            "q = ",
+            "line 4: in [[source]] 1: the model has no variable 'q'; it has near, left, turn",
+        ),
+        ("left = ", "near = ", "line 11: in [[source]] 2: near comes from source 1 already"),
+        (
+            "compression",
+            "compresion",
+            "line 10: unknown key 'compresion' in [[source]] 2; did you mean 'compression'",
+        ),
+        (
+            '"cbor"',
+            '"cbr"',
+            "line 10: compression = 'cbr' in [[source]] 2 is not a value it can have; did you mean 'cbor'",
+        ),
+        (
+            "ranges[3]",
+            "ranges[-3]",
+            "line 11: variables in [[source]] 2: 'ranges[-3]' is no place in a message",
+        ),
+        ("/scan", "scan me", "line 8: topic in [[source]] 2: 'scan me' is no topic name"),
+        ("ws://two:9090", "two:9090", "line 7: uri in [[source]] 2: 'two:9090' is no WebSocket URI"),
+        (
+            'topic = "/imu"',
+            'topic = "/scan"',
+            "line 15: in [[source]] 3: source 2 is the same topic of the same server",
+        ),
+        ('{ left = "ranges[3]" }', "{}", "line 11: in [[source]] 2: nothing is read from it"),
+        (
+            'variables = { left = "ranges[3]" }\n',
+            "",
+            "line 14: in [[source]] 3: source 2 has no 'variables' either",
+        ),
+        ("\n[[source]]\n", "\n[[sources]]\n", "unknown key 'sources'; did you mean 'source'"),
+        ("[[source]]", "[[source", "line 1: "),
+    ],
+)
+def test_mistakes(written, old, new, said):
+    path = written(FILE.replace(old, new))
+    with pytest.raises(BuildError) as caught:
+        read_sources(path, "ws://one:9090").place(VARIABLES)
+    assert str(caught.value).startswith(f"{path}")
+    assert said in str(caught.value)
+
+
+def test_a_variable_that_no_source_has(written):
+    path = written(FILE + 'variables = { turn = "angular_velocity.z" }\n')
+    more = tuple(Variable(name=name, bits=3, values=4) for name in ("back", "front"))
+    file = read_sources(path, "ws://one:9090")
+    assert [each.source for each in file.place(VARIABLES)] == [0, 1, 2]
+    with pytest.raises(BuildError, match="no source has back, front; add them to a source's variables"):
+        file.place(VARIABLES + more)
+
+
+def test_nothing_left_for_the_last(written):
+    path = written(FILE.replace('{ near = "range" }', '{ near = "range", turn = "x" }'))
+    with pytest.raises(
+        BuildError, match=r"line 13: in \[\[source\]\] 3: the other sources have all variables"
+    ):
+        read_sources(path, "ws://one:9090").place(VARIABLES)
+
+
+def test_no_server(written):
+    with pytest.raises(
+        BuildError, match=r"line 2: in \[\[source\]\] 1: it has no uri, and no --uri was given"
+    ):
+        read_sources(written(FILE), None)
+
+
+def test_no_file(tmp_path):
+    with pytest.raises(BuildError, match=r"sources.toml: No such file"):
+        read_sources(tmp_path / "sources.toml", None)
+
+
+@pytest.mark.parametrize(
+    ("flags", "said"),
+    [
+        (("--topic", "/t"), "--topic /t: the file of --sources says that"),
+        (("--type", "a/B"), "--type a/B: the file of --sources says that"),
+        (("--prior-path", "p"), "--prior-path p: the file of --sources says that"),
+    ],
+)
+def test_flags_that_say_the_same(tmp_path, written, flags, said):
+    result = build(tmp_path, "--sources", str(written(FILE)), *flags)
+    assert result.exit_code == 2
+    assert said in result.stderr
+
+
+@given(st.text(st.sampled_from("ab_3[].x-"), max_size=12) | st.from_regex(_PATH, fullmatch=True))
+def test_a_place_is_what_the_subscriber_takes(path):
+    try:
+        parse_path(path)
+        taken = True
+    except PathError:
+        taken = False
+    assert bool(_PATH.fullmatch(path)) == taken
+
+
+def test_many_sources_are_too_many(written):
+    table = '[[source]]\nuri = "ws://one:9090"\ntopic = "/t{}"\ntype = "a/B"\nvariables = {{ near = "x" }}\n'
+    with pytest.raises(BuildError, match="at most 256 items"):
+        read_sources(written("".join(map(table.format, range(257)))), None)
+
+
+def test_the_example_of_the_documentation(written):
+    page = (Path(__file__).parents[2] / "docs" / "deployment.md").read_text()
+    (example,) = re.findall(r"^```toml\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    file = read_sources(written(example), "ws://robot:9090")
+    names = ("ahead", "colour", "left", "near", "turn")
+    placed = file.place(tuple(Variable(name=name, bits=3, values=4) for name in names))
+    assert [(each.source, each.path) for each in placed] == [
+        (1, "ranges[0]"),
+        (3, "data[2]"),
+        (1, "ranges[90]"),
+        (0, "range"),
+        (2, "angular_velocity.z"),
+    ]
+    assert file.sources[1].uri == "ws://lidar-computer:9090"
