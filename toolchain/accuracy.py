@@ -69,6 +69,7 @@ class ZScores:
     Attributes:
         cycles: The length c.
         counts: How many counts were looked at.
+        draws: How many independent draws of random numbers those come from, which the intervals rest on: the banks.
         rms: Root of the mean square: 1 where streams are as good as independent bits, 1.6 where the variance is 2.6 times that.
         mean: 0 where they are unbiased.
         beyond_three: Share beyond 3 either way; 0.0027 of normal ones.
@@ -76,6 +77,7 @@ class ZScores:
 
     cycles: int
     counts: int
+    draws: int
     rms: Interval
     mean: Interval
     beyond_three: float
@@ -264,25 +266,27 @@ def _z_scores(
     weights: list[NDArray[np.float64]],
     cycles: int,
 ) -> ZScores | None:
-    squares: list[float] = []
-    sums: list[float] = []
-    sizes: list[int] = []
+    # Frames with the same bank share all random numbers: a bank is one draw, however many frames use it.
+    free = boards.parameters.rng_reset is RngReset.FREE
+    drawn: dict[int, NDArray[np.float64]] = {}
     beyond = 0
     for frame, chance in zip(places, weights, strict=True):
         addresses, row = readings.of_machine(frame, boards.machines[0])
-        ran = boards.run_for(addresses, row, frame % boards.parameters.rng_banks, cycles)
+        bank = frame % boards.parameters.rng_banks
+        ran = boards.run_for(addresses, row, bank, cycles)
         looked_at = (chance * cycles >= EXPECTED_COUNT) & (chance < 1)
         if not looked_at.any():
             continue
         p = chance[looked_at]
         z = (np.concatenate(ran.counts)[looked_at] - cycles * p) / np.sqrt(cycles * p * (1 - p))
-        squares.append(float((z**2).sum()))
-        sums.append(float(z.sum()))
-        sizes.append(len(z))
+        sums = np.array([(z**2).sum(), z.sum(), len(z)])
+        key = frame if free else bank
+        drawn[key] = drawn[key] + sums if key in drawn else sums
         beyond += int((np.abs(z) > 3).sum())
-    if not sizes:
+    if not drawn:
         return None
-    table = np.array([squares, sums, sizes]).T
+    table = np.array(list(drawn.values()))
+    counts = int(table[:, 2].sum())
 
     def root_mean_square(rows: NDArray[np.float64]) -> float:
         return math.sqrt(rows[:, 0].sum() / rows[:, 2].sum())
@@ -292,10 +296,11 @@ def _z_scores(
 
     return ZScores(
         cycles=cycles,
-        counts=sum(sizes),
+        counts=counts,
+        draws=len(table),
         rms=_bootstrap_rows(table, root_mean_square),
         mean=_bootstrap_rows(table, mean),
-        beyond_three=beyond / sum(sizes),
+        beyond_three=beyond / counts,
     )
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, TypeVar
 
 import numpy as np
 
@@ -32,6 +32,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from toolchain.readings import Readings
+
+_Word = TypeVar("_Word", np.uint16, np.uint32)
 
 SIDE: Final = 100.0
 """Of the square in which the boat is, in metres."""
@@ -177,9 +179,13 @@ class FaultyMachine:
 
     def __init__(self, machine: BM1Machine, *, seed: int) -> None:
         self._machine = machine
-        self._random = np.random.default_rng(seed)
+        self.reseed(seed)
         self._numbers = random_numbers(machine)
         self._shown: dict[int, NDArray[np.uint16]] = {}
+
+    def reseed(self, seed: int) -> None:
+        """Flip other bits from now on."""
+        self._random = np.random.default_rng(seed)
 
     def counts(
         self,
@@ -257,12 +263,13 @@ def _faults(frames: int, seed: int, advance: Callable[[str], None]) -> dict[str,
         for frame in range(frames)
     ]
     found: dict[str, list[Fault]] = {}
+    faulty = FaultyMachine(machine, seed=seed)
     for name, kind in _KINDS.items():
         faults = []
         for number, rate in enumerate(RATES):
             advance(f"{name}, {rate:g} flipped")
             random = np.random.default_rng([seed, number])
-            faulty = FaultyMachine(machine, seed=seed + number)
+            faulty.reseed(seed + number)
             variations = []
             for frame in range(frames):
                 ours = kind(faulty, codes[frame], likelihoods[frame], rate, random, frame)
@@ -381,13 +388,12 @@ def _floating_point(
     return posterior
 
 
-def _flipped(
-    words: NDArray[np.uint16] | NDArray[np.uint32], width: int, rate: float, random: np.random.Generator
-) -> NDArray[np.uint32]:
+def _flipped(words: NDArray[_Word], width: int, rate: float, random: np.random.Generator) -> NDArray[_Word]:
     """The words with each of their low bits flipped with this probability."""
     flips = random.random((*words.shape, width)) < rate
     mask = (flips.astype(np.uint64) << np.arange(width, dtype=np.uint64)).sum(axis=-1)
-    return (words.astype(np.uint64) ^ mask).astype(np.uint32)
+    faulty: NDArray[_Word] = words ^ mask.astype(words.dtype)
+    return faulty
 
 
 _KINDS: Final = {

@@ -36,8 +36,8 @@ if TYPE_CHECKING:
 MAX_POINTS: Final = 10_000
 MAX_FILE_BYTES: Final = 1 << 28
 
-_NOWHERE: Final = {"uri": "ws://nowhere:9090", "topic": "/readings", "type": "std_msgs/Float64"}
-"""A sweep has no robot; these stand where a build has one."""
+_BEGIN: Final = b'{"key":"'
+"""How every line of results begins."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -82,7 +82,9 @@ class Sweep:
                 message = f"a target count of {target} stops nothing: expected 1 or more"
                 raise BuildError(message)
             yield BuildOptions(
-                **_NOWHERE,
+                uri="ws://nowhere:9090",  # a sweep has no robot
+                topic="/readings",
+                type="std_msgs/Float64",
                 partitions=self.partitions,
                 scale=scale,
                 prob_bits=prob_bits,
@@ -272,7 +274,6 @@ class Results:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.points: dict[str, Point] = {}
-        self._torn = False
         try:
             content = path.read_bytes() if path.exists() else b""
         except OSError as reason:
@@ -283,7 +284,10 @@ class Results:
             raise BuildError(message)
         lines = content.split(b"\n")
         # A power cut in the middle of a line leaves a last line without its end: that point is measured again.
-        self._torn = lines.pop() != b""
+        torn = lines.pop()
+        if torn and not torn.startswith(_BEGIN[: len(torn)]):
+            lines.append(torn)
+        self._torn_at = len(content) - len(torn) if torn else None
         for number, line in enumerate(lines, start=1):
             try:
                 point = Point.model_validate_json(line)
@@ -298,9 +302,11 @@ class Results:
         Raises:
             BuildError: The file can't be written.
         """
-        line = ("\n" if self._torn else "") + point.model_dump_json() + "\n"
-        self._torn = False
+        line = point.model_dump_json() + "\n"
         try:
+            if self._torn_at is not None:
+                os.truncate(self.path, self._torn_at)
+                self._torn_at = None
             descriptor = os.open(self.path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
             try:
                 written = os.write(descriptor, line.encode())

@@ -321,7 +321,7 @@ def _accuracy_part(found: Inspection) -> str:
     if accuracy.z is not None:
         z = accuracy.z
         rows.append(
-            f"  z-scores of {z.counts:,} counts in runs of {z.cycles:,} cycles against equation 2.1: root mean square "
+            f"  z-scores of {z.counts:,} counts from {z.draws:,} draws of random numbers, {z.cycles:,} cycles each, against equation 2.1: root mean square "
             f"{_interval(z.rms, '.2f')} (1 is ideal), mean {_interval(z.mean, '.2f')}, beyond 3: {z.beyond_three:.2%} "
             "(0.27 % is normal)."
         )

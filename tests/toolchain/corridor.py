@@ -1,0 +1,50 @@
+"""A small model and its machine, for tests that look at machines from outside."""
+
+import numpy as np
+
+from machines.bm1 import BM1Machine
+from machines.parameters import BM1Parameters
+from toolchain.conditional import normal
+from toolchain.model import Known, Model, PriorSelect, cell_centres, interval
+from toolchain.quantise import quantise
+
+
+def corridor(cells=12, *, sigma=1.0, select=False, missing=False):
+    """A corridor of ten metres: a range, a loudness that may be missing, and a prior that may be selected."""
+    place = interval("x", 0.0, 10.0, cells=cells)
+    (x,) = cell_centres(place)
+    loud = 0.05 + 0.9 * np.exp(-x / 3)
+    rows = np.stack([np.exp(-x / 4), np.exp(x / 4), np.ones(cells)])
+    return Model(
+        name="corridor",
+        searched=(place,),
+        known=(
+            normal(
+                "range",
+                mean=x,
+                sigma=sigma,
+                values=21,
+                step=0.5,
+                on_missing="missing" if missing else "error",
+            ),
+            Known(
+                name="loud", table=np.array([1 - loud, loud]), on_missing="missing" if missing else "error"
+            ),
+        ),
+        prior_select=PriorSelect(name="door", table=rows / rows.sum(axis=1, keepdims=True))
+        if select
+        else None,
+    )
+
+
+def machine_of(model, *, prob_bits=8, **others):
+    """The model's machine on one board."""
+    quantised = quantise(model, prob_bits=prob_bits)
+    parameters = BM1Parameters(
+        lines=model.lines,
+        sensor_bits=tuple(known.bits for known in model.known),
+        prior_bits=0 if model.prior_select is None else model.prior_select.bits,
+        prob_bits=prob_bits,
+        **others,
+    )
+    return BM1Machine(parameters, quantised.prior, quantised.tables)
