@@ -24,7 +24,7 @@ from services.command_line import ends_well, make_app, run_async
 from services.errors import SettingsError
 from services.logs import say
 from services.result_file import ResultFile, open_result_file, record
-from services.result_picture import Axis, axes_of, in_colour, picture, printable
+from services.result_picture import ROWS, Axis, axes_of, in_colour, picture, printable
 from services.serving import deployment_for
 from services.settings import Settings, load_settings
 from toolchain.deployment import Deployment
@@ -32,6 +32,8 @@ from toolchain.deployment import Deployment
 _QUEUE_SIZE: Final = 1024
 """Frames that may wait for a slow terminal or a slow disk."""
 _PICTURES_A_SECOND: Final = 10
+_WORDS: Final = 7
+"""Lines of a terminal that are left for what is said beside a picture."""
 
 Show = Callable[[Heard, list[Axis]], None]
 
@@ -155,12 +157,13 @@ def _drawing() -> Iterator[Show]:
     """On a terminal one picture that changes, elsewhere one below the other."""
     console = Console(highlight=False, markup=False)
     colour = in_colour(console)
+    rows = max(console.height - _WORDS, 2) if console.is_terminal else ROWS
 
     def drawn(heard: Heard, axes: list[Axis]) -> Group | Text:
         words = Text(line(heard, axes))
         if not isinstance(heard, Posterior):
             return words
-        return Group(words, picture(heard, axes, width=console.width, colour=colour))
+        return Group(words, picture(heard, axes, width=console.width, rows=rows, colour=colour))
 
     if not console.is_terminal:
         yield lambda heard, axes: console.print(drawn(heard, axes))

@@ -80,7 +80,7 @@ def in_colour(console: Console) -> bool:
     return console.color_system is not None and not console.no_color
 
 
-def picture(posterior: Posterior, axes: list[Axis], *, width: int, colour: bool) -> Text:
+def picture(posterior: Posterior, axes: list[Axis], *, width: int, colour: bool, rows: int = ROWS) -> Text:
     """Draw a posterior.
 
     Args:
@@ -88,20 +88,21 @@ def picture(posterior: Posterior, axes: list[Axis], *, width: int, colour: bool)
         axes: of it, in its order.
         width: characters across.
         colour: whether cells are coloured; else they are characters from " " to "@".
+        rows: lines at most, four for words not counted.
     """
-    width = min(width, WIDTH)
+    width, rows = min(width, WIDTH), max(min(rows, ROWS), 2)
     if len(axes) == 1:
-        return _bars(posterior.values, axes[0], width, colour)
+        return _bars(posterior.values, axes[0], width, rows, colour)
     largest = sorted(sorted(range(len(axes)), key=lambda at: -axes[at].size)[:2])
     down, across = (axes[at] for at in largest)
-    text = _heat(posterior.marginal(down.label, across.label), down, across, width, colour)
+    text = _heat(posterior.marginal(down.label, across.label), down, across, (width, rows), colour)
     if summed := [printable(axis.label) for at, axis in enumerate(axes) if at not in largest]:
         text.append(f"\nsummed over {', '.join(summed)}")
     return text
 
 
-def _bars(values: npt.NDArray[np.float64], axis: Axis, width: int, colour: bool) -> Text:
-    step = -(-axis.size // ROWS)
+def _bars(values: npt.NDArray[np.float64], axis: Axis, width: int, rows: int, colour: bool) -> Text:
+    step = -(-axis.size // rows)
     blocks = _blocks(values, step, 0)
     names = [_range(axis, at * step, min((at + 1) * step, axis.size) - 1) for at in range(len(blocks))]
     wide = max(map(len, names))
@@ -117,11 +118,14 @@ def _bars(values: npt.NDArray[np.float64], axis: Axis, width: int, colour: bool)
     return text
 
 
-def _heat(values: npt.NDArray[np.float64], down: Axis, across: Axis, width: int, colour: bool) -> Text:
+def _heat(
+    values: npt.NDArray[np.float64], down: Axis, across: Axis, room: tuple[int, int], colour: bool
+) -> Text:
+    width, rows = room
     ends = [down.shown(0), down.shown(down.size - 1)]
     margin = max(*map(len, ends), len(printable(down.label))) + 1
     columns = max((width - margin - 2) // 2, 4)
-    down_step, across_step = -(-down.size // ROWS), -(-across.size // columns)
+    down_step, across_step = -(-down.size // rows), -(-across.size // columns)
     blocks = _blocks(_blocks(values, down_step, 0), across_step, 1)
     text = Text(no_wrap=True, overflow="crop")
     text.append(f"{printable(down.label):>{margin - 1}}\n")

@@ -7,6 +7,8 @@ import asyncio
 import contextlib
 import itertools
 import json
+import os
+import pty
 import re
 import signal
 import subprocess
@@ -108,6 +110,39 @@ async def test_pictures_without_colour(stage, stack, boat):
     assert await listen.end() == 0
     assert "\x1b" not in listen.out
     assert listen.out.count("@@") == 2
+
+
+@pytest.mark.parametrize("asked", [{}, {"NO_COLOR": "1"}])
+async def test_on_a_terminal_one_picture_changes(stack, asked):
+    _, uri = stack
+    ours, its = pty.openpty()
+    environment = {key: value for key, value in os.environ.items() if key != "NO_COLOR"}
+    listen = subprocess.Popen(
+        [str(BIN / "listen"), "--uri", uri, "--plot", "--count", "4"],
+        stdout=its,
+        stderr=subprocess.DEVNULL,
+        env=environment | {"TERM": "xterm-256color", "LINES": "24", "COLUMNS": "80"} | asked,
+    )
+    os.close(its)
+
+    def read() -> str:
+        shown = b""
+        with contextlib.suppress(OSError):  # the other end was closed
+            while part := os.read(ours, 1 << 16):
+                shown += part
+        return shown.decode()
+
+    try:
+        async with asyncio.timeout(PATIENCE):
+            shown = await asyncio.to_thread(read)
+        assert listen.wait(PATIENCE) == 0
+    finally:
+        listen.kill()
+        os.close(ours)
+    assert "\x1b[2K" in shown  # a line that is drawn again
+    assert ("\x1b[48;5;" in shown) == (not asked)
+    assert ("@@" in shown) == bool(asked)
+    assert shown.endswith("\x1b[?25h")  # the cursor is back
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
