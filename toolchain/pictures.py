@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from toolchain.claims import Claims
     from toolchain.explore import Point
 
-_DPI: Final = 90
+_DPI: Final = 75
 _COLOURS: Final = ("#4477aa", "#ee6677", "#228833", "#ccbb44", "#66ccee", "#aa3377", "#bbbbbb")
 _MARKERS: Final = "osD^v<>P"
 
