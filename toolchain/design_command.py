@@ -57,7 +57,12 @@ def inspect_(
     readings: _Readings = None,
     reading: _Columns = None,
     tolerance: _Tolerance = 0.1,
-    frames: _Frames = 200,
+    frames: Annotated[
+        int | None,
+        typer.Option(
+            help="Frames of readings at most; default 200, or 20 of a machine that is slow to emulate."
+        ),
+    ] = None,
     banks: _Banks = 4,
     seed: _Seed = 1,
     clock: Annotated[float, typer.Option(help="The boards' clock, hertz.")] = 100e6,
@@ -100,8 +105,7 @@ def inspect_(
             device=device,
             pcie=Pcie.SOFT if soft_pcie else Pcie.HARD,
         )
-        with counting(frames) as advance:
-            found = inspect(directory, options, advance)
+        found = inspect(directory, options, counting)
         typer.echo(as_json(found) if json else report(found), nl=False)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Final
 
@@ -20,7 +21,8 @@ from toolchain.readings import model_of_codes, recorded_readings, sample_reading
 from toolchain.resources import Pcie, Tables, device_named, estimate
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
+    from contextlib import AbstractContextManager
     from pathlib import Path
 
     from machines.bm1 import BM1Machine
@@ -32,7 +34,12 @@ if TYPE_CHECKING:
     from toolchain.readings import Readings
     from toolchain.resources import Estimate
 
+    Counting = AbstractContextManager[Callable[[], None]]
+
 CLOCK_MAX_HZ: Final = 1e12
+FRAMES: Final = 200
+SLOW_FRAMES: Final = 20
+"""Of machines that run a cycle at a time: one generator a cell, or no LFSRs."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -47,7 +54,7 @@ class InspectOptions:
         recording: Recorded readings, or None to draw them.
         columns: `NAME=COLUMN`s of the recording.
         tolerance_s: In a bag, how far from a row another topic's message may be, seconds.
-        frames: How many frames at most.
+        frames: How many frames at most; None for 200, or 20 of a machine that only the slow kernel runs.
         banks: Sets of seeds that each is run with.
         seed: Of the readings that are drawn.
         clock_hz: The clock that times are said at.
@@ -62,7 +69,7 @@ class InspectOptions:
     recording: Path | None = None
     columns: tuple[str, ...] = ()
     tolerance_s: float = 0.1
-    frames: int = 200
+    frames: int | None = None
     banks: int = 4
     seed: int = 1
     clock_hz: float = 100e6
@@ -87,15 +94,21 @@ class Inspection:
     clock_hz: float
 
 
+@contextmanager
+def uncounted(_frames: int) -> Iterator[Callable[[], None]]:
+    """Tell nobody how far it is."""
+    yield lambda: None
+
+
 def inspect(
-    directory: Path, options: InspectOptions, advance: Callable[[], None] = lambda: None
+    directory: Path, options: InspectOptions, counting: Callable[[int], Counting] = uncounted
 ) -> Inspection:
     """Look at a deployment.
 
     Args:
         directory: The folder that `toolchain build` wrote.
         options: With what.
-        advance: Called after every frame.
+        counting: Told how many frames there are, it gives what is called after each.
 
     Raises:
         ToolchainError: No deployment, a model that it was not built from, or options that mean nothing.
@@ -132,6 +145,8 @@ def inspect(
             pcie=options.pcie,
             tables=Tables.COLUMN,
         )
+    with counting(len(readings)) as advance:
+        accuracy = measure(boards, readings, model, banks=options.banks, advance=advance)
     return Inspection(
         deployment=deployment,
         machine=whole,
@@ -139,7 +154,7 @@ def inspect(
         losses=losses,
         reported_losses=_reported(directory),
         readings=readings,
-        accuracy=measure(boards, readings, model, banks=options.banks, advance=advance),
+        accuracy=accuracy,
         resources=resources,
         column_resources=side_by_side,
         energy=energy(machines, readings),
@@ -191,12 +206,15 @@ def _model(
 def _readings(
     deployment: Deployment, whole: BM1Machine, model: Model | None, options: InspectOptions
 ) -> Readings:
+    frames = options.frames
+    if frames is None:
+        frames = FRAMES if whole.parameters.shared and whole.parameters.rng.lfsr_bits else SLOW_FRAMES
     if options.recording is not None:
         return recorded_readings(
             options.recording,
             deployment.variables,
             options.columns,
-            frames=options.frames,
+            frames=frames,
             tolerance_s=options.tolerance_s,
         )
     if options.columns:
@@ -205,10 +223,10 @@ def _readings(
         )
         raise BuildError(message)
     if model is not None:
-        return sample_readings(model, options.frames, seed=options.seed)
+        return sample_readings(model, frames, seed=options.seed)
     drawn_from = model_of_codes(deployment.name, deployment.searched, deployment.variables, whole)
-    source = f"{options.frames} frames drawn from what the codes say of the model (seed {options.seed})"
-    return sample_readings(drawn_from, options.frames, seed=options.seed, source=source)
+    source = f"{frames} frames drawn from what the codes say of the model (seed {options.seed})"
+    return sample_readings(drawn_from, frames, seed=options.seed, source=source)
 
 
 def _reported(directory: Path) -> str:
