@@ -2,12 +2,11 @@
 
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any
+from typing import Any, NamedTuple
 
 
-@dataclass(frozen=True, slots=True)
-class MessageReceived:
-    """A message of a subscribed topic: for which of this client's subscriptions."""
+class MessageReceived(NamedTuple):
+    """A message of a subscribed topic: for which of this client's subscriptions (a tuple: made in a third of the time)."""
 
     topic: str
     msg: dict[str, Any]

@@ -126,9 +126,8 @@ class Subscription(_Handle):
             if queue[0].blind_seconds:
                 message = self._keep_blind(message)
         queue.append(message)
-        waiter = self._waiter
-        if waiter is not None and not waiter.done():
-            waiter.set_result(None)
+        if self._waiter is not None:
+            self._wake()
 
     def _note_blind(self, seconds: float) -> None:
         seconds = min(seconds, time.monotonic() - self._begun)
@@ -153,17 +152,26 @@ class Subscription(_Handle):
         while not queue:
             if self._closed:
                 raise StopAsyncIteration
-            if self._waiter is not None:
-                raise ConcurrentReadError(
-                    f"another task waits for messages of {self.topic} already: a second reader needs a "
-                    "subscription of its own"
-                )
-            self._waiter = asyncio.get_running_loop().create_future()
-            try:
-                await self._waiter
-            finally:
-                self._waiter = None
+            await self._news()
         return queue.popleft()
+
+    async def _news(self) -> None:
+        """Wait until something has come, the subscription has ended, or the time is over (see `next`)."""
+        if self._waiter is not None:
+            raise ConcurrentReadError(
+                f"another task waits for messages of {self.topic} already: a second reader needs a "
+                "subscription of its own"
+            )
+        self._waiter = asyncio.get_running_loop().create_future()
+        try:
+            await self._waiter
+        finally:
+            self._waiter = None
+
+    def _wake(self) -> None:
+        waiter = self._waiter
+        if waiter is not None and not waiter.done():
+            waiter.set_result(None)
 
     async def next(self, timeout: float) -> Message:  # noqa: ASYNC109  # the limit is part of the error
         """Wait for one message.
@@ -177,14 +185,29 @@ class Subscription(_Handle):
             DisconnectedError: subscription or client are closed.
             ConcurrentReadError: another task waits here.
         """
+        queue = self._queue
+        if queue:
+            return queue.popleft()
         begun = time.monotonic()
+        over = False
+
+        def end() -> None:
+            nonlocal over
+            over = True
+            self._wake()
+
+        # asyncio.timeout would take longer than all the rest.
+        timer = asyncio.get_running_loop().call_later(timeout, end)
         try:
-            async with asyncio.timeout(timeout):
-                return await self.__anext__()
-        except TimeoutError:
-            why = await self._why_silent() or self._session.said_since(begun)
-        except StopAsyncIteration:
-            raise DisconnectedError(f"the subscription of {self.topic} is closed") from None
+            while not queue and not over:
+                if self._closed:
+                    raise DisconnectedError(f"the subscription of {self.topic} is closed")
+                await self._news()
+        finally:
+            timer.cancel()
+        if queue:
+            return queue.popleft()
+        why = await self._why_silent() or self._session.said_since(begun)
         raise NoMessageError(
             f"no message of {self.topic} came from {self._session.uri} within {timeout:g} s{why}"
         )
@@ -216,8 +239,7 @@ class Subscription(_Handle):
     def end(self) -> None:
         """End the iteration, after what waits in the queue."""
         super().end()
-        if self._waiter is not None and not self._waiter.done():
-            self._waiter.set_result(None)
+        self._wake()
 
     def _take_back(self) -> None:
         del self._session.receivers[self._number]
@@ -278,7 +300,9 @@ class Publication(_Handle):
                 await session.wait_turn(f"a message of {self.topic}", timeout)
             finally:
                 self._waiting -= 1
-        await session.send(self._written(msg))
+        session.send_now(self._written(msg))
+        if session.is_others_turn():
+            await asyncio.sleep(0)
 
     @property
     def must_wait(self) -> bool:

@@ -97,6 +97,7 @@ class _Advertised:
     queue_size: int
     qos: Qos | None
     wire_id: str
+    prefix: bytes  # of its messages on the wire; a brace completes them
     holders: set[int] = field(default_factory=set)
     latched: bytes | None = None  # the last message, said again after a reconnection
 
@@ -268,7 +269,9 @@ class ClientCore:
         key = absolute(topic)
         advertised = self._advertised.get(key)
         if advertised is None:
-            advertised = _Advertised(topic, type_name, latch, queue_size, qos, f"advertise:{topic}:{number}")
+            prefix = b'{"op":"publish","topic":"%b","msg":' % topic.encode()
+            wire_id = f"advertise:{topic}:{number}"
+            advertised = _Advertised(topic, type_name, latch, queue_size, qos, wire_id, prefix)
             self._advertised[key] = advertised
             self._send_advertise(advertised)
         elif not same_type(advertised.type, type_name) or advertised.latch != latch or advertised.qos != qos:
@@ -299,17 +302,17 @@ class ClientCore:
             EncodeError: the message cannot leave as JSON; a NaN or an infinity is named with its place.
         """
         advertised = self._advertisements[advertisement]
-        before, after = b'{"op":"publish","topic":"%b","msg":' % advertised.topic.encode(), b"}"
+        prefix = advertised.prefix
         try:
             body = encode(
                 msg,
                 nonfinite="refuse",
-                max_size=self._max_size - len(before) - len(after),
+                max_size=self._max_size - len(prefix) - 1,
                 max_depth=self._max_depth - 1,
             )
         except EncodeError as error:
             raise EncodeError(f"a message of {advertised.topic} cannot be published: {error}") from None
-        data = before + body + after
+        data = b"%b%b}" % (prefix, body)
         if advertised.latch:
             advertised.latched = data
         return data

@@ -83,8 +83,8 @@ class Message(NamedTuple):
     Attributes:
         topic: as the server names it.
         msg: the ROS message; shared by all subscriptions of the topic, so not to be changed.
-        received_ns: ``time.time_ns()`` at its arrival.
-        received_monotonic_ns: ``time.monotonic_ns()`` at its arrival.
+        received_ns: ``time.time_ns()`` at its arrival, the same for all that the socket brought at once.
+        received_monotonic_ns: ``time.monotonic_ns()`` then.
         blind_seconds: for how long, before this message, nothing could be heard because the connection was lost;
             0 but for the first message after a reconnection.
     """
@@ -238,7 +238,7 @@ class Session:
             max_size=self._limits.max_size,
             ping_interval=self._limits.ping_interval,
             ping_timeout=self._limits.ping_timeout,
-            on_message=self._take,
+            on_messages=self._take,
             on_lost=self._lost,
         )
         self._websocket = websocket
@@ -380,13 +380,13 @@ class Session:
         else:
             self._send_pieces(self._open_websocket(), data)
 
-    async def send(self, data: bytes) -> None:
-        """Hand a message to the socket; every now and then other tasks get their turn after it. Errors as `send_now`."""
-        self.send_now(data)
+    def is_others_turn(self) -> bool:
+        """Whether so many messages were sent in a row that other tasks are to get their turn. Ask after each."""
         self._in_a_row += 1
-        if self._in_a_row >= _IN_A_ROW:
-            self._in_a_row = 0
-            await asyncio.sleep(0)
+        if self._in_a_row < _IN_A_ROW:
+            return False
+        self._in_a_row = 0
+        return True
 
     def together(self) -> AbstractContextManager[None]:
         """Have what is sent inside leave in one piece (see `bridge.client.Ros.together`)."""
@@ -473,15 +473,19 @@ class Session:
 
     # Receiving
 
-    def _take(self, data: bytes) -> None:
+    def _take(self, messages: list[bytes]) -> None:
         received_ns, received_monotonic_ns = time.time_ns(), time.monotonic_ns()
-        event = self.core.receive(data, received_monotonic_ns * 1e-9)
-        if type(event) is MessageReceived:
-            message = Message(event.topic, event.msg, received_ns, received_monotonic_ns)
-            for number in event.subscriptions:
-                self.receivers[number](message)
-        else:
-            self._take_other(event)
+        now = received_monotonic_ns * 1e-9
+        receive, receivers = self.core.receive, self.receivers
+        for data in messages:
+            event = receive(data, now)
+            if type(event) is MessageReceived:
+                topic, msg, subscriptions = event
+                message = Message(topic, msg, received_ns, received_monotonic_ns)
+                for number in subscriptions:
+                    receivers[number](message)
+            else:
+                self._take_other(event)
 
     def _take_other(self, event: Event | None) -> None:
         match event:

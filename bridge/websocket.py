@@ -1,14 +1,19 @@
 """One WebSocket connection: opened with clear errors, each message handed over at once, a silent peer noticed.
 
-A message goes from the socket's callback straight to its receiver: no queue and no task in between. Liveness is
-watched here rather than by the library's keepalive, so that anything the peer sends counts as a sign of life and
-a silent one is given up within ``ping_interval + ping_timeout``.
+A message goes from the socket's callback straight to its receiver: no queue and no task in between. Whole messages
+are found and written by `frames`; handshake, control frames, fragments, whatever is broken and the end are the
+library's. It is given whole frames alone, so it always stands between two of them (``_framed``); once anything is
+wrong or ends, all that comes is the library's.
+
+Liveness is watched here rather than by the library's keepalive, so that anything the peer sends counts as a sign
+of life and a silent one is given up within ``ping_interval + ping_timeout``.
 """
 
 import asyncio
 import logging
 import socket
 import ssl
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from http import HTTPStatus
@@ -19,6 +24,7 @@ from websockets.client import ClientProtocol
 from websockets.exceptions import (
     InvalidHandshake,
     InvalidMessage,
+    InvalidState,
     InvalidStatus,
     InvalidURI,
     PayloadTooBig,
@@ -28,6 +34,7 @@ from websockets.protocol import Event, State
 from websockets.uri import WebSocketURI, parse_uri
 
 from bridge.errors import AccessRefusedError, BridgeError, NotRosbridgeError, UnreachableError, UriError
+from bridge.frames import UNKNOWN, UNSOUND, frame_end, mask_keys, masked_text, whole_messages
 from bridge.json_codec import excerpt
 from bridge.route import Route, connect_along, shown
 
@@ -35,6 +42,7 @@ from bridge.route import Route, connect_along, shown
 WRITE_LIMIT: Final = 1 << 16
 #: Seconds that the closing handshake may take.
 CLOSE_TIMEOUT: Final = 1.0
+_END_OF_HANDSHAKE: Final = b"\r\n\r\n"
 #: Seconds by which the watch may be late before that counts as this process having slept, not the peer.
 _OVERSLEPT: Final = 0.5
 
@@ -84,7 +92,7 @@ class WebSocket(ClientConnection):
         *,
         ping_interval: float,
         ping_timeout: float,
-        on_message: Callable[[bytes], None],
+        on_messages: Callable[[list[bytes]], None],
         on_lost: Callable[["WebSocket", str], None],
     ) -> None:
         """Prepare the connection; `open_websocket` makes and opens it."""
@@ -99,14 +107,20 @@ class WebSocket(ClientConnection):
         self.opened = False
         self.first_bytes = b""
         self._early: list[Frame] = []
-        self._on_message = on_message
+        self._on_messages = on_messages
         self._on_lost = on_lost
         self._interval = ping_interval
         self._patience = ping_timeout
         self._last_heard = self.loop.time()
         self._pinged = False
         self._watch: asyncio.TimerHandle | None = None
+        self._handshake = b""
+        self._framed = False
+        self._rest = bytearray()
+        self._wanted = 0
+        self._largest = protocol.max_message_size or sys.maxsize
         self._begun: bytearray | None = None
+        self._keys = mask_keys()
         self._silent_for = 0.0
         self._held = 0
 
@@ -131,8 +145,15 @@ class WebSocket(ClientConnection):
 
     def send_now(self, data: bytes) -> None:
         """Hand one text message to the socket (or to its buffer, without limit: see ``paused`` and ``drain``)."""
-        self.protocol.send_text(data)
-        self.send_data()
+        protocol = self.protocol
+        if protocol.state is not State.OPEN:
+            raise InvalidState(f"connection is {protocol.state.name.lower()}")
+        frame = masked_text(data, next(self._keys))
+        if self._held or protocol.writes:
+            protocol.writes.append(frame)
+            self.send_data()
+        else:
+            self.transport.write(frame)
 
     @contextmanager
     def together(self) -> Iterator[None]:
@@ -165,8 +186,81 @@ class WebSocket(ClientConnection):
         """Take bytes from the socket."""
         self._last_heard = self.loop.time()
         self._pinged = False
+        if self._framed:
+            self._take_frames(data)
+            return
         if not self.opened:
             self.first_bytes = (self.first_bytes + data)[:64]
+            if self.protocol.state is State.CONNECTING:
+                self._take_handshake(data)
+                return
+        self._give_library(data)
+
+    def eof_received(self) -> None:
+        """Take note that the peer says nothing more."""
+        self._give_rest()
+        super().eof_received()
+
+    def _take_handshake(self, data: bytes) -> None:
+        """Give the library the answer to the handshake, up to where frames begin."""
+        before = self._handshake
+        end = (before + data).find(_END_OF_HANDSHAKE)
+        if end < 0:
+            self._handshake = (before + data)[-len(_END_OF_HANDSHAKE) + 1 :]
+            self._give_library(data)
+            return
+        frames = end + len(_END_OF_HANDSHAKE) - len(before)
+        self._give_library(data[:frames])
+        # A refusal may have a body: that is the library's too.
+        self._framed = self.protocol.state is State.OPEN
+        if frames < len(data):
+            (self._take_frames if self._framed else self._give_library)(data[frames:])
+
+    def _take_frames(self, data: bytes) -> None:
+        """Take frames: hand whole messages over, have the library read each of the others."""
+        if self._rest:
+            self._rest += data
+            if len(self._rest) < self._wanted:
+                return
+            data = bytes(self._rest)
+            self._rest.clear()
+        at, size = 0, len(data)
+        while at < size:
+            begun = self.protocol.current_size  # bytes of a message in several frames, None outside of one
+            if begun is None and self.opened:
+                messages, at = whole_messages(data, at, masked=False, largest=self._largest)
+                if messages:
+                    self._on_messages(messages)
+                if at == size:
+                    return
+            end = frame_end(data, at, masked=False, largest=self._largest - (begun or 0))
+            if end == UNKNOWN or end > size:
+                self._rest += data[at:]
+                self._wanted = (
+                    end - at
+                )  # less than there is if nobody knows yet: then the next bytes are looked at
+                return
+            if end == UNSOUND:
+                self._framed = False
+                end = size
+            self._give_library(data[at:end])
+            at = end
+            if self.protocol.state is not State.OPEN:
+                self._framed = False
+                if at < size:
+                    self._give_library(data[at:])
+                return
+
+    def _give_rest(self) -> None:
+        """Give the library what there is of a frame, and all that may come after it."""
+        if self._framed:
+            self._framed = False
+            if self._rest:
+                self.protocol.receive_data(bytes(self._rest))
+                self._rest.clear()
+
+    def _give_library(self, data: bytes) -> None:
+        """Have the library read some bytes, and do what comes of it."""
         super().data_received(data)
         if self.protocol.state is not State.OPEN:
             if not self.opened and self.protocol.handshake_exc is not None:
@@ -184,7 +278,7 @@ class WebSocket(ClientConnection):
             self._early.append(event)
             return
         if self._begun is None and event.fin:
-            self._on_message(bytes(event.data))
+            self._on_messages([bytes(event.data)])
             return
         # In several frames. Their sizes together are limited by the protocol.
         if self._begun is None:
@@ -192,10 +286,11 @@ class WebSocket(ClientConnection):
         self._begun += event.data
         if event.fin:
             whole, self._begun = bytes(self._begun), None
-            self._on_message(whole)
+            self._on_messages([whole])
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Take note of the end, and tell it."""
+        self._give_rest()
         super().connection_lost(exc)
         if self._watch is not None:
             self._watch.cancel()
@@ -252,7 +347,7 @@ async def open_websocket(
     max_size: int,
     ping_interval: float,
     ping_timeout: float,
-    on_message: Callable[[bytes], None],
+    on_messages: Callable[[list[bytes]], None],
     on_lost: Callable[[WebSocket, str], None],
 ) -> WebSocket:
     """Connect, without permessage-deflate: on a local network it costs more than it saves.
@@ -265,7 +360,7 @@ async def open_websocket(
         max_size: bytes of one incoming message; a larger one ends the connection.
         ping_interval: seconds of silence after which the peer is asked for a sign of life.
         ping_timeout: seconds that it then has.
-        on_message: is called with each message.
+        on_messages: is called with the messages, those that came together at once.
         on_lost: is called once, with the reason, when the connection ends.
 
     Returns:
@@ -283,7 +378,7 @@ async def open_websocket(
             ClientProtocol(uri, max_size=max_size, logger=_log),
             ping_interval=ping_interval,
             ping_timeout=ping_timeout,
-            on_message=on_message,
+            on_messages=on_messages,
             on_lost=on_lost,
         )
         made.append(websocket)

@@ -23,11 +23,11 @@ from websockets.http11 import Request
 from websockets.protocol import State
 from websockets.server import ServerProtocol
 
+from bridge.frames import UNKNOWN, UNSOUND, frame_end, header, whole_messages
 from bridge.hub.broker import Broker
 from bridge.hub.definitions import RosVersion
 from bridge.hub.door import Door, choose_subprotocol
 from bridge.hub.errors import HubError
-from bridge.hub.frames import apply_mask, header, next_frame
 from bridge.hub.graph import Client, Graph
 from bridge.hub.limits import HubLimits
 
@@ -342,21 +342,26 @@ class _Connection(asyncio.Protocol):
                 self._hand_over(data[at : at + _SLICE])
                 at = min(at + _SLICE, size)
                 break
-            frame = next_frame(data, at)
-            if frame.end - frame.body > largest:
-                self._quick = False  # the library closes the connection for it, before it has come
-                continue
-            if not frame.end or frame.end > size:
-                self._rest, self._wanted = data[at:], frame.end - at if frame.end else 0
+            client = self._client
+            if self._partial is None and client is not None:
+                found, at = whole_messages(
+                    data, at, masked=True, largest=largest, count=_TURN - frames, until=turn_end
+                )
+                frames += len(found)
+                for message in found:
+                    receive(client, message, now)
+                if found:
+                    continue
+            end = frame_end(data, at, masked=True, largest=largest)
+            if end == UNSOUND:
+                self._quick = False  # the library closes the connection for it, before all of it has come
+            elif end == UNKNOWN or end > size:
+                self._rest, self._wanted = data[at:], end - at if end else 0
                 at = size
-                break
-            frames += 1
-            if frame.plain and self._partial is None and self._client is not None:
-                body = frame.body
-                receive(self._client, apply_mask(data[body : frame.end], data[body - 4 : body]), now)
             else:
-                self._hand_over(data[at : frame.end])
-            at = frame.end
+                frames += 1
+                self._hand_over(data[at:end])
+                at = end
         self._hub.serve()
         return at
 

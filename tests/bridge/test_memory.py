@@ -59,7 +59,7 @@ async def test_a_reader_that_never_reads(kind):
         def play(rounds: int) -> None:
             for number in range(rounds):
                 for piece in pieces:
-                    take(piece.replace(b'"id":1,', b'"id":%d,' % number) if kind == "broken" else piece)
+                    take([piece.replace(b'"id":1,', b'"id":%d,' % number) if kind == "broken" else piece])
 
         assert growth(play, 1200) < SLACK
         assert subscription.lost == (0 if kind == "broken" else 1800 - 8)
@@ -76,9 +76,9 @@ async def test_calls_and_goals_that_come_and_go():
             core = ros._session.core
             for number in range(rounds):
                 call = core.call("/echo", {"n": number})
-                take(b'{"op":"service_response","id":"%b","values":{},"result":true}' % call.encode())
+                take([b'{"op":"service_response","id":"%b","values":{},"result":true}' % call.encode()])
                 goal = core.send_goal("/fly", "p/Fly", {}, feedback=True)
-                take(b'{"op":"action_result","id":"%b","values":{},"status":4}' % goal.encode())
+                take([b'{"op":"action_result","id":"%b","values":{},"status":4}' % goal.encode()])
                 core.unsubscribe(core.subscribe("/b", "p/T"))
                 core.data_to_send()
 

@@ -1,50 +1,13 @@
-"""Frames found here are the frames that the library finds, however the bytes are cut."""
+"""The hub hears the same messages whatever the frames they come in, however the bytes are cut."""
 
 import asyncio
 from typing import Any
 
-import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from websockets.frames import Frame, Opcode
 
-from bridge.hub import frames
 from tests.bridge.hub.sockets import Bare, client, running_hub
-
-SIZES = [0, 1, 125, 126, 127, 65_535, 65_536]
-
-
-@pytest.mark.parametrize("size", SIZES)
-@pytest.mark.parametrize("mask", [True, False])
-@pytest.mark.parametrize("opcode", [Opcode.TEXT, Opcode.BINARY, Opcode.CONT])
-def test_a_frame_is_found_wherever_it_begins(size: int, mask: bool, opcode: Opcode) -> None:
-    payload = b"x" * size
-    data = b"before" + Frame(opcode, payload).serialize(mask=mask) + b"after"
-    found = frames.next_frame(data, 6)
-    assert found.end == len(data) - 5
-    assert found.end - found.body == size
-    assert found.plain is (mask and opcode in {Opcode.TEXT, Opcode.BINARY})
-    if mask:
-        body = found.body
-        assert frames.apply_mask(data[body : found.end], data[body - 4 : body]) == payload
-
-
-@pytest.mark.parametrize("opcode", [Opcode.PING, Opcode.PONG, Opcode.CLOSE])
-def test_control_frames_are_the_librarys(opcode: Opcode) -> None:
-    data = Frame(opcode, b"xx").serialize(mask=True)
-    assert frames.next_frame(data, 0) == (6, len(data), False)
-    assert not frames.next_frame(Frame(Opcode.TEXT, b"xx", fin=False).serialize(mask=True), 0).plain
-    assert not frames.next_frame(b"\xc1" + Frame(Opcode.TEXT, b"xx").serialize(mask=True)[1:], 0).plain
-
-
-@pytest.mark.parametrize("size", SIZES)
-def test_a_frame_whose_beginning_is_not_all_there_has_no_end(size: int) -> None:
-    data = Frame(Opcode.TEXT, b"x" * size).serialize(mask=True)
-    header = len(data) - size
-    for known in range(header + 1):
-        end = frames.next_frame(data[:known], 0).end
-        assert end in {0, len(data)}
-    assert frames.next_frame(data[:header], 0).end == len(data)
 
 
 @given(

@@ -9,7 +9,8 @@ from websockets.asyncio.client import connect
 from websockets.exceptions import InvalidStatus
 from websockets.frames import Frame, Opcode
 
-from bridge.hub import frames, server
+from bridge import frames
+from bridge.hub import server
 from bridge.hub.door import Door
 from bridge.hub.errors import HubError
 from bridge.hub.limits import HubLimits

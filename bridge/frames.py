@@ -1,0 +1,132 @@
+"""WebSocket frames at speed: whole messages in and out; everything else is the library's to judge.
+
+Nearly all that is said over a rosbridge connection is one unfragmented message after another. `whole_messages` finds
+these in the bytes of a socket; whatever is anything else (control frames, fragments, broken ones) is handed on to the
+sans-I/O protocol of ``websockets`` as it is, which stands between two frames all the time.
+
+Source: RFC 6455, sections 5.2, 5.3 and 10.3.
+"""
+
+import os
+import sys
+from collections.abc import Iterator
+from struct import Struct
+from typing import Final
+
+try:
+    from websockets.speedups import apply_mask
+except ImportError:  # a build of websockets without its C extension
+    from websockets.utils import apply_mask
+
+_TEXT: Final = 0x81
+_BINARY: Final = 0x82
+_MASKED: Final = 0x80
+_BRACE: Final = ord("{")
+#: Payloads from these lengths on have a longer header.
+_MEDIUM: Final = 126
+_LONG: Final = 1 << 16
+_MEDIUM_HEADER: Final = Struct("!BBH").pack
+_LONG_HEADER: Final = Struct("!BBQ").pack
+#: First bytes of frames that a peer may send: an end or not, no reserved bit, an opcode that there is.
+_SOUND: Final = frozenset(end | opcode for end in (0, 0x80) for opcode in (0, 1, 2, 8, 9, 10))
+#: Keys that are drawn at once.
+_KEYS: Final = 1024
+
+#: Instead of a frame's end: not enough of its header has come; it is for the library to refuse.
+UNKNOWN: Final = 0
+UNSOUND: Final = -1
+
+
+def whole_messages(
+    data: bytes, at: int, *, masked: bool, largest: int, count: int = sys.maxsize, until: int = sys.maxsize
+) -> tuple[list[bytes], int]:
+    """Take the messages that begin at ``at``, each whole in one frame, up to whatever else there is.
+
+    Args:
+        data: what came.
+        at: where a frame begins in it.
+        masked: whether the peer is a client, which masks its frames, or a server, which does not.
+        largest: bytes of one message at most; what is larger is something else.
+        count: messages to take at most.
+        until: where none is to begin any more.
+
+    Returns:
+        The payloads, and where the first frame begins that is something else (`frame_end` tells more of it), or
+        is not complete yet; the length of ``data`` if there is none.
+    """
+    found: list[bytes] = []
+    size = len(data)
+    last = min(size - 1, until)
+    bit, key = (_MASKED, 4) if masked else (0, 0)
+    while at < last and len(found) < count:
+        first, length = data[at], data[at + 1] ^ bit
+        if first not in (_TEXT, _BINARY) or length >= _MASKED:
+            break
+        body = at + 2
+        if length >= _MEDIUM:
+            body += 2 if length == _MEDIUM else 8
+            if body > size:
+                break
+            length = int.from_bytes(data[at + 2 : body], "big")
+        body += key
+        end = body + length
+        if end > size or length > largest:
+            break
+        found.append(apply_mask(data[body:end], data[body - 4 : body]) if masked else data[body:end])
+        at = end
+    return found, at
+
+
+def frame_end(data: bytes, at: int, *, masked: bool, largest: int) -> int:
+    """Where the frame ends that begins at ``at``: beyond the end of ``data`` while it is not complete.
+
+    Returns:
+        The end; `UNKNOWN` while its header is not complete; `UNSOUND` if the peer may send no such frame, or none of
+        more than ``largest`` bytes: then the library must see at once all that has come.
+    """
+    size = len(data)
+    if size < at + 2:
+        return UNKNOWN
+    second = data[at + 1]
+    if data[at] not in _SOUND or (second >= _MASKED) is not masked:
+        return UNSOUND
+    length, body = second & 0x7F, at + 2
+    if length >= _MEDIUM:
+        body += 2 if length == _MEDIUM else 8
+        if body > size:
+            return UNKNOWN
+        length = int.from_bytes(data[at + 2 : body], "big")
+    if length > largest:
+        return UNSOUND
+    return body + (4 if masked else 0) + length
+
+
+def header(payload: bytes) -> bytes:
+    """The beginning of an unmasked frame of a whole message: text for JSON, binary for CBOR."""
+    first = _TEXT if payload[0] == _BRACE else _BINARY
+    length = len(payload)
+    if length < _MEDIUM:
+        return bytes((first, length))
+    if length < _LONG:
+        return _MEDIUM_HEADER(first, _MEDIUM, length)
+    return _LONG_HEADER(first, _MEDIUM + 1, length)
+
+
+def masked_text(payload: bytes, key: bytes) -> bytes:
+    """A client's frame of a whole text message, masked with ``key``."""
+    length = len(payload)
+    if length < _MEDIUM:
+        begin = bytes((_TEXT, _MASKED | length))
+    elif length < _LONG:
+        begin = _MEDIUM_HEADER(_TEXT, _MASKED | _MEDIUM, length)
+    else:
+        begin = _LONG_HEADER(_TEXT, _MASKED | (_MEDIUM + 1), length)
+    return b"".join((begin, key, apply_mask(payload, key)))
+
+
+def mask_keys() -> Iterator[bytes]:
+    """Keys for one connection's frames, without end: no one can foresee them, each is used once."""
+    while True:
+        drawn = os.urandom(4 * _KEYS)
+        for at in range(0, len(drawn), 4):
+            yield drawn[at : at + 4]
