@@ -140,6 +140,84 @@ def build(
 
 
 @app.command()
+def check(
+    context: typer.Context,
+    path: Annotated[
+        Path,
+        typer.Argument(
+            help="Folder that holds model.py, a network's file, or a deployment's folder.",
+            metavar="MODEL|DIR",
+        ),
+    ],
+    settings: flags.Settings = None,
+    searched: flags.Searched = "",
+    known: flags.KnownNames = "",
+    given: flags.Given = None,
+    prior_select: flags.PriorSelectName = "",
+    on_missing: flags.OnMissingFlag = OnMissing.ERROR,
+    partitions: flags.Partitions = 1,
+    interface: flags.Interface = None,
+    scale: flags.ScaleFlag = Scale.ADDRESS,
+    prob_bits: flags.ProbBits = 8,
+    bits: flags.Bits = None,
+    prior_mode: flags.PriorModeFlag = PriorMode.TABLE,
+    counter_bits: flags.CounterBits = 8,
+    target_count: flags.TargetCount = None,
+    max_cycles: flags.MaxCycles = 2**17,
+    stop: flags.StopFlag = Stop.SLICES,
+    rng: flags.Rng = RngKind.LFSR32,
+    rng_table: flags.RngTable = None,
+    rng_banks: flags.RngBanks = 16,
+    rng_reset: flags.RngResetFlag = RngReset.BANK,
+    shared: flags.Shared = True,
+    steps_per_clock: flags.StepsPerClock = 0,
+    sensor_mode: flags.SensorModeFlag = SensorMode.COLUMN,
+    replicas: flags.Replicas = 1,
+    json: Annotated[bool, typer.Option("--json", help="One JSON object a line.")] = False,
+) -> None:
+    """Say what is wrong before anything runs: of a model as it would be built, or of a deployment.
+
+    For example `toolchain check casestudies/boat --partitions 4`, or `toolchain check build/boat`. Exit code 2 if there
+    is an error among the findings, else 0.
+    """
+    with one_sentence():
+        from toolchain.build_command import NetworkQuestion, Unread
+        from toolchain.check_command import UNTOLD_TARGET, run_check
+
+        options = BuildOptions(
+            **UNTOLD_TARGET,
+            partitions=partitions,
+            scale=scale,
+            prob_bits=prob_bits,
+            prior_mode=prior_mode,
+            counter_bits=counter_bits,
+            target_count=target_count,
+            max_cycles=max_cycles,
+            stop=stop,
+            rng=rng,
+            rng_banks=rng_banks,
+            rng_reset=rng_reset,
+            shared=shared,
+            steps_per_clock=steps_per_clock,
+            sensor_mode=sensor_mode,
+            replicas=replicas,
+        )
+        question = NetworkQuestion(
+            searched=searched,
+            known=known,
+            given=tuple(given or ()),
+            prior_select=prior_select,
+            on_missing=on_missing.value,
+        )
+        unread = Unread(
+            settings=tuple(settings or ()), bits=tuple(bits or ()), interface=interface, rng_table=rng_table
+        )
+        said = [name for name in context.params if name not in {"path", "json"} and _was_said(context, name)]
+        code = run_check(path, question, options, unread, said, json=json)
+    raise typer.Exit(code)
+
+
+@app.command()
 def new(
     name: Annotated[Path, typer.Argument(help="The folder to make; its last part names the model.")],
 ) -> None:
@@ -242,6 +320,12 @@ def main() -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, _end)
     app()
+
+
+def _was_said(context: typer.Context, name: str) -> bool:
+    """Whether a flag stood on the command line, rather than being a default."""
+    source = context.get_parameter_source(name)
+    return source is not None and source.name == "COMMANDLINE"
 
 
 def _end(number: int, _frame: FrameType | None) -> None:

@@ -46,6 +46,15 @@ class ColumnLoss:
     dead_values: int
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VanishedFloor:
+    """An outlier floor that became code 0 somewhere: whose, what that does, and what to change."""
+
+    name: str
+    what: str
+    advice: str
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Quantised:
     """A model's codes for all lines, before they are split over boards.
@@ -56,12 +65,14 @@ class Quantised:
         tables: uint16[2**bits, lines] per known variable; addresses beyond the served ones hold 0, the top one,
             a missing reading's, all ones.
         losses: The prior's and one per known variable.
+        floors: Outlier floors that are too low for the codes.
         warnings: What a user should know, a sentence each.
     """
 
     prior: NDArray[np.uint16]
     tables: tuple[NDArray[np.uint16], ...]
     losses: tuple[ColumnLoss, ...]
+    floors: tuple[VanishedFloor, ...]
     warnings: tuple[str, ...]
 
 
@@ -80,6 +91,7 @@ def quantise(model: Model, *, prob_bits: int = 8, scale: Scale = Scale.ADDRESS) 
     prior_codes, prior_loss = _quantised_prior(model, prob_bits, scale)
     losses = [prior_loss]
     warnings: list[str] = []
+    floors: list[VanishedFloor] = []
     tables = []
     for known in model.known:
         ratios = scaled(known.table, scale)
@@ -92,14 +104,21 @@ def quantise(model: Model, *, prob_bits: int = 8, scale: Scale = Scale.ADDRESS) 
         losses.append(loss)
         vanished = (served == 0) & (ratios > 0)
         if known.floor and vanished.any():
-            warnings.append(_vanished_floor(known, ratios, vanished, prob_bits))
+            floors.append(floor := _vanished_floor(known, ratios, vanished, prob_bits))
+            warnings.append(f"Variable {known.name}: {floor.what}; {floor.advice}.")
         if loss.dead_values:
             warnings.append(
                 f"Variable {known.name}: {loss.dead_values} of its {known.values} values are possible but have "
                 "code 0 on every line, so such a reading gives no posterior; use --scale address or more "
                 "--prob-bits."
             )
-    return Quantised(prior=prior_codes, tables=tuple(tables), losses=tuple(losses), warnings=tuple(warnings))
+    return Quantised(
+        prior=prior_codes,
+        tables=tuple(tables),
+        losses=tuple(losses),
+        floors=tuple(floors),
+        warnings=tuple(warnings),
+    )
 
 
 def written_prior(prior: ArrayLike, *, lines: int, prob_bits: int) -> NDArray[np.uint16]:
@@ -175,15 +194,18 @@ def _loss(name: str, bits: int, exact: NDArray[np.float64], quantised: NDArray[n
 
 def _vanished_floor(
     known: Known, ratios: NDArray[np.float64], vanished: NDArray[np.bool_], prob_bits: int
-) -> str:
+) -> VanishedFloor:
     """Say that a variable's floor is too low for the codes, and how high or wide would do."""
     least = float(ratios[vanished].min())
     enough = known.floor * 0.5 ** (prob_bits + 1) / least
     needed = math.ceil(-math.log2(least) - 1)
     wider = f" or --prob-bits {needed}" if needed <= PROB_BITS_MAX else ""
-    return (
-        f"Variable {known.name}: its outlier floor of {known.floor:g} vanishes at "
-        f"{np.count_nonzero(vanished.any(axis=1))} of its {known.values} values (below 2^-{prob_bits + 1} of the "
-        f"largest probability there), so that one outlier makes the true line impossible; use a floor of about "
-        f"{enough:.2g}{wider}."
+    return VanishedFloor(
+        name=known.name,
+        what=(
+            f"its outlier floor of {known.floor:g} vanishes at {np.count_nonzero(vanished.any(axis=1))} of its "
+            f"{known.values} values (below 2^-{prob_bits + 1} of the largest probability there), so that one outlier "
+            "makes the true line impossible"
+        ),
+        advice=f"use a floor of about {enough:.2g}{wider}",
     )
