@@ -119,6 +119,13 @@ def test_a_topic_that_is_silent_is_not_said_to_be_apart():
     assert not frames.too_far_apart()
 
 
+def test_topics_that_all_may_be_missing_wait_for_nothing():
+    optional = [variable(f"D{at}", source=at, on_missing="missing") for at in range(2)]
+    frames = FrameAssembler(deployment(*optional, sources=2))
+    assert frames.too_far_apart() == ""
+    assert frames.take(1, stamped(0, D1=3), 1, 1).addresses == [None, 3]
+
+
 def test_which_topics_are_needed():
     optional = variable("D2", source=1, on_missing="missing")
     frames = FrameAssembler(deployment(variable("D1"), optional, sources=2))
