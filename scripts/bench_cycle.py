@@ -42,7 +42,7 @@ STAGES = (
 _TICKS = os.sysconf("SC_CLK_TCK")
 LINES = 32 * 32
 BOUND = 2.5
-"""What a cycle may take beyond the boards' computing, in floors."""
+"""What a cycle may take, in times of the floor and the boards' computing together."""
 WINDOW = 4
 """Readings under way at once when frames per second are measured."""
 
@@ -261,8 +261,8 @@ def summary(measured: Measured, floor: float) -> dict[str, Any]:
         "per_second": measured.per_second,
         "compute_us": compute,
         "machines_us": statistics.median(measured.stages["boards_compute"]),
+        "ratio": cycle / (floor + compute),
         "ratio_beyond_compute": (cycle - compute) / floor,
-        "bound_us": BOUND * floor + compute,
         "stages_us": {name: statistics.median(values) for name, values in measured.stages.items()},
         "cpu_us_per_frame": measured.cpu,
     }
@@ -285,11 +285,11 @@ def show(figures: dict[str, Any]) -> None:
     table.add_row(
         "of it, the slowest machine, us", "", *(f"{figures[name]['machines_us']:.0f}" for name in stacks)
     )
-    table.add_row(
-        "(median - boards' computing) / floor",
-        "1",
-        *(f"{figures[name]['ratio_beyond_compute']:.2f}" for name in stacks),
-    )
+    for title, key in (
+        ("median / (floor + boards' computing)", "ratio"),
+        ("(median - boards' computing) / floor", "ratio_beyond_compute"),
+    ):
+        table.add_row(title, "1", *(f"{figures[name][key]:.2f}" for name in stacks))
     table.add_section()
     for stage in STAGES:
         if stage != "boards_compute":
@@ -304,9 +304,9 @@ def show(figures: dict[str, Any]) -> None:
         table.add_row(f"CPU of {command}, us", "", *("" if each is None else f"{each:.0f}" for each in used))
     out = Console()
     out.print(table)
-    bounds = ", ".join(f"{name} {figures[name]['bound_us']:.0f} us" for name in stacks)
     out.print(
-        f"bound, {BOUND:g} x floor + boards' computing: {bounds}; {figures['cores']} cores; seed {figures['seed']}"
+        f"aim: a cycle takes at most {BOUND:g} times what floor and boards take; {figures['cores']} cores, "
+        f"seed {figures['seed']}"
     )
 
 
