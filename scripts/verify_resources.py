@@ -82,6 +82,8 @@ SYNTHESISED = (
     case(20, 2, 8, counter_bits=20, rng_banks=1),
     case(6, 3, 9, shared=False, rng_banks=1, rng=RngKind.LFSR16),
     case(40, 3, 10),
+    case(64, 1, 11, counter_bits=32),
+    case(128, 1, 12),
 )
 
 

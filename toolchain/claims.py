@@ -40,6 +40,8 @@ SIDE: Final = 100.0
 SIGMA: Final = 12.0
 """Of a distance, in metres: more than a cell of the coarsest grid, or the grid would decide how well a line fits."""
 STEP: Final = 2.0
+"""Metres between the distances told apart."""
+CODE_BITS: Final = 8
 GRIDS: Final = (8, 12, 16, 24, 32, 48, 64)
 SENSORS: Final = (1, 2, 3, 4, 6, 8, 10, 12)
 TARGETS: Final = (15, 31, 63, 127, 255, 511, 1023, 2047, 4095)
@@ -50,6 +52,7 @@ _MIDDLE_SENSORS: Final = 4
 _MIDDLE_GRID: Final = 16
 _MIDDLE_TARGET: Final = 255
 _FAULT_CYCLES: Final = 2**14
+_FAULT_BANKS: Final = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +116,7 @@ def beacons(grid: int = _MIDDLE_GRID, sensors: int = _MIDDLE_SENSORS) -> Model:
 
 def machine_of(model: Model, counter_bits: int = 12) -> BM1Machine:
     """Return the model's machine with codes of 8 bits, on one board."""
-    quantised = quantise(model, prob_bits=8, scale=Scale.ADDRESS)
+    quantised = quantise(model, prob_bits=CODE_BITS, scale=Scale.ADDRESS)
     parameters = BM1Parameters(
         lines=model.lines, sensor_bits=tuple(known.bits for known in model.known), counter_bits=counter_bits
     )
@@ -148,13 +151,13 @@ def run_claims(
         lines=lines,
         sensors=sensors,
         targets=targets,
-        faults=_faults(fault_frames, seed, advance),
+        faults=_all_faults(fault_frames, seed, advance),
     )
 
 
 def experiments() -> int:
     """How many times `run_claims` calls `advance`."""
-    return len(GRIDS) + len(SENSORS) + len(TARGETS) + len(_KINDS) * len(RATES)
+    return len(GRIDS) + len(SENSORS) + len(TARGETS) + len(KINDS) * len(RATES)
 
 
 def _course(x: float, model: Model, target: int, frames: int, seed: int) -> Course:
@@ -244,148 +247,136 @@ class FaultyMachine:
         return kept
 
 
-def _faults(frames: int, seed: int, advance: Callable[[str], None]) -> dict[str, list[Fault]]:
+@dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """One frame of readings, as the different ways of computing take it.
+
+    Attributes:
+        codes: uint16[columns, lines], what a machine's tables answer.
+        likelihoods: float64[sensors, lines], what the model's do.
+        bank: Set of seeds.
+    """
+
+    codes: NDArray[np.uint16]
+    likelihoods: NDArray[np.float64]
+    bank: int
+
+
+class Faults:
+    """Ways of computing a posterior while bits are flipped; each returns None where there is none left.
+
+    Args:
+        machine: The machine of which streams, random numbers and tables are flipped.
+        seed: Of the flips.
+    """
+
+    def __init__(self, machine: BM1Machine, *, seed: int) -> None:
+        self._machine = FaultyMachine(machine, seed=seed)
+        self.reseed(seed)
+
+    def reseed(self, seed: int) -> None:
+        """Flip other bits from now on."""
+        self._machine.reseed(seed)
+        self._random = np.random.default_rng([seed, 1])
+
+    def streams(self, frame: Frame, rate: float) -> NDArray[np.float64] | None:
+        """Flip a cell's bit of a cycle."""
+        return self._counted(frame, frame.codes, stream_rate=rate)
+
+    def numbers(self, frame: Frame, rate: float) -> NDArray[np.float64] | None:
+        """Flip a bit of a random number, with which a whole column compares."""
+        return self._counted(frame, frame.codes, number_rate=rate)
+
+    def tables(self, frame: Frame, rate: float) -> NDArray[np.float64] | None:
+        """Flip a bit of a code; it stays so for the frame."""
+        return self._counted(frame, _flipped(frame.codes, CODE_BITS, rate, self._random))
+
+    def fixed_point(self, frame: Frame, rate: float) -> NDArray[np.float64] | None:
+        """Multiply the codes in 8 bits, with an exponent common to all lines; flip a bit of a factor or of a product."""
+        product = np.full(frame.codes.shape[1], 2**CODE_BITS - 1, dtype=np.uint16)
+        for row in frame.codes:
+            factor = decode_code(_flipped(row, CODE_BITS, rate, self._random), CODE_BITS)
+            wide = product.astype(np.uint32) * np.round(2**CODE_BITS * factor).astype(np.uint32)
+            shift = max(0, int(wide.max()).bit_length() - CODE_BITS)
+            rounded = np.minimum((wide + (1 << shift >> 1)) >> shift, 2**CODE_BITS - 1).astype(np.uint16)
+            product = _flipped(rounded, CODE_BITS, rate, self._random)
+        total = int(product.sum())
+        return product / total if total else None
+
+    def floating_point(self, frame: Frame, rate: float) -> NDArray[np.float64] | None:
+        """Multiply float32s; flip a bit of a factor or of a product."""
+        product = np.ones(frame.likelihoods.shape[1], dtype=np.float32)
+        with np.errstate(all="ignore"):  # flipped exponents overflow
+            for row in frame.likelihoods.astype(np.float32):
+                factor = _flipped(row.view(np.uint32), 32, rate, self._random).view(np.float32)
+                words = (product * factor).view(np.uint32)
+                product = _flipped(words, 32, rate, self._random).view(np.float32)
+            weights = np.clip(product.astype(np.float64), 0.0, None)
+            posterior: NDArray[np.float64] = weights / weights.sum()
+        # What is infinite or no number says nothing.
+        return posterior if np.isfinite(posterior).all() else None
+
+    def _counted(
+        self, frame: Frame, codes: NDArray[np.uint16], *, stream_rate: float = 0.0, number_rate: float = 0.0
+    ) -> NDArray[np.float64] | None:
+        counts, _ = self._machine.counts(
+            codes,
+            bank=frame.bank,
+            target_count=_MIDDLE_TARGET,
+            max_cycles=_FAULT_CYCLES,
+            stream_rate=stream_rate,
+            number_rate=number_rate,
+        )
+        total = int(counts.sum())
+        return counts / total if total else None
+
+
+KINDS: Final[dict[str, Callable[[Faults, Frame, float], NDArray[np.float64] | None]]] = {
+    "machine: stream bits": Faults.streams,
+    "machine: bits of random numbers": Faults.numbers,
+    "machine: table bits": Faults.tables,
+    "8-bit fixed point": Faults.fixed_point,
+    "32-bit floating point": Faults.floating_point,
+}
+"""What is compared, by its name in the picture."""
+
+
+def frames_of(model: Model, machine: BM1Machine, readings: Readings) -> list[Frame]:
+    """Return the frames of some readings."""
+    return [
+        Frame(
+            codes=np.stack(
+                [machine.prior[0], *(table[at] for table, at in zip(machine.tables, addresses, strict=True))]
+            ),
+            likelihoods=np.stack([known.table[at] for known, at in zip(model.known, addresses, strict=True)]),
+            bank=number % _FAULT_BANKS,
+        )
+        for number, addresses in enumerate(readings.addresses.tolist())
+    ]
+
+
+def _all_faults(count: int, seed: int, advance: Callable[[str], None]) -> dict[str, list[Fault]]:
     model = beacons()
     machine = machine_of(model)
-    readings = sample_readings(model, frames, seed=seed)
-    exact = [exact_posterior(model, *_model_frame(readings, frame)) for frame in range(frames)]
-    likelihoods = [
-        np.stack([known.table[at] for known, at in zip(model.known, readings.addresses[frame], strict=True)])
-        for frame in range(frames)
-    ]
-    codes = [
-        np.stack(
-            [
-                machine.prior[0],
-                *(table[at] for table, at in zip(machine.tables, readings.addresses[frame], strict=True)),
-            ]
-        )
-        for frame in range(frames)
-    ]
+    readings = sample_readings(model, count, seed=seed)
+    frames = frames_of(model, machine, readings)
+    exact = [exact_posterior(model, readings.of_model(at)[0]) for at in range(count)]
+    faults = Faults(machine, seed=seed)
     found: dict[str, list[Fault]] = {}
-    faulty = FaultyMachine(machine, seed=seed)
-    for name, kind in _KINDS.items():
-        faults = []
+    for name, kind in KINDS.items():
+        found[name] = []
         for number, rate in enumerate(RATES):
             advance(f"{name}, {rate:g} flipped")
-            random = np.random.default_rng([seed, number])
-            faulty.reseed(seed + number)
-            variations = []
-            for frame in range(frames):
-                ours = kind(faulty, codes[frame], likelihoods[frame], rate, random, frame)
-                # No posterior, or one that is no number, says nothing at all.
-                good = ours is not None and bool(np.isfinite(ours).all())
-                variations.append(
-                    0.5 * float(np.abs(ours - exact[frame]).sum()) if ours is not None and good else 1.0
-                )
+            faults.reseed(seed + number)
+            ours = [kind(faults, frame, rate) for frame in frames]
+            variations = [
+                1.0 if posterior is None else 0.5 * float(np.abs(posterior - truth).sum())
+                for posterior, truth in zip(ours, exact, strict=True)
+            ]
             mean = float(np.mean(variations))
-            half = 1.96 * float(np.std(variations)) / np.sqrt(frames)
-            faults.append(Fault(rate, mean, max(0.0, mean - half), min(1.0, mean + half)))
-        found[name] = faults
+            half = 1.96 * float(np.std(variations)) / np.sqrt(count)
+            found[name].append(Fault(rate, mean, max(0.0, mean - half), min(1.0, mean + half)))
     return found
-
-
-def _model_frame(readings: Readings, frame: int) -> tuple[tuple[int | None, ...]]:
-    return (readings.of_model(frame)[0],)
-
-
-def _machine_posterior(
-    faulty: FaultyMachine,
-    codes: NDArray[np.uint16],
-    frame: int,
-    *,
-    stream_rate: float = 0.0,
-    number_rate: float = 0.0,
-) -> NDArray[np.float64] | None:
-    counts, _ = faulty.counts(
-        codes,
-        bank=frame % 4,
-        target_count=_MIDDLE_TARGET,
-        max_cycles=_FAULT_CYCLES,
-        stream_rate=stream_rate,
-        number_rate=number_rate,
-    )
-    total = counts.sum()
-    return counts / total if total else None
-
-
-def _flipped_stream(
-    faulty: FaultyMachine,
-    codes: NDArray[np.uint16],
-    _likelihoods: NDArray[np.float64],
-    rate: float,
-    _random: np.random.Generator,
-    frame: int,
-) -> NDArray[np.float64] | None:
-    """A cell's bit of a cycle is flipped."""
-    return _machine_posterior(faulty, codes, frame, stream_rate=rate)
-
-
-def _flipped_numbers(
-    faulty: FaultyMachine,
-    codes: NDArray[np.uint16],
-    _likelihoods: NDArray[np.float64],
-    rate: float,
-    _random: np.random.Generator,
-    frame: int,
-) -> NDArray[np.float64] | None:
-    """A bit of a random number is flipped."""
-    return _machine_posterior(faulty, codes, frame, number_rate=rate)
-
-
-def _flipped_tables(
-    faulty: FaultyMachine,
-    codes: NDArray[np.uint16],
-    _likelihoods: NDArray[np.float64],
-    rate: float,
-    random: np.random.Generator,
-    frame: int,
-) -> NDArray[np.float64] | None:
-    """A bit of a table is flipped, and stays so for the frame."""
-    return _machine_posterior(faulty, _flipped(codes, 8, rate, random), frame)
-
-
-def _fixed_point(
-    _faulty: FaultyMachine,
-    codes: NDArray[np.uint16],
-    _likelihoods: NDArray[np.float64],
-    rate: float,
-    random: np.random.Generator,
-    _frame: int,
-) -> NDArray[np.float64] | None:
-    """The same codes multiplied in 8 bits, with an exponent common to all lines; a bit of a factor or a product is flipped."""
-    product = np.full(codes.shape[1], 255, dtype=np.uint16)
-    for row in codes:
-        wide = product.astype(np.uint32) * np.round(
-            256 * decode_code(_flipped(row, 8, rate, random), 8)
-        ).astype(np.uint32)
-        largest = int(wide.max())
-        if largest == 0:
-            return None
-        shift = max(0, largest.bit_length() - 8)
-        product = np.minimum((wide + (1 << shift >> 1)) >> shift, 255).astype(np.uint16)
-        product = _flipped(product, 8, rate, random)
-    total = int(product.sum())
-    return product / total if total else None
-
-
-def _floating_point(
-    _faulty: FaultyMachine,
-    _codes: NDArray[np.uint16],
-    likelihoods: NDArray[np.float64],
-    rate: float,
-    random: np.random.Generator,
-    _frame: int,
-) -> NDArray[np.float64] | None:
-    """float32 products; a bit of a factor or of a product is flipped."""
-    product = np.ones(likelihoods.shape[1], dtype=np.float32)
-    with np.errstate(all="ignore"):  # flipped exponents overflow
-        for row in likelihoods:
-            factor = _flipped(row.astype(np.float32).view(np.uint32), 32, rate, random).view(np.float32)
-            product = _flipped((product * factor).view(np.uint32), 32, rate, random).view(np.float32)
-        weights = np.clip(product.astype(np.float64), 0.0, None)
-        posterior: NDArray[np.float64] = weights / weights.sum()
-    return posterior
 
 
 def _flipped(words: NDArray[_Word], width: int, rate: float, random: np.random.Generator) -> NDArray[_Word]:
@@ -394,12 +385,3 @@ def _flipped(words: NDArray[_Word], width: int, rate: float, random: np.random.G
     mask = (flips.astype(np.uint64) << np.arange(width, dtype=np.uint64)).sum(axis=-1)
     faulty: NDArray[_Word] = words ^ mask.astype(words.dtype)
     return faulty
-
-
-_KINDS: Final = {
-    "machine: stream bits": _flipped_stream,
-    "machine: bits of random numbers": _flipped_numbers,
-    "machine: table bits": _flipped_tables,
-    "8-bit fixed point": _fixed_point,
-    "32-bit floating point": _floating_point,
-}

@@ -12,7 +12,7 @@ from toolchain.emulation import EmulatedBoards, split
 from toolchain.errors import ModelError
 from toolchain.fusion import exact_posterior
 from toolchain.model import Known, Model, dimension
-from toolchain.readings import Readings, sample_readings
+from toolchain.readings import MISSING, Readings, sample_readings
 
 
 def boards_of(machine, count=1, *, target=255, limit=2**15, stop=Stop.SLICES):
@@ -111,6 +111,19 @@ def test_frames_without_a_posterior_are_counted():
     assert accuracy.impossible == 0.5
     assert accuracy.without == 0.5
     assert accuracy.machine.total_variation.value < 0.05
+
+
+def test_a_selected_prior_and_missing_readings():
+    model = corridor(16, sigma=1.5, select=True, missing=True)
+    readings = sample_readings(model, 30, seed=1)
+    readings.addresses[::3, 0] = MISSING
+    readings.prior_addresses[::5] = MISSING
+    accuracy = measure(
+        boards_of(machine_of(model, prob_bits=12, counter_bits=12), 2, target=2000), readings, model
+    )
+    assert accuracy.frames == 30
+    assert accuracy.quantising.total_variation.value < 0.003
+    assert accuracy.machine.total_variation.value < 0.03
 
 
 def test_readings_that_the_model_finds_impossible():

@@ -8,7 +8,8 @@ import pytest
 from machines.bm1 import Start, addressed_codes
 from machines.reference import ReferenceBM1
 from toolchain import claims
-from toolchain.claims import FaultyMachine, beacons, machine_of, run_claims
+from toolchain.claims import KINDS, Faults, FaultyMachine, beacons, frames_of, machine_of, run_claims
+from toolchain.fusion import exact_posterior
 from toolchain.pictures import draw_claims
 from toolchain.readings import sample_readings
 
@@ -46,17 +47,21 @@ def test_flips_happen_as_often_as_asked_for():
 
 def test_every_kind_of_fault_changes_something(small):
     model, machine = small
-    readings = sample_readings(model, 1, seed=1)
-    addresses, _ = readings.of_machine(0, machine)
-    codes = addressed_codes(machine, Start(addresses=addresses, target_count=1, max_cycles=1))
-    likelihoods = np.stack([known.table[at] for known, at in zip(model.known, addresses, strict=True)])
-    for name, kind in claims._KINDS.items():
-        whole, torn = (
-            kind(FaultyMachine(machine, seed=1), codes, likelihoods, rate, np.random.default_rng(1), 0)
-            for rate in (0.0, 0.05)
-        )
+    (frame,) = frames_of(model, machine, sample_readings(model, 1, seed=1))
+    for name, kind in KINDS.items():
+        whole, torn = (kind(Faults(machine, seed=1), frame, rate) for rate in (0.0, 0.05))
         assert whole.sum() == pytest.approx(1), name
         assert torn is None or not np.array_equal(whole, torn), name
+
+
+def test_products_without_faults_are_exact_inference(small):
+    model, machine = small
+    readings = sample_readings(model, 3, seed=1)
+    for at, frame in enumerate(frames_of(model, machine, readings)):
+        exact = exact_posterior(model, readings.of_model(at)[0])
+        faults = Faults(machine, seed=1)
+        assert faults.floating_point(frame, 0.0) == pytest.approx(exact, abs=1e-5)
+        assert 0.5 * np.abs(faults.fixed_point(frame, 0.0) - exact).sum() < 0.05
 
 
 def test_the_claims(monkeypatch, tmp_path):

@@ -9,6 +9,8 @@ import time
 from pathlib import Path
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from machines.parameters import RngKind
@@ -182,6 +184,37 @@ def test_the_pareto_front():
     ]
     assert [int(each.key, 16) for each in pareto(points)] == [1, 3, 4, 6, 7]
     assert pareto([point(1).model_copy(update={"total_variation": None})]) == []
+
+
+@given(st.lists(st.tuples(*[st.integers(0, 3)] * 4), min_size=1, max_size=12))
+def test_what_is_not_on_the_front_is_beaten_by_what_is(figures):
+    points = [
+        point(key, variation=a, cycles=b, alms=c, without=d / 3) for key, (a, b, c, d) in enumerate(figures)
+    ]
+    front = {each.key for each in pareto(points)}
+    best = [own for own, each in zip(figures, points, strict=True) if each.key in front]
+    for own, each in zip(figures, points, strict=True):
+        beaten = any(other != own and all(a <= b for a, b in zip(other, own, strict=True)) for other in best)
+        assert beaten == (each.key not in front)
+
+
+BIF = """network weather { }
+variable rain { type discrete [ 2 ] { no, yes }; }
+variable shoes { type discrete [ 2 ] { dry, wet }; }
+probability ( rain ) { table 0.7, 0.3; }
+probability ( shoes | rain ) { (no) 0.9, 0.1; (yes) 0.2, 0.8; }
+"""
+
+
+def test_a_network_is_explored_too(tmp_path):
+    network = tmp_path / "weather.bif"
+    network.write_text(BIF)
+    question = ["--searched", "rain", "--known", "shoes"]
+    lists = ["--prob-bits", "8", "--targets", "15", "--rngs", "lfsr16,table", "--scales", "none"]
+    result = run(network, *question, *lists)
+    assert result.exit_code == 0, result.stderr
+    assert "none     table" in result.stdout
+    assert "--searched asks a network's file" in run(tmp_path, *question).stderr
 
 
 def test_the_command(case):
