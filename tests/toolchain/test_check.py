@@ -219,6 +219,10 @@ def test_a_column_and_a_board_without_hope():
     (column,) = [finding for finding in found(findings, "dead-lines") if finding.about == "K"]
     assert "every value of it has code 0 at s = 1, which can never count" in column.what
     assert only(findings, "dead-board").about == "board 1"
+    forgiving = model_of(
+        spread, prior=np.array([0.6, 0.4]), known=(Known(name="K", table=spread, on_missing="missing"),)
+    )  # the line counts where K is missing
+    assert not found(check_model(forgiving, replace(coarse, scale=Scale.COLUMN)), "dead-lines")
     findings = check_model(model_of(np.full((5, 2), 0.2)), coarse)
     assert only(findings, "dead-lines").severity is Severity.ERROR
 

@@ -4,15 +4,21 @@ import re
 import shlex
 from pathlib import Path
 
+import numpy as np
 import pytest
 import typer
 from pydantic import BaseModel
 from typer.testing import CliRunner
 
+from toolchain import check
+from toolchain.build import assemble
 from toolchain.case_study import load_model
 from toolchain.command import app
 from toolchain.deployment import DeploymentFile
 from toolchain.errors import ModelError
+from toolchain.model import Known, Model, dimension
+from toolchain.options import BuildOptions
+from toolchain.vhdl_parameters import parameters_vhd
 
 DOCS = Path(__file__).parents[2] / "docs"
 
@@ -111,3 +117,36 @@ def test_the_boiler_is_a_question_and_the_printed_refusal_is_said(tmp_path):
     with pytest.raises(ModelError) as caught:
         load_model(tmp_path, {})
     assert f"error: {caught.value}\n" in MODELS
+
+
+def test_every_check_is_described():
+    source = Path(check.__file__).read_text()
+    names = set(re.findall(r'check="([a-z-]+)"', source)) - {"rng"}
+    described = documented((DOCS / "toolchain.md").read_text(), "What is wrong, before anything runs")
+    assert set(described) == names
+
+
+def test_every_constant_of_the_parameters():
+    text = parameters_vhd(*built_for_the_documentation())
+    constants = set(re.findall(r"^  constant (\w+)", text, re.MULTILINE))
+    assert set(documented((DOCS / "outputs.md").read_text(), "bm1_parameters.vhd")) == constants
+
+
+def built_for_the_documentation():
+    model = Model(
+        name="m",
+        searched=(dimension("s", size=2),),
+        known=(Known(name="K", table=np.full((2, 2), 0.5)),),
+    )
+    built = assemble(model, BuildOptions(uri="ws://robot:9090", topic="/readings", type="a/B"))
+    return built.deployment, built.images
+
+
+@pytest.mark.parametrize("part", ["memories", "project", "deployment"])
+def test_every_option_of_regenerate(part):
+    text = (DOCS / "toolchain.md").read_text()
+    section = text.split("\n## One part again", 1)[1].split("\n## ", 1)[0]
+    question = {"--set", "--searched", "--known", "--given", "--prior-select", "--on-missing", "--help", "-h"}
+    command = typer.main.get_command(app).commands["regenerate"].commands[part]
+    for name in {name for each in command.params for name in each.opts if name.startswith("-")} - question:
+        assert name in section
