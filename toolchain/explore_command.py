@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 CLAIMS_NAME: Final = "claims.json"
 CLAIMS_PICTURE: Final = "claims.png"
-CLAIM_FRAMES: Final = 20
+CLAIM_FRAMES: Final = 100
 """Frames at each rate of flipped bits, at most: they run cycle by cycle."""
 
 
