@@ -309,3 +309,68 @@ class TestPosterior:
         pairing.add_report(FrameReport(stamp_ns=0, heard_ns=0, outcome="", received_ns=10_000))
         (posterior,) = pairing.add_posterior(result(1, 9_000))
         assert posterior.latency_us is None
+
+
+JSON = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers()
+    | st.integers(10**18, 10**400)
+    | st.floats()
+    | st.text(max_size=5)
+    | st.sampled_from(["9" * 5000, "1e999", "nan", "true"]),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=3), inner, max_size=3),
+    max_leaves=6,
+)
+
+
+class TestHostile:
+    """Whatever comes on the topics is read or refused in one sentence; what was read can be used."""
+
+    @given(
+        st.dictionaries(st.sampled_from(["layout", "data"]), JSON)
+        | st.fixed_dictionaries(
+            {
+                "data": st.lists(st.floats(0, 1) | JSON, max_size=6),
+                "layout": st.fixed_dictionaries(
+                    {
+                        "dim": st.lists(
+                            st.fixed_dictionaries(
+                                {"label": st.text(max_size=2), "size": st.integers(0, 3) | JSON}
+                            ),
+                            max_size=3,
+                        ),
+                        "data_offset": st.integers(0, 2) | JSON,
+                    }
+                ),
+            }
+        )
+    )
+    def test_posteriors(self, message):
+        try:
+            posterior = read_posterior(message, 0)
+        except BadResultError as error:
+            assert len(str(error)) < 1000
+            return
+        assert posterior.at(posterior.best()) == posterior.probability
+        assert list(posterior.mean()) == list(posterior.labels)
+        assert posterior.values.shape == posterior.sizes
+
+    @given(
+        st.dictionaries(st.sampled_from(["header", "status"]), JSON),
+        st.dictionaries(
+            st.sampled_from(["number", "published", "cycles", "received_ns", "sent_ns", "compute_us"]),
+            JSON.map(str),
+        ),
+    )
+    def test_reports(self, wild, values):
+        for message in (wild, frame_message(**values), frame_message() | wild):
+            try:
+                report = read_frame_report(message, 0)
+            except BadResultError as error:
+                assert len(str(error)) < 1000
+                continue
+            pairing = Pairing()
+            for heard in [*pairing.add_report(report), *pairing.add_posterior(result(1, 5))]:
+                if isinstance(heard, Posterior):
+                    assert heard.latency_us is None or heard.latency_us >= 0

@@ -145,8 +145,9 @@ async def test_on_a_terminal_one_picture_changes(stack, asked):
     assert shown.endswith("\x1b[?25h")  # the cursor is back
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-@pytest.mark.parametrize("name", ["out.npz", "out.csv"])
+@pytest.mark.parametrize(
+    ("number", "code", "name"), [(signal.SIGINT, 130, "out.npz"), (signal.SIGTERM, 143, "out.csv")]
+)
 async def test_what_ends_it_loses_nothing(stage, stack, tmp_path, number, code, name):
     _, uri = stack
     path = tmp_path / name
@@ -212,6 +213,28 @@ async def test_silence_and_another_model(stage, boat):
             await asyncio.sleep(0.05)
     assert await other.end() == 2
     assert "the posterior that came has x 2, but the deployment of" in other.err
+
+
+async def test_silence_and_nonsense_later(stage):
+    _, uri = await stage.hub()
+    waiting = stage.start("listen", "--uri", uri, "--first-data-timeout", "2")
+    ending = stage.start("listen", "--uri", uri, "--timeout", "1.5")
+    async with connect(uri) as ros:
+        results = await ros.advertise("/BMresults", "std_msgs/Float64MultiArray")
+        while not (waiting.out and ending.out):
+            assert waiting.process.poll() is None, waiting.err
+            await results.publish(result(1))
+            await asyncio.sleep(0.05)
+        await results.publish({"data": "nonsense"})
+        assert await ending.end() == 3
+        await waiting.says("warning: nothing came on /bm/frame and /BMresults .* within 2 s")
+        before = len(waiting.out.splitlines())
+        await results.publish(result(2))
+        assert (await printed(waiting, before + 1))[-1].startswith("frame -: y 0, x 2 with 0.75")
+        waiting.send(signal.SIGTERM)
+        assert await waiting.end() == 143
+    for listen in (waiting, ending):
+        assert "warning: a message on /BMresults is not the std_msgs/Float64MultiArray" in listen.err
 
 
 def program(text: str, uri: str) -> list[str]:

@@ -164,16 +164,6 @@ async def test_a_topic_may_come_as_cbor(stage, deployment):
             assert operation.get("compression") == asked
 
 
-async def test_once(stage, deployment, robots):
-    async with connect(robots.uris[0]) as ros, posteriors(ros) as heard:
-        master = stage.start("master", "--once", "-d", str(deployment))
-        posterior = await heard.next(PATIENCE)
-        assert posterior.best() == {"s": 2}
-        assert posterior.probability > 0.9
-        assert abs(posterior.stamp_ns - time.time_ns()) < 10e9
-        assert await master.end() == 0
-
-
 async def test_clocks_that_disagree_are_named_and_what_is_unpaired_is_counted(stage, deployment, robots):
     robots.late_s = 5.0
     async with connect(robots.uris[0]) as ros, posteriors(ros) as heard:
@@ -182,9 +172,13 @@ async def test_clocks_that_disagree_are_named_and_what_is_unpaired_is_counted(st
             r"messages come on all topics but make no frame: the newest of /(scan|imu) is \S+ s older than that of "
             r"/(range|cells) \(/cells without a header, so by receipt\), and the tolerance is 0.5 s"
         )
-        await asyncio.sleep(4)  # 64 messages of each topic are kept
+        await asyncio.sleep(1)
         robots.late_s = 0.0
-        assert [(await heard.next(PATIENCE)).best() for _ in range(3)] == [{"s": 2}] * 3
+        for _ in range(3):
+            posterior = await heard.next(PATIENCE)
+            assert posterior.best() == {"s": 2}
+            assert posterior.probability > 0.9
+            assert abs(posterior.stamp_ns - time.time_ns()) < 10e9
         assert await master.end() == 0
     assert "3 results published" in master.err
     unpaired = int(master.err.rsplit(" unpaired", 1)[0].rsplit(None, 1)[1])
@@ -223,7 +217,7 @@ async def test_a_beam_that_is_not_there(stage, deployment):
     case = stage.where / "corridor"
     command = [str(BIN / "toolchain"), "build", str(case), "-o", str(deployment), "--sources", str(sources)]
     subprocess.run(command, check=True, capture_output=True, timeout=PATIENCE)
-    master = stage.start("master", "--once", "-d", str(deployment))
-    assert await master.end() == 4
-    said = master.err.splitlines()[-1]
+    subscriber = stage.start("subscriber", "-d", str(deployment))
+    assert await subscriber.end() == 4
+    said = subscriber.err.splitlines()[-1]
     assert "/scan: the message has no field 'ranges[360]': 'ranges' has 360 elements" in said
