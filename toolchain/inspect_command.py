@@ -8,6 +8,8 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Final
 
+import numpy as np
+
 from toolchain.accuracy import measure
 from toolchain.build import REPORT_NAME
 from toolchain.build_command import NetworkQuestion, Unread, read_model
@@ -83,7 +85,6 @@ class Inspection:
 
     deployment: Deployment
     machine: BM1Machine
-    scale: Scale | None
     losses: tuple[ColumnLoss, ...] | None
     reported_losses: str
     readings: Readings
@@ -123,7 +124,7 @@ def inspect(
     deployment = load_deployment(directory)
     machines = machines_of(deployment)
     whole = joined(machines)
-    model, scale, losses = _model(deployment, whole, options)
+    model, losses = _model(deployment, whole, options)
     readings = _readings(deployment, whole, model, options)
     section = deployment.machine
     boards = EmulatedBoards(
@@ -150,7 +151,6 @@ def inspect(
     return Inspection(
         deployment=deployment,
         machine=whole,
-        scale=scale,
         losses=losses,
         reported_losses=_reported(directory),
         readings=readings,
@@ -181,21 +181,22 @@ def machines_of(deployment: Deployment) -> tuple[BM1Machine, ...]:
 
 def _model(
     deployment: Deployment, whole: BM1Machine, options: InspectOptions
-) -> tuple[Model | None, Scale | None, tuple[ColumnLoss, ...] | None]:
-    """The unquantised model, once its codes are the deployment's; with how it was scaled and what that lost."""
+) -> tuple[Model | None, tuple[ColumnLoss, ...] | None]:
+    """The unquantised model, once its codes are the deployment's, and what quantising it lost."""
     if options.model is None:
-        return None, None, None
+        return None, None
     unread = Unread(settings=options.settings, bits=options.bits)
     model = read_model(options.model, options.question, unread)
     if model.lines == deployment.machine.lines and len(model.known) == whole.parameters.sensors:
-        for scale in Scale:
-            quantised = quantise(model, prob_bits=whole.parameters.prob_bits, scale=scale)
-            tables = (quantised.prior, *quantised.tables)
-            if all(
-                ours.shape == theirs.shape and (ours == theirs).all()
-                for ours, theirs in zip(tables, (whole.prior, *whole.tables), strict=True)
-            ):
-                return model, scale, quantised.losses
+        scale = Scale(deployment.machine.scale)
+        quantised = quantise(model, prob_bits=whole.parameters.prob_bits, scale=scale)
+        if all(
+            np.array_equal(ours, theirs)
+            for ours, theirs in zip(
+                (quantised.prior, *quantised.tables), (whole.prior, *whole.tables), strict=True
+            )
+        ):
+            return model, quantised.losses
     message = (
         f"{deployment.directory} was not built from {options.model} with these settings: its codes are others; give the "
         "same --set and --bits as to the build, or build it again"
@@ -267,7 +268,7 @@ def _machine_part(found: Inspection) -> str:
             f"columns and the prior, on {boards} board{'s' if boards > 1 else ''}{split}."
         ),
         (
-            f"Codes of {p.prob_bits} bits{f' (scale = {found.scale})' if found.scale else ''}, counters of {p.counter_bits} "
+            f"Codes of {p.prob_bits} bits (scale = {machine.scale}), counters of {p.counter_bits} "
             f"bits, {p.rng} {'one a column' if p.shared else 'one a cell'} with {p.steps_per_clock} steps a clock and "
             f"{p.rng_banks} bank{'s' if p.rng_banks > 1 else ''}; stops at a count of {machine.target_count} or after "
             f"{machine.max_cycles} cycles, stop = {machine.stop}."
