@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final, TypedDict
 import typer
 
 from toolchain import case_study
-from toolchain.build_command import read_model, read_options
+from toolchain.build_command import on_device, read_model, read_options
 from toolchain.check import check_deployment, check_model, refusal
 from toolchain.deployment import FILE_NAME
 from toolchain.errors import BuildError, ToolchainError
@@ -90,6 +90,7 @@ def _findings(
     try:
         options = read_options(options, unread)
         model = read_model(path, question, unread)
+        options = on_device(options, model, unread.device)
     except ToolchainError as reason:
         return [refusal(reason, "the model")]
     return check_model(model, options)

@@ -156,6 +156,7 @@ def check(
     prior_select: flags.PriorSelectName = "",
     on_missing: flags.OnMissingFlag = OnMissing.ERROR,
     partitions: flags.Partitions = 1,
+    device: flags.DeviceFlag = None,
     interface: flags.Interface = None,
     scale: flags.ScaleFlag = Scale.ADDRESS,
     prob_bits: flags.ProbBits = 8,
@@ -210,7 +211,11 @@ def check(
             on_missing=on_missing.value,
         )
         unread = Unread(
-            settings=tuple(settings or ()), bits=tuple(bits or ()), interface=interface, rng_table=rng_table
+            settings=tuple(settings or ()),
+            bits=tuple(bits or ()),
+            interface=interface,
+            rng_table=rng_table,
+            device=device,
         )
         said = [name for name in context.params if name not in {"path", "json"} and _was_said(context, name)]
         code = run_check(path, question, options, unread, said, json=json)

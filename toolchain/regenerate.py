@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 from pydantic import ValidationError
 
 from pcie_shim.programming_file import Image, Partition, read_image
-from toolchain.build import REPORT_NAME, assemble, build_report, refused_option
+from toolchain.build import REPORT_NAME, assemble, board_interface, build_report, refused_option
 from toolchain.deployment import (
     FILE_NAME,
     Deployment,
@@ -26,6 +26,7 @@ from toolchain.output_files import (
     text_file,
     write_files,
 )
+from toolchain.partition import partition_lines
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -105,7 +106,7 @@ def regenerate_memories(directory: Path, model: Model | None = None, *, build_da
     parts = [
         image_files(new, built.images),
         memory_files(new, built.images),
-        text_file(REPORT_NAME, build_report(model, new, built.quantised)),
+        text_file(REPORT_NAME, build_report(model, new, built.quantised, _interface_reason(model, new))),
         text_file(FILE_NAME, deployment_text(new)),  # last: a folder that is half new has the old hashes
     ]
     return sorted(change for part in parts for change in write_files(directory, part))
@@ -234,6 +235,13 @@ def _listed(values: Sequence[object]) -> str:
     return ", ".join(
         f"{value[0]} ({value[1]})" if isinstance(value, tuple) else str(value) for value in values
     )
+
+
+def _interface_reason(model: Model, deployment: Deployment) -> str:
+    """Return what the report says of the interface: as a build without --interface would, where it has the same."""
+    machine = deployment.machine
+    interface, reason = board_interface(model, partition_lines(model.lines, len(deployment.boards)), None)
+    return reason if interface == (machine.interface_sensors, machine.interface_results) else ", as asked for"
 
 
 def _with_targets(new: Deployment, old: Deployment) -> Deployment:
