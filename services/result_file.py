@@ -11,7 +11,6 @@ from itertools import product
 from pathlib import Path
 from typing import Any, Final, Protocol
 
-import numpy as np
 import orjson
 
 from bridge.results import Heard, Posterior
@@ -210,6 +209,8 @@ class _Archive:
         """Write what is not written yet."""
         if self._written == len(self._heard):
             return
+        import numpy as np
+
         heard = self._heard
         arrays: dict[str, Any] = {
             "probabilities": np.array([each.probabilities for each in heard]).reshape(-1, *heard[0].sizes),

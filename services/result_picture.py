@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
-import numpy as np
-import numpy.typing as npt
 from rich.console import Console
 from rich.text import Text
 
 from bridge.results import Posterior
 from toolchain.deployment import Deployment, Dimension
+
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
 
 ROWS: Final = 32
 """Lines of a picture at most; finer posteriors are drawn in blocks of cells."""
@@ -151,6 +153,8 @@ def _heat(
 
 def _blocks(values: npt.NDArray[np.float64], step: int, axis: int) -> npt.NDArray[np.float64]:
     """Sums over blocks of so many cells along an axis; the last block may have fewer."""
+    import numpy as np
+
     return np.add.reduceat(values, np.arange(0, values.shape[axis], step), axis=axis)
 
 
