@@ -41,8 +41,8 @@ IN_FLIGHT = 32
 """Messages under way when servers are compared."""
 WINDOW = {SMALL: 400, LARGE: 100}
 """Messages that a receiving client may be behind, by their values: less than the hub would drop for it."""
-COUNTS = {SMALL: (4000, 4000, 300), LARGE: (300, 600, 100)}
-"""By values of a message: how many are published, received and sent round in a turn."""
+COUNTS = {SMALL: (12_000, 12_000, 600), LARGE: (1_000, 2_000, 200)}
+"""By values of a message: how many are published, received and sent round in a turn; the fastest client takes 50 ms."""
 PER_SIZE = 40
 SERVER_MESSAGES = {"hub": 100_000, "Tornado double": 8_000}
 SERVER_TURNS = 5
