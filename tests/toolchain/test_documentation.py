@@ -24,7 +24,7 @@ DOCS = Path(__file__).parents[2] / "docs"
 
 
 def documented(text, heading):
-    section = text.split(f"\n## {heading}", 1)[1].split("\n## ", 1)[0]
+    section = re.split(r"\n##+ ", text.split(f"\n## {heading}", 1)[1], maxsplit=1)[0]
     return [
         key
         for row in re.findall(r"^\| (`.+?) \|", section, re.MULTILINE)
