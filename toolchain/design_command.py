@@ -63,7 +63,10 @@ def inspect_(
             help="Frames of readings at most; default 200, or 20 of a machine that is slow to emulate."
         ),
     ] = None,
-    banks: _Banks = 4,
+    banks: Annotated[
+        int | None,
+        typer.Option(help="Sets of seeds that each frame is run with; default 4, or 1 of such a machine."),
+    ] = None,
     seed: _Seed = 1,
     clock: Annotated[float, typer.Option(help="The boards' clock, hertz.")] = 100e6,
     device: _Device = "proce-v-d8",

@@ -40,8 +40,10 @@ if TYPE_CHECKING:
 
 CLOCK_MAX_HZ: Final = 1e12
 FRAMES: Final = 200
+BANKS: Final = 4
 SLOW_FRAMES: Final = 20
 """Of machines that run a cycle at a time: one generator a cell, or no LFSRs."""
+SLOW_BANKS: Final = 1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,7 +59,7 @@ class InspectOptions:
         columns: `NAME=COLUMN`s of the recording.
         tolerance_s: In a bag, how far from a row another topic's message may be, seconds.
         frames: How many frames at most; None for 200, or 20 of a machine that only the slow kernel runs.
-        banks: Sets of seeds that each is run with.
+        banks: Sets of seeds that each is run with; None for 4, or 1 of such a machine.
         seed: Of the readings that are drawn.
         clock_hz: The clock that times are said at.
         device: What a board has.
@@ -72,7 +74,7 @@ class InspectOptions:
     columns: tuple[str, ...] = ()
     tolerance_s: float = 0.1
     frames: int | None = None
-    banks: int = 4
+    banks: int | None = None
     seed: int = 1
     clock_hz: float = 100e6
     device: str = "proce-v-d8"
@@ -117,7 +119,7 @@ def inspect(
     if not 1.0 <= options.clock_hz <= CLOCK_MAX_HZ:
         message = f"--clock is {options.clock_hz:g}, expected hertz from 1 to {CLOCK_MAX_HZ:g}, such as 100e6"
         raise BuildError(message)
-    if options.banks < 1:
+    if options.banks is not None and options.banks < 1:
         message = f"--banks is {options.banks}, expected 1 or more"
         raise BuildError(message)
     device = device_named(options.device)
@@ -146,8 +148,9 @@ def inspect(
             pcie=options.pcie,
             tables=Tables.COLUMN,
         )
+    banks = options.banks or (SLOW_BANKS if _is_slow(whole) else BANKS)
     with counting(len(readings)) as advance:
-        accuracy = measure(boards, readings, model, banks=options.banks, advance=advance)
+        accuracy = measure(boards, readings, model, banks=banks, advance=advance)
     return Inspection(
         deployment=deployment,
         machine=whole,
@@ -209,7 +212,7 @@ def _readings(
 ) -> Readings:
     frames = options.frames
     if frames is None:
-        frames = FRAMES if whole.parameters.shared and whole.parameters.rng.lfsr_bits else SLOW_FRAMES
+        frames = SLOW_FRAMES if _is_slow(whole) else FRAMES
     if options.recording is not None:
         return recorded_readings(
             options.recording,
@@ -228,6 +231,10 @@ def _readings(
     drawn_from = model_of_codes(deployment.name, deployment.searched, deployment.variables, whole)
     source = f"{frames} frames drawn from what the codes say of the model (seed {options.seed})"
     return sample_readings(drawn_from, frames, seed=options.seed, source=source)
+
+
+def _is_slow(machine: BM1Machine) -> bool:
+    return not machine.parameters.shared or machine.parameters.rng.lfsr_bits is None
 
 
 def _reported(directory: Path) -> str:

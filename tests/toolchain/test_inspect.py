@@ -159,6 +159,14 @@ def test_a_build_on_a_device_takes_its_own_number_of_boards(case):
     )  # as many as were asked for, since they are more
 
 
+def test_a_machine_that_is_slow_to_emulate_is_looked_at_for_fewer_frames(case):
+    build(case, "--per-cell", "--target-count", "20")
+    result = CliRunner().invoke(app, ["inspect", str(case.parent / "out")])
+    assert result.exit_code == 0, result.stderr
+    assert "Readings: 20 frames drawn from what the codes say of the model (seed 1).\n" in result.stdout
+    assert "lfsr32 one a cell" in result.stdout
+
+
 def test_units():
     assert _unit(20.48e-6, "s") == "20.5 us"
     assert _unit(100e6, "Hz") == "100 MHz"
