@@ -32,6 +32,7 @@ from toolchain.deployment import (
     write_deployment,
 )
 from toolchain.errors import BuildError
+from toolchain.memories import generators
 from toolchain.options import SensorMode
 from toolchain.output_files import memory_files, quartus_files, write_files
 from toolchain.partition import Block, partition_lines
@@ -47,6 +48,7 @@ DEFAULT_INTERFACE: Final = (20, 1200)
 
 REPORT_NAME: Final = "report.txt"
 
+_MOST_SEEDS: Final = 1 << 23
 _FLAGS: Final = {"tolerance_s": "--tolerance", "path": "--prior-path"}
 
 
@@ -102,6 +104,7 @@ def assemble(model: Model, options: BuildOptions) -> Built:
     interface, interface_reason = board_interface(model, blocks, options.interface)
     try:
         parameters = machine_parameters(model, options)
+        _check_seeds(replace(parameters, lines=blocks[0].lines))
         quantised = quantise(model, prob_bits=options.prob_bits, scale=options.scale)
         images = _images(model, quantised, parameters, blocks, interface, options)
     except (MachineError, PcieShimError) as reason:
@@ -331,6 +334,15 @@ def check_options(options: BuildOptions) -> None:
             f"--replicas {options.replicas}: this version's boards hold one machine each; use --replicas 1"
         )
         raise BuildError(message)
+
+
+def _check_seeds(board: BM1Parameters) -> None:
+    """Refuse a board whose seeds would be a memory of gigabytes."""
+    seeds = board.rng_banks * generators(board)
+    if seeds > _MOST_SEEDS and board.rng is not RngKind.IDEAL:
+        most = _MOST_SEEDS // generators(board)
+        message = f"--rng-banks {board.rng_banks} takes {seeds} seeds a board, and {_MOST_SEEDS} can be: use at most {most}"
+        raise BuildError(message + ("" if board.shared else ", or --shared"))
 
 
 def _check_prior(model: Model, options: BuildOptions) -> None:

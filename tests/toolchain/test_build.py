@@ -113,6 +113,15 @@ def test_options_arrive_in_the_deployment_and_in_the_images(tmp_path):
     )
 
 
+def test_seeds_that_no_memory_holds(tmp_path):
+    options = replace(OPTIONS, rng_banks=65536, shared=False)
+    with pytest.raises(
+        BuildError, match="takes 9633792 seeds a board, and 8388608 can be: use at most 57065, or --shared"
+    ):
+        build_deployment(model(size=7), tmp_path / "out", options)
+    assert not (tmp_path / "out").exists()
+
+
 def test_the_target_is_the_counters_largest_count(tmp_path):
     assert build_deployment(model(), tmp_path, OPTIONS).deployment.machine.target_count == 255
 
