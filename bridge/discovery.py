@@ -4,7 +4,7 @@ A server announces itself as an instance of the service ``_rosbridge._tcp.local.
 a client must know in its properties: ``path`` of the URL, ``tls``, ``token`` and ``ros`` (1 or 2). All of them may be
 missing, so that a line in Avahi's configuration announces a rosbridge server that knows nothing of this.
 
-``zeroconf`` is an extra (``pip install 'rosbayes[discover]'``), imported when one of these functions is called.
+``zeroconf`` is an extra (``pip install zeroconf``), imported when one of these functions is called.
 What comes from the network is anybody's: it is bounded, and fit to be printed.
 
 Source: RFC 6762 and 6763.
@@ -235,8 +235,7 @@ async def _zeroconf(interfaces: Sequence[str] | None) -> AsyncIterator[AsyncZero
         from zeroconf.asyncio import AsyncZeroconf
     except ImportError:
         raise DiscoveryError(
-            "finding robots by name needs the package zeroconf, which is not installed: "
-            "pip install 'rosbayes[discover]'"
+            "finding robots by name needs the package zeroconf, which is not installed: pip install zeroconf"
         ) from None
     try:
         zeroconf = AsyncZeroconf(interfaces=InterfaceChoice.All if interfaces is None else list(interfaces))

@@ -123,7 +123,7 @@ def _rosbags() -> Any:
         from rosbags import typesys
     except ImportError:
         raise DefinitionError(
-            "reading serialised messages needs the package rosbags: pip install 'rosbayes[messages]'"
+            "reading serialised messages needs the package rosbags: pip install rosbags"
         ) from None
     return typesys
 

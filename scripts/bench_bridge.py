@@ -356,7 +356,7 @@ def codec() -> dict[str, float]:
 async def bench(arguments: argparse.Namespace) -> int:
     """Measure everything, print the tables, write the picture and the JSON."""
     clients, found = kinds(), Figures()
-    with tempfile.TemporaryDirectory(prefix="rosbayes-bench-") as folder:
+    with tempfile.TemporaryDirectory(prefix="bench-rosbayes-") as folder:
         hub, tornado = (Process(name, Path(folder, name)) for name in ("hub", "tornado"))
         try:
             await hub.start("hub", "--port", "0")
@@ -538,7 +538,7 @@ def draw(by_values: dict[str, dict[str, float]], path: Path) -> bool:
     try:
         import matplotlib as mpl
     except ImportError:
-        print("no picture: install matplotlib (pip install 'rosbayes[pictures]')", file=sys.stderr)
+        print("no picture: install matplotlib (pip install matplotlib)", file=sys.stderr)
         return False
     mpl.use("Agg")
     from matplotlib import pyplot as plt

@@ -180,7 +180,7 @@ async def bench(arguments: argparse.Namespace) -> int:
     floor: list[float] = []
     stacks = {"processes": Measured(), "fused": Measured()}
     topics = {"processes": BOAT_TOPIC, "fused": FUSED_TOPIC}
-    with tempfile.TemporaryDirectory(prefix="rosbayes-bench-") as folder:
+    with tempfile.TemporaryDirectory(prefix="bench-rosbayes-") as folder:
         where = Path(folder)
         hub, echo = (Process(name, where / f"{name}.log") for name in ("hub", "echo"))
         masters = {name: Process(f"master ({name})", where / f"{name}.log") for name in stacks}

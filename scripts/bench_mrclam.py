@@ -68,7 +68,7 @@ async def bench(arguments: argparse.Namespace) -> int:
     landmarks = read_landmarks(landmarks_file)
     recordings = {name: read_recording(arguments.data / name) for name in RECORDINGS}
     found = []
-    with tempfile.TemporaryDirectory(prefix="rosbayes-bench-") as folder:
+    with tempfile.TemporaryDirectory(prefix="bench-rosbayes-") as folder:
         where = Path(folder)
         hub, master = (Process(name, where / f"{name}.log") for name in ("hub", "master"))
         try:

@@ -267,7 +267,7 @@ async def check(arguments: argparse.Namespace) -> int:
     """Run everything, print the table; 1 if anything failed."""
     versions = [arguments.ros_version] if arguments.ros_version else ["1", "2"]
     outcomes: list[Outcome] = []
-    with tempfile.TemporaryDirectory(prefix="rosbayes-conformance-") as folder:
+    with tempfile.TemporaryDirectory(prefix="conformance-rosbayes-") as folder:
         work = Path(folder)
         if arguments.only in {None, "roslibpy"}:
             clients = install_roslibpy()

@@ -268,7 +268,7 @@ def verify(only: list[str]) -> Checks:
     """Do all of it."""
     python, wheel = environment()
     checks = Checks()
-    with tempfile.TemporaryDirectory(prefix="rosbayes-networks-") as temporary:
+    with tempfile.TemporaryDirectory(prefix="networks-rosbayes-") as temporary:
         folder = Path(temporary)
         names = unpack(wheel, folder)
         checks.check("pgmpy's wheel", len(names) == NETWORKS, f"{len(names)} networks")

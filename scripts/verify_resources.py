@@ -316,7 +316,7 @@ def main() -> int:
         )
         return 2
     passed = failed = 0
-    with tempfile.TemporaryDirectory(prefix="rosbayes-resources-") as where:
+    with tempfile.TemporaryDirectory(prefix="resources-rosbayes-") as where:
         folder = Path(where)
         for each in SIMULATED:
             ours, theirs = reference(machine_of(each), frames_of(each)), simulated(each, folder)

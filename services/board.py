@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import signal
+import socket
 import sys
 import time
 from pathlib import Path
@@ -78,6 +79,16 @@ def serve_one(
     return ended_by[0] if ended_by else 0
 
 
+def _check_free(endpoint: Endpoint) -> None:
+    """Refuse a place where others' boards are: from here on, what lies there counts as our own."""
+    for each in (endpoint, endpoint.programming):
+        with socket.socket(socket.AF_UNIX) as probe, contextlib.suppress(OSError):
+            probe.settimeout(1)
+            probe.connect(each.path)
+            msg = f"another process listens at {each}; end it, or give --directory another folder"
+            raise SettingsError(msg)
+
+
 class BoardProcesses:
     """Boards 0 to n-1, each a process forked from this one."""
 
@@ -99,6 +110,8 @@ class BoardProcesses:
 
         # the children share these pages: four imports of numba would take 1.6 s
         warm_up()
+        for endpoint in self._endpoints:
+            _check_free(endpoint)
         try:
             for at in range(len(self._endpoints)):
                 self._fork(at)
@@ -208,8 +221,11 @@ def board(
         if misbehave:
             msg = "--misbehave belongs to a single board: start it with --listen ENDPOINT"
             raise SettingsError(msg)
-        if directory is None or not directory.is_dir():
-            msg = f"--directory {directory or ''} is no folder; name one for the boards' sockets"
+        if directory is None:
+            msg = "--boards needs --directory DIR, a folder for the boards' sockets"
+            raise SettingsError(msg)
+        if not directory.is_dir():
+            msg = f"--directory {directory} is no folder; name one for the boards' sockets"
             raise SettingsError(msg)
         BoardProcesses(directory, boards, restarts, run_directory).run()
     wrong = Misbehaviour.parse(misbehave) if misbehave else None

@@ -7,9 +7,11 @@ Boards stay processes, or devices, of their own.
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import threading
 from collections.abc import Callable, Coroutine
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Self, TypeVar, cast
 
 from pcie_shim.errors import BoardError, PcieShimError
 from services.errors import exit_code_of
@@ -25,6 +27,7 @@ from services.subscriber import ROLE as SUBSCRIBER
 from services.subscriber import Subscriber
 from toolchain.deployment import Deployment
 
+Result = TypeVar("Result")
 Hear = Callable[[AnyRecord], None]
 
 
@@ -110,7 +113,7 @@ class FusedBoards:
         """
         async with self._link, status_served(self._run_directory, PCIE_APP, self._progress.status):
             try:
-                self._progress.ready = Ready(await asyncio.to_thread(self._boards.open))
+                self._progress.ready = Ready(await _in_thread(self._boards.open))
                 self._link.keep(self._progress.ready)
                 while True:
                     await asyncio.sleep(TICK)
@@ -118,7 +121,7 @@ class FusedBoards:
                         if self._boards.is_late:
                             self._collect()
                     elif self._boards.gone and self._looking is None:
-                        for board in await asyncio.to_thread(self._boards.mend):
+                        for board in await _in_thread(self._boards.mend):
                             self._link.send(Notice("info", f"board {board} is back, programmed"))
             except PcieShimError as error:
                 self._link.send(Trouble(exit_code_of(error), str(error)))
@@ -180,10 +183,37 @@ class FusedBoards:
 
     async def _look(self, number: int, error: BoardError) -> None:
         try:
-            await asyncio.to_thread(self._boards.look, error)
+            await _in_thread(lambda: self._boards.look(error))
         finally:
             self._looking = None
         self._link.send(frame_failed(number, error))
+
+
+async def _in_thread(work: Callable[[], Result]) -> Result:
+    """What takes long, in a thread that nobody waits for when the run ends meanwhile."""
+    loop = asyncio.get_running_loop()
+    future: asyncio.Future[Result] = loop.create_future()
+
+    def tell(result: Result | None, error: BaseException | None) -> None:
+        if future.done():
+            return
+        if error is not None:
+            future.set_exception(error)
+        else:
+            future.set_result(cast("Result", result))
+
+    def run() -> None:
+        result: Result | None = None
+        failure: BaseException | None = None
+        try:
+            result = work()
+        except BaseException as error:
+            failure = error
+        with contextlib.suppress(RuntimeError):  # the loop is closed: nobody waits any more
+            loop.call_soon_threadsafe(tell, result, failure)
+
+    threading.Thread(target=run, daemon=True).start()
+    return await future
 
 
 def fused_services(

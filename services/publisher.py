@@ -19,6 +19,7 @@ import typer
 
 from bridge.client import Publication, Ros, State, Subscription, connect
 from bridge.errors import BridgeError, NoMessageError
+from bridge.results import FRAME_TOPIC, FRAME_TYPE
 from machines.bm1 import StopReason
 from services import options
 from services.command_line import ends_well, make_app, run_async
@@ -26,8 +27,6 @@ from services.errors import InputLineError, SettingsError, exit_code_of
 from services.logs import get_logger, say
 from services.records import AnyRecord, Begin, BoardOutcome, FrameResult, Publish, Published, Ready, Trouble
 from services.results import (
-    FRAME_TOPIC,
-    FRAME_TYPE,
     FrameReport,
     Inferred,
     posterior_layout,

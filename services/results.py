@@ -16,9 +16,6 @@ from machines.posterior import posterior_of_lines
 from services.records import FrameResult, Publish
 from toolchain.deployment import Deployment
 
-FRAME_TOPIC = "/bm/frame"
-FRAME_TYPE = "diagnostic_msgs/DiagnosticArray"
-
 REASON_WORDS = {
     StopReason.NONE: "not started",
     StopReason.OVERFLOW: "overflow",

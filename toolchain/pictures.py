@@ -26,7 +26,9 @@ def check_pictures_possible() -> None:
         BuildError: matplotlib is not installed.
     """
     if find_spec("matplotlib") is None:
-        message = "a plot needs matplotlib, which is not installed: run pip install 'rosbayes[pictures]', or leave out --plot"
+        message = (
+            "a plot needs matplotlib, which is not installed: run pip install matplotlib, or leave out --plot"
+        )
         raise BuildError(message)
 
 

@@ -147,7 +147,7 @@ def _messages(path: Path, topics: tuple[str, ...]) -> Iterator[tuple[str, int, A
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
-        message = f"{path} is no CSV file, and bags are read by rosbags: pip install 'rosbayes[messages]'"
+        message = f"{path} is no CSV file, and bags are read by rosbags: pip install rosbags"
         raise ModelError(message) from None
     count = 0
     try:

@@ -40,7 +40,9 @@ _TIMES: Final = {"builtin_interfaces/msg/Time": "time", "builtin_interfaces/msg/
 #: What the fields of a time are called in ROS 1, by rosbags' names, which are ROS 2's.
 _ROS1_TIME: Final = {"sec": "secs", "nanosec": "nsecs"}
 #: Types that keep what was made of them: clients can name no more than there are.
-_MISSING: Final = "the hub has no message definitions here: install rosbags (pip install 'rosbayes[messages]') and start it again"
+_MISSING: Final = (
+    "the hub has no message definitions here: install rosbags (pip install rosbags) and start it again"
+)
 
 _Convert = Callable[[Any], Any]
 

@@ -34,7 +34,7 @@ def check_pictures_possible() -> None:
     """
     if find_spec("matplotlib") is None:
         raise OutputError(
-            "the pictures need matplotlib, which is not installed: run pip install 'rosbayes[pictures]', "
+            "the pictures need matplotlib, which is not installed: run pip install matplotlib, "
             "or leave out --out"
         )
 

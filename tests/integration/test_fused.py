@@ -60,6 +60,15 @@ async def test_a_signal_ends_everything(stage, boat, number, code):
     await stage.nothing_left("hub")
 
 
+async def test_a_signal_while_the_boards_start_is_not_waited_out(stage, boat):
+    _, uri = await stage.hub()
+    master = stage.start(*FUSED, "--loop", "-d", str(boat), "--uri", uri, "--peer-timeout", "60")
+    await master.says("subscriber: connected")
+    master.send(signal.SIGINT)
+    assert await master.end(30) == 130  # not the minute that boards may take
+    await stage.nothing_left("hub")
+
+
 async def test_a_killed_master_leaves_nothing(stage, boat):
     *_, master = await looping(stage, boat)
     master.send(signal.SIGKILL)

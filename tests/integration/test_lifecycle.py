@@ -168,6 +168,22 @@ async def test_loop_survives_a_killed_board_and_gives_up_on_the_fourth(stage, bo
     await stage.nothing_left("hub")
 
 
+async def test_a_second_set_of_boards_leaves_the_first_alone(stage, tmp_path):
+    first = stage.start("board", "--boards", "2", "--directory", str(tmp_path))
+    paths = {f"board{at}{kind}.sock" for at in (0, 1) for kind in ("", ".program")}
+    deadline = time.monotonic() + 20
+    while {path.name for path in tmp_path.glob("*.sock")} < paths:
+        assert time.monotonic() < deadline, first.err
+        await asyncio.sleep(0.05)
+    second = stage.start("board", "--boards", "2", "--directory", str(tmp_path))
+    assert await second.end() == 2
+    assert second.err.count("\n") == 1
+    assert "another process listens at" in second.err
+    assert {path.name for path in tmp_path.glob("*.sock")} >= paths
+    first.send(signal.SIGTERM)
+    assert await first.end() == 143
+
+
 async def test_loop_gives_up_on_a_service_that_dies_too_often(stage, boat):
     _, _, robot, master = await looping(stage, boat)
     for time_ in range(1, 4):
