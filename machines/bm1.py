@@ -80,6 +80,22 @@ class BM1Machine:
         return hash(self.parameters)
 
 
+SHORTEST_SLICE: Final = 256
+"""Cycle at which the first slice ends at the earliest; the next ones end at twice the last one's end."""
+
+
+def first_slice(target_count: int) -> int:
+    """The cycle at which the first of a frame's slices ends: 256 * 2^k, the first that is twice the target or more.
+
+    No counter can reach the target earlier than in as many cycles, and even a line whose every other cycle counts takes
+    twice as many: a slice that ended before would cost every board a doorbell and an answer for nothing.
+    """
+    end = SHORTEST_SLICE
+    while end < 2 * target_count:
+        end *= 2
+    return end
+
+
 class StopReason(IntEnum):
     """Why a machine stands still. The numbers are those of the status register."""
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final, Literal, NoReturn, Self
 
 import numpy as np
 
-from machines.bm1 import CYCLES_MAX, StopReason
+from machines.bm1 import CYCLES_MAX, StopReason, first_slice
 from machines.parameters import PriorMode
 from pcie_shim import register_map as rm
 from pcie_shim.doorbell import following
@@ -61,8 +61,6 @@ if TYPE_CHECKING:
     from pcie_shim.endpoint import Endpoint
     from pcie_shim.programming_file import Image
 
-SHORTEST_SLICE: Final = 256
-"""Cycle at which the first slice ends at the earliest; the next ones end at twice the last one's end."""
 SLACK_S: Final = 5.0
 """Seconds that a board may take beyond what its cycles need at its measured speed."""
 FIRST_WAIT_S: Final = 0.01
@@ -663,18 +661,6 @@ class MiniCluster:
         return [
             codes[offset : offset + board.lines] for offset, board in zip(offsets, self._boards, strict=True)
         ]
-
-
-def first_slice(target_count: int) -> int:
-    """The cycle at which the first of a frame's slices ends: 256 * 2^k, the first that is twice the target or more.
-
-    No counter can reach the target earlier than in as many cycles, and even a line whose every other cycle counts takes
-    twice as many: a slice that ended before would cost every board a doorbell and an answer for nothing.
-    """
-    end = SHORTEST_SLICE
-    while end < 2 * target_count:
-        end *= 2
-    return end
 
 
 def _check_images(boards: int, images: Sequence[Image]) -> None:

@@ -21,7 +21,7 @@ Listen = Annotated[
     str | None,
     typer.Option(
         "--listen",
-        help="Serve a master at this endpoint instead of standard input and output.",
+        help="Serve at this endpoint (a master; a board: its host) instead of standard input and output.",
         metavar="unix:PATH|tcp://HOST:PORT",
     ),
 ]

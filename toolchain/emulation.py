@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from machines.bm1 import BM1Machine, Start, StopReason
+from machines.bm1 import BM1Machine, Start, StopReason, first_slice
 from machines.kernel import make_kernel
 from machines.parameters import COUNTER_BITS_MAX, BM1Parameters
 from machines.posterior import joint_posterior
@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import NDArray
-
-SHORTEST_SLICE: Final = 256
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -130,14 +128,6 @@ class EmulatedBoards:
             tuple(kernel.cycles for kernel in self._kernels),
             tuple(kernel.reason for kernel in self._kernels),
         )
-
-
-def first_slice(target_count: int) -> int:
-    """Return the cycle at which a frame's first slice ends: 256 * 2^k, the first that is twice the target or more."""
-    end = SHORTEST_SLICE
-    while end < 2 * target_count:
-        end *= 2
-    return end
 
 
 def split(machine: BM1Machine, boards: int) -> tuple[BM1Machine, ...]:

@@ -2,20 +2,14 @@
 
 import pytest
 
-from machines.bm1 import Start, StopReason
+from machines.bm1 import Start, StopReason, first_slice
 from machines.reference import ReferenceBM1
-from pcie_shim import driver
 from tests.toolchain.corridor import corridor, machine_of
 from toolchain.deployment import Stop
-from toolchain.emulation import EmulatedBoards, first_slice, joined, split
+from toolchain.emulation import EmulatedBoards, joined, split
 from toolchain.errors import BuildError
 
 MACHINE = machine_of(corridor(13, sigma=0.7))
-
-
-def test_the_first_slice_is_the_drivers():
-    for target in (1, 127, 128, 129, 255, 1000, 65535):
-        assert first_slice(target) == driver.first_slice(target)
 
 
 def test_boards_split_and_joined():
