@@ -430,6 +430,9 @@ def load_deployment(directory: Path, *, images: bool = True, edited: bool = Fals
     """
     directory = Path(directory)
     path = directory / FILE_NAME
+    if directory.is_file():
+        message = f"{directory} is a file; give the folder that 'toolchain build' wrote, here perhaps {directory.parent}"
+        raise DeploymentError(message)
     if not path.is_file():
         message = f"{directory} holds no deployment: {path} is not there; make one with 'toolchain build'"
         raise DeploymentError(message)

@@ -94,6 +94,11 @@ async def serve_hub(
             ssl=door.tls,
             ssl_handshake_timeout=hub.limits.handshake_timeout if door.tls else None,
         )
+    except socket.gaierror as error:
+        raise HubError(
+            f"the hub cannot listen on {host}: that is no address or name of this machine ({error.strerror}); "
+            "give one, for example 127.0.0.1, or 0.0.0.0 for all of them"
+        ) from None
     except OSError as error:
         raise HubError(
             f"the hub cannot listen on {host} port {port} ({error.strerror or error}): "

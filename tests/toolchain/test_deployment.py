@@ -4,6 +4,7 @@ build ──▶ deployment.toml ──▶ (a user edits it) ──▶ load_deplo
           boards/*.bm                              └─ one sentence: file, line, nearest right name
 """
 
+import re
 import string
 import subprocess
 import sys
@@ -397,3 +398,12 @@ def test_a_subscriber_needs_no_numpy():
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60
     )
     assert done.stdout == "False\n"
+
+
+def test_a_file_in_place_of_its_folder_is_told(tmp_path):
+    file = tmp_path / "deployment.toml"
+    file.write_text("")
+    with pytest.raises(
+        DeploymentError, match=rf"is a file; give the folder .* perhaps {re.escape(str(tmp_path))}"
+    ):
+        load_deployment(file)
