@@ -60,7 +60,7 @@ async def test_without_zeroconf_one_sentence_says_so(monkeypatch: pytest.MonkeyP
     for module in ("zeroconf", "zeroconf.asyncio"):
         monkeypatch.setitem(sys.modules, module, None)
     for attempt in (discover(0.1), resolve("Robot", 0.1)):
-        with pytest.raises(DiscoveryError, match=r"pip install 'rosbayes\[discover\]'") as caught:
+        with pytest.raises(DiscoveryError, match=r"pip install zeroconf") as caught:
             await attempt
         assert caught.value.exit_code == 2
 

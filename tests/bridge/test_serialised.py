@@ -189,7 +189,7 @@ def test_without_rosbags_one_sentence_says_so(monkeypatch):
         return real(name, *args, **options)
 
     monkeypatch.setattr(builtins, "__import__", without)
-    with pytest.raises(DefinitionError, match=r"pip install 'rosbayes\[messages\]'"):
+    with pytest.raises(DefinitionError, match=r"pip install rosbags"):
         MessageTypes().read(b"", "std_msgs/String")
 
 
