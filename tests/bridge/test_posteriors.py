@@ -276,7 +276,6 @@ async def test_no_server():
 CTRL_C = """
 import os, signal, sys
 from bridge.posteriors import listen
-signal.signal(signal.SIGINT, signal.default_int_handler)  # who runs in the background has it ignored
 def function(posterior):
     print("got", posterior.number, flush=True)
     if "{when}" == "inside":
