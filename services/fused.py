@@ -61,7 +61,7 @@ class FusedLink:
         """Hand a record to the master."""
         if self._to_master is None:
             return False
-        self._to_master(record)  # type: ignore[arg-type]  # every record that a service sends is one of them
+        self._to_master(cast("AnyRecord", record))
         return True
 
     def keep(self, record: Record) -> None:
@@ -82,7 +82,7 @@ class FusedEnd:
 
     def send(self, record: Record) -> bool:
         """Hand a record to the service."""
-        self._to_service(record)  # type: ignore[arg-type]  # every record that the master sends is one of them
+        self._to_service(cast("AnyRecord", record))
         return True
 
     def close(self) -> None:
