@@ -28,11 +28,11 @@ import numpy as np
 from machines.bm1 import BM1Machine
 from machines.parameters import BM1Parameters, RngKind
 from machines.posterior import posterior
-from toolchain.distribution import Distribution
 from toolchain.errors import ModelError
-from toolchain.fusion import exact_posterior
-from toolchain.joint import JointDistribution
-from toolchain.model import Model
+from toolchain.models.distribution import Distribution
+from toolchain.models.fusion import exact_posterior
+from toolchain.models.joint import JointDistribution
+from toolchain.models.model import Model
 from toolchain.networks import read_network
 from toolchain.quantise import quantise
 

@@ -1,7 +1,7 @@
 """The resource estimator beside a synthesis, and the synthesised text beside the reference machine: scripts/verify resources.
 
-small machines --> toolchain.rtl (Verilog) --> Icarus Verilog --> counts, cycles, reasons, states: the reference's, to the bit?
-                                          └--> yosys synth_intel_alm --> ALUTs, registers: what toolchain.resources says?
+small machines --> toolchain.analysis.rtl (Verilog) --> Icarus Verilog --> counts, cycles, reasons, states: the reference's, to the bit?
+                                          └--> yosys synth_intel_alm --> ALUTs, registers: what toolchain.analysis.resources says?
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from rich.table import Table
 from machines.bm1 import BM1Machine, Start, StopReason
 from machines.parameters import BM1Parameters, PriorMode, RngKind, RngReset
 from machines.reference import ReferenceBM1
-from toolchain import rtl
-from toolchain.resources import Alms, logic_of
+from toolchain.analysis import rtl
+from toolchain.analysis.resources import Alms, logic_of
 
 LIMIT_S = 240.0
 """For one run of a tool."""

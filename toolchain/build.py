@@ -32,15 +32,15 @@ from toolchain.deployment import (
     write_deployment,
 )
 from toolchain.errors import BuildError
-from toolchain.memories import generators
 from toolchain.options import SensorMode
-from toolchain.output_files import memory_files, quartus_files, write_files
+from toolchain.outputs.memories import generators
+from toolchain.outputs.output_files import memory_files, quartus_files, write_files
+from toolchain.outputs.rng_table import random_table
 from toolchain.partition import Block, partition_lines
 from toolchain.quantise import Quantised, quantise
-from toolchain.rng_table import random_table
 
 if TYPE_CHECKING:
-    from toolchain.model import Model
+    from toolchain.models.model import Model
     from toolchain.options import BuildOptions
 
 DEFAULT_INTERFACE: Final = (20, 1200)

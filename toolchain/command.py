@@ -9,11 +9,11 @@ import typer
 
 # NumPy and what needs it are imported where they are used: --help answers at once.
 from machines.parameters import PriorMode, RngKind, RngReset
-from toolchain import design_command, flags, regenerate_command
+from toolchain.commands import design, flags, regenerate
+from toolchain.commands.refusals import one_sentence
 from toolchain.deployment import Queue, Stop
-from toolchain.fit_options import FitMethod, FitOptions, FitPrior
+from toolchain.learning.fit_options import FitMethod, FitOptions, FitPrior
 from toolchain.options import BuildOptions, OnMissing, Scale, SensorMode
-from toolchain.refusals import one_sentence
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -23,8 +23,8 @@ app = typer.Typer(
 )
 
 
-app.add_typer(regenerate_command.app, name="regenerate")
-app.add_typer(design_command.app)
+app.add_typer(regenerate.app, name="regenerate")
+app.add_typer(design.app)
 
 
 @app.callback()
@@ -95,7 +95,7 @@ def build(
     --known smoke,dysp -o build/asia --uri ws://localhost:9090 --topic /patient --type clinic_msgs/Patient`
     """
     with one_sentence():
-        from toolchain.build_command import NetworkQuestion, Unread, run_build
+        from toolchain.commands.build import NetworkQuestion, Unread, run_build
 
         options = BuildOptions(
             uri=uri or "",
@@ -182,8 +182,8 @@ def check(
     is an error among the findings, else 0.
     """
     with one_sentence():
-        from toolchain.build_command import NetworkQuestion, Unread
-        from toolchain.check_command import UNTOLD_TARGET, run_check
+        from toolchain.commands.build import NetworkQuestion, Unread
+        from toolchain.commands.check import UNTOLD_TARGET, run_check
 
         options = BuildOptions(
             **UNTOLD_TARGET,
@@ -231,7 +231,7 @@ def new(
     For example `toolchain new mymodel`; it prints how to go on.
     """
     with one_sentence():
-        from toolchain.new import new_model
+        from toolchain.commands.new import new_model
 
         typer.echo(new_model(name), nl=False)
 
@@ -304,7 +304,7 @@ def fit(
     --pool 'range_*' --pool 'bearing_*' --check DATA/ds1_robot5.csv`
     """
     with one_sentence():
-        from toolchain.fit_command import run_fit
+        from toolchain.commands.fit import run_fit
 
         options = FitOptions(
             truth=tuple(truth),

@@ -20,7 +20,7 @@ from toolchain.options import Scale
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
-    from toolchain.model import Known, Model
+    from toolchain.models.model import Known, Model
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

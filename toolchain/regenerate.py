@@ -18,7 +18,7 @@ from toolchain.deployment import (
 )
 from toolchain.errors import BuildError, DeploymentError, ModelError
 from toolchain.options import BuildOptions, Scale
-from toolchain.output_files import (
+from toolchain.outputs.output_files import (
     Change,
     image_files,
     memory_files,
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from toolchain.deployment import Queue, Stop, Variable
-    from toolchain.model import Model
+    from toolchain.models.model import Model
 
 Changes = list[tuple[str, Change]]
 

@@ -18,9 +18,9 @@ from casestudies.boat.geometry import (
     SENSOR_NAMES,
     distance_sigma,
 )
-from toolchain.conditional import normal, wrapped_normal
 from toolchain.errors import ModelError
-from toolchain.model import Known, Model, cell_centres, interval
+from toolchain.models.conditional import normal, wrapped_normal
+from toolchain.models.model import Known, Model, cell_centres, interval
 
 DISTANCE_BITS = 7
 BEARING_BITS = 9

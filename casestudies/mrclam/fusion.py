@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from casestudies.mrclam.landmarks import Landmark
 from casestudies.mrclam.model import BEARING_SIGMA, FLOOR, RANGE_SIGMA, X_LIMITS, Y_LIMITS
-from toolchain.fusion import fuse
-from toolchain.model import cell_centres, interval
+from toolchain.models.fusion import fuse
+from toolchain.models.model import cell_centres, interval
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from casestudies.mrclam.landmarks import read_landmarks
-from toolchain.conditional import normal, wrapped_normal
 from toolchain.errors import ModelError
-from toolchain.fitted import with_fit
-from toolchain.model import Known, Model, cell_centres, interval
+from toolchain.learning.fitted import with_fit
+from toolchain.models.conditional import normal, wrapped_normal
+from toolchain.models.model import Known, Model, cell_centres, interval
 
 X_LIMITS = (-2.0, 7.0)
 Y_LIMITS = (-7.0, 7.0)

@@ -21,7 +21,7 @@ from pcie_shim.programming_file import read_image
 from tests.integration.conftest import READING, build_boat
 from toolchain.address import to_address
 from toolchain.deployment import load_deployment
-from toolchain.fusion import exact_posterior
+from toolchain.models.fusion import exact_posterior
 
 LISTENER = str(Path(__file__).with_name("roslibpy_listener.py"))
 FRAMES = 1000

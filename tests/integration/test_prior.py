@@ -29,7 +29,7 @@ def built(folder, *, select, options=()):
     (folder / "model.py").write_text(
         textwrap.dedent(f"""
             import numpy as np
-            from toolchain.model import Known, Model, PriorSelect, dimension
+            from toolchain.models.model import Known, Model, PriorSelect, dimension
 
             def model():
                 return Model(

@@ -24,7 +24,7 @@ from tests.integration.conftest import BIN
 PATIENCE = 60
 MODEL = """
 import numpy as np
-from toolchain.model import Known, Model, dimension
+from toolchain.models.model import Known, Model, dimension
 
 def known(name, step, values, offset=0.0):
     likely = np.full((values, 4), 0.2 / (values - 1))

@@ -4,8 +4,8 @@ import numpy as np
 
 from machines.bm1 import BM1Machine
 from machines.parameters import BM1Parameters
-from toolchain.conditional import normal
-from toolchain.model import Known, Model, PriorSelect, cell_centres, interval
+from toolchain.models.conditional import normal
+from toolchain.models.model import Known, Model, PriorSelect, cell_centres, interval
 from toolchain.quantise import quantise
 
 

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from machines.parameters import RngKind, RngReset
 from pcie_shim.programming_file import read_image
 from toolchain.build import build_date, build_deployment
-from toolchain.conditional import normal, wrapped_normal
 from toolchain.deployment import Queue, Stop, load_deployment
 from toolchain.errors import BuildError, DeploymentError, ToolchainError
-from toolchain.model import Known, Model, cell_centres, interval
+from toolchain.models.conditional import normal, wrapped_normal
+from toolchain.models.model import Known, Model, cell_centres, interval
 from toolchain.options import BuildOptions, Scale
 from toolchain.quantise import quantise
 

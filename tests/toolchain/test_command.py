@@ -13,11 +13,11 @@ from typer.testing import CliRunner
 from pcie_shim.programming_file import read_image
 from toolchain.command import app
 from toolchain.deployment import load_deployment
-from toolchain.mif import read_mif
+from toolchain.outputs.mif import read_mif
 
 MODEL = """
 import numpy as np
-from toolchain.model import Known, Model, dimension
+from toolchain.models.model import Known, Model, dimension
 
 def model(size: int = 4):
     return Model(name="tiny", searched=(dimension("s", size=size),),
@@ -242,9 +242,9 @@ def test_a_written_prior(case):
 
 def test_a_question_is_a_model_too(case):
     (case / "model.py").write_text(
-        "from toolchain.distribution import uniform\n"
-        "from toolchain.joint import JointDistribution\n"
-        "from toolchain.symbol import IntegerType, Symbol\n"
+        "from toolchain.models.distribution import uniform\n"
+        "from toolchain.models.joint import JointDistribution\n"
+        "from toolchain.models.symbol import IntegerType, Symbol\n"
         "def model():\n"
         "    return JointDistribution('q', (uniform(Symbol('s', IntegerType(1, 6))),)).ask(['s'])\n"
     )

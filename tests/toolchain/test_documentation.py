@@ -10,15 +10,15 @@ import typer
 from pydantic import BaseModel
 from typer.testing import CliRunner
 
-from toolchain import check
 from toolchain.build import assemble
-from toolchain.case_study import load_model
+from toolchain.checks import check
 from toolchain.command import app
 from toolchain.deployment import DeploymentFile
 from toolchain.errors import ModelError
-from toolchain.model import Known, Model, dimension
+from toolchain.models.case_study import load_model
+from toolchain.models.model import Known, Model, dimension
 from toolchain.options import BuildOptions
-from toolchain.vhdl_parameters import parameters_vhd
+from toolchain.outputs.vhdl_parameters import parameters_vhd
 
 DOCS = Path(__file__).parents[2] / "docs"
 
@@ -102,7 +102,7 @@ def test_the_models_page_works_as_printed(tmp_path, monkeypatch):
     (hook,) = re.findall(r"^    (return with_fit.*)$", MODELS, re.MULTILINE)
     text = text.replace("sigma: float = 0.3) -> Question:", "sigma: float = 0.3, fit: Path | None = None):")
     (tmp_path / "mymodel" / "model.py").write_text(
-        "from pathlib import Path\nfrom toolchain.fitted import with_fit\n" + text + f"    {hook}\n"
+        "from pathlib import Path\nfrom toolchain.learning.fitted import with_fit\n" + text + f"    {hook}\n"
     )
     fitted = load_model(tmp_path / "mymodel", {"fit": "build/walks.toml"})
     assert fitted.known[0].normal.sigma.max() < 0.2

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from machines.encode import decode_code, encode_probability
 from machines.errors import ParameterError
-from toolchain.conditional import normal
-from toolchain.model import Known, Model, dimension
+from toolchain.models.conditional import normal
+from toolchain.models.model import Known, Model, dimension
 from toolchain.options import Scale
 from toolchain.quantise import quantise, scaled
 

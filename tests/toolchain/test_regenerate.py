@@ -12,8 +12,8 @@ from toolchain.errors import DamagedDeploymentError
 
 MODEL = """
 import numpy as np
-from toolchain.conditional import normal
-from toolchain.model import Model, cell_centres, interval
+from toolchain.models.conditional import normal
+from toolchain.models.model import Model, cell_centres, interval
 
 def model(sigma: float = 1.0, values: int = 12, cells: int = 8, swapped: bool = False, other: str = "D2"):
     place = interval("x", 0, 10, cells=cells)

@@ -17,7 +17,7 @@ from toolchain.sources import _PATH, read_sources
 
 MODEL = """
 import numpy as np
-from toolchain.model import Known, Model, dimension
+from toolchain.models.model import Known, Model, dimension
 
 def model(path: str = ""):
     table = np.full((4, 4), 0.25)

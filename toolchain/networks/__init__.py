@@ -10,7 +10,7 @@ from toolchain.errors import ModelError, NetworkFileError
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from toolchain.joint import JointDistribution
+    from toolchain.models.joint import JointDistribution
     from toolchain.networks.builder import NetworkBuilder
 
 MAX_BYTES: Final = 32 << 20

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Final, Literal, Protocol
 
 import numpy as np
 
-from toolchain.distribution import MAX_ENTRIES, Factor, potential, table
 from toolchain.errors import ModelError, NetworkFileError
-from toolchain.joint import JointDistribution
-from toolchain.symbol import IntegerType, LabelType, Symbol
+from toolchain.models.distribution import MAX_ENTRIES, Factor, potential, table
+from toolchain.models.joint import JointDistribution
+from toolchain.models.symbol import IntegerType, LabelType, Symbol
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -11,7 +11,7 @@ from casestudies.boat.geometry import SENSOR_NAMES, map_grid
 from casestudies.boat.model import model
 from casestudies.boat.normaliser import normalise
 from casestudies.boat.simulator import Boat
-from toolchain.fusion import exact_posterior
+from toolchain.models.fusion import exact_posterior
 
 
 def test_the_columns_are_in_the_order_of_the_sensors():

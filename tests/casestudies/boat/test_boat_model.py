@@ -12,7 +12,7 @@ from casestudies.boat.model import model
 from machines.parameters import BM1Parameters
 from toolchain.address import to_address
 from toolchain.errors import ModelError
-from toolchain.fusion import exact_posterior
+from toolchain.models.fusion import exact_posterior
 from toolchain.quantise import quantise
 
 BOAT = model()

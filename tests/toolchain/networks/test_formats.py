@@ -11,11 +11,11 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from toolchain.distribution import Potential
 from toolchain.errors import NetworkFileError
-from toolchain.fusion import exact_posterior
+from toolchain.models.distribution import Potential
+from toolchain.models.fusion import exact_posterior
+from toolchain.models.symbol import IntegerType, LabelType
 from toolchain.networks import MAX_BYTES, is_network, read_network
-from toolchain.symbol import IntegerType, LabelType
 
 BIF = """\
 // The dog problem, in BIF

@@ -1,0 +1,316 @@
+"""Sweeps: every point is kept before the next begins, a sweep goes on where it stopped, the front is the front."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from typer.testing import CliRunner
+
+from machines.parameters import RngKind
+from tests.toolchain.corridor import corridor
+from toolchain.analysis.explore import Point, Results, Sweep, explore, pareto, run_task, tasks
+from toolchain.analysis.readings import sample_readings
+from toolchain.analysis.resources import DEVICES
+from toolchain.command import app
+from toolchain.deployment import Stop
+from toolchain.errors import BuildError
+from toolchain.options import Scale
+
+D8 = DEVICES["proce-v-d8"]
+MODEL = """
+import numpy as np
+from toolchain.models.conditional import normal
+from toolchain.models.model import Model, cell_centres, interval
+
+def model(cells: int = 12):
+    place = interval("x", 0.0, 10.0, cells=cells)
+    (x,) = cell_centres(place)
+    return Model(name="corridor", searched=(place,),
+                 known=(normal("range", mean=x, sigma=1.0, values=21, step=0.5),))
+"""
+
+
+def sweep(**others):
+    settings = {
+        "prob_bits": (4, 8),
+        "target_counts": (15, 63),
+        "rngs": (RngKind.LFSR16,),
+        "scales": (Scale.ADDRESS,),
+        "steps_per_clock": (0,),
+        "partitions": 1,
+        "stop": Stop.OWN,
+        "max_cycles": 4096,
+        "banks": 1,
+    }
+    return Sweep(**(settings | others))
+
+
+def point(key, variation=0.1, cycles=100.0, alms=1000.0, without=0.0):
+    return Point(
+        key=f"{key:064x}",
+        scale="address",
+        rng="lfsr32",
+        steps_per_clock=8,
+        prob_bits=8,
+        target_count=255,
+        counter_bits=8,
+        partitions=1,
+        frames=10,
+        total_variation=variation,
+        total_variation_low=variation,
+        total_variation_high=variation,
+        quantising=0.0,
+        kl_bits=0.0,
+        map_agreement=1.0,
+        z_rms=1.0,
+        without=without,
+        cycles_median=cycles,
+        cycles_95=cycles,
+        alms=alms,
+        blocks=1,
+        fits=True,
+    )
+
+
+@pytest.fixture
+def case(tmp_path):
+    folder = tmp_path / "case"
+    folder.mkdir()
+    (folder / "model.py").write_text(MODEL)
+    return folder
+
+
+def run(case, *arguments):
+    command = [
+        "explore",
+        str(case),
+        "-o",
+        str(case.parent / "r.jsonl"),
+        "--frames",
+        "5",
+        "--max-cycles",
+        "2000",
+    ]
+    return CliRunner().invoke(app, [*command, *arguments])
+
+
+def test_keys_name_what_the_figures_depend_on():
+    model = corridor()
+    readings = sample_readings(model, 5, seed=1)
+    keys = [task.key for task in tasks(model, sweep(), readings, D8)]
+    assert len(set(keys)) == 4
+    assert keys == [task.key for task in tasks(model, sweep(), readings, D8)]
+    others = [
+        tasks(corridor(sigma=1.1), sweep(), readings, D8),
+        tasks(model, sweep(), sample_readings(model, 5, seed=2), D8),
+        tasks(model, sweep(max_cycles=4097), readings, D8),
+        tasks(model, sweep(partitions=2), readings, D8),
+        tasks(model, sweep(banks=2), readings, D8),
+    ]
+    for other in others:
+        assert not set(keys) & {task.key for task in other}
+    wider = tasks(model, sweep(prob_bits=(4, 8, 12)), readings, D8)
+    assert set(keys) < {task.key for task in wider}
+
+
+def test_a_sweep_goes_on_where_it_stopped(tmp_path):
+    model = corridor()
+    readings = sample_readings(model, 5, seed=1)
+    found = tasks(model, sweep(), readings, D8)
+    measured = []
+
+    def measure_two(task):
+        if len(measured) == 2:
+            raise KeyboardInterrupt
+        measured.append(task.key)
+        return run_task(model, task, readings, D8, 1)
+
+    first = Results(tmp_path / "r.jsonl")
+    with pytest.raises(KeyboardInterrupt):
+        explore(found, first.points, measure_two, first.append, lambda _: None)
+    again = Results(tmp_path / "r.jsonl")
+    assert list(again.points) == measured
+    more = []
+    explore(
+        found,
+        again.points,
+        lambda task: more.append(task.key) or run_task(model, task, readings, D8, 1),
+        again.append,
+        lambda _: None,
+    )
+    assert measured + more == [task.key for task in found]
+    assert len(Results(tmp_path / "r.jsonl").points) == 4
+
+
+def test_a_torn_last_line_is_measured_again(tmp_path):
+    path = tmp_path / "r.jsonl"
+    Results(path).append(point(1))
+    with path.open("a") as file:
+        file.write('{"key":"00')
+    results = Results(path)
+    assert list(results.points) == [point(1).key]
+    results.append(point(2))
+    assert list(Results(path).points) == [point(1).key, point(2).key]
+
+
+def test_a_file_of_something_else_is_left_alone(tmp_path):
+    path = tmp_path / "notes.txt"
+    for notes in ("my notes\n", "my notes"):
+        path.write_text(notes)
+        with pytest.raises(BuildError, match="line 1, is no result of a sweep"):
+            Results(path)
+        assert path.read_text() == notes
+    with pytest.raises(BuildError, match="can't be written"):
+        Results(tmp_path / "there" / "r.jsonl").append(point(1))
+
+
+def test_the_pareto_front():
+    best = point(1, variation=0.01, cycles=10, alms=10)
+    points = [
+        best,
+        point(2, variation=0.01, cycles=10, alms=11),
+        point(3, variation=0.005, cycles=20, alms=20),
+        point(4, variation=0.02, cycles=5, alms=10),
+        point(5, variation=0.02, cycles=11, alms=10),
+        point(6, variation=0.001, cycles=1, alms=1, without=0.5),
+        best.model_copy(update={"key": f"{7:064x}"}),
+    ]
+    assert [int(each.key, 16) for each in pareto(points)] == [1, 3, 4, 6, 7]
+    assert pareto([point(1).model_copy(update={"total_variation": None})]) == []
+
+
+@given(st.lists(st.tuples(*[st.integers(0, 3)] * 4), min_size=1, max_size=12))
+def test_what_is_not_on_the_front_is_beaten_by_what_is(figures):
+    points = [
+        point(key, variation=a, cycles=b, alms=c, without=d / 3) for key, (a, b, c, d) in enumerate(figures)
+    ]
+    front = {each.key for each in pareto(points)}
+    best = [own for own, each in zip(figures, points, strict=True) if each.key in front]
+    for own, each in zip(figures, points, strict=True):
+        beaten = any(other != own and all(a <= b for a, b in zip(other, own, strict=True)) for other in best)
+        assert beaten == (each.key not in front)
+
+
+BIF = """network weather { }
+variable rain { type discrete [ 2 ] { no, yes }; }
+variable shoes { type discrete [ 2 ] { dry, wet }; }
+probability ( rain ) { table 0.7, 0.3; }
+probability ( shoes | rain ) { (no) 0.9, 0.1; (yes) 0.2, 0.8; }
+"""
+
+
+def test_a_network_is_explored_too(tmp_path):
+    network = tmp_path / "weather.bif"
+    network.write_text(BIF)
+    question = ["--searched", "rain", "--known", "shoes"]
+    lists = ["--prob-bits", "8", "--targets", "15", "--rngs", "lfsr16,table", "--scales", "none"]
+    result = run(network, *question, *lists)
+    assert result.exit_code == 0, result.stderr
+    assert "none     table" in result.stdout
+    assert "--searched asks a network's file" in run(tmp_path, *question).stderr
+
+
+def test_the_command(case):
+    result = run(
+        case, "--prob-bits", "4,8", "--targets", "15", "--rngs", "lfsr8,lfsr16", "--scales", "address"
+    )
+    assert result.exit_code == 0, result.stderr
+    # An LFSR of 8 bits is too narrow for codes of 8: three machines are left.
+    assert result.stderr.startswith("3 machines of corridor over 5 frames drawn from the model (seed 1)\n")
+    assert "3 of 3 machines are in" in result.stderr
+    rows = result.stdout.splitlines()
+    assert len(rows) == 5
+    assert any(row.startswith("* address") for row in rows)
+    again = run(
+        case, "--prob-bits", "4,8", "--targets", "15", "--rngs", "lfsr8,lfsr16", "--scales", "address"
+    )
+    assert "; 3 of them are in" in again.stderr
+    assert again.stdout == result.stdout
+
+
+def test_a_plot(case):
+    pytest.importorskip("matplotlib")
+    plot = case.parent / "sweep.png"
+    result = run(case, "--prob-bits", "4", "--targets", "15,63", "--rngs", "lfsr16", "--plot", str(plot))
+    assert result.exit_code == 0, result.stderr
+    assert plot.read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["--prob-bits", "4;8"], "--prob-bits 4;8: expected whole numbers with commas"),
+        (["--rngs", "lfsr31"], "--rngs lfsr31: expected some of lfsr8, lfsr16"),
+        (["--targets", "0"], "a target count of 0 stops nothing"),
+        (
+            ["--prob-bits", "16", "--rngs", "lfsr16"],
+            "none of these machines can be built: lfsr16 is too narrow",
+        ),
+        (["--device", "d9"], "--device d9: expected one of proce-v-d8"),
+        (["--reading", "a=b"], "add --readings FILE"),
+        (["--frames", "0"], "--frames is 0, expected 1 or more"),
+        (["--claims", "x"], "--claims has a model of its own"),
+        (["--partitions", "13"], "12 lines can't be split over 13 boards"),
+        (["--banks", "0"], "numbers from 1"),
+    ],
+)
+def test_mistakes(case, arguments, sentence):
+    result = run(case, *arguments)
+    assert result.exit_code == 2, result.stdout
+    assert result.stderr.splitlines()[-1].startswith("error: ")
+    assert sentence in result.stderr
+
+
+def test_nothing_to_explore():
+    result = CliRunner().invoke(app, ["explore"])
+    assert result.exit_code == 2
+    assert result.stderr.startswith("error: name a model to explore")
+
+
+def test_ctrl_c_keeps_what_is_done(case):
+    results = case.parent / "r.jsonl"
+    command = [sys.executable, "-c", "from toolchain.command import main; main()", "explore", str(case)]
+    command += [
+        "-o",
+        str(results),
+        "--frames",
+        "40",
+        "--max-cycles",
+        "100000",
+        "--rngs",
+        "ideal",
+        "--targets",
+        "255,1023",
+    ]
+    root = Path(__file__).parents[3]
+    child = subprocess.Popen(
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=root,
+        env=os.environ | {"NO_COLOR": "1"},
+    )
+    limit = time.monotonic() + 60
+    while (
+        not (results.exists() and results.stat().st_size)
+        and child.poll() is None
+        and time.monotonic() < limit
+    ):
+        time.sleep(0.05)
+    child.send_signal(signal.SIGINT)
+    out, err = child.communicate(timeout=60)
+    assert child.returncode == 130, err
+    assert "ended by SIGINT" in err
+    assert "Traceback" not in err
+    done = int(re.search(r"(\d+) of 16 machines are in", err)[1])
+    assert 1 <= done < 16
+    assert len(Results(results).points) == done
+    assert len(out.splitlines()) == done + 2

@@ -1,0 +1,120 @@
+"""Resources: what can be counted exactly is, and what the thesis found comes out."""
+
+from dataclasses import replace
+
+import pytest
+
+from machines.parameters import BM1Parameters, PriorMode, RngKind
+from toolchain.analysis.resources import (
+    DEVICES,
+    Pcie,
+    Tables,
+    boards_needed,
+    device_named,
+    estimate,
+    logic_of,
+    with_lines,
+)
+from toolchain.errors import BuildError
+
+D8 = DEVICES["proce-v-d8"]
+BOAT = BM1Parameters(lines=1024, sensor_bits=(7, 7, 7, 9, 9, 9))
+
+
+def on_d8(parameters, *, results=1200, **others):
+    return estimate(parameters, D8, interface=(20, results), **others)
+
+
+def test_the_boat_does_not_fit_one_board_and_a_quarter_does():
+    whole, quarter = on_d8(BOAT), on_d8(with_lines(BOAT, 256))
+    assert not whole.fits
+    assert whole.alms > 0.8 * D8.alms
+    assert quarter.fits
+    assert quarter.alm_share < 0.5
+    assert quarter.blocks == 6 * 256  # a block a cell: 512 words of 8 bits, or fewer
+    assert quarter.logic_tables == 0
+
+
+def test_readout_and_interface_registers_count():
+    small, large = on_d8(with_lines(BOAT, 4), results=4), on_d8(with_lines(BOAT, 4))
+    assert large.logic.registers - small.logic.registers == 1196 * 32
+    assert large.alms > small.alms + 1196 * 32 / 4
+
+
+def test_tables_in_bits_and_blocks():
+    quarter = with_lines(BOAT, 256)
+    assert on_d8(quarter).table_bits == 256 * 3 * 8 * (128 + 512)
+    # 256 codes of 8 bits side by side, 5 in each block of 512 words of 40 bits
+    assert on_d8(quarter, tables=Tables.COLUMN).blocks == 6 * 52
+    assert on_d8(BOAT, tables=Tables.COLUMN).fits
+    deep = BM1Parameters(lines=1, sensor_bits=(12,))
+    assert on_d8(deep).blocks == 2  # 4096 words of 8 bits: two blocks of 4096 x 5
+    assert on_d8(replace(deep, prior_bits=9)).blocks == 3
+
+
+def test_a_controller_of_logic_takes_8000_to_30000_elements():
+    hard, soft = on_d8(BOAT), on_d8(BOAT, pcie=Pcie.SOFT)
+    assert hard.pcie_alms == (0, 0)
+    assert [round(alms * 2.65) for alms in soft.pcie_alms] == [8000, 30000]
+    assert soft.alms - hard.alms == pytest.approx(soft.pcie_alms[1])
+    with pytest.raises(BuildError, match="has no hard PCIe controller"):
+        estimate(BOAT, replace(D8, hard_pcie=False), interface=(20, 1200))
+
+
+def test_registers_are_counted_exactly():
+    # What yosys finds in these (scripts/verify resources has more).
+    for lines, sensors, registers in ((8, 3, 488), (8, 6, 596), (32, 3, 872)):
+        parameters = BM1Parameters(lines=lines, sensor_bits=(4,) * sensors)
+        assert logic_of(parameters, interface_words=lines, word_bits=8).registers == registers
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        {"lines": 2048},
+        {"prob_bits": 12},
+        {"counter_bits": 16},
+        {"sensor_bits": (7, 7, 7, 9, 9, 9, 9)},
+        {"shared": False},
+        {"rng": RngKind.TABLE, "steps_per_clock": 1},
+        {"prior_mode": PriorMode.WRITTEN},
+        {"rng_banks": 256},
+    ],
+)
+def test_more_of_anything_takes_more(more):
+    base, larger = on_d8(BOAT, results=2048), on_d8(replace(BOAT, **more), results=2048)
+    assert (larger.alms, larger.blocks, larger.logic.registers) != (
+        base.alms,
+        base.blocks,
+        base.logic.registers,
+    )
+    if "rng" not in more:
+        assert larger.logic.aluts >= base.logic.aluts
+        assert larger.logic.registers >= base.logic.registers
+
+
+def test_boards_for_the_boat():
+    count, why = boards_needed(BOAT, D8)
+    assert 2 <= count <= 4
+    assert why.startswith("1024 lines need two boards: on one Gidel Proce V D8")
+    assert "209,920 of 262,400 can be used" in why
+    assert boards_needed(with_lines(BOAT, 256), D8)[0] == 1
+    for boards in range(1, count):
+        assert not on_d8(with_lines(BOAT, -(-1024 // boards))).fits
+    assert on_d8(with_lines(BOAT, -(-1024 // count))).fits
+
+
+def test_boards_for_more_lines_than_the_register_map_holds():
+    many = BM1Parameters(lines=10_000, sensor_bits=(2,))
+    count, why = boards_needed(many, D8)
+    assert count == 3
+    assert "the register map has room for 4096 lines a board" in why
+
+
+def test_what_has_no_estimate():
+    with pytest.raises(BuildError, match="rng = ideal exists emulated only"):
+        boards_needed(replace(BOAT, rng=RngKind.IDEAL), D8)
+    with pytest.raises(BuildError, match="not even one line fits"):
+        boards_needed(BM1Parameters(lines=4, sensor_bits=(16,) * 60, prob_bits=16), D8)
+    with pytest.raises(BuildError, match="--device d9: expected one of proce-v-d8"):
+        device_named("d9")

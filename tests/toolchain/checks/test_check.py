@@ -1,0 +1,516 @@
+"""What `toolchain check` says of readings and lines holds on the machine, and every mistake has its finding."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from typer.testing import CliRunner
+
+from machines.bm1 import Start, StopReason
+from machines.parameters import PriorMode, RngKind, RngReset
+from machines.reference import ReferenceBM1
+from toolchain.build import assemble, build_deployment
+from toolchain.checks.check import check_deployment, check_model, line_name, reading
+from toolchain.checks.finding import Severity
+from toolchain.command import app
+from toolchain.errors import ModelError
+from toolchain.models.conditional import normal, wrapped_normal
+from toolchain.models.model import Known, Model, PriorSelect, cell_centres, dimension, interval
+from toolchain.options import BuildOptions, Scale, SensorMode
+from toolchain.outputs.mif import Mif, mif_text
+
+OPTIONS = BuildOptions(uri="ws://robot:9090", topic="/readings", type="std_msgs/Float64MultiArray")
+
+
+def model(*, known=None, **changes):
+    place = interval("x", 0, 10, cells=10)
+    (x,) = cell_centres(place)
+    known = known or (normal("D", mean=x, sigma=2.0, values=15, floor=0.05),)
+    return Model(**{"name": "small", "searched": (place,), "known": tuple(known)} | changes)
+
+
+def found(findings, check):
+    return [finding for finding in findings if finding.check == check]
+
+
+def only(findings, check):
+    (finding,) = found(findings, check)
+    return finding
+
+
+def test_nothing_to_say():
+    assert check_model(model(), OPTIONS) == []
+
+
+# What is said of readings and lines, on the machine
+
+
+@st.composite
+def sparse_models(draw):
+    """Tables with many zeros, so that lines die and readings become impossible."""
+    lines = draw(st.integers(1, 5))
+    known = []
+    for name in ("A", "B")[: draw(st.integers(1, 2))]:
+        values = draw(st.integers(1, 4))
+        weights = draw(
+            st.lists(st.sampled_from([0, 0, 0, 1, 4000]), min_size=values * lines, max_size=values * lines)
+        )
+        table = np.array(weights, float).reshape(values, lines)
+        table[0, table.sum(axis=0) == 0] = 1
+        missing = draw(st.sampled_from(["error", "missing"]))
+        known.append(Known(name=name, table=table / table.sum(axis=0), on_missing=missing))
+    prior = np.array(draw(st.lists(st.sampled_from([0, 1, 4000]), min_size=lines, max_size=lines)), float)
+    if not prior.any():
+        prior[0] = 1
+    return Model(
+        name="sparse",
+        searched=(dimension("s", size=lines),),
+        known=tuple(known),
+        prior=prior / prior.sum(),
+    )
+
+
+@settings(max_examples=60, deadline=None)
+@given(sparse_models(), st.sampled_from(list(Scale)), st.data())
+def test_the_machine_bears_it_out(sparse, scale, data):
+    """An impossible reading ends every frame that has it; of the others some frame goes; a dead line never counts."""
+    options = replace(
+        OPTIONS,
+        prob_bits=data.draw(st.sampled_from([1, 4])),
+        scale=scale,
+        partitions=data.draw(st.integers(1, sparse.lines)),
+    )
+    findings = check_model(sparse, options)
+    kernels = [ReferenceBM1(image.machine) for image in assemble(sparse, options).images]
+
+    def run(*addresses):
+        """Counts over all boards, and whether no board had anything to count."""
+        start = Start(addresses=addresses, target_count=200, max_cycles=2000)
+        reasons = [kernel.start(start) for kernel in kernels]
+        return (
+            np.concatenate([kernel.counts for kernel in kernels]),
+            all(reason is StopReason.IMPOSSIBLE for reason in reasons),
+        )
+
+    reachable = [
+        [*range(known.values), *([2**known.bits - 1] if known.on_missing == "missing" else [])]
+        for known in sparse.known
+    ]
+    frames = {
+        tuple(addresses): run(*addresses)
+        for addresses in np.array(np.meshgrid(*reachable, indexing="ij"))
+        .reshape(len(reachable), -1)
+        .T.tolist()
+    }
+    assert any(finding.severity is Severity.ERROR for finding in findings) == all(
+        impossible for _, impossible in frames.values()
+    )
+    if any(finding.severity is Severity.ERROR for finding in findings):
+        return
+    said = {}
+    for finding in found(findings, "impossible-readings"):
+        said.setdefault(finding.about, []).append(finding.what)
+    for place, known in enumerate(sparse.known):
+        impossible = [
+            all(ends for addresses, (_, ends) in frames.items() if addresses[place] == address)
+            for address in range(known.values)
+        ]
+        # that it leaves no line by itself is what the check says; with other readings more frames are impossible
+        single = [
+            not any((assemble_table(sparse, options, place)[address] != 0) & alive(sparse, options))
+            for address in range(known.values)
+        ]
+        assert all(ends for ends, dead in zip(impossible, single, strict=True) if dead)
+        count = sum(int(what.split(" of its ")[0].split()[-1]) for what in said.get(known.name, []))
+        assert count == sum(single)
+    counted = sum(counts for counts, _ in frames.values()) > 0
+    assert not (counted & ~alive(sparse, options)).any()
+
+
+def assemble_table(sparse, options, place):
+    return assemble(sparse, options).quantised.tables[place]
+
+
+def alive(sparse, options):
+    """Lines with a code in the prior and in some reachable row of each column."""
+    quantised = assemble(sparse, options).quantised
+    lines = quantised.prior[0] != 0
+    for known, table in zip(sparse.known, quantised.tables, strict=True):
+        rows = (
+            table[: known.values]
+            if known.on_missing == "error"
+            else np.vstack([table[: known.values], table[-1:]])
+        )
+        lines &= rows.any(axis=0)
+    return lines
+
+
+def test_readings_are_named_in_the_variables_own_words():
+    table = np.array([[0.0, 0.0], [0.5, 1.0], [0.0, 0.0], [0.0, 0.0], [0.5, 0.0]])
+    rain = dimension("rain", size=2, states=("no", "yes"))
+    known = (
+        Known(name="D", table=table, offset=-2.0, step=0.5),
+        Known(name="door", table=table, states=("a", "b", "c", "d", "e")),
+    )
+    findings = check_model(Model(name="m", searched=(rain,), known=known), OPTIONS)
+    numbers, words = found(findings, "impossible-readings")
+    assert (numbers.severity, numbers.about) == (Severity.NOTE, "D")
+    assert "3 of its 5 values (-2, -1 to -0.5) never occur" in numbers.what
+    assert "3 of its 5 values (a, c to d) never occur" in words.what
+    assert line_name((rain, dimension("x", size=3, offset=1.5)), 5) == "rain = yes, x = 3.5"
+    assert reading(known[0].as_variable(), 7) == "a missing reading"
+
+
+def test_a_possible_reading_without_a_code():
+    table = np.array([[0.999, 0.999], [0.001, 0.001]])
+    options = replace(OPTIONS, scale=Scale.COLUMN)
+    finding = only(check_model(model_of(table), options), "impossible-readings")
+    assert finding.severity is Severity.WARNING
+    assert (
+        "1 of its 2 values (1, 0.001 of all readings) have code 0 on every line that can count"
+        in finding.what
+    )
+    assert finding.advice == "use --scale address or more --prob-bits"
+    machine = assemble(model_of(table), options).images[0].machine
+    start = Start(addresses=(1,), target_count=255, max_cycles=100)
+    assert ReferenceBM1(machine).start(start) is StopReason.IMPOSSIBLE
+
+
+def model_of(table, **changes):
+    lines = len(table[0])
+    return Model(
+        **{
+            "name": "t",
+            "searched": (dimension("s", size=lines),),
+            "known": (Known(name="K", table=np.array(table)),),
+        }
+        | changes
+    )
+
+
+def test_lines_that_the_prior_excludes_or_loses():
+    table = np.full((2, 4), 0.5)
+    prior = np.array([0.0, 1e-6, 0.5, 0.5 - 1e-6])
+    meant, lost = found(check_model(model_of(table, prior=prior), OPTIONS), "dead-lines")[::-1]
+    assert (meant.severity, lost.severity) == (Severity.NOTE, Severity.WARNING)
+    assert meant.what == "the model says that s = 0 is never the case, so it never counts"
+    assert "it has code 0 at s = 1, which can never count" in lost.what
+    written = replace(OPTIONS, prior_mode=PriorMode.WRITTEN)
+    assert not found(check_model(model_of(table, prior=prior), written), "dead-lines")
+
+
+def test_lines_and_rows_of_a_selected_prior():
+    rows = np.array([[1.0, 0, 0], [0, 1.0, 0]])
+    select = PriorSelect(name="room", table=rows)
+    findings = check_model(model_of(np.full((2, 3), 0.5), prior_select=select), OPTIONS)
+    assert [finding.what for finding in found(findings, "dead-lines")] == [
+        "the model says that s = 2 is never the case, so it never counts"
+    ]
+    assert not found(findings, "impossible-readings")
+
+
+def test_a_column_and_a_board_without_hope():
+    coarse = replace(OPTIONS, scale=Scale.NONE, prob_bits=1, partitions=2)
+    spread = np.array([[0.5, 0.2]] + [[0.5, 0.2]] + [[0, 0.2]] * 3)
+    findings = check_model(model_of(spread, prior=np.array([0.6, 0.4])), replace(coarse, scale=Scale.COLUMN))
+    (column,) = [finding for finding in found(findings, "dead-lines") if finding.about == "K"]
+    assert "every value of it has code 0 at s = 1, which can never count" in column.what
+    assert only(findings, "dead-board").about == "board 1"
+    forgiving = model_of(
+        spread, prior=np.array([0.6, 0.4]), known=(Known(name="K", table=spread, on_missing="missing"),)
+    )  # the line counts where K is missing
+    assert not found(check_model(forgiving, replace(coarse, scale=Scale.COLUMN)), "dead-lines")
+    findings = check_model(model_of(np.full((5, 2), 0.2)), coarse)
+    assert only(findings, "dead-lines").severity is Severity.ERROR
+
+
+def test_a_floor_that_vanishes():
+    place = interval("x", 0, 10, cells=10)
+    (x,) = cell_centres(place)
+    known = normal("D", mean=x, sigma=0.4, values=11, floor=1e-4)
+    finding = only(check_model(model(known=(known,)), OPTIONS), "vanished-floor")
+    assert (finding.severity, finding.about) == (Severity.WARNING, "D")
+    floor = float(finding.advice.removeprefix("use a floor of about ").split()[0])
+    mended = normal("D", mean=x, sigma=0.4, values=11, floor=floor * 1.05)
+    assert not found(check_model(model(known=(mended,)), OPTIONS), "vanished-floor")
+    wider = int(finding.advice.rpartition(" ")[2])
+    assert not found(check_model(model(known=(known,)), replace(OPTIONS, prob_bits=wider)), "vanished-floor")
+
+
+def test_true_lines_lost_to_the_codes():
+    findings = check_model(model(), replace(OPTIONS, scale=Scale.NONE, prob_bits=5))
+    assert "most often one of D (" in only(findings, "lost-mass").what
+
+
+# Generators
+
+
+@pytest.mark.parametrize(
+    ("changes", "check", "about", "part"),
+    [
+        ({"rng_banks": 1}, "rng-banks", "rng_banks = 1", "every frame sees the same random numbers"),
+        ({"rng": RngKind.IDEAL}, "rng", "rng = ideal", "exist emulated only"),
+        (
+            {"steps_per_clock": 1},
+            "rng-steps",
+            "steps_per_clock = 1",
+            "share 7 bits with those of the next cycle",
+        ),
+        (
+            {"rng": RngKind.LFSR16},
+            "rng-period",
+            "rng = lfsr16",
+            "repeat after 65535 cycles, and a frame may run 131072",
+        ),
+        (
+            {"rng": RngKind.LFSR16, "steps_per_clock": 15},
+            "rng-period",
+            "rng = lfsr16",
+            "repeat after 4369 cycles (65535 steps, of which a clock takes 15)",
+        ),
+        ({"rng": RngKind.TABLE}, "rng-period", "rng = table", "repeat after 65536 cycles"),
+        (
+            {"target_count": 200, "max_cycles": 199},
+            "stopping",
+            "the machine",
+            "no counter can reach 200 in 199",
+        ),
+    ],
+)
+def test_generators_and_stopping(changes, check, about, part):
+    finding = only(check_model(model(), replace(OPTIONS, **changes)), check)
+    assert finding.about == about
+    assert part in finding.what
+    assert finding.severity is (Severity.NOTE if check == "rng" else Severity.WARNING)
+
+
+def test_what_ends_a_warning_about_generators():
+    free = replace(OPTIONS, rng_banks=1, rng_reset=RngReset.FREE)
+    short = replace(OPTIONS, rng=RngKind.LFSR16, max_cycles=65535)
+    for options in (free, short, replace(OPTIONS, target_count=200, max_cycles=200)):
+        assert check_model(model(), options) == []
+
+
+def test_related_columns_name_the_bits():
+    """An LFSR of 8 bits has 255 states: with so few, three columns' bits are bound to be related."""
+    known = tuple(Known(name=f"K{i}", table=np.array([[0.9, 0.1], [0.1, 0.9]])) for i in range(6))
+    options = replace(OPTIONS, rng=RngKind.LFSR8, prob_bits=7, max_cycles=255)
+    related = found(check_model(model_of([[0.9, 0.1], [0.1, 0.9]], known=known), options), "rng-relation")
+    assert related[0].severity is Severity.ERROR
+    assert "random bits of different columns" in related[0].what
+    assert "use a wider --rng" in related[0].advice
+    cells = replace(options, shared=False, rng_banks=3)
+    related = found(check_model(model_of([[0.9, 0.1], [0.1, 0.9]], known=known), cells), "rng-relation")
+    assert "of 6 lines in a bank" in related[0].what
+
+
+@pytest.mark.parametrize(
+    ("table", "check", "severity", "part"),
+    [
+        (
+            np.arange(512) // 2 * 2,
+            "rng-table",
+            Severity.WARNING,
+            "the numbers are not equally often in the table",
+        ),
+        (np.arange(4096) % 256, "rng-relation", Severity.WARNING, "their random numbers correlate by"),
+        (
+            np.full(100, 7),
+            "rng-table",
+            Severity.WARNING,
+            "code 8 counts in 1 of the cycles instead of 0.03125",
+        ),
+        (np.array([3]), "rng-relation", Severity.ERROR, "they play the table from the same place"),
+    ],
+)
+def test_tables_of_random_numbers(table, check, severity, part):
+    options = replace(OPTIONS, rng=RngKind.TABLE, rng_table=table.astype(np.uint32), max_cycles=10)
+    findings = found(check_model(model(), options), check)
+    assert any(finding.severity is severity and part in finding.what for finding in findings), findings
+
+
+@pytest.mark.parametrize("bits", [1, 2, 16])
+def test_codes_of_any_width(bits):
+    options = replace(OPTIONS, rng=RngKind.TABLE, prob_bits=bits, max_cycles=10)
+    assert not [finding for finding in check_model(model(), options) if finding.check.startswith("rng")]
+
+
+# Ranges and columns
+
+
+@pytest.mark.parametrize(
+    ("changes", "check", "part", "advice"),
+    [
+        ({"bits": 6}, "address-bits", "its memory is 4 times as deep as need be", "use --bits B=4"),
+        (
+            {"period": 12},
+            "range",
+            "only 10 are served: those from 10 on are out of range",
+            "give it 12 values",
+        ),
+        ({"period": 8}, "range", "the last 2 of its 10 values never occur", "a period of 10"),
+        ({"on_range": "missing"}, "range", "a missing one is an error (on_missing)", 'on_missing="missing"'),
+    ],
+)
+def test_ranges(changes, check, part, advice):
+    known = wrapped_normal("B", mean=np.arange(4.0), sigma=1.0, values=10, step=1.0, floor=0.05)
+    searched = (dimension("s", size=4),)
+    findings = check_model(model(searched=searched, known=(replace(known, **changes),)), OPTIONS)
+    finding = only(findings, check)
+    assert finding.about == "B"
+    assert part in finding.what
+    assert advice in finding.advice
+
+
+def test_columns_without_effect_and_readings_used_twice():
+    table = np.full((2, 3), 0.5)
+    known = tuple(Known(name=name, table=table, path="data[0]") for name in "AB")
+    findings = check_model(model_of(table, known=known), OPTIONS)
+    assert [finding.about for finding in found(findings, "column-without-effect")] == ["A", "B"]
+    assert only(findings, "same-reading").about == "A and B"
+
+
+# What can't be built
+
+
+def test_several_mistakes_at_once():
+    options = replace(OPTIONS, partitions=11, prob_bits=17)
+    findings = check_model(model(), options)
+    assert [(finding.severity, finding.about) for finding in findings] == [
+        (Severity.ERROR, "the partitions"),
+        (Severity.ERROR, "the machine"),
+    ]
+    (finding,) = check_model(model(), replace(OPTIONS, interface=(1, 9)))
+    assert "the model is larger than the interface 1x9" in finding.what
+    (finding,) = check_model(model(), replace(OPTIONS, sensor_mode=SensorMode.CELL))
+    assert "--sensor-mode cell" in finding.what
+
+
+def test_a_range_that_does_not_fit_its_bits_is_named():
+    with pytest.raises(
+        ModelError, match="variable 'K': K serves 4 values, but 2 bits hold 3 beside the address"
+    ):
+        model_of(np.full((4, 2), 0.25), known=(Known(name="K", table=np.full((4, 2), 0.25), bits=2),))
+
+
+# Deployments
+
+
+@pytest.fixture
+def deployment(tmp_path):
+    build_deployment(model(), tmp_path / "out", replace(OPTIONS, partitions=2))
+    return tmp_path / "out"
+
+
+def test_a_deployment_says_what_its_model_said(tmp_path):
+    table = np.array([[0.0, 0.0, 0.0], [0.999, 0.5, 1.0], [0.001, 0.5, 0.0]])
+    options = replace(OPTIONS, scale=Scale.COLUMN, rng=RngKind.LFSR16, partitions=2, rng_banks=1)
+    one = model_of(table, prior=np.array([0.0, 0.5, 0.5]))
+    build_deployment(one, tmp_path / "out", options)
+    said = {(finding.check, finding.about) for finding in check_model(one, options)}
+    assert {(finding.check, finding.about) for finding in check_deployment(tmp_path / "out")} == said
+    assert ("impossible-readings", "K") in said
+    assert ("dead-lines", "the prior") in said
+
+
+def test_files_of_a_deployment(deployment):
+    assert check_deployment(deployment) == []
+    (deployment / "bm_arch/Memory_MIFs/board0_prior.mif").write_text(mif_text(Mif(40, (1,))))
+    (deployment / "bm1.tcl").unlink()
+    memories, project = check_deployment(deployment)
+    assert (memories.check, memories.about) == ("files", "bm_arch/Memory_MIFs/board0_prior.mif")
+    assert memories.what == "is not as it was built"
+    assert memories.advice == f"use 'toolchain regenerate memories {deployment}'"
+    assert (project.about, project.what) == ("bm1.tcl", "is not there")
+
+
+def test_comments_are_not_contents(deployment):
+    path = deployment / "bm_arch/bm1_parameters.vhd"
+    path.write_text(path.read_text().replace("-- Parameters", "-- My parameters") + "\n-- seen\n")
+    assert check_deployment(deployment) == []
+    path.write_text(path.read_text().replace("LINES             : positive := 10", "LINES : positive := 11"))
+    assert len(check_deployment(deployment)) == 1
+
+
+def test_a_damaged_deployment(deployment):
+    image = deployment / "boards/board0.bm"
+    image.write_bytes(image.read_bytes()[:-1])
+    (finding,) = check_deployment(deployment)
+    assert finding.severity is Severity.ERROR
+    assert "board0.bm is damaged" in finding.what
+
+
+# The command
+
+
+def check(*arguments):
+    return CliRunner().invoke(app, ["check", *map(str, arguments)])
+
+
+@pytest.fixture
+def case(tmp_path):
+    folder = tmp_path / "case"
+    folder.mkdir()
+    (folder / "model.py").write_text(
+        "import numpy as np\n"
+        "from toolchain.models.model import Known, Model, dimension\n"
+        "def model(size: int = 4, bits: int = 0):\n"
+        "    return Model(name='tiny', searched=(dimension('s', size=size),),\n"
+        "                 known=(Known(name='K', table=np.full((2, size), 0.5), bits=bits),))\n"
+    )
+    return folder
+
+
+def test_the_command(case):
+    result = check(case)
+    assert result.exit_code == 0
+    assert result.stdout == (
+        "note: K: each of its values has the same code on every line, so its readings change nothing; leave it out, or "
+        "use more --prob-bits\n"
+    )
+    assert result.stderr == f"{case}: 0 errors, 0 warnings, 1 note\n"
+
+
+def test_the_command_with_json(case):
+    result = check(case, "--json", "--rng-banks", 1, "--prob-bits", 17, "--bits", "K=4")
+    assert result.exit_code == 2
+    (finding,) = map(json.loads, result.stdout.splitlines())
+    assert finding == {
+        "severity": "error",
+        "check": "cannot-be-built",
+        "about": "the machine",
+        "what": "prob_bits is 17; it must be from 1 to 16",
+        "advice": "",
+    }
+    assert result.stderr == ""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "part"),
+    [
+        (["--set", "bits=1"], "error: the model: variable 'K': K serves 2 values, but 1 bits hold 1"),
+        (["--interface", "x"], "error: the model: --interface: 'x' is no interface"),
+        (["--partitions", "9"], "error: the partitions: 4 lines can't be split over 9 boards"),
+    ],
+)
+def test_what_cannot_be_built_is_an_error(case, arguments, part):
+    result = check(case, *arguments)
+    assert result.exit_code == 2
+    assert part in result.stdout
+
+
+def test_a_deployment_by_the_command(deployment):
+    result = check(deployment)
+    assert (result.exit_code, result.stdout) == (0, "")
+    refused = check(deployment, "--prob-bits", 8)
+    assert refused.exit_code == 2
+    assert "error: --prob-bits is for a model; " in refused.stderr
+
+
+def test_neither_model_nor_deployment(tmp_path):
+    result = check(tmp_path)
+    assert result.exit_code == 2
+    assert "holds neither a model (model.py) nor a deployment (deployment.toml)" in result.stderr

@@ -1,0 +1,176 @@
+"""Inspect: a deployment explained, with its model or without; what it says, and what it refuses."""
+
+import json
+
+import pytest
+from typer.testing import CliRunner
+
+from toolchain.build import build_deployment
+from toolchain.command import app
+from toolchain.commands.inspect import _unit, machines_of
+from toolchain.deployment import load_deployment
+
+MODEL = """
+import numpy as np
+from toolchain.models.conditional import normal
+from toolchain.models.model import Known, Model, cell_centres, interval
+
+def model(cells: int = 12):
+    place = interval("x", 0.0, 10.0, cells=cells)
+    (x,) = cell_centres(place)
+    loud = 0.05 + 0.9 * np.exp(-x / 3)
+    return Model(name="corridor", searched=(place,), known=(
+        normal("range", mean=x, sigma=1.0, values=21, step=0.5, on_missing="missing"),
+        Known(name="loud", table=np.array([1 - loud, loud]))))
+"""
+TARGET = ["--uri", "ws://robot:9090", "--topic", "/readings", "--type", "std_msgs/Float64"]
+
+
+@pytest.fixture
+def case(tmp_path):
+    folder = tmp_path / "case"
+    folder.mkdir()
+    (folder / "model.py").write_text(MODEL)
+    return folder
+
+
+@pytest.fixture
+def deployment(case):
+    build(case)
+    return case.parent / "out"
+
+
+def build(case, *arguments):
+    result = CliRunner().invoke(
+        app, ["build", str(case), "-o", str(case.parent / "out"), *TARGET, "--partitions", "2", *arguments]
+    )
+    assert result.exit_code == 0, result.stderr
+    return result
+
+
+def look(deployment, *arguments):
+    return CliRunner().invoke(app, ["inspect", str(deployment), "--frames", "20", *arguments])
+
+
+def test_with_the_model(case, deployment):
+    result = look(deployment, "--model", str(case), "--clock", "50e6")
+    assert result.exit_code == 0, result.stderr
+    text = result.stdout
+    assert text.startswith("Deployment corridor (")
+    assert "12 lines (x 12), 2 sensor columns and the prior, on 2 boards of 6 lines each." in text
+    assert "Codes of 8 bits (scale = address)" in text
+    for words in (
+        "Lost by quantising",
+        "20 frames drawn from the model (seed 1), each with 4 sets of seeds.",
+        "time at 50 MHz",
+        "of that, by quantising alone",
+        "z-scores of",
+        "PCIe controller hard",
+        "It fits",
+        "Energy of a frame",
+        "not a measurement",
+        "a register's clock costs",
+    ):
+        assert words in text, words
+
+
+def test_without_the_model(deployment):
+    result = look(deployment)
+    assert result.exit_code == 0, result.stderr
+    report = (deployment / "report.txt").read_text()
+    losses = next(part for part in report.split("\n\n") if part.startswith("Lost by quantising"))
+    assert losses in result.stdout
+    assert "drawn from what the codes say of the model" in result.stdout
+    assert "by quantising alone" not in result.stdout
+    assert "Name the model with --model" in result.stdout
+    (deployment / "report.txt").unlink()
+    assert "Lost by quantising: unknown here" in look(deployment).stdout
+
+
+def test_json(case, deployment):
+    result = look(deployment, "--model", str(case), "--json", "--soft-pcie")
+    found = json.loads(result.stdout)
+    assert (found["lines"], found["columns"], found["boards"], found["clock_hz"]) == (12, 3, 2, 100e6)
+    assert found["accuracy"]["frames"] == 20
+    assert 0 < found["accuracy"]["machine"]["total_variation"]["value"] < 0.2
+    assert [loss["name"] for loss in found["losses"]] == ["prior", "range", "loud"]
+    assert all(each["fits"] and each["pcie_alms"][1] > 10_000 for each in found["resources"])
+    assert found["energy_model"]["dynamic_j"] > 0
+
+
+def test_recorded_readings(case, deployment):
+    recording = case.parent / "run.csv"
+    recording.write_text("range_m,loud\n3.0,1\n,0\n4.5,0\n")
+    result = look(
+        deployment, "--readings", str(recording), "--reading", "range=range_m", "--reading", "loud=loud"
+    )
+    assert result.exit_code == 0, result.stderr
+    assert "Readings: 3 of 3 rows of run.csv, each with 4 sets of seeds." in result.stdout
+
+
+def test_a_deployment_with_columns_of_another_width(case):
+    build(case, "--bits", "range=6", "--scale", "column", "--rng", "lfsr16", "--stop", "own")
+    out = case.parent / "out"
+    result = look(out, "--model", str(case), "--bits", "range=6")
+    assert result.exit_code == 0, result.stderr
+    assert "(scale = column)" in result.stdout
+    assert "stop = own" in result.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["--model", "{case}", "--set", "cells=13"], "was not built from"),
+        (["--model", "{case}", "--bits", "range=7"], "was not built from"),
+        (["--clock", "0"], "--clock is 0, expected hertz"),
+        (["--clock", "nan"], "--clock is nan, expected hertz"),
+        (["--device", "d9"], "--device d9: expected one of proce-v-d8"),
+        (["--reading", "range=a"], "add --readings FILE"),
+        (["--readings", "{case}/none.csv"], "none.csv is not there"),
+        (["--banks", "0"], "--banks is 0"),
+        (["--frames", "-1"], "--frames is -1"),
+    ],
+)
+def test_mistakes(case, deployment, arguments, sentence):
+    result = look(deployment, *[argument.format(case=case) for argument in arguments])
+    assert result.exit_code == 2
+    assert result.stderr.startswith("error: ")
+    assert sentence in result.stderr
+    assert result.stdout == ""
+
+
+def test_no_deployment(tmp_path):
+    result = look(tmp_path)
+    assert result.exit_code == 2
+    assert "holds no deployment" in result.stderr
+
+
+def test_the_machines_are_those_that_were_built(case, deployment):
+    machines = machines_of(load_deployment(deployment))
+    assert [machine.parameters.lines for machine in machines] == [6, 6]
+    assert build_deployment.__module__ == "toolchain.build"
+
+
+def test_a_build_on_a_device_takes_its_own_number_of_boards(case):
+    result = build(case, "--device", "proce-v-d8")
+    assert "All 12 lines fit one Gidel Proce V D8 (Stratix V GS D8):" in result.stderr
+    assert (
+        len(load_deployment(case.parent / "out").boards) == 2
+    )  # as many as were asked for, since they are more
+
+
+def test_a_machine_that_is_slow_to_emulate_is_looked_at_for_fewer_frames(case):
+    build(case, "--per-cell", "--target-count", "20")
+    result = CliRunner().invoke(app, ["inspect", str(case.parent / "out")])
+    assert result.exit_code == 0, result.stderr
+    assert "Readings: 20 frames drawn from what the codes say of the model (seed 1).\n" in result.stdout
+    assert "lfsr32 one a cell" in result.stdout
+
+
+def test_units():
+    assert _unit(20.48e-6, "s") == "20.5 us"
+    assert _unit(100e6, "Hz") == "100 MHz"
+    assert _unit(1e-3, "s") == "1 ms"
+    assert _unit(1.0, "s") == "1 s"
+    assert _unit(0.0, "s") == "0 s"
+    assert _unit(3e-15, "J") == "0.003 pJ"

@@ -1,0 +1,85 @@
+"""`toolchain new` starts a model that builds as it says, and a robot that says what the model reads."""
+
+import ast
+import re
+import shlex
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from toolchain.address import to_address
+from toolchain.command import app
+from toolchain.deployment import load_deployment
+from toolchain.models.case_study import load_model
+from toolchain.models.fusion import exact_posterior
+
+
+def run(*arguments):
+    return CliRunner().invoke(app, list(arguments))
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_what_it_prints_builds(here):
+    made = run("new", "mymodel")
+    assert made.exit_code == 0, made.stderr
+    (command,) = re.findall(r"^ +(toolchain build .*)$", made.stdout, re.MULTILINE)
+    built = run(*shlex.split(command)[1:])
+    assert built.exit_code == 0, built.stderr
+    deployment = load_deployment(here / "build" / "mymodel")
+    assert deployment.name == "mymodel"
+    assert [variable.path for variable in deployment.variables] == ["data[0]", "data[1]"]
+    smaller = run(*shlex.split(command)[1:], "--set", "cells=20")
+    assert smaller.exit_code == 0
+    assert load_deployment(here / "build" / "mymodel").machine.lines == 20
+
+
+def test_the_robot_says_what_the_model_reads(here):
+    made = run("new", "deep/er/mymodel")
+    folder = here / "deep" / "er" / "mymodel"
+    text = (folder / "robot.py").read_text()
+    calls = [node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Call)]
+    arguments = [
+        [ast.literal_eval(each) for each in call.args]
+        for call in calls
+        if call.args and not isinstance(call.args[0], ast.Call | ast.Name)
+    ]
+    topic, kind = next(each for each in arguments if len(each) == 2)
+    assert f"--topic {topic} --type {kind}" in made.stdout
+    (message,) = next(each for each in arguments if isinstance(each[0], dict))
+    model = load_model(folder, {})
+    addresses = [
+        to_address(variable, reading)
+        for variable, reading in zip(model.variables, message["data"], strict=True)
+    ]
+    posterior = exact_posterior(model, addresses)
+    assert model.searched[0].value(int(np.argmax(posterior))) == pytest.approx(6.5, abs=0.2)
+
+
+def test_it_overwrites_nothing(here):
+    run("new", "mymodel")
+    (here / "mymodel" / "model.py").write_text("mine")
+    again = run("new", "mymodel")
+    assert again.exit_code == 2
+    assert "mymodel/model.py is there already; choose another name" in again.stderr
+    assert (here / "mymodel" / "model.py").read_text() == "mine"
+
+
+@pytest.mark.parametrize("name", ["3d", "my model", "a-b", "..", "", "é", "a" * 80])
+def test_names_that_no_topic_can_have(here, name):
+    refused = run("new", name)
+    assert refused.exit_code == 2
+    assert "names no model" in refused.stderr
+    assert not list(here.iterdir())
+
+
+def test_a_folder_that_cannot_be_written(here):
+    (here / "file").write_text("")
+    refused = run("new", "file/mymodel")
+    assert refused.exit_code == 2
+    assert "can't be written" in refused.stderr

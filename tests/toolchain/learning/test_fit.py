@@ -1,0 +1,484 @@
+"""Learning: what made a recording is found again, counts are Dirichlet's, and a fit is the same after its file.
+
+model ──▶ simulated readings with ground truth ──▶ fit ──▶ file ──▶ the model that made them
+"""
+
+import json
+import math
+import os
+import re
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from typer.testing import CliRunner
+
+from toolchain.command import app
+from toolchain.errors import ModelError
+from toolchain.learning.fit import LEAST_READINGS, fit_model, locate, mixture
+from toolchain.learning.fit_options import FitMethod, FitOptions, FitPrior
+from toolchain.learning.fitted import apply_fit, cell_spread, mean_slopes, read_fit, with_fit, write_fit
+from toolchain.models.case_study import load_model
+from toolchain.models.conditional import normal, wrapped_normal
+from toolchain.models.model import Known, Model, cell_centres, dimension, interval
+
+MRCLAM = os.environ.get("ROSBAYES_MRCLAM")
+TURN = 2 * np.pi
+
+CASE = """
+import numpy as np
+from pathlib import Path
+from toolchain.models.conditional import normal
+from toolchain.learning.fitted import with_fit
+from toolchain.models.model import Known, Model, cell_centres, interval
+
+def model(fit: Path | None = None):
+    place = interval("x", 0.0, 10.0, cells=100)
+    (x,) = cell_centres(place)
+    near = np.where(x < 5, 0.8, 0.2)
+    wall = normal("wall", mean=10.0 - x, sigma=1.0, values=101, step=0.1, on_missing="missing")
+    back = normal("back", mean=x, sigma=1.0, values=101, step=0.1, on_missing="missing")
+    door = Known(name="door", table=np.array([1 - near, near]), states=("shut", "open"), on_missing="missing")
+    return with_fit(Model(name="corridor", searched=(place,), known=(wall, back, door)), fit)
+"""
+
+
+def room(cells=16):
+    y, x = interval("y", 0, 8, cells=cells), interval("x", 0, 8, cells=cells)
+    ys, xs = cell_centres(y, x)
+    return Model(
+        name="room",
+        searched=(y, x),
+        known=(
+            normal("range", mean=np.hypot(xs + 2, ys + 1), sigma=1.0, values=150, step=0.1),
+            wrapped_normal(
+                "bearing",
+                mean=np.arctan2(ys + 1, xs - 3),
+                sigma=0.5,
+                values=180,
+                step=TURN / 180,
+                offset=-np.pi,
+            ),
+        ),
+    )
+
+
+def simulated(rows, *, sigma=0.2, bias=0.0, outliers=0.2, seed=1):
+    """Truth and readings of the room, as columns."""
+    random = np.random.default_rng(seed)
+    y, x = random.uniform(0, 8, (2, rows))
+    distance = np.hypot(x + 2, y + 1) + bias + random.normal(0, sigma, rows)
+    bearing = (
+        np.arctan2(y + 1, x - 3) + random.normal(0, sigma / 4, rows) + TURN * random.integers(-1, 2, rows)
+    )
+    wild = random.random(rows) < outliers
+    distance[wild] = random.uniform(0, 15, wild.sum())
+    bearing[wild] = random.uniform(-np.pi, np.pi, wild.sum())
+    truth = {"y": y.tolist(), "x": x.tolist()}
+    return truth, {"range": distance.tolist(), "bearing": bearing.tolist()}
+
+
+def learn(model, truth, readings, **options):
+    rows = len(next(iter(truth.values())))
+    located = locate(model, truth, rows)
+    return fit_model(model, located, readings, [], FitOptions(truth=(), **options))
+
+
+def test_normals_are_found_again():
+    truth, readings = simulated(3000, sigma=0.2, bias=0.3, outliers=0.2)
+    fit, supports = learn(room(), truth, readings, bias=True)
+    distance, bearing = fit.file.variables
+    # in a cell the mean is taken as linear, which adds a little to sigma
+    assert distance.sigma == pytest.approx(0.2, rel=0.1)
+    assert distance.bias == pytest.approx(0.3, abs=0.02)
+    assert distance.outliers == pytest.approx(0.2, abs=0.03)
+    assert bearing.sigma == pytest.approx(0.05, rel=0.15)
+    assert bearing.bias == pytest.approx(0, abs=0.01)
+    assert [support.readings for support in supports] == [3000, 3000]
+    assert supports[0].cells == 256
+
+
+def test_a_bias_is_fitted_only_on_request():
+    truth, readings = simulated(500, bias=0.3)
+    fit, _ = learn(room(), truth, readings)
+    assert [variable.bias for variable in fit.file.variables] == [0, 0]
+
+
+@given(st.floats(0.01, 2), st.floats(0.0, 0.6), st.integers(0, 1000))
+@settings(max_examples=25, deadline=None)
+def test_the_mixture_finds_sigma_and_share(sigma, share, seed):
+    random = np.random.default_rng(seed)
+    residuals = random.normal(0, sigma, 3000)
+    wild = random.random(3000) < share
+    residuals[wild] = random.uniform(-15, 15, wild.sum())
+    _, found, (outliers,) = mixture([residuals], [30.0], bias=False, least_sigma=1e-3)
+    assert found == pytest.approx(sigma, rel=0.15)
+    assert outliers == pytest.approx(share, abs=0.06)
+
+
+def test_a_pool_shares_sigma_and_each_keeps_its_share():
+    random = np.random.default_rng(2)
+    few, many = random.normal(0, 0.1, 20), random.normal(0, 0.1, 2000)
+    broken = random.uniform(-5, 5, 200)
+    _, sigma, shares = mixture([few, many, broken], [10.0] * 3, bias=False, least_sigma=1e-3)
+    assert sigma == pytest.approx(0.1, rel=0.1)
+    assert shares[0] < 0.15
+    assert shares[1] < 0.02
+    assert shares[2] > 0.9
+
+
+def test_exact_readings_have_a_sigma_all_the_same():
+    assert mixture([np.zeros(50)], [1.0], bias=True, least_sigma=0.005) == (
+        0.0,
+        0.005,
+        [pytest.approx(1 / 52, abs=3e-3)],
+    )
+
+
+def test_the_spread_inside_a_cell_is_part_of_the_fitted_table():
+    model = room(cells=4)
+    ranged = model.known[0]
+    ys, xs = cell_centres(*model.searched)
+    away = np.hypot(xs + 2, ys + 1)
+    slopes = mean_slopes(model, ranged)
+    assert slopes[0] == pytest.approx(2 * (ys + 1) / away, abs=0.35)  # cells of 2 m
+    assert cell_spread(model, ranged) == pytest.approx(np.full(16, 2 / math.sqrt(12)), rel=0.2)
+    truth, readings = simulated(2000)
+    fit, _ = learn(model, truth, readings)
+    fitted = apply_fit(model, fit)
+    assert np.all(fitted.known[0].normal.sigma > 0.9 * 2 / math.sqrt(12))
+
+
+def test_slopes_of_a_bearing_go_the_short_way_round():
+    line = interval("x", -1, 1, cells=4)
+    mean = np.array([3.0, 3.1, -3.1, -3.0])
+    model = Model(
+        name="m",
+        searched=(line,),
+        known=(wrapped_normal("b", mean=mean, sigma=1, values=60, step=TURN / 60),),
+    )
+    gap = TURN - 6.2
+    assert mean_slopes(model, model.known[0])[0] == pytest.approx(
+        [0.1, (0.1 + gap) / 2, (0.1 + gap) / 2, 0.1]
+    )
+
+
+def test_rows_without_a_truth_are_left_out():
+    model = room()
+    truth = {"y": [1.0, None, 9.0, math.nan, -0.01, 8.0, "north"], "x": [1.0] * 7}
+    located = locate(model, truth, 7)
+    assert located.rows.tolist() == [0]
+    assert located.outside == 6
+    assert located.lines.tolist() == [2 * 16 + 2]
+    assert located.within[:, 0] == pytest.approx([-0.5, -0.5])
+
+
+def door(cells=4):
+    table = np.array([[0.9, 0.5, 0.5, 0.2], [0.1, 0.5, 0.5, 0.8]])
+    return Model(
+        name="door",
+        searched=(dimension("x", size=cells, states=("a", "b", "c", "d")),),
+        known=(Known(name="door", table=table, states=("shut", "open")),),
+    )
+
+
+@pytest.mark.parametrize("prior", list(FitPrior))
+def test_counts_are_dirichlets(prior):
+    truth = {"x": ["a", "a", "a", "d", "c", 1]}
+    readings = {"door": ["shut", "open", 1, 0, None, "ajar"]}
+    fit, (support,) = learn(door(), truth, readings, method=FitMethod.COUNTS, pseudo_count=2.0, prior=prior)
+    base = door().known[0].table if prior is FitPrior.MODEL else np.full((2, 4), 0.5)
+    counts = np.array([[1, 0, 0, 1], [2, 0, 0, 0]])
+    assert fit.tables["door"] == pytest.approx((counts + 2 * base) / (counts.sum(axis=0) + 2))
+    assert (support.readings, support.cells, support.median, support.refused) == (4, 2, 2.0, 1)
+
+
+def test_counts_come_near_what_made_them():
+    random = np.random.default_rng(4)
+    model = door()
+    lines = random.integers(0, 4, 20000)
+    opened = (random.random(20000) < model.known[0].table[1, lines]).astype(int)
+    fit, _ = learn(
+        model,
+        {"x": lines.tolist()},
+        {"door": opened.tolist()},
+        method=FitMethod.COUNTS,
+        prior=FitPrior.UNIFORM,
+    )
+    assert fit.tables["door"] == pytest.approx(model.known[0].table, abs=0.03)
+    assert apply_fit(model, fit).known[0].states == ("shut", "open")
+
+
+def test_few_readings_leave_what_was_set_by_hand(tmp_path):
+    truth, readings = simulated(LEAST_READINGS - 1)
+    fit, _ = learn(room(), truth, readings)
+    assert fit.file.variables == ()
+    assert np.array_equal(apply_fit(room(), fit).known[0].table, room().known[0].table)
+
+
+def test_a_fit_is_the_same_after_its_file(tmp_path):
+    truth, readings = simulated(300)
+    fit, _ = learn(room(), truth, readings)
+    write_fit(tmp_path / "fit.toml", fit)
+    assert read_fit(tmp_path / "fit.toml").file == fit.file
+    fitted = with_fit(room(), tmp_path / "fit.toml")
+    for ours, theirs in zip(fitted.known, apply_fit(room(), fit).known, strict=True):
+        assert np.array_equal(ours.table, theirs.table)
+    assert with_fit(room(), None).known[0].table is not None
+    finer = with_fit(room(cells=40), tmp_path / "fit.toml")
+    assert finer.lines == 1600
+
+
+def test_counted_tables_are_the_same_after_their_file_and_so_are_its_bytes(tmp_path):
+    fit, _ = learn(door(), {"x": ["a", "b"]}, {"door": [1, 0]}, method=FitMethod.COUNTS)
+    for name in ("a.npz", "b.npz"):
+        write_fit(tmp_path / name, fit)
+    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+    again = read_fit(tmp_path / "a.npz")
+    assert again.file == fit.file
+    assert np.array_equal(again.tables["door"], fit.tables["door"])
+    with pytest.raises(ModelError, match="writes a file that ends in .npz"):
+        write_fit(tmp_path / "a.toml", fit)
+
+
+def archive(path, members):
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file:
+        for name, data in members.items():
+            file.writestr(name, data)
+    return path
+
+
+def array_bytes(header, data=b""):
+    text = header.encode().ljust(117) + b"\n"
+    return b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text + data
+
+
+META = json.dumps(
+    {
+        "format": 1,
+        "method": "counts",
+        "model": "m",
+        "floor": 0.0,
+        "recordings": [],
+        "variables": [{"name": "k", "rows": 1}],
+    }
+)
+HUGE = array_bytes("{'descr': '<f8', 'fortran_order': False, 'shape': (1000000, 1000000), }", b"12345678")
+
+
+@pytest.mark.parametrize(
+    "members",
+    [
+        {},
+        {"fit.json": "{"},
+        {"fit.json": "[" * 100_000},
+        {"fit.json": "[]"},
+        {"fit.json": META},
+        {"fit.json": META, "table0.npy": b"nothing"},
+        {"fit.json": META, "table0.npy": HUGE},
+        {
+            "fit.json": META,
+            "table0.npy": array_bytes("{'descr': '|O', 'fortran_order': False, 'shape': (1, 1), }", b"x" * 8),
+        },
+        {
+            "fit.json": META,
+            "table0.npy": array_bytes(
+                "{'descr': '<f8', 'fortran_order': False, 'shape': (2, 1), }", b"x" * 8
+            ),
+        },
+        {"fit.json": META.replace('"k"', "7")},
+        {"fit.json": META.replace("counts", "normals")},
+    ],
+)
+def test_a_damaged_or_hostile_file_of_tables_is_refused(tmp_path, members):
+    path = archive(tmp_path / "x.npz", members)
+    with pytest.raises(ModelError, match=re.escape(str(path))):
+        read_fit(path)
+
+
+def test_a_file_that_unpacks_to_too_much_is_refused(tmp_path):
+    path = tmp_path / "bomb.npz"
+    with (
+        zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file,
+        file.open("fit.json", "w", force_zip64=True) as member,
+    ):
+        for _ in range(300):
+            member.write(bytes(1 << 20))
+    with pytest.raises(ModelError, match="bomb.npz"):
+        read_fit(path)
+    path.write_bytes(b"no archive")
+    with pytest.raises(ModelError, match="or is damaged: BadZipFile"):
+        read_fit(path)
+    with pytest.raises(ModelError, match="can't be read: No such file"):
+        read_fit(tmp_path / "nowhere.npz")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "sentence"),
+    [
+        (
+            "sigma = ",
+            "sgima = ",
+            r"line \d+: unknown key 'sgima' in \[\[variable\]\] 1; did you mean 'sigma'",
+        ),
+        ('method = "normals"', 'method = "counts"', "whose tables `toolchain fit` writes as .npz"),
+        ("format = 1", "format = 2", "format"),
+        ('name = "range"', 'name = "rnge"', "is of a model with rnge; room has range, bearing"),
+        ("outliers = 0.", "outliers = 7.", "outliers"),
+        ("sigma = 0.", "sigma = -0.", "sigma"),
+        ("sigma = ", "sigma = 0 # ", "sigma of range is 0, expected a positive"),
+    ],
+)
+def test_a_fit_that_was_edited_wrongly(tmp_path, old, new, sentence):
+    truth, readings = simulated(300)
+    path = tmp_path / "fit.toml"
+    write_fit(path, learn(room(), truth, readings)[0])
+    path.write_text(path.read_text().replace(old, new, 1))
+    with pytest.raises(ModelError, match=sentence):
+        with_fit(room(), path)
+
+
+def test_what_cannot_be_learnt_in_this_way():
+    with pytest.raises(ModelError, match="door is not normal around a mean .* --method counts"):
+        learn(door(), {"x": [0]}, {"door": [1]})
+    with pytest.raises(ModelError, match="no row has a true value inside the searched dimensions"):
+        learn(door(), {"x": [77]}, {"door": [1]}, method=FitMethod.COUNTS)
+    truth, readings = simulated(20)
+    with pytest.raises(ModelError, match=r"--pool rnge\* is none of the variables"):
+        learn(room(), truth, readings, pool=("rnge*",))
+    fit, _ = learn(door(), {"x": [0]}, {"door": [1]}, method=FitMethod.COUNTS)
+    other = Model(
+        name="o", searched=(dimension("x", size=3),), known=(Known(name="door", table=np.full((2, 3), 0.5)),)
+    )
+    with pytest.raises(ModelError, match=r"has shape \(2, 4\), the model's \(2, 3\)"):
+        apply_fit(other, fit)
+
+
+@pytest.fixture
+def corridor(tmp_path):
+    folder = tmp_path / "corridor"
+    folder.mkdir()
+    (folder / "model.py").write_text(CASE)
+    random = np.random.default_rng(8)
+    for name in ("learn.csv", "check.csv"):
+        x = random.uniform(0, 10, 400)
+        lines = ["true_x,wall_m,back_m,door"]
+        for at in x:
+            opened = "open" if random.random() < (0.8 if at < 5 else 0.2) else "shut"
+            back = f"{at + random.normal(0, 0.1):.3f}" if random.random() < 0.5 else ""
+            lines.append(f"{at:.3f},{10 - at + random.normal(0, 0.1):.3f},{back},{opened}")
+        (tmp_path / name).write_text("\n".join(lines) + "\n")
+    return tmp_path
+
+
+def fit(folder, *arguments):
+    command = ["fit", str(folder / "corridor"), str(folder / "learn.csv"), "--truth", "x=true_x", *arguments]
+    return CliRunner().invoke(app, command)
+
+
+def test_the_command_fits_normals_and_a_model_loads_them(corridor):
+    out = corridor / "fit.toml"
+    result = fit(
+        corridor,
+        "-o",
+        str(out),
+        "--floor",
+        "0",
+        "--reading",
+        "wall=wall_m",
+        "--reading",
+        "back=back_m",
+        "--check",
+        str(corridor / "check.csv"),
+    )
+    assert result.exit_code == 0, result.stderr
+    assert "400 rows with a truth inside the searched dimensions, 0 others" in result.stdout
+    assert re.search(r"wall +400 +\d+ +\d% +\d+ +0.1\d* +0 +0.\d%", result.stdout)
+    assert re.search(r"back +(19|2)\d\d? ", result.stdout)
+    medians = [float(each) for each in re.findall(r"median (\d+\.\d+)", result.stdout)]
+    surprises = [float(each) for each in re.findall(r"true cell (\d+\.\d+) bits", result.stdout)]
+    assert medians[1] < medians[0]
+    assert surprises[1] < surprises[0]
+    fitted = load_model(corridor / "corridor", {"fit": str(out)})
+    assert fitted.known[0].normal.sigma.max() < 0.25
+    assert f"Wrote {out}." in result.stdout
+
+
+def test_the_command_counts(corridor):
+    out = corridor / "fit.npz"
+    result = fit(
+        corridor, "-o", str(out), "--reading", "door=door", "--method", "counts", "--pseudo-count", "3"
+    )
+    assert result.exit_code == 0, result.stderr
+    assert "rest on the prior alone: the model's own table, worth 3 readings a cell" in result.stdout
+    fitted = load_model(corridor / "corridor", {"fit": str(out)})
+    assert fitted.known[2].table[1, :50].mean() == pytest.approx(0.8, abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["-o", "fit.npz"], "the method normals writes a file that ends in .toml"),
+        (["-o", "fit.toml", "--method", "counts"], "the method counts writes a file that ends in .npz"),
+        (["-o", "fit.toml"], "learn.csv has no column 'wall'; it has true_x, wall_m, back_m, door"),
+        (
+            ["-o", "fit.toml", "--reading", "wal=wall_m"],
+            "--reading wal: the model has no such known variable",
+        ),
+        (["-o", "fit.toml", "--reading", "wall"], "--reading wall: expected KEY=VALUE"),
+        (["-o", "fit.toml", "--truth", "y=true_x"], "--truth y: the model searches x"),
+        (["-o", "fit.toml", "--floor", "1"], "--floor is 1, expected"),
+        (["-o", "fit.npz", "--method", "counts", "--pseudo-count", "0"], "--pseudo-count is 0, expected"),
+        (["-o", "fit.toml", "--tolerance", "-1"], "--tolerance is -1, expected"),
+        (["-o", "fit.toml", "--reading", "wall=wall_m", "--check", "LEARN"], "is learnt from"),
+    ],
+)
+def test_mistakes_of_the_command(corridor, arguments, sentence):
+    result = fit(corridor, *(each.replace("LEARN", str(corridor / "learn.csv")) for each in arguments))
+    assert result.exit_code == 2, result.stdout
+    assert sentence in result.stderr
+    assert "Traceback" not in result.stderr
+    assert not list(corridor.glob("fit.*"))
+
+
+def test_a_star_stands_for_the_same_text(corridor):
+    case = corridor / "corridor" / "model.py"
+    case.write_text(case.read_text().replace('"wall"', '"wall_range"').replace('"back"', '"back_range"'))
+    result = fit(corridor, "-o", str(corridor / "fit.toml"), "--reading", "*_range=*_m", "--pool", "*_range")
+    assert result.exit_code == 0, result.stderr
+    variables = read_fit(corridor / "fit.toml").file.variables
+    assert [variable.name for variable in variables] == ["wall_range", "back_range"]
+    assert variables[0].sigma == variables[1].sigma
+
+
+@pytest.mark.skipif(not MRCLAM, reason="ROSBAYES_MRCLAM names no folder with the landmarks' recordings")
+def test_fitted_on_robot_3_better_on_robot_5_than_by_hand(tmp_path):
+    data = Path(MRCLAM)
+    case = Path(__file__).parents[3] / "casestudies" / "mrclam"
+    command = ["fit", str(case), str(data / "ds1_robot3.csv"), "-o", str(tmp_path / "fit.toml")]
+    command += [
+        "--set",
+        f"landmarks={data / 'landmarks.csv'}",
+        "--truth",
+        "y=ref_y_m",
+        "--truth",
+        "x=ref_x_m",
+    ]
+    command += ["--reading", "range_*=range_*_m", "--reading", "bearing_*=bearing_*_rad"]
+    command += ["--pool", "range_*", "--pool", "bearing_*", "--check", str(data / "ds1_robot5.csv")]
+    result = CliRunner().invoke(app, command)
+    assert result.exit_code == 0, result.stderr
+    print(result.stdout)
+    by_hand, fitted = (
+        (float(median), float(mean))
+        for median, mean in re.findall(r"median (\d+\.\d+), mean (\d+\.\d+)", result.stdout)
+    )
+    assert fitted[0] < by_hand[0]
+    assert fitted[1] < 0.6 * by_hand[1]
+    assert (
+        load_model(case, {"landmarks": str(data / "landmarks.csv"), "fit": str(tmp_path / "fit.toml")}).lines
+        == 1024
+    )

@@ -1,0 +1,127 @@
+"""A user's model.py: found, called with --set values, and every mistake in it a sentence with its line."""
+
+import sys
+import textwrap
+from pathlib import Path
+
+import pytest
+
+from toolchain.errors import ModelError
+from toolchain.models.case_study import load_model
+
+MODEL = """
+from enum import Enum
+from pathlib import Path
+from typing import Literal
+import numpy as np
+from toolchain.models.model import Known, Model, dimension
+
+class Kind(Enum):
+    COARSE = "coarse"
+    FINE = "fine"
+
+def model(size: int = 4, share: float = 0.5, name: str = "tiny", file: Path | None = None, flat: bool = True,
+          kind: Kind = Kind.FINE, mode: Literal["a", 2] = "a", plain=3, table: dict | None = None) -> Model:
+    known = Known(name="K", table=np.array([[share] * size, [1 - share] * size]))
+    words = f"{name} {type(file).__name__} {flat} {kind.name} {mode!r} {plain!r}"
+    return Model(name=words, searched=(dimension("s", size=size),), known=(known,))
+"""
+
+
+@pytest.fixture
+def case(tmp_path):
+    def write(text=MODEL):
+        (tmp_path / "model.py").write_text(textwrap.dedent(text))
+        return tmp_path
+
+    return write
+
+
+def test_defaults(case):
+    model = load_model(case(), {})
+    assert model.lines == 4
+    assert model.name == "tiny NoneType True FINE 'a' 3"
+
+
+def test_values_are_read_as_their_parameters_types(case):
+    settings = {
+        "size": "3",
+        "share": "0.25",
+        "name": "12",
+        "file": "x.csv",
+        "flat": "No",
+        "kind": "coarse",
+        "mode": "2",
+        "plain": "7",
+    }
+    model = load_model(case(), settings)
+    assert model.lines == 3
+    assert model.known[0].table[0, 0] == 0.25
+    assert model.name == f"12 {type(Path()).__name__} False COARSE 2 7"
+
+
+@pytest.mark.parametrize(
+    ("settings", "sentence"),
+    [
+        ({"siz": "3"}, "the model has no parameter 'siz'; did you mean 'size'?"),
+        ({"zzzzzz": "3"}, "the model has no parameter 'zzzzzz'; expected one of size, share, name"),
+        ({"size": "3.5"}, "--set size=3.5: expected an integer"),
+        ({"plain": "x"}, "--set plain=x: expected an integer"),
+        ({"share": "half"}, "--set share=half: expected a number"),
+        ({"flat": "maybe"}, "--set flat=maybe: expected one of true, false"),
+        ({"kind": "fin"}, "--set kind=fin: expected one of coarse, fine"),
+        ({"mode": "b"}, "--set mode=b: expected one of a, 2"),
+        ({"table": "{}"}, "--set table={}: the model's table can't be given on the command line"),
+        ({"size": "0"}, "P(K | S) has shape (2, 0), expected (values, lines)"),
+    ],
+)
+def test_wrong_settings(case, settings, sentence):
+    with pytest.raises(ModelError) as caught:
+        load_model(case(), settings)
+    assert sentence in str(caught.value)
+    assert caught.value.exit_code == 2
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("def model(file):\n    pass", "the model needs file: add --set file=VALUE"),
+        ("def model():\n    return 1 / 0", "line 2: model() raised ZeroDivisionError: division by zero"),
+        ("def model():\n    raise ValueError('a\\nb')", "line 2: model() raised ValueError: a b"),
+        ("def model():\n    assert False", "line 2: model() raised AssertionError"),
+        ("\nimport nowhere_to_be_found", "line 2: it raised ModuleNotFoundError"),
+        ("def model(:\n", "line 1: invalid syntax"),
+        ("x = 1", "defines no model()"),
+        ("model = 1", "defines no model()"),
+        ("def model():\n    return 5", "model() returned int, expected a toolchain.models.model.Model"),
+        ("def model():\n    pass", "model() returned NoneType"),
+        ("def model(x: 'Nonsense' = 1):\n    pass", "an annotation raised NameError"),
+    ],
+)
+def test_mistakes_in_the_file(case, text, sentence):
+    folder = case(text)
+    with pytest.raises(ModelError) as caught:
+        load_model(folder, {})
+    assert sentence in str(caught.value)
+    assert str(folder / "model.py") in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_no_parameters_at_all(case):
+    with pytest.raises(ModelError, match="the model has no parameters, so --set size means nothing"):
+        load_model(case("def model():\n    pass"), {"size": "3"})
+
+
+def test_no_folder_and_no_model(tmp_path):
+    with pytest.raises(ModelError, match=r"has no model\.py"):
+        load_model(tmp_path, {})
+    with pytest.raises(ModelError, match="is no folder"):
+        load_model(tmp_path / "nowhere", {})
+
+
+def test_a_module_beside_the_model_can_be_imported_and_nothing_stays_behind(case):
+    folder = case("import beside_the_model\n" + MODEL)
+    (folder / "beside_the_model.py").write_text("")
+    before = list(sys.path)
+    assert load_model(folder, {}).lines == 4
+    assert sys.path == before

@@ -1,0 +1,310 @@
+"""Joint distributions and questions: exact against enumeration, and refused exactly where naive fusion does not hold.
+
+random network ──▶ ask(searched, known) ──▶ model ──▶ posterior  ══  sum over the whole joint table
+                                       └──▶ refused  ══  two known symbols are dependent given the searched ones
+"""
+
+import itertools
+import re
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from casestudies.boat.geometry import (
+    BEACONS,
+    BEARING_NAMES,
+    BEARING_SIGMA,
+    DISTANCE_NAMES,
+    MAP_HIGH,
+    MAP_LOW,
+    distance_sigma,
+)
+from casestudies.boat.model import model as boat_model
+from toolchain.errors import ModelError
+from toolchain.models.distribution import conditional_normal, potential, table, uniform
+from toolchain.models.fusion import exact_posterior
+from toolchain.models.joint import JointDistribution
+from toolchain.models.symbol import IntegerType, IntervalType, LabelType, Symbol
+
+YES_NO = LabelType("no", "yes")
+R, S, G = (Symbol(name, YES_NO) for name in ("R", "S", "G"))
+SPRINKLER = JointDistribution(
+    "sprinkler",
+    (
+        table(R, [0.8, 0.2]),
+        table(S, [[0.6, 0.99], [0.4, 0.01]], given=[R]),
+        table(G, [[[1, 0.2], [0.1, 0.01]], [[0, 0.8], [0.9, 0.99]]], given=[S, R]),
+    ),
+)
+
+
+def full_table(joint):
+    """The whole joint distribution, and its axes' names."""
+    names = [symbol.name for symbol in joint.symbols]
+    letters = dict(zip(names, itertools.count(), strict=False))
+    operands = []
+    for factor in joint.factors:
+        operands += [factor.table, [letters[symbol.name] for symbol in factor.scope]]
+    return np.einsum(*operands, list(letters.values())), names
+
+
+def enumerated(joint, searched, known, values, fixed=()):
+    """P(searched | known = values) by summing the whole table."""
+    whole, names = full_table(joint)
+    at = [slice(None)] * len(names)
+    for name, value in (*zip(known, values, strict=True), *fixed):
+        at[names.index(name)] = slice(value, value + 1)
+    whole = whole[tuple(at)]
+    order = [names.index(name) for name in searched]
+    others = tuple(axis for axis in range(len(names)) if axis not in order)
+    left = whole.sum(axis=others)
+    left = np.transpose(left, np.argsort(np.argsort(order)))
+    return (left / left.sum()).ravel()
+
+
+def test_the_sprinkler_of_the_thesis():
+    model = SPRINKLER.ask(["R"], ["G"]).model()
+    assert exact_posterior(model, [1])[1] == pytest.approx(0.16038 / 0.44838)
+    assert model.known[0].states == ("no", "yes")
+    assert model.searched[0].states == ("no", "yes")
+
+
+def test_what_is_summed_over_is_gone_and_what_is_given_is_fixed():
+    model = SPRINKLER.ask(["R"], ["G"], given={"S": "yes"}).model()
+    expected = enumerated(SPRINKLER, ["R"], ["G"], [1], [("S", 1)])
+    assert exact_posterior(model, [1]) == pytest.approx(expected)
+
+
+def test_a_joint_search_has_a_line_for_each_combination():
+    model = SPRINKLER.ask(["S", "R"], ["G"]).model()
+    assert [dimension.label for dimension in model.searched] == ["S", "R"]
+    assert exact_posterior(model, [1]) == pytest.approx(enumerated(SPRINKLER, ["S", "R"], ["G"], [1]))
+    turned = SPRINKLER.ask(["R", "S"], ["G"]).model()
+    assert exact_posterior(turned, [1]) == pytest.approx(enumerated(SPRINKLER, ["R", "S"], ["G"], [1]))
+
+
+def random_network(seed, size):
+    random = np.random.default_rng(seed)
+    symbols = [Symbol(f"v{at}", IntegerType(0, int(random.integers(1, 4)) - (at == 0))) for at in range(size)]
+    factors = []
+    for at, symbol in enumerate(symbols):
+        parents = [symbols[k] for k in range(at) if random.random() < 0.4]
+        shape = (symbol.size, *(parent.size for parent in parents))
+        weights = random.gamma(0.7, size=shape) + 1e-3
+        factors.append(table(symbol, weights / weights.sum(axis=0), given=parents))
+    random.shuffle(factors)
+    return JointDistribution("random", tuple(factors)), random
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.integers(0, 2**32), st.integers(2, 7), st.integers(1, 2), st.integers(1, 3), st.integers(0, 1))
+def test_a_question_is_exact_or_refused_for_a_reason(seed, size, searching, knowing, giving):
+    assume(searching + knowing + giving <= size)
+    joint, random = random_network(seed, size)
+    names = random.permutation([symbol.name for symbol in joint.symbols]).tolist()
+    searched, known = names[:searching], names[searching : searching + knowing]
+    fixed = [(name, 0) for name in names[searching + knowing :][:giving]]
+    given_ = {name: str(int(joint.symbol(name).values()[value])) for name, value in fixed}
+    try:
+        model = joint.ask(searched, known, given=given_).model()
+    except ModelError as error:
+        match = re.match(r"(\w+) and (\w+) are not independent given", str(error))
+        assert dependence(joint, searched, [match[1], match[2]], fixed) > 1e-13
+        return
+    sizes = [joint.symbol(name).size for name in known]
+    for values in itertools.product(*map(range, sizes)):
+        expected = enumerated(joint, searched, known, values, fixed)
+        assert exact_posterior(model, values) == pytest.approx(expected, abs=1e-12)
+    partly = [None] + [0] * (len(known) - 1)  # a missing reading is summed over, too
+    expected = enumerated(joint, searched, known[1:], partly[1:], fixed)
+    assert exact_posterior(model, partly) == pytest.approx(expected, abs=1e-12)
+
+
+def dependence(joint, searched, pair, fixed):
+    whole, names = full_table(joint)
+    at = [slice(None)] * len(names)
+    for name, value in fixed:
+        at[names.index(name)] = slice(value, value + 1)
+    whole = whole[tuple(at)]
+    wanted = [*pair, *searched]
+    order = [names.index(name) for name in wanted]
+    left = whole.sum(axis=tuple(axis for axis in range(len(names)) if axis not in order))
+    left = np.transpose(left, np.argsort(np.argsort(order)))
+    left = left.reshape(*left.shape[:2], -1)
+    left /= left.sum(axis=(0, 1))
+    product = left.sum(axis=1, keepdims=True) * left.sum(axis=0, keepdims=True)
+    return np.abs(left - product).max()
+
+
+@pytest.mark.parametrize(
+    ("searched", "known", "sentence"),
+    [
+        (
+            ["G"],
+            ["R", "S"],
+            "R and S are not independent given G: R -> S joins them; leave R or S out of the known",
+        ),
+        (["S"], ["R", "G"], "R and G are not independent given S: R -> G joins them"),
+    ],
+)
+def test_refusals_draw_the_path(searched, known, sentence):
+    with pytest.raises(ModelError, match=re.escape(sentence)):
+        SPRINKLER.ask(searched, known).model()
+
+
+def chain(*names, arrows):
+    """A network along a line: `>` has the left one as the parent of the right one."""
+    symbols = [Symbol(name, YES_NO) for name in names]
+    parents = {name: [] for name in names}
+    for (left, right), arrow in zip(itertools.pairwise(symbols), arrows, strict=True):
+        (parents[right.name] if arrow == ">" else parents[left.name]).append(left if arrow == ">" else right)
+    random = np.random.default_rng(5)
+    factors = []
+    for symbol in symbols:
+        above = parents[symbol.name]
+        weights = random.random((2, *(2 for _ in above))) + 0.1
+        factors.append(table(symbol, weights / weights.sum(axis=0), given=above))
+    return JointDistribution("chain", tuple(factors))
+
+
+def test_a_hidden_variable_on_the_path_can_be_searched_too():
+    joint = chain("k", "h", "l", "s", arrows="<>>")
+    with pytest.raises(ModelError, match="k <- h -> l joins them; search h too, or leave k or l out"):
+        joint.ask(["s"], ["k", "l"]).model()
+    model = joint.ask(["s", "h"], ["k", "l"]).model()
+    assert exact_posterior(model, [1, 0]) == pytest.approx(enumerated(joint, ["s", "h"], ["k", "l"], [1, 0]))
+
+
+def test_a_common_effect_that_is_searched_joins_its_causes():
+    joint = chain("k", "s", "l", arrows="><")
+    with pytest.raises(ModelError, match="k -> s <- l joins them; leave k or l out"):
+        joint.ask(["s"], ["k", "l"]).model()
+
+
+def test_a_common_effect_that_nobody_asks_for_joins_nothing():
+    joint = chain("s", "k", "c", "l", arrows=">><")
+    model = joint.ask(["s"], ["k", "l"]).model()
+    assert exact_posterior(model, [1, 0]) == pytest.approx(enumerated(joint, ["s"], ["k", "l"], [1, 0]))
+
+
+def test_an_arc_that_changes_nothing_joins_nothing():
+    k, s, m = (Symbol(name, YES_NO) for name in "ksm")
+    idle = table(m, np.array([[[0.3, 0.6]] * 2, [[0.7, 0.4]] * 2]), given=[k, s])
+    joint = JointDistribution(
+        "idle", (table(s, [0.4, 0.6]), table(k, [[0.2, 0.9], [0.8, 0.1]], given=[s]), idle)
+    )
+    model = joint.ask(["s"], ["k", "m"]).model()
+    assert exact_posterior(model, [1, 0]) == pytest.approx(enumerated(joint, ["s"], ["k", "m"], [1, 0]))
+
+
+def test_a_markov_network():
+    random = np.random.default_rng(3)
+    a, b, c, d = (Symbol(name, IntegerType(0, 2)) for name in "abcd")
+    joint = JointDistribution(
+        "markov",
+        (
+            potential([a, b], random.random((3, 3))),
+            potential([c, a], random.random((3, 3))),
+            potential([c, d], random.random((3, 3))),
+        ),
+    )
+    model = joint.ask(["a"], ["b", "d"]).model()
+    assert exact_posterior(model, [2, 1]) == pytest.approx(enumerated(joint, ["a"], ["b", "d"], [2, 1]))
+    with pytest.raises(ModelError, match="b -- a -- c joins them; search a too"):
+        joint.ask(["d"], ["b", "c"]).model()
+
+
+def test_a_line_that_is_impossible_changes_no_code():
+    s, k = Symbol("s", IntegerType(0, 2)), Symbol("k", YES_NO)
+    joint = JointDistribution(
+        "impossible",
+        (table(s, [0.5, 0.5, 0]), table(k, [[0.9, 0.8, 0.0], [0.1, 0.2, 1.0]], given=[s])),
+    )
+    model = joint.ask(["s"], ["k"]).model()
+    assert model.prior_distribution.tolist() == [0.5, 0.5, 0]
+    assert model.known[0].table[1].max() == 0.2 or model.prior_distribution[2] == 0
+    assert exact_posterior(model, [1]) == pytest.approx([1 / 3, 2 / 3, 0])
+
+
+@pytest.mark.parametrize(
+    ("make", "sentence"),
+    [
+        (lambda: SPRINKLER.ask([], ["G"]), "searches nothing"),
+        (lambda: SPRINKLER.ask(["R"], ["R"]), "R is in the question twice"),
+        (lambda: SPRINKLER.ask(["R"], ["G"], given={"G": "yes"}), "G is in the question twice"),
+        (lambda: SPRINKLER.ask(["R"], ["G"], prior_select="G"), "G is in the question twice"),
+        (lambda: SPRINKLER.ask(["rain"], ["G"]), "no variable 'rain'; it has R, S, G"),
+        (lambda: SPRINKLER.ask(["R"], given={"S": "maybe"}), "S is never 'maybe'; expected no, yes"),
+        (
+            lambda: JointDistribution("j", (table(S, [[0.5, 0.5], [0.5, 0.5]], given=[R]),)),
+            "R has no distribution",
+        ),
+        (lambda: JointDistribution("j", (uniform(R), uniform(R))), "R has two distributions"),
+        (
+            lambda: JointDistribution("j", (uniform(R), uniform(Symbol("R", IntegerType(0, 1))))),
+            "two different symbols 'R'",
+        ),
+        (
+            lambda: JointDistribution(
+                "j", tuple(table(a, np.full((2, 2), 0.5), given=[b]) for a, b in ((R, S), (S, G), (G, R)))
+            ),
+            "is a circle",
+        ),
+    ],
+)
+def test_refused_joints_and_questions(make, sentence):
+    with pytest.raises(ModelError, match=sentence):
+        make()
+
+
+def test_what_is_given_may_be_impossible():
+    s, e = Symbol("s", YES_NO), Symbol("e", YES_NO)
+    joint = JointDistribution("j", (uniform(s), table(e, [[1, 1], [0, 0]], given=[s])))
+    with pytest.raises(ModelError, match="what is given is impossible"):
+        joint.ask(["s"], given={"e": "yes"}).model()
+
+
+def test_a_table_above_the_limit_is_refused_before_it_is_made():
+    wide = [Symbol(f"w{at}", IntegerType(0, 999)) for at in range(3)]
+    joint = JointDistribution("wide", tuple(uniform(symbol) for symbol in wide))
+    with pytest.raises(ModelError, match="1000000000 entries|1000000 lines with 1000 values"):
+        joint.ask(["w0", "w1"], ["w2"]).model()
+    hidden = Symbol("h", IntegerType(0, 1))
+    many = [Symbol(f"s{at}", IntegerType(0, 15)) for at in range(7)]
+    factors = [potential([symbol, hidden], np.ones((16, 2))) for symbol in many]
+    question = JointDistribution("many", tuple(factors)).ask([symbol.name for symbol in many])
+    with pytest.raises(ModelError, match="the most is 16777216"):
+        question.model()
+    ask_five = JointDistribution("many", tuple(factors)).ask([symbol.name for symbol in many[:4]], ["s4"])
+    assert ask_five.model().lines == 16**4
+
+
+def test_the_boat_as_a_joint_distribution_is_the_boat():
+    y, x = Symbol("y", IntervalType(MAP_LOW, MAP_HIGH, 8)), Symbol("x", IntervalType(MAP_LOW, MAP_HIGH, 8))
+    factors = [uniform(y), uniform(x)]
+    for name, (beacon_x, beacon_y) in zip(DISTANCE_NAMES, BEACONS, strict=True):
+
+        def distance(y, x, beacon_x=beacon_x, beacon_y=beacon_y):
+            return np.hypot(x - beacon_x, y - beacon_y)
+
+        def sigma(y, x, distance=distance):
+            return np.vectorize(distance_sigma)(distance(y, x))
+
+        symbol = Symbol(name, IntegerType(0, 100), bits=7, on_range="clamp")
+        factors.append(conditional_normal(symbol, (y, x), mean=distance, sigma=sigma))
+    for name, (beacon_x, beacon_y) in zip(BEARING_NAMES, BEACONS, strict=True):
+
+        def bearing(y, x, beacon_x=beacon_x, beacon_y=beacon_y):
+            return np.degrees(np.arctan2(y - beacon_y, x - beacon_x))
+
+        symbol = Symbol(name, IntegerType(0, 359, wraps=True), bits=9)
+        factors.append(conditional_normal(symbol, (y, x), mean=bearing, sigma=BEARING_SIGMA))
+    asked = JointDistribution("boat", tuple(factors)).ask((y, x), [*DISTANCE_NAMES, *BEARING_NAMES]).model()
+    expected = boat_model(width=8, height=8)
+    assert asked.searched == expected.searched
+    assert asked.variables == expected.variables
+    for ours, theirs in zip(asked.known, expected.known, strict=True):
+        assert ours.table == pytest.approx(theirs.table, abs=1e-15)
+        assert ours.normal.mean == pytest.approx(theirs.normal.mean)

@@ -1,0 +1,335 @@
+"""Every memory of a machine as a MIF: what it holds, read back by srec_cat; the parameters, read by GHDL."""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from machines.parameters import PriorMode, RngKind, RngReset
+from machines.rng import random_numbers
+from pcie_shim.programming_file import read_image
+from toolchain.build import build_deployment
+from toolchain.deployment import load_deployment
+from toolchain.models.conditional import normal
+from toolchain.models.model import Known, Model, PriorSelect, cell_centres, interval
+from toolchain.options import BuildOptions
+from toolchain.outputs.memories import packed_words
+from toolchain.outputs.mif import parse_mif, read_mif
+from toolchain.outputs.rng_table import random_table
+
+OPTIONS = BuildOptions(uri="ws://robot:9090", topic="/readings", type="std_msgs/Float64MultiArray")
+KINDS = [
+    {},
+    {"prob_bits": 5, "partitions": 2, "rng": RngKind.LFSR8, "rng_banks": 3},
+    {"prob_bits": 12, "partitions": 4, "shared": False, "rng": RngKind.LFSR24},
+    {"prob_bits": 16, "partitions": 3, "counter_bits": 32, "rng_reset": RngReset.FREE},
+    {"rng": RngKind.TABLE, "rng_banks": 2, "prior_mode": PriorMode.WRITTEN},
+    {"rng": RngKind.TABLE, "shared": False, "partitions": 2, "prob_bits": 3, "steps_per_clock": 5},
+]
+
+
+def model(*, select=False):
+    place = interval("x", 0, 10, cells=7)
+    (x,) = cell_centres(place)
+    rows = np.vstack([np.full(7, 1 / 7), np.arange(7) / 21, np.eye(7)[0]])
+    return Model(
+        name='tëst "quoted"\nname --',
+        searched=(place,),
+        known=(
+            normal("D\n1;", mean=x, sigma=1.0, values=15, floor=0.05),
+            Known(name="door", table=np.array([x / 10, 1 - x / 10])),
+        ),
+        prior_select=PriorSelect(name="room", table=rows) if select else None,
+    )
+
+
+def build(folder, *, select=False, **changes):
+    select = select and changes.get("prior_mode") is not PriorMode.WRITTEN
+    build_deployment(model(select=select), folder, replace(OPTIONS, **changes))
+    deployment = load_deployment(folder)
+    return [read_image(deployment.image_path(board)) for board in range(len(deployment.boards))]
+
+
+def unpacked(path, machine):
+    """Codes by address and line, taken out of the words one by one."""
+    bits, lines = machine.parameters.prob_bits, machine.parameters.lines
+    mif = read_mif(path)
+    assert mif.width == bits * lines
+    return [[word >> (bits * line) & (2**bits - 1) for line in range(lines)] for word in mif.words]
+
+
+@pytest.mark.parametrize("changes", KINDS)
+def test_the_memories_hold_the_machine(tmp_path, changes):
+    images = build(tmp_path, select=True, **changes)
+    folder = tmp_path / "bm_arch" / "Memory_MIFs"
+    for board, image in enumerate(images):
+        machine = image.machine
+        assert unpacked(folder / f"board{board}_prior.mif", machine) == machine.prior.tolist()
+        for column, table in enumerate(machine.tables, start=1):
+            assert unpacked(folder / f"board{board}_column{column}.mif", machine) == table.tolist()
+        parameters = machine.parameters
+        seeds = read_mif(folder / ("rng_seeds.mif" if parameters.shared else f"board{board}_rng_seeds.mif"))
+        expected = [random_numbers(machine).restart(bank) for bank in range(parameters.rng_banks)]
+        assert list(seeds.words) == np.ravel(expected).tolist()
+        if parameters.rng is RngKind.TABLE:
+            assert seeds.width == 16
+            assert list(read_mif(folder / "rng_table.mif").words) == machine.rng_table.tolist()
+        else:
+            assert seeds.width == parameters.rng.lfsr_bits
+    assert (folder / "rng_table.mif").is_file() == (changes.get("rng") is RngKind.TABLE)
+
+
+@given(st.integers(1, 16), st.integers(1, 40), st.integers(1, 130), st.integers(0, 2**32))
+def test_a_word_is_the_codes_of_all_lines(prob_bits, lines, rows, seed):
+    codes = np.random.default_rng(seed).integers(0, 2**prob_bits, (rows, lines), dtype=np.uint16)
+    expected = [sum(int(code) << (prob_bits * line) for line, code in enumerate(row)) for row in codes]
+    assert list(packed_words(codes, prob_bits)) == expected
+
+
+def test_the_made_table_has_every_number_equally_often():
+    for bits in (1, 8, 16):
+        assert np.bincount(random_table(bits)).tolist() == [2 ** (16 - bits)] * 2**bits
+    assert not np.array_equal(random_table(16), np.arange(65536))
+
+
+@pytest.mark.parametrize("changes", KINDS)
+def test_srec_cat_reads_the_same_words(tmp_path, changes):
+    """Words of up to 62 bits: srec_cat holds no longer ones."""
+    if shutil.which("srec_cat") is None:
+        pytest.skip("srec_cat is not there; Debian has it in the package srecord")
+    build(tmp_path, **changes, interface=(2, 7))
+    read = 0
+    for path in sorted((tmp_path / "bm_arch" / "Memory_MIFs").iterdir()):
+        mif = read_mif(path)
+        if mif.width > 62:
+            continue
+        binary = tmp_path / "words.bin"
+        subprocess.run(
+            ["srec_cat", path, "-mif", "-o", binary, "-binary"], check=True, timeout=60, capture_output=True
+        )
+        size = -(-mif.width // 8)
+        data = binary.read_bytes()
+        words = [int.from_bytes(data[at : at + size], "little") for at in range(0, len(data), size)]
+        assert words == list(mif.words), path.name
+        read += 1
+    assert read
+
+
+PROBE = """
+use work.bm1_parameters.all;
+use std.textio.all;
+library ieee; use ieee.std_logic_1164.all;
+entity probe is end entity;
+architecture run of probe is
+  procedure say(what : string) is variable text : line; begin
+    write(text, what); writeline(output, text);
+  end procedure;
+begin
+  process begin
+    say("lines " & to_string(LINES) & " sensors " & to_string(SENSORS) & " columns " & to_string(COLUMNS));
+    say("bits " & to_string(PROB_BITS) & " " & to_string(PRIOR_BITS) & " " & to_string(COUNTER_BITS));
+    for c in SENSOR_BITS'range loop say("sensor " & to_string(c) & " " & to_string(SENSOR_BITS(c))); end loop;
+    say("rng " & rng_kind_t'image(RNG_KIND) & " " & to_string(RNG_SHARED) & " " & to_string(STEPS_PER_CLOCK)
+        & " " & to_string(RNG_RESET_BANK) & " " & to_string(RNG_BANKS) & " " & to_string(PRIOR_WRITTEN));
+    say("stop " & to_hstring(TARGET_COUNT) & " " & to_hstring(MAX_CYCLES));
+    say("interface " & to_string(INTERFACE_SENSORS) & " " & to_string(INTERFACE_RESULTS));
+    say("hashes " & to_hstring(MAP_HASH) & " " & to_hstring(MODEL_HASH));
+    for b in PARTITIONS'range loop
+      say("board " & to_string(b) & " " & to_string(PARTITIONS(b).lines) & " "
+          & to_string(PARTITIONS(b).line_offset) & " " & to_hstring(PARTITIONS(b).image_hash));
+    end loop;
+    {more}
+    wait;
+  end process;
+end architecture;
+"""
+SEEDS = """for b in RNG_SEEDS'range(1) loop for c in RNG_SEEDS'range(2) loop
+      say("seed " & to_string(b) & " " & to_string(c) & " " & to_string(RNG_SEEDS(b, c)));
+    end loop; end loop;"""
+
+
+def ghdl(folder, *arguments):
+    done = subprocess.run(
+        ["ghdl", *arguments], check=False, cwd=folder, capture_output=True, text=True, timeout=100
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [KINDS[1], KINDS[2], KINDS[4], {"rng": RngKind.IDEAL}],
+    ids=["lfsr8", "cells", "table", "ideal"],
+)
+def test_ghdl_finds_every_parameter(tmp_path, changes):
+    if shutil.which("ghdl") is None:
+        pytest.skip("ghdl is not there; Debian has it in a package of this name")
+    images = build(tmp_path, **changes)
+    deployment, parameters = load_deployment(tmp_path), images[0].machine.parameters
+    seeds = parameters.shared and parameters.rng is not RngKind.IDEAL
+    (tmp_path / "probe.vhd").write_text(PROBE.format(more=SEEDS if seeds else ""))
+    ghdl(tmp_path, "-a", "--std=08", "bm_arch/bm1_parameters.vhd", "probe.vhd")
+    said = ghdl(tmp_path, "--elab-run", "--std=08", "probe").lower().splitlines()
+    image = images[0]
+    assert said == [
+        f"lines {deployment.machine.lines} sensors 2 columns 3",
+        f"bits {parameters.prob_bits} 0 {parameters.counter_bits}",
+        "sensor 1 4",
+        "sensor 2 2",
+        f"rng rng_{parameters.rng} {parameters.shared} {parameters.steps_per_clock} "
+        f"{parameters.rng_reset == 'bank'} {parameters.rng_banks} {parameters.prior_mode == 'written'}".lower(),
+        f"stop {deployment.machine.target_count:08x} {131072:016x}",
+        "interface 20 1200",
+        f"hashes {image.map_hash} {image.model_hash}",
+        *(
+            f"board {b} {each.machine.parameters.lines} {each.partition.line_offset} {each.image_hash}"
+            for b, each in enumerate(images)
+        ),
+        *(
+            f"seed {bank} {column} {int(seed):0{16 if parameters.rng is RngKind.TABLE else 8}b}"
+            for bank in range(parameters.rng_banks if seeds else 0)
+            for column, seed in enumerate(random_numbers(image.machine).restart(bank))
+        ),
+    ]
+
+
+def test_no_sensors_and_many_seeds(tmp_path):
+    """A package with an empty array of widths, and one whose seeds are in the memory alone."""
+    place = interval("x", 0, 10, cells=2)
+    build_deployment(Model(name="p", searched=(place,), known=()), tmp_path, replace(OPTIONS, rng_banks=5000))
+    text = (tmp_path / "bm_arch" / "bm1_parameters.vhd").read_text()
+    assert "SENSOR_BITS       : natural_array_t(1 to 0) := (others => 0);" in text
+    assert "The seeds are in Memory_MIFs alone" in text
+    assert len(read_mif(tmp_path / "bm_arch" / "Memory_MIFs" / "rng_seeds.mif").words) == 5000
+    if shutil.which("ghdl"):
+        ghdl(tmp_path, "-a", "--std=08", "bm_arch/bm1_parameters.vhd")
+
+
+def test_names_harm_no_file(tmp_path):
+    build(tmp_path)
+    for path in tmp_path.rglob("*.*"):
+        if path.suffix in {".vhd", ".mif", ".qsf", ".qpf", ".tcl"}:
+            text = path.read_text(encoding="ascii")
+            assert "\nname" not in text
+            assert "\n1;" not in text
+    assert "tiles, P(D\\n1; | S)" in (tmp_path / "bm_arch" / "Memory_MIFs" / "board0_column1.mif").read_text()
+
+
+def test_the_project_has_a_revision_for_every_board(tmp_path):
+    build(tmp_path, partitions=2)
+    project = (tmp_path / "bm1.qpf").read_text()
+    assert re.findall(r'PROJECT_REVISION = "(.*)"', project) == ["bm1_board0", "bm1_board1"]
+    for board in range(2):
+        text = (tmp_path / f"bm1_board{board}.qsf").read_text()
+        named = re.findall(r'-name (?:MIF|VHDL)_FILE "(.*)"', text)
+        assert all((tmp_path / name).is_file() for name in named)
+        assert {name.rpartition("/")[2] for name in named} == {
+            "bm1_parameters.vhd",
+            f"board{board}_prior.mif",
+            f"board{board}_column1.mif",
+            f"board{board}_column2.mif",
+            "rng_seeds.mif",
+        }
+        assert f"set_parameter -name BOARD {board}\n" in text
+        assert "DEVICE 5SGSMD8" in text
+    assert "foreach revision {bm1_board0 bm1_board1} {" in (tmp_path / "bm1.tcl").read_text()
+    for path in tmp_path.glob("bm1*"):
+        assert "NOT VERIFIED BY QUARTUS" in path.read_text()
+
+
+TCL = """
+package provide ::quartus::project 1
+package provide ::quartus::flow 1
+proc project_open args { puts "open $args" }
+proc project_close {} { puts close }
+proc set_global_assignment args { puts "set $args" }
+proc export_assignments {} { puts export }
+proc execute_flow args { puts "flow $args" }
+set quartus(args) [list $folder]
+source bm1.tcl
+"""
+
+
+def test_the_script_names_the_sources_and_compiles_every_board(tmp_path):
+    if shutil.which("tclsh") is None:
+        pytest.skip("tclsh is not there; Debian has it in the package tcl")
+    build(tmp_path, partitions=2)
+    (tmp_path / "hdl").mkdir()
+    for name in ("b.vhd", "a.vhd", "c.txt"):
+        (tmp_path / "hdl" / name).touch()
+
+    def run(folder):
+        return subprocess.run(
+            ["tclsh"],
+            check=False,
+            input=f"set folder {folder}\n{TCL}",
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            timeout=60,
+        )
+
+    expected = []
+    for board in range(2):
+        expected += [f"open bm1 -revision bm1_board{board}"]
+        expected += [f"set -name VHDL_FILE hdl/{name}.vhd" for name in "ab"]
+        expected += ["export", "flow -compile", "close"]
+    assert run("hdl").stdout.splitlines() == expected
+    assert "error: no .vhd file in 'boards'" in run("boards").stderr
+
+
+def test_generators_that_exist_emulated_only_have_no_seeds_and_no_project(tmp_path):
+    build(tmp_path, partitions=2)
+    build(tmp_path, rng=RngKind.IDEAL)
+    assert not list(tmp_path.glob("bm1*"))
+    assert sorted(path.name for path in (tmp_path / "bm_arch" / "Memory_MIFs").iterdir()) == [
+        "board0_column1.mif",
+        "board0_column2.mif",
+        "board0_prior.mif",
+    ]
+
+
+ELSEWHERE = """
+import sys
+from dataclasses import replace
+from pathlib import Path
+from tests.toolchain.test_memories import OPTIONS, model
+from toolchain.build import build_deployment
+build_deployment(model(), Path(sys.argv[1]), replace(OPTIONS, partitions=2, build_date="2020-02-02T02:02:02Z"))
+"""
+
+
+def test_the_same_bytes_in_another_folder_locale_and_hash_seed(tmp_path):
+    found = []
+    for number, language in enumerate(["C", "C.UTF-8"]):
+        folder = tmp_path / f"number {number}"
+        subprocess.run(
+            [sys.executable, "-c", ELSEWHERE, folder],
+            check=True,
+            timeout=100,
+            env=os.environ
+            | {"PYTHONHASHSEED": str(number), "LC_ALL": language, "TZ": ["UTC", "Asia/Tokyo"][number]},
+        )
+        found.append(
+            {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+        )
+    assert found[0] == found[1]
+    for name, content in found[0].items():
+        assert str(tmp_path).encode() not in content, name
+        assert b"2020" not in content or name.suffix == ".bm", name
+
+
+def test_every_mif_of_a_build_is_canonical(tmp_path):
+    build(tmp_path)
+    for path in (tmp_path / "bm_arch" / "Memory_MIFs").iterdir():
+        entries = [
+            line for line in path.read_text().splitlines() if " : " in line and not line.startswith("--")
+        ]
+        assert len(entries) == len(parse_mif(path.read_text()).words)

@@ -1,0 +1,135 @@
+"""MIFs: what is written is read again, every form is read, and a mistake is a sentence with its line."""
+
+from contextlib import suppress
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from toolchain.errors import MifError
+from toolchain.outputs.mif import Mif, mif_text, parse_mif, read_mif
+
+HEAD = "WIDTH=8; DEPTH=8; ADDRESS_RADIX=HEX; DATA_RADIX=HEX;\nCONTENT BEGIN\n"
+
+
+@st.composite
+def memories(draw):
+    width = draw(st.sampled_from([1, 3, 8, 12, 32, 57, 64, 130, 4096]))
+    return Mif(width, tuple(draw(st.lists(st.integers(0, 2**width - 1), min_size=1, max_size=300))))
+
+
+@given(memories(), st.lists(st.text(), max_size=3))
+def test_what_is_written_is_read(memory, comments):
+    text = mif_text(memory, comments)
+    assert text.isascii()
+    assert parse_mif(text) == memory
+
+
+def test_the_canonical_form():
+    assert mif_text(Mif(10, (0, 1023, 5)), ["a\nb é"]) == (
+        "-- a\\nb \\xe9\nWIDTH=10;\nDEPTH=3;\nADDRESS_RADIX=HEX;\nDATA_RADIX=HEX;\nCONTENT BEGIN\n"
+        "0 : 000;\n1 : 3FF;\n2 : 005;\nEND;\n"
+    )
+
+
+@given(
+    st.data(),
+    st.sampled_from(["BIN", "OCT", "DEC", "HEX", "UNS"]),
+    st.sampled_from(["BIN", "OCT", "DEC", "HEX", "UNS"]),
+)
+def test_every_form_is_read(data, address_radix, data_radix):
+    """A memory cut into runs, ranges and single words, in any radix, with comments between."""
+    words = data.draw(st.lists(st.integers(0, 255), min_size=1, max_size=40))
+    shape = {"BIN": "b", "OCT": "o", "DEC": "d", "HEX": "x", "UNS": "d"}
+
+    def spoken(number):
+        if data_radix == "DEC" and number >= 128 and data.draw(st.booleans()):
+            return str(number - 256)
+        return data.draw(st.sampled_from(["", "00"])) + format(number, shape[data_radix])
+
+    def gap():
+        return data.draw(st.sampled_from([" ", "\n", "\t", " -- 1 : 2;\n", " %8 : %", "%\n%\r\n"]))
+
+    text = f"depth{gap()}={gap()}{len(words)};Width = 8 ; DATA_RADIX={data_radix};ADDRESS_RADIX = {address_radix.lower()};"
+    text += f"{gap()}content{gap()}Begin{gap()}"
+    at = 0
+    while at < len(words):
+        run = words[at : at + data.draw(st.integers(1, 6))]
+        first, last = (format(end, shape[address_radix]) for end in (at, at + len(run) - 1))
+        if data.draw(st.booleans()):
+            said = run[:1] if len(set(run)) == 1 else run
+            text += f"[{gap()}{first}{gap()}..{gap()}{last}{gap()}]{gap()}:"
+        else:
+            said = run
+            text += f"{first}{gap()}:"
+        text += gap() + gap().join(spoken(word) for word in said) + f"{gap()};{gap()}"
+        at += len(run)
+    assert parse_mif(text + data.draw(st.sampled_from(["END;", "end ;\n", "END"]))) == Mif(8, tuple(words))
+
+
+def test_what_is_left_out_is_zero_and_hexadecimal_is_the_default():
+    assert parse_mif("DEPTH=12;WIDTH=8;CONTENT BEGIN A:10; END;").words == (0,) * 10 + (16, 0)
+
+
+def test_the_words_of_a_range_are_repeated():
+    assert parse_mif(HEAD + "[1..5] : 1 2;\nEND;").words == (0, 1, 2, 1, 2, 1, 0, 0)
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("", "line 1: expected WIDTH, DEPTH, ADDRESS_RADIX, DATA_RADIX or CONTENT BEGIN, found the end of"),
+        ("\n\nWITH=3;", "line 3: expected WIDTH, DEPTH"),
+        ("WIDTH=8;\nCONTENT BEGIN", "line 2: DEPTH is missing before CONTENT"),
+        ("WIDTH=8;\nWIDTH=8;", "line 2: WIDTH is given twice"),
+        ("WIDTH=0;", "line 1: WIDTH is 0, expected 1 to"),
+        ("WIDTH=99999999999;", "line 1: WIDTH is 99999999999, expected 1 to"),
+        ("DEPTH=99999999999;", "line 1: DEPTH is 99999999999, expected 1 to"),
+        ("DEPTH=" + "9" * 5000, "line 1: a decimal number of 5000 digits is too long"),
+        ("WIDTH=F;", "line 1: expected a number for WIDTH, in DEC, found 'F'"),
+        ("WIDTH=8", "line 1: expected ';', found the end of the file"),
+        ("DATA_RADIX=ROMAN;", "line 1: expected one of BIN, OCT, DEC, UNS, HEX, found 'ROMAN'"),
+        ("WIDTH=8; DEPTH=8;\nCONTENT\nBEGUN", "line 3: expected BEGIN after CONTENT, found 'BEGUN'"),
+        (HEAD + "0 : 1;\n", "line 4: expected an address or END;, found the end of the file"),
+        (HEAD + "0 : 100;", "line 3: the word 100 (HEX) doesn't fit 8 bits"),
+        (HEAD + "0 : -1;", "line 3: expected a word or ';', found '-1'"),
+        (HEAD + "0 : 1_0;", "line 3: expected a word or ';', found '1_0'"),
+        (HEAD + "0 : G;", "line 3: expected a word or ';', in HEX, found 'G'"),
+        (HEAD + "0 : ;", "line 3: expected a word after ':', found ';'"),
+        (HEAD + "8 : 1;", "line 3: address 8 is outside the memory, whose last one is 7"),
+        (HEAD + "6 : 1 2\n3;", "line 4: the entry of line 3 goes on to address 8, but the last one is 7"),
+        (HEAD + "0 : " + "1 " * 9, "line 3: the entry of line 3 has more words than the memory, which has 8"),
+        (HEAD + "0 : 1;\n[0..2] : 1;", "line 4: address 0 is given twice, the second time by the entry of"),
+        (HEAD + "[3..2] : 1;", "line 3: the range ends at address 2, before it begins at 3"),
+        (HEAD + "[3,2] : 1;", "line 3: ',' means nothing here"),
+        (HEAD + "[3:2] : 1;", "line 3: expected '..' between the ends of a range, found ':'"),
+        (HEAD + "0 = 1;", "line 3: expected ':', found '='"),
+        (HEAD + "% never\n ends", "line 3: a comment begins with % and never ends"),
+        (HEAD + "END;\n0 : 1;", "line 4: expected the end of the file after END;, found '0'"),
+        ("WIDTH=8; DEPTH=1; DATA_RADIX=DEC; CONTENT BEGIN 0 : -129; END;", "-129 (DEC) doesn't fit 8 bits"),
+    ],
+)
+def test_mistakes(text, sentence):
+    with pytest.raises(MifError) as caught:
+        parse_mif(text, "a.mif")
+    assert str(caught.value).startswith("a.mif, line ")
+    assert sentence in str(caught.value)
+
+
+@given(st.text(alphabet="WIDTHEPCON=8;:[]. 01A%-\n"))
+def test_noise_is_refused_or_read_but_never_fails_otherwise(noise):
+    with suppress(MifError):
+        parse_mif(HEAD + noise)
+
+
+@pytest.mark.parametrize(("width", "words"), [(3, (8,)), (3, (-1,)), (0, (0,)), (3, ())])
+def test_no_memory_holds_it(width, words):
+    with pytest.raises(MifError):
+        Mif(width, words)
+
+
+def test_a_file(tmp_path):
+    (tmp_path / "a.mif").write_bytes(b"-- \xe9\xff\n" + mif_text(Mif(4, (1, 2))).encode())
+    assert read_mif(tmp_path / "a.mif") == Mif(4, (1, 2))
+    with pytest.raises(MifError, match="No such file"):
+        read_mif(tmp_path / "b.mif")

@@ -1,0 +1,1 @@
+"""What a machine will do: its accuracy, cycles, resources and energy, and sweeps over possible machines."""

@@ -1,0 +1,328 @@
+"""How good a machine's posteriors are: beside exact inference, with the loss by quantising as a part of its own.
+
+Three posteriors of each frame are compared: of the model (float64), of the codes (float64 on what quantising left),
+and of the machine (counts). Codes beside model is what quantising loses, machine beside codes what sampling loses.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from machines.encode import decode_code
+from machines.parameters import RngReset
+from toolchain.errors import ModelError
+from toolchain.models.fusion import exact_posterior, fuse
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
+    from machines.bm1 import BM1Machine
+    from toolchain.analysis.emulation import EmulatedBoards
+    from toolchain.analysis.readings import Readings
+    from toolchain.models.model import Model
+
+RESAMPLES: Final = 1000
+LEVEL: Final = 0.95
+"""Of every confidence interval."""
+
+EXPECTED_COUNT: Final = 5.0
+"""z-scores are taken of lines that are expected to count at least so often: below, a count is not near normal."""
+
+_NORMAL_95: Final = 1.959964
+_TIE: Final = 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class Interval:
+    """A figure and its 95 % confidence interval."""
+
+    value: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Difference:
+    """How far posteriors are from others, on average over frames.
+
+    Attributes:
+        total_variation: Half the sum of absolute differences, 0 to 1.
+        kl_bits: KL(ours || theirs) in bits. (The other way round it is infinite wherever a count is 0.)
+        map_agreement: Share of frames in which the most probable line is the same.
+    """
+
+    total_variation: Interval
+    kl_bits: Interval
+    map_agreement: Interval
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ZScores:
+    """Counts of runs of a fixed length against equation 2.1: (n - c p) / sqrt(c p (1 - p)).
+
+    Attributes:
+        cycles: The length c.
+        counts: How many counts were looked at.
+        draws: How many independent draws of random numbers those come from, which the intervals rest on: the banks.
+        rms: Root of the mean square: 1 where streams are as good as independent bits, 1.6 where the variance is 2.6 times that.
+        mean: 0 where they are unbiased.
+        beyond_three: Share beyond 3 either way; 0.0027 of normal ones.
+    """
+
+    cycles: int
+    counts: int
+    draws: int
+    rms: Interval
+    mean: Interval
+    beyond_three: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Cycles:
+    """Cycles of the board that runs longest, over frames and banks."""
+
+    median: Interval
+    percentile_95: Interval
+    worst: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Accuracy:
+    """What a machine does on some readings.
+
+    Attributes:
+        frames: Frames.
+        banks: Sets of seeds that each was run with.
+        impossible: Share of frames in which no line can count, although the model has a posterior (or always, without one).
+        without: Share of runs without a posterior: these, and those that counted nothing in time.
+        overflow: Share of runs that a full counter ended.
+        machine: The machine beside the model; None without a model.
+        quantising: Exact inference on the codes beside the model; None without a model.
+        sampling: The machine beside exact inference on its codes.
+        z: Counts beside equation 2.1; None where no line counts often enough.
+        cycles: How long frames take.
+    """
+
+    frames: int
+    banks: int
+    impossible: float
+    without: float
+    overflow: float
+    machine: Difference | None
+    quantising: Difference | None
+    sampling: Difference | None
+    z: ZScores | None
+    cycles: Cycles
+
+
+class _Differences:
+    """Collects differences, frame after frame; runs of one frame are averaged."""
+
+    def __init__(self) -> None:
+        self._frames: list[tuple[float, float, float]] = []
+
+    def add(self, ours: list[NDArray[np.float64]], theirs: NDArray[np.float64]) -> None:
+        """Take the posteriors of one frame."""
+        if ours:
+            self._frames.append(tuple(np.mean([_difference(each, theirs) for each in ours], axis=0).tolist()))
+
+    def summary(self) -> Difference | None:
+        """Return the averages, or None where there was no frame."""
+        if not self._frames:
+            return None
+        columns = np.array(self._frames)
+        return Difference(
+            total_variation=_bootstrap(columns[:, 0], np.mean),
+            kl_bits=_bootstrap(columns[:, 1], np.mean),
+            map_agreement=_share(float(columns[:, 2].mean()), len(columns)),
+        )
+
+
+def measure(
+    boards: EmulatedBoards,
+    readings: Readings,
+    model: Model | None,
+    *,
+    banks: int = 4,
+    advance: Callable[[], None] = lambda: None,
+) -> Accuracy:
+    """Run a machine on readings and compare what comes out with exact inference.
+
+    Args:
+        boards: The machine.
+        readings: The frames; what the model finds impossible on every line is left out.
+        model: The unquantised model, or None where only codes are at hand.
+        banks: Sets of seeds to run each frame with; at most as many as the machine has.
+        advance: Called after every frame.
+
+    Raises:
+        ModelError: No frame that the model finds possible.
+    """
+    parameters = boards.parameters
+    banks = max(1, min(banks, parameters.rng_banks if parameters.rng_reset is RngReset.BANK else banks))
+    of_machine, of_codes, of_sampling = _Differences(), _Differences(), _Differences()
+    lengths: list[list[int]] = []
+    weights: list[NDArray[np.float64]] = []
+    places: list[int] = []
+    frames = impossible = without = overflow = 0
+    for frame in range(len(readings)):
+        exact = None
+        if model is not None:
+            addresses, row = readings.of_model(frame)
+            try:
+                exact = exact_posterior(model, addresses, prior_address=row)
+            except ModelError:
+                advance()
+                continue
+        frames += 1
+        of_board, prior_row = readings.of_machine(frame, boards.machines[0])
+        likelihood = np.concatenate(
+            [_line_probabilities(machine, of_board, prior_row) for machine in boards.machines]
+        )
+        ran = [boards.run(of_board, prior_row, _bank(boards, frame, run, banks)) for run in range(banks)]
+        posteriors = [posterior for each in ran if (posterior := each.posterior) is not None]
+        without += banks - len(posteriors)
+        overflow += sum(any(reason.name == "OVERFLOW" for reason in each.reasons) for each in ran)
+        lengths.append([each.length for each in ran])
+        if not likelihood.any():
+            impossible += 1
+        else:
+            codes = fuse(likelihood, ())
+            of_sampling.add(posteriors, codes)
+            weights.append(likelihood)
+            places.append(frame)
+            if exact is not None:
+                of_codes.add([codes], exact)
+        if exact is not None:
+            of_machine.add(posteriors, exact)
+        advance()
+    if not frames:
+        message = f"none of the readings ({readings.source}) is possible in the model"
+        raise ModelError(message)
+    lengths_found = np.array(lengths)
+    return Accuracy(
+        frames=frames,
+        banks=banks,
+        impossible=impossible / frames,
+        without=without / (frames * banks),
+        overflow=overflow / (frames * banks),
+        machine=of_machine.summary(),
+        quantising=of_codes.summary(),
+        sampling=of_sampling.summary(),
+        z=_z_scores(boards, readings, places, weights, int(np.median(lengths_found[lengths_found > 0])))
+        if (lengths_found > 0).any()
+        else None,
+        cycles=Cycles(
+            median=_bootstrap(lengths_found, np.median),
+            percentile_95=_bootstrap(lengths_found, lambda a, **k: np.quantile(a, 0.95, **k)),
+            worst=int(lengths_found.max()),
+        ),
+    )
+
+
+def code_posterior(
+    machine: BM1Machine, addresses: tuple[int, ...], prior_address: int
+) -> NDArray[np.float64] | None:
+    """Return exact inference on a whole machine's codes, float64[lines]; None where no line can count."""
+    weights = _line_probabilities(machine, addresses, prior_address)
+    return fuse(weights, ()) if weights.any() else None
+
+
+def _bank(boards: EmulatedBoards, frame: int, run: int, banks: int) -> int:
+    return (frame * banks + run) % boards.parameters.rng_banks
+
+
+def _line_probabilities(
+    machine: BM1Machine, addresses: tuple[int, ...], prior_address: int
+) -> NDArray[np.float64]:
+    """The probability that each line counts in a cycle: float64[lines]."""
+    width = machine.parameters.prob_bits
+    product = decode_code(machine.prior[prior_address], width)
+    for table, address in zip(machine.tables, addresses, strict=True):
+        product = product * decode_code(table[address], width)
+    return product
+
+
+def _difference(ours: NDArray[np.float64], theirs: NDArray[np.float64]) -> tuple[float, float, float]:
+    variation = 0.5 * float(np.abs(ours - theirs).sum())
+    held = ours > 0
+    # A code above 0 never stands for a probability of 0; only the smallest of doubles can have become one.
+    ratio = ours[held] / np.maximum(theirs[held], np.finfo(np.float64).tiny)
+    divergence = max(0.0, float(ours[held] @ np.log2(ratio)))
+    same = (theirs >= theirs.max() * (1 - _TIE)) & (ours >= ours.max() * (1 - _TIE))
+    return variation, divergence, float(same.any())
+
+
+def _z_scores(
+    boards: EmulatedBoards,
+    readings: Readings,
+    places: list[int],
+    weights: list[NDArray[np.float64]],
+    cycles: int,
+) -> ZScores | None:
+    # Frames with the same bank share all random numbers: a bank is one draw, however many frames use it.
+    free = boards.parameters.rng_reset is RngReset.FREE
+    drawn: dict[int, NDArray[np.float64]] = {}
+    beyond = 0
+    for frame, chance in zip(places, weights, strict=True):
+        addresses, row = readings.of_machine(frame, boards.machines[0])
+        bank = frame % boards.parameters.rng_banks
+        ran = boards.run_for(addresses, row, bank, cycles)
+        looked_at = (chance * cycles >= EXPECTED_COUNT) & (chance < 1)
+        if not looked_at.any():
+            continue
+        p = chance[looked_at]
+        z = (np.concatenate(ran.counts)[looked_at] - cycles * p) / np.sqrt(cycles * p * (1 - p))
+        sums = np.array([(z**2).sum(), z.sum(), len(z)])
+        key = frame if free else bank
+        drawn[key] = drawn[key] + sums if key in drawn else sums
+        beyond += int((np.abs(z) > 3).sum())
+    if not drawn:
+        return None
+    table = np.array(list(drawn.values()))
+    counts = int(table[:, 2].sum())
+
+    def root_mean_square(rows: NDArray[np.float64]) -> float:
+        return math.sqrt(rows[:, 0].sum() / rows[:, 2].sum())
+
+    def mean(rows: NDArray[np.float64]) -> float:
+        return float(rows[:, 1].sum() / rows[:, 2].sum())
+
+    return ZScores(
+        cycles=cycles,
+        counts=counts,
+        draws=len(table),
+        rms=_bootstrap_rows(table, root_mean_square),
+        mean=_bootstrap_rows(table, mean),
+        beyond_three=beyond / counts,
+    )
+
+
+def _bootstrap(values: NDArray[np.float64], statistic: Callable[..., NDArray[np.float64]]) -> Interval:
+    """A statistic over frames (the first axis), and its percentile bootstrap interval: whole frames are drawn."""
+    chosen = np.random.default_rng(0).integers(0, len(values), (RESAMPLES, len(values)))
+    drawn = np.asarray(values)[chosen].reshape(RESAMPLES, -1)
+    low, high = np.quantile(statistic(drawn, axis=1), [(1 - LEVEL) / 2, (1 + LEVEL) / 2]).tolist()
+    return Interval(float(statistic(values.reshape(-1), axis=0)), low, high)
+
+
+def _bootstrap_rows(rows: NDArray[np.float64], statistic: Callable[[NDArray[np.float64]], float]) -> Interval:
+    chosen = np.random.default_rng(0).integers(0, len(rows), (RESAMPLES, len(rows)))
+    low, high = np.quantile(
+        [statistic(rows[each]) for each in chosen], [(1 - LEVEL) / 2, (1 + LEVEL) / 2]
+    ).tolist()
+    return Interval(statistic(rows), low, high)
+
+
+def _share(share: float, frames: int) -> Interval:
+    """A share of frames and its Wilson interval, which is right where all of them agree too."""
+    square = _NORMAL_95**2 / frames
+    middle = (share + square / 2) / (1 + square)
+    half = _NORMAL_95 / (1 + square) * math.sqrt(share * (1 - share) / frames + square / (4 * frames))
+    return Interval(share, max(0.0, middle - half), min(1.0, middle + half))

@@ -1,0 +1,107 @@
+"""What a frame costs in energy: a model that counts toggles of nets, with assumptions that are said aloud.
+
+Nothing here was measured on a board. Toggles come from the machine's structure and from its codes; what a toggle costs
+is one number for all nets.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from machines.encode import decode_code
+from toolchain.analysis.resources import logic_of
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from machines.bm1 import BM1Machine
+    from toolchain.analysis.readings import Readings
+
+CORE_VOLTAGE: Final = 0.9
+"""Volts, of a Stratix V."""
+NET_CAPACITANCE: Final = 1.2e-12
+"""Farads that a net with its routing is assumed to have."""
+TOGGLE_J: Final = 0.5 * NET_CAPACITANCE * CORE_VOLTAGE**2
+CLOCK_J: Final = 0.05e-12
+"""Joules that a register's clock is assumed to cost in a cycle."""
+COMPARATOR_ACTIVITY: Final = 0.25
+"""Toggles in a cycle that a look-up table or a carry inside a comparator is assumed to make."""
+STATIC_W: Final = 2.0
+"""Watts that a board's FPGA is assumed to leak."""
+
+ASSUMPTIONS: Final = (
+    (
+        f"a toggle of a net costs C V^2 / 2 with C = {NET_CAPACITANCE * 1e12:g} pF and V = {CORE_VOLTAGE:g} V, that is "
+        f"{TOGGLE_J * 1e12:.2f} pJ"
+    ),
+    f"a register's clock costs {CLOCK_J * 1e12:g} pJ a cycle",
+    "a random bit toggles every other cycle, at every cell that it reaches",
+    f"nets inside a comparator toggle {COMPARATOR_ACTIVITY:g} times a cycle",
+    "a cell's bit of probability p toggles 2 p (1 - p) times, a counter twice and its comparison once for each count",
+    f"an FPGA leaks {STATIC_W:g} W; memories and the PCIe link are left out",
+)
+_FRAMES: Final = 50
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Energy:
+    """The model's figures for all boards together.
+
+    Attributes:
+        toggles: Nets that toggle in a cycle.
+        cycle_j: Joules of a cycle, without leakage.
+        static_w: Watts of leakage.
+    """
+
+    toggles: float
+    cycle_j: float
+    static_w: float
+
+    def frame_j(self, cycles: float, clock_hz: float) -> tuple[float, float]:
+        """Return the joules of a frame: for its toggles, and for leakage while it runs."""
+        return cycles * self.cycle_j, cycles / clock_hz * self.static_w
+
+
+def energy(machines: Sequence[BM1Machine], readings: Readings) -> Energy:
+    """Return the model of a machine on readings.
+
+    Args:
+        machines: Each board's machine.
+        readings: What its codes' activity is averaged over; the first 50 frames are enough.
+    """
+    toggles = clocked = 0.0
+    for machine in machines:
+        p = machine.parameters
+        logic = logic_of(p, interface_words=p.lines)
+        parts = {part.name: part for part in logic.parts}
+        generators = parts["generators"]
+        cells = p.lines * p.columns
+        toggles += (generators.registers + generators.aluts) / 2
+        toggles += cells * p.prob_bits / 2
+        toggles += parts["cells"].aluts * COMPARATOR_ACTIVITY
+        toggles += _stream_toggles(machine, readings)
+        clocked += generators.registers + parts["counters"].registers + parts["control"].registers
+    return Energy(
+        toggles=toggles,
+        cycle_j=toggles * TOGGLE_J + clocked * CLOCK_J,
+        static_w=len(machines) * STATIC_W,
+    )
+
+
+def _stream_toggles(machine: BM1Machine, readings: Readings) -> float:
+    """Toggles of the cells' bits, the lines' ANDs, their counters and what compares those; a mean over frames."""
+    width = machine.parameters.prob_bits
+    found = []
+    for frame in range(min(len(readings), _FRAMES)):
+        addresses, row = readings.of_machine(frame, machine)
+        chances = [decode_code(machine.prior[row], width)]
+        chances += [
+            decode_code(table[at], width) for table, at in zip(machine.tables, addresses, strict=True)
+        ]
+        line = np.prod(chances, axis=0)
+        bits = sum(float((2 * chance * (1 - chance)).sum()) for chance in chances)
+        found.append(bits + float((2 * line * (1 - line)).sum()) + 3 * float(line.sum()))
+    return float(np.mean(found))

@@ -1,0 +1,146 @@
+"""Pictures of sweeps and claims; matplotlib is loaded only when one is drawn."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any, Final
+
+from toolchain.errors import BuildError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from toolchain.analysis.claims import Claims
+    from toolchain.analysis.explore import Point
+
+_DPI: Final = 75
+_COLOURS: Final = ("#4477aa", "#ee6677", "#228833", "#ccbb44", "#66ccee", "#aa3377", "#bbbbbb")
+_MARKERS: Final = "osD^v<>P"
+
+
+def check_pictures_possible() -> None:
+    """Find out before a long run that its picture can't be drawn.
+
+    Raises:
+        BuildError: matplotlib is not installed.
+    """
+    if find_spec("matplotlib") is None:
+        message = (
+            "a plot needs matplotlib, which is not installed: run pip install matplotlib, or leave out --plot"
+        )
+        raise BuildError(message)
+
+
+def draw_sweep(path: Path, name: str, points: Sequence[Point], front: Sequence[Point]) -> None:
+    """Draw accuracy against cycles, a point's size being its ALMs, and the Pareto front.
+
+    Raises:
+        BuildError: The file can't be written.
+    """
+    figure = _figure((7.2, 4.8))
+    axes = figure.subplots()
+    shown = [point for point in points if point.total_variation is not None]
+    largest = max((point.alms or 0.0 for point in shown), default=0.0) or 1.0
+    kinds = sorted({(point.scale, point.rng) for point in shown})
+    for at, kind in enumerate(kinds):
+        of_kind = [point for point in shown if (point.scale, point.rng) == kind]
+        axes.scatter(
+            [point.cycles_median for point in of_kind],
+            [point.total_variation for point in of_kind],
+            s=[20 + 120 * (point.alms or 0.0) / largest for point in of_kind],
+            color=_COLOURS[at % len(_COLOURS)],
+            marker=_MARKERS[at % len(_MARKERS)],
+            alpha=0.6,
+            label=f"{kind[1]}, scale {kind[0]}",
+        )
+    axes.scatter(
+        [point.cycles_median for point in front],
+        [point.total_variation for point in front],
+        s=220,
+        facecolors="none",
+        edgecolors="black",
+        linewidths=0.8,
+        label="Pareto front",
+    )
+    axes.set(
+        xscale="log",
+        yscale="log",
+        xlabel="cycles of a frame (median)",
+        ylabel="total variation to exact inference (mean)",
+        title=f"{name}: accuracy against cycles; the larger, the more ALMs",
+    )
+    axes.grid(alpha=0.3, which="both")
+    axes.legend(fontsize="small", frameon=False)
+    _save(figure, path)
+
+
+def draw_claims(path: Path, claims: Claims) -> None:
+    """Draw the thesis's claims, a panel each.
+
+    Raises:
+        BuildError: The file can't be written.
+    """
+    figure = _figure((11.0, 7.4))
+    panels = figure.subplots(2, 2)
+    for axes, series, title, label in (
+        (panels[0, 0], claims.lines, "(a) lines: cycles do not depend on them (2.1.2)", "lines"),
+        (panels[0, 1], claims.sensors, "(b) sensors: cycles grow with them (2.1.2, 4.3)", "sensors"),
+        (panels[1, 0], claims.targets, "(c) counters: cycles grow with their size (2.1.2)", "target count"),
+    ):
+        axes.plot([each.x for each in series], [each.median for each in series], "o-", color=_COLOURS[0])
+        axes.fill_between(
+            [each.x for each in series],
+            [each.low for each in series],
+            [each.high for each in series],
+            color=_COLOURS[0],
+            alpha=0.2,
+            linewidth=0,
+        )
+        scale = "linear" if label == "sensors" else "log"
+        axes.set(xscale=scale, yscale="log", xlabel=label, ylabel="cycles (median, quartiles)", title=title)
+        axes.grid(alpha=0.3, which="both")
+    low, high = panels[0, 0].get_ylim()
+    panels[0, 0].set_ylim(low / 3, high * 3)
+    axes = panels[1, 1]
+    for at, (name, faults) in enumerate(claims.faults.items()):
+        axes.errorbar(
+            [each.rate or claims.lowest_rate / 3 for each in faults],
+            [each.total_variation for each in faults],
+            yerr=[
+                [each.total_variation - each.low for each in faults],
+                [each.high - each.total_variation for each in faults],
+            ],
+            marker=_MARKERS[at],
+            markersize=4,
+            color=_COLOURS[at],
+            linewidth=1.2,
+            capsize=2,
+            label=name,
+        )
+    axes.set(
+        xscale="log",
+        xlabel=f"share of bits that are flipped (leftmost: none, drawn at {claims.lowest_rate / 3:.0e})",
+        ylabel="total variation (mean, 95 %)",
+        title="(d) flipped bits (2.1.1)",
+        ylim=(0, 1.02),
+    )
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize="small", frameon=False)
+    _save(figure, path)
+
+
+def _figure(size: tuple[float, float]) -> Any:
+    check_pictures_possible()
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=size, layout="constrained")
+
+
+def _save(figure: Any, path: Path) -> None:
+    """Write a picture; without matplotlib's version in it, so that it changes only where the drawing does."""
+    try:
+        figure.savefig(path, dpi=_DPI, metadata={"Software": None} if path.suffix == ".png" else None)
+    except (OSError, ValueError) as reason:
+        message = f"{path} can't be written: {getattr(reason, 'strerror', None) or reason}; name a file that ends in .png"
+        raise BuildError(message) from None

@@ -1,0 +1,235 @@
+"""Readings to try a machine on: drawn from a model, or recorded; as addresses of its columns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from machines.encode import decode_code
+from toolchain.address import to_address
+from toolchain.errors import BuildError, ModelError, ReadingError
+from toolchain.learning.recording import read_recording
+from toolchain.models.model import Known, Model, PriorSelect
+from toolchain.settings import key_values
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from machines.bm1 import BM1Machine
+    from toolchain.deployment import Dimension, Variable
+
+MISSING: Final = -1
+
+_WEIGHT_STEPS: Final = 500
+
+
+@dataclass(frozen=True, eq=False)
+class Readings:
+    """Frames of readings.
+
+    Attributes:
+        source: Where they come from, a clause.
+        addresses: int64[frames, sensors], in the columns' order; `MISSING` for a missing reading.
+        prior_addresses: int64[frames], what selects the prior; `MISSING` where nothing does.
+    """
+
+    source: str
+    addresses: NDArray[np.int64]
+    prior_addresses: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self.addresses)
+
+    def of_model(self, frame: int) -> tuple[tuple[int | None, ...], int | None]:
+        """Return a frame as `toolchain.models.fusion.exact_posterior` takes it."""
+        row = int(self.prior_addresses[frame])
+        addresses = tuple(None if at == MISSING else at for at in self.addresses[frame].tolist())
+        return addresses, None if row == MISSING else row
+
+    def of_machine(self, frame: int, machine: BM1Machine) -> tuple[tuple[int, ...], int]:
+        """Return a frame as a machine takes it: a missing reading is its column's top address."""
+        parameters = machine.parameters
+        addresses = tuple(
+            parameters.missing_address(column) if at == MISSING else at
+            for column, at in enumerate(self.addresses[frame].tolist(), start=1)
+        )
+        row = int(self.prior_addresses[frame])
+        return addresses, parameters.prior_addresses - 1 if row == MISSING else row
+
+
+def sample_readings(model: Model, frames: int, *, seed: int, source: str = "") -> Readings:
+    """Draw readings from a model: a line from the prior, then each reading given that line; none is missing.
+
+    Where the prior is selected, every selection is as probable as every other.
+
+    Args:
+        model: The model.
+        frames: How many.
+        seed: The same one draws the same readings.
+        source: What they are said to be.
+
+    Raises:
+        BuildError: No frames.
+    """
+    if frames < 1:
+        message = f"--frames is {frames}, expected 1 or more"
+        raise BuildError(message)
+    random = np.random.default_rng(seed)
+    rows = np.full(frames, MISSING, dtype=np.int64)
+    if model.prior_select is None:
+        lines = random.choice(model.lines, size=frames, p=_normalised(model.prior_distribution))
+    else:
+        rows = random.integers(0, model.prior_select.values, frames)
+        lines = np.array(
+            [random.choice(model.lines, p=_normalised(model.prior_select.table[row])) for row in rows]
+        )
+    addresses = np.empty((frames, len(model.known)), dtype=np.int64)
+    for column, known in enumerate(model.known):
+        cumulative = np.cumsum(known.table[:, lines], axis=0)
+        drawn = random.random(frames) * cumulative[-1]
+        addresses[:, column] = (cumulative <= drawn).sum(axis=0)
+    return Readings(source or f"{frames} frames drawn from the model (seed {seed})", addresses, rows)
+
+
+def model_of_codes(
+    name: str, searched: Sequence[Dimension], variables: Sequence[Variable], machine: BM1Machine
+) -> Model:
+    """Return a model that a whole machine's codes are one of: what readings are drawn from where the model is not at hand.
+
+    Each row of a table was divided by its maximum before it was quantised; the factors are found again as those
+    with which every line's column sums to 1, as nearly as possible (expectation maximisation).
+
+    Args:
+        name: What it is called.
+        searched: The searched dimensions.
+        variables: All known variables, those that are columns in their order.
+        machine: The machine with all lines.
+    """
+    width = machine.parameters.prob_bits
+    known = []
+    sensors = [variable for variable in variables if variable.kind == "sensor"]
+    for variable, table in zip(sensors, machine.tables, strict=True):
+        codes = decode_code(table[: variable.values], width)
+        known.append(Known(name=variable.name, table=_conditional(codes), bits=variable.bits))
+    prior = decode_code(machine.prior, width)
+    select = next((variable for variable in variables if variable.kind == "prior_select"), None)
+    if select is None:
+        return Model(name=name, searched=tuple(searched), known=tuple(known), prior=_distribution(prior[0]))
+    rows = np.stack([_distribution(row) for row in prior[: select.values]])
+    return Model(
+        name=name,
+        searched=tuple(searched),
+        known=tuple(known),
+        prior=_distribution(prior[-1]),
+        prior_select=PriorSelect(name=select.name, table=rows, bits=select.bits),
+    )
+
+
+def _conditional(codes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Scale rows so that columns sum to about 1, then make them do so; a column of zeros becomes uniform."""
+    codes = np.where(codes.sum(axis=0) > 0, codes, 1.0)
+    served = codes.sum(axis=1) > 0
+    weights = served / max(int(served.sum()), 1)
+    for _ in range(_WEIGHT_STEPS):
+        back = codes @ (1.0 / (weights @ codes))
+        weights = np.divide(weights * back, codes.sum(axis=1), out=np.zeros_like(weights), where=served)
+    table = weights[:, np.newaxis] * codes
+    scaled: NDArray[np.float64] = table / table.sum(axis=0)
+    return scaled
+
+
+def _distribution(ratios: NDArray[np.float64]) -> NDArray[np.float64]:
+    total = ratios.sum()
+    return ratios / total if total > 0 else np.full(ratios.shape, 1 / ratios.size)
+
+
+def _normalised(distribution: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A model's distributions sum to 1 within 1e-6; drawing wants it closer."""
+    exact: NDArray[np.float64] = distribution / distribution.sum()
+    return exact
+
+
+def recorded_readings(
+    path: Path,
+    variables: Sequence[Variable],
+    given: Sequence[str],
+    *,
+    frames: int,
+    tolerance_s: float = 0.1,
+) -> Readings:
+    """Return the readings of a recording, spread over its length.
+
+    Args:
+        path: CSV, MCAP or bag.
+        variables: All known variables, those that are columns in their order.
+        given: NAME=COLUMN, where a variable's readings are; `*` stands for the same in both. Default: its name.
+        frames: How many rows at most.
+        tolerance_s: In a bag, how far from a row another topic's message may be, seconds.
+
+    Raises:
+        ModelError: No such recording or column, or no row that the machine takes.
+        BuildError: A name that no variable has, or no frames.
+    """
+    if frames < 1:
+        message = f"--frames is {frames}, expected 1 or more"
+        raise BuildError(message)
+    columns = reading_columns([variable.name for variable in variables], given)
+    recording = read_recording(path, list(dict.fromkeys(columns.values())), tolerance_s=tolerance_s)
+    rows: list[list[int]] = []
+    refused, first = 0, ""
+    for at in np.unique(np.linspace(0, recording.rows - 1, min(frames, recording.rows)).astype(int)).tolist():
+        try:
+            row = [
+                to_address(variable, recording.columns[columns[variable.name]][at])
+                if variable.name in columns
+                else to_address(variable, None)
+                for variable in variables
+            ]
+        except ReadingError as error:
+            refused, first = refused + 1, first or str(error)
+            continue
+        rows.append([MISSING if address is None else address for address in row])
+    if not rows:
+        message = f"{path} has no row that this machine takes" + (f": {first}" if first else "")
+        raise ModelError(message)
+    addresses = np.array(rows, dtype=np.int64).reshape(len(rows), len(variables))
+    sensors = [at for at, variable in enumerate(variables) if variable.kind == "sensor"]
+    selects = [at for at, variable in enumerate(variables) if variable.kind == "prior_select"]
+    prior = addresses[:, selects[0]] if selects else np.full(len(rows), MISSING, dtype=np.int64)
+    left_out = f", {refused} more that it refuses ({first})" if refused else ""
+    source = f"{len(rows)} of {recording.rows} rows of {path.name}{left_out}"
+    return Readings(source, addresses[:, sensors], prior)
+
+
+def reading_columns(names: Sequence[str], given: Sequence[str], flag: str = "--reading") -> dict[str, str]:
+    """Return the recording's column for each variable that is named, or for all by their own names.
+
+    Raises:
+        BuildError: A pattern that fits no variable.
+    """
+    if not given:
+        return {name: name for name in names}
+    columns: dict[str, str] = {}
+    for pattern, column in key_values(given, flag, "range=COLUMN").items():
+        before, star, after = pattern.partition("*")
+        fitting = [
+            name
+            for name in names
+            if (
+                name.startswith(before) and name.endswith(after) and len(name) >= len(before) + len(after)
+                if star
+                else name == pattern
+            )
+        ]
+        if not fitting:
+            message = f"{flag} {pattern}: there is no such known variable; there are {', '.join(names[:20])}"
+            raise BuildError(message)
+        for name in fitting:
+            same = name[len(before) : len(name) - len(after)] if star else ""
+            columns[name] = column.replace("*", same)
+    return columns

@@ -1,0 +1,1 @@
+"""The subcommands of `toolchain`: their flags, and what they print."""

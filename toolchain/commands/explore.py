@@ -1,0 +1,271 @@
+"""What `toolchain explore` does: a sweep's table, plot and Pareto front, or the thesis's claims as experiments."""
+
+from __future__ import annotations
+
+import sys
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, TypeVar
+
+import typer
+
+from machines.parameters import RngKind
+from toolchain.analysis.explore import Results, Sweep, explore, pareto, run_task, tasks
+from toolchain.analysis.readings import recorded_readings, sample_readings
+from toolchain.analysis.resources import device_named
+from toolchain.commands.build import NetworkQuestion, Unread, read_model
+from toolchain.errors import BuildError
+from toolchain.options import Scale
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+    from enum import StrEnum
+    from pathlib import Path
+
+    from toolchain.analysis.claims import Course
+    from toolchain.analysis.explore import Point
+    from toolchain.deployment import Stop
+
+    Kind = TypeVar("Kind", bound=StrEnum)
+
+CLAIMS_NAME: Final = "claims.json"
+CLAIMS_PICTURE: Final = "claims.png"
+CLAIM_FRAMES: Final = 100
+"""Frames at each rate of flipped bits, at most: they run cycle by cycle."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ExploreOptions:
+    """A sweep as a user writes it: lists with commas between their parts.
+
+    Attributes:
+        settings: `KEY=VALUE`s for the model.
+        bits: `NAME=BITS`s for the model.
+        question: What a network is asked.
+        prob_bits: Widths of codes.
+        targets: Target counts.
+        rngs: Kinds of generators.
+        scales: Kinds of scaling.
+        steps: Steps a clock.
+        partitions: Boards.
+        stop: When boards stop.
+        max_cycles: After how many cycles a machine stops anyway.
+        recording: Recorded readings, or None to draw them.
+        columns: `NAME=COLUMN`s of the recording.
+        frames: How many frames at most.
+        banks: Sets of seeds that each is run with.
+        seed: Of the readings that are drawn.
+        device: What a board has.
+    """
+
+    settings: tuple[str, ...]
+    bits: tuple[str, ...]
+    question: NetworkQuestion
+    prob_bits: str
+    targets: str
+    rngs: str
+    scales: str
+    steps: str
+    partitions: int
+    stop: Stop
+    max_cycles: int
+    recording: Path | None
+    columns: tuple[str, ...]
+    frames: int
+    banks: int
+    seed: int
+    device: str
+
+
+def run_explore(path: Path, results: Path, plot: Path | None, options: ExploreOptions) -> None:
+    """Sweep, keeping every point in the results' file, and print what there is, also when it is interrupted.
+
+    Raises:
+        ToolchainError: Anything that is wrong with the model, the lists or the files.
+    """
+    if plot is not None:
+        from toolchain.analysis.pictures import check_pictures_possible
+
+        check_pictures_possible()
+    device = device_named(options.device)
+    sweep = _sweep(options)
+    model = read_model(path, options.question, Unread(settings=options.settings, bits=options.bits))
+    if options.recording is None:
+        if options.columns:
+            message = (
+                f"--reading {options.columns[0]} says where in a recording a reading is: add --readings FILE"
+            )
+            raise BuildError(message)
+        readings = sample_readings(model, options.frames, seed=options.seed)
+    else:
+        readings = recorded_readings(
+            options.recording, model.variables, options.columns, frames=options.frames
+        )
+    kept = Results(results)
+    found = tasks(model, sweep, readings, device)
+    there = sum(task.key in kept.points for task in found)
+    typer.echo(
+        f"{len(found)} machines of {model.name} over {readings.source}"
+        + (f"; {there} of them are in {results}" if there else ""),
+        err=True,
+    )
+    try:
+        with _progress(len(found)) as advance:
+            explore(
+                found,
+                kept.points,
+                lambda task: run_task(model, task, readings, device, sweep.banks),
+                kept.append,
+                lambda point: advance(_named(point)),
+            )
+    finally:
+        # Ctrl-C too: what is done is shown, and it is in the file.
+        points = [kept.points[task.key] for task in found if task.key in kept.points]
+        if points:
+            front = pareto(points)
+            typer.echo(table(points, front), nl=False)
+            typer.echo(f"{len(points)} of {len(found)} machines are in {results}", err=True)
+            if plot is not None:
+                from toolchain.analysis.pictures import draw_sweep
+
+                draw_sweep(plot, model.name, points, front)
+                typer.echo(f"Wrote {plot}", err=True)
+
+
+def _sweep(options: ExploreOptions) -> Sweep:
+    if options.partitions < 1 or options.max_cycles < 1 or options.banks < 1:
+        message = "--partitions, --max-cycles and --banks are numbers from 1"
+        raise BuildError(message)
+    return Sweep(
+        prob_bits=_numbers("--prob-bits", options.prob_bits),
+        target_counts=_numbers("--targets", options.targets),
+        rngs=_members("--rngs", options.rngs, RngKind),
+        scales=_members("--scales", options.scales, Scale),
+        steps_per_clock=_numbers("--steps", options.steps),
+        partitions=options.partitions,
+        stop=options.stop,
+        max_cycles=options.max_cycles,
+        banks=options.banks,
+    )
+
+
+def _numbers(flag: str, text: str) -> tuple[int, ...]:
+    try:
+        return tuple(dict.fromkeys(int(part) for part in text.split(",")))
+    except ValueError:
+        message = f"{flag} {text}: expected whole numbers with commas between them, such as {flag} 4,8"
+        raise BuildError(message) from None
+
+
+def _members(flag: str, text: str, kind: type[Kind]) -> tuple[Kind, ...]:
+    try:
+        return tuple(dict.fromkeys(kind(part.strip()) for part in text.split(",")))
+    except ValueError:
+        message = f"{flag} {text}: expected some of {', '.join(kind)}, with commas between them"
+        raise BuildError(message) from None
+
+
+def table(points: Sequence[Point], front: Sequence[Point]) -> str:
+    """Return the sweep as text; the Pareto front's points have a star."""
+    keys = {point.key for point in front}
+    rows = [
+        (
+            "  scale    rng     steps  codes  target  total variation (95 %)     by codes    KL bits  same MAP   z rms  without   cycles"
+            "      95 %     ALMs  blocks  fits"
+        )
+    ]
+    for point in sorted(points, key=lambda each: (each.cycles_median, each.total_variation or 1.0)):
+        variation = (
+            f"{point.total_variation:7.4f} ({point.total_variation_low:.4f}..{point.total_variation_high:.4f})"
+            if point.total_variation is not None
+            else "-"
+        )
+        rows.append(
+            f"{'*' if point.key in keys else ' '} {point.scale:8} {point.rng:7} {point.steps_per_clock:5d}  {point.prob_bits:5d}  "
+            f"{point.target_count:6d}  {variation:>24}  {_cell(point.quantising, '.4f'):>9}  {_cell(point.kl_bits, '.4f'):>9}  "
+            f"{_cell(point.map_agreement, '.0%'):>8}  {_cell(point.z_rms, '.2f'):>6}  {point.without:7.1%}  "
+            f"{point.cycles_median:7,.0f}  {point.cycles_95:8,.0f}  {_cell(point.alms, ',.0f'):>7}  {_cell(point.blocks, ','):>6}  "
+            f"{'-' if point.fits is None else 'yes' if point.fits else 'no':>4}"
+        )
+    rows.append(
+        "* nothing else here is better in one of total variation, cycles, ALMs and frames without a posterior, and as good in the others"
+    )
+    return "\n".join(rows) + "\n"
+
+
+def _cell(value: float | None, form: str) -> str:
+    return "-" if value is None else f"{value:{form}}"
+
+
+def _named(point: Point) -> str:
+    return f"{point.rng}, codes of {point.prob_bits} bits, target {point.target_count}, scale {point.scale}"
+
+
+def run_claims_command(directory: Path, *, frames: int, seed: int) -> None:
+    """Run the thesis's claims as experiments, print their figures and draw them.
+
+    Raises:
+        BuildError: No matplotlib, a folder that can't be written, or no frames.
+    """
+    from toolchain.analysis.claims import experiments, run_claims
+    from toolchain.analysis.pictures import check_pictures_possible, draw_claims
+
+    check_pictures_possible()
+    if frames < 1:
+        message = f"--frames is {frames}, expected 1 or more"
+        raise BuildError(message)
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+    except OSError as reason:
+        message = f"{directory} can't be made: {reason.strerror or reason}"
+        raise BuildError(message) from None
+    with _progress(experiments()) as advance:
+        claims = run_claims(frames=frames, fault_frames=min(frames, CLAIM_FRAMES), seed=seed, advance=advance)
+    for heading, courses in (
+        ("Cycles by the number of lines (4 sensors, target 255):", claims.lines),
+        ("Cycles by the number of sensors (256 lines, target 255):", claims.sensors),
+        ("Cycles by the target count (256 lines, 4 sensors):", claims.targets),
+    ):
+        typer.echo(_courses(heading, courses), nl=False)
+    typer.echo(f"Total variation by the share of flipped bits ({claims.fault_frames} frames):")
+    for name, faults in claims.faults.items():
+        typer.echo(
+            f"  {name:31} " + "  ".join(f"{fault.rate:g}: {fault.total_variation:.3f}" for fault in faults)
+        )
+    try:
+        (directory / CLAIMS_NAME).write_text(claims.as_json(), encoding="utf-8")
+    except OSError as reason:
+        message = f"{directory / CLAIMS_NAME} can't be written: {reason.strerror or reason}"
+        raise BuildError(message) from None
+    draw_claims(directory / CLAIMS_PICTURE, claims)
+    typer.echo(f"Wrote {directory / CLAIMS_NAME} and {directory / CLAIMS_PICTURE}", err=True)
+
+
+def _courses(heading: str, courses: Sequence[Course]) -> str:
+    rows = [heading, "          median   quartiles"]
+    rows += [
+        f"  {each.x:6,.0f}  {each.median:7,.0f}   {each.low:,.0f} to {each.high:,.0f}" for each in courses
+    ]
+    return "\n".join(rows) + "\n"
+
+
+@contextmanager
+def _progress(total: int) -> Iterator[Callable[[str], None]]:
+    """A bar on a terminal, nothing elsewhere; what is under way, or was last done, stands beside it."""
+    if not sys.stderr.isatty():
+        yield lambda _: None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), TextColumn("{task.description}"))
+    with Progress(*columns, console=Console(stderr=True)) as progress:
+        bar = progress.add_task("", total=total)
+        yield lambda what: progress.update(bar, advance=1, description=what)
+
+
+@contextmanager
+def counting(total: int) -> Iterator[Callable[[], None]]:
+    """The same for frames, which have no names."""
+    with _progress(total) as advance:
+        yield lambda: advance("frames")

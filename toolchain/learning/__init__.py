@@ -1,0 +1,1 @@
+"""Tables learnt from recorded readings with ground truth."""

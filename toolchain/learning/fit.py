@@ -1,0 +1,306 @@
+"""Learns a model's tables from recordings with ground truth: normals with an outliers' share, or counts.
+
+**Normals.** A reading is `mean(S) + bias + noise` with noise N(0, sigma^2), or, for a share of the readings, anything
+in the variable's range alike. Bias, sigma and share come from expectation maximisation on the residuals at the true
+place; inside a cell the mean is taken as linear. Sigma and bias may be shared by a pool of variables; the share is
+each variable's own, with one outlier and one good reading in advance (a Beta(2, 2) prior's mode).
+
+**Counts.** P(k | s) = (n(k, s) + a q(k | s)) / (n(s) + a): a Dirichlet prior worth `a` readings in every cell, which
+looks like q, the model's own table or a uniform one.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from toolchain.address import to_address
+from toolchain.errors import ModelError, ReadingError
+from toolchain.learning.fit_options import FitMethod, FitOptions, FitPrior
+from toolchain.learning.fitted import Fit, FitFile, FittedRecording, FittedVariable, mean_slopes, wrapped
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from toolchain.deployment import Dimension
+    from toolchain.models.model import Known, Model
+
+LEAST_READINGS: Final = 10
+"""A pool with fewer readings keeps what was set by hand."""
+
+_ROUNDS: Final = 1000
+_SETTLED: Final = 1e-10
+_LEAST_SIGMA: Final = 0.05
+"""Of a step: recordings that were rounded, or simulated without noise, have no spread at all."""
+_TO_SIGMA: Final = 1.4826
+"""From a normal's median absolute deviation to its sigma."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Truth:
+    """Where the truth lay in each row that a model can learn from.
+
+    Attributes:
+        rows: int64[n], the recording's rows that have a true value of every searched dimension, inside the grid.
+        lines: int64[n], the line of each.
+        within: float64[dimensions, n], how far from the cell's centre, in cells: -0.5 to 0.5.
+        outside: How many other rows there are.
+    """
+
+    rows: NDArray[np.int64]
+    lines: NDArray[np.int64]
+    within: NDArray[np.float64]
+    outside: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Support:
+    """How much data a table rests on.
+
+    Attributes:
+        name: The variable.
+        readings: Its readings, in rows with a truth.
+        cells: Lines of the machine that have at least one of them.
+        median: Of the readings in such a line.
+        refused: Readings that are no values of the variable.
+    """
+
+    name: str
+    readings: int
+    cells: int
+    median: float
+    refused: int
+
+
+def locate(model: Model, columns: Mapping[str, Sequence[object]], rows: int) -> Truth:
+    """Return where the truth lay.
+
+    Args:
+        model: The model; its searched dimensions say what a cell is.
+        columns: True values of each searched dimension, by its label.
+        rows: How many rows the recording has.
+    """
+    places = np.array(
+        [[_position(dimension, value) for value in columns[dimension.label]] for dimension in model.searched]
+    ).reshape(len(model.searched), rows)
+    sizes = np.array([dimension.size for dimension in model.searched])[:, np.newaxis]
+    with np.errstate(invalid="ignore"):  # NaN is no place
+        cells = np.floor(places + 0.5)
+        inside = np.all((cells >= 0) & (cells < sizes), axis=0)
+    cells = cells[:, inside].astype(np.int64)
+    lines = np.ravel_multi_index(tuple(cells), tuple(int(size) for size in sizes[:, 0]))
+    return Truth(
+        rows=np.flatnonzero(inside),
+        lines=np.asarray(lines, dtype=np.int64),
+        within=places[:, inside] - cells,
+        outside=rows - int(inside.sum()),
+    )
+
+
+def fit_model(
+    model: Model,
+    truth: Truth,
+    readings: Mapping[str, Sequence[object]],
+    recordings: Sequence[FittedRecording],
+    options: FitOptions,
+) -> tuple[Fit, tuple[Support, ...]]:
+    """Learn from rows with a truth.
+
+    Args:
+        model: The model.
+        truth: Where the truth lay.
+        readings: Of each known variable that is to be learnt, one a row of the recording.
+        recordings: What is told about the recordings in the file.
+        options: Method, pools, priors.
+
+    Returns:
+        The fit, and how much data each table rests on.
+
+    Raises:
+        ModelError: No row has a truth, or a variable that can't be learnt in this way.
+    """
+    if not len(truth.rows):
+        message = "no row has a true value inside the searched dimensions: is --truth right, and in the model's unit?"
+        raise ModelError(message)
+    known = {each.name: each for each in model.known}
+    if options.method is FitMethod.NORMALS:
+        supports, variables = _normals(
+            model, truth, {name: (known[name], readings[name]) for name in readings}, options
+        )
+        tables: dict[str, NDArray[np.float64]] = {}
+    else:
+        supports, variables, tables = [], [], {}
+        for name, values in readings.items():
+            tables[name], support = _counted(known[name], truth, values, options)
+            supports.append(support)
+            variables.append(FittedVariable(name=name, rows=support.readings))
+    file = FitFile(
+        method=options.method.value,
+        model=model.name,
+        floor=options.floor if options.method is FitMethod.NORMALS else 0.0,
+        recordings=tuple(recordings),
+        variables=tuple(variables),
+    )
+    return Fit(file=file, tables=tables), tuple(supports)
+
+
+def _position(dimension: Dimension, value: object) -> float:
+    """Return a true value as a place along a dimension, in cells; NaN where it is none."""
+    if isinstance(value, str) and value in dimension.states:
+        return float(dimension.states.index(value))
+    if isinstance(value, str) or not isinstance(value, int | float):
+        return math.nan
+    return (float(value) - dimension.offset) / dimension.step
+
+
+def _normals(
+    model: Model,
+    truth: Truth,
+    readings: Mapping[str, tuple[Known, Sequence[object]]],
+    options: FitOptions,
+) -> tuple[list[Support], list[FittedVariable]]:
+    residuals: dict[str, NDArray[np.float64]] = {}
+    widths: dict[str, float] = {}
+    supports = []
+    for name, (known, values) in readings.items():
+        residuals[name], support = _residuals(model, known, truth, values)
+        widths[name] = known.values * known.step
+        supports.append(support)
+    fitted: dict[str, FittedVariable] = {}
+    for pool in _pools(list(readings), options.pool):
+        if sum(len(residuals[name]) for name in pool) < LEAST_READINGS:
+            continue
+        least = _LEAST_SIGMA * min(readings[name][0].step for name in pool)
+        bias, sigma, shares = mixture(
+            [residuals[name] for name in pool],
+            [widths[name] for name in pool],
+            bias=options.bias,
+            least_sigma=least,
+        )
+        for name, share in zip(pool, shares, strict=True):
+            fitted[name] = FittedVariable(
+                name=name, rows=len(residuals[name]), sigma=sigma, bias=bias, outliers=share
+            )
+    return supports, [fitted[name] for name in readings if name in fitted]
+
+
+def mixture(
+    residuals: Sequence[NDArray[np.float64]],
+    widths: Sequence[float],
+    *,
+    bias: bool,
+    least_sigma: float,
+) -> tuple[float, float, list[float]]:
+    """Fit one normal and, for each variable, the share of its readings that are uniform instead.
+
+    Args:
+        residuals: Of each variable, reading minus expectation.
+        widths: Each variable's range: an outlier lies anywhere in it.
+        bias: Whether the normal's mean is fitted; else it is 0.
+        least_sigma: The least standard deviation.
+
+    Returns:
+        The mean, the standard deviation and the shares.
+    """
+    everything = np.concatenate(residuals)
+    mean = float(np.median(everything)) if bias else 0.0
+    sigma = max(_TO_SIGMA * float(np.median(np.abs(everything - mean))), least_sigma)
+    shares = [0.1] * len(residuals)
+    for _ in range(_ROUNDS):
+        weights = []
+        for number, (away, width) in enumerate(zip(residuals, widths, strict=True)):
+            good = (
+                (1 - shares[number])
+                * np.exp(-0.5 * ((away - mean) / sigma) ** 2)
+                / (math.sqrt(2 * math.pi) * sigma)
+            )
+            weights.append(good / (good + shares[number] / width))
+            shares[number] = 1 - (float(weights[-1].sum()) + 1) / (len(away) + 2)
+        weight = np.concatenate(weights)
+        total = float(weight.sum())
+        if not total > 0:
+            break
+        before = (mean, sigma)
+        mean = float(weight @ everything) / total if bias else 0.0
+        sigma = max(math.sqrt(float(weight @ (everything - mean) ** 2) / total), least_sigma)
+        if abs(sigma - before[1]) <= _SETTLED * sigma and abs(mean - before[0]) <= _SETTLED * sigma:
+            break
+    return mean, sigma, shares
+
+
+def _residuals(
+    model: Model, known: Known, truth: Truth, values: Sequence[object]
+) -> tuple[NDArray[np.float64], Support]:
+    """Return reading minus expectation at the true place, for every row that has a reading."""
+    slopes = mean_slopes(model, known)
+    if known.normal is None:  # mean_slopes has refused it
+        raise AssertionError
+    expected = known.normal.mean[truth.lines] + (slopes[:, truth.lines] * truth.within).sum(axis=0)
+    numbers = np.array([_number(values[row]) for row in truth.rows])
+    there = np.isfinite(numbers)
+    away = numbers[there] - expected[there]
+    if known.period is not None:
+        away = wrapped(away, known.period * abs(known.step))
+    refused = sum(values[row] is not None for row in truth.rows) - int(there.sum())
+    return away, _support(known.name, truth.lines[there], refused)
+
+
+def _number(value: object) -> float:
+    return float(value) if isinstance(value, int | float) else math.nan
+
+
+def _counted(
+    known: Known, truth: Truth, values: Sequence[object], options: FitOptions
+) -> tuple[NDArray[np.float64], Support]:
+    variable = known.as_variable().model_copy(update={"on_missing": "missing"})
+    counts = np.zeros(known.table.shape)
+    used, refused = [], 0
+    for row, line in zip(truth.rows.tolist(), truth.lines.tolist(), strict=True):
+        if values[row] is None:
+            continue
+        try:
+            address = to_address(variable, values[row])
+        except ReadingError:
+            address = None
+        if address is None:
+            refused += 1
+        else:
+            counts[address, line] += 1
+            used.append(line)
+    base = known.table if options.prior is FitPrior.MODEL else np.full_like(known.table, 1 / known.values)
+    worth = options.pseudo_count
+    table: NDArray[np.float64] = (counts + worth * base) / (counts.sum(axis=0) + worth)
+    return table, _support(known.name, np.array(used, dtype=np.int64), refused)
+
+
+def _support(name: str, lines: NDArray[np.int64], refused: int) -> Support:
+    _, counts = np.unique(lines, return_counts=True)
+    return Support(
+        name=name,
+        readings=len(lines),
+        cells=len(counts),
+        median=float(np.median(counts)) if len(counts) else 0.0,
+        refused=refused,
+    )
+
+
+def _pools(names: Sequence[str], patterns: Sequence[str]) -> list[list[str]]:
+    """Return the variables that share a normal: those of each pattern, and every other one by itself."""
+    left = list(names)
+    pools = []
+    for pattern in patterns:
+        pool = [name for name in left if fnmatchcase(name, pattern)]
+        if not pool:
+            message = (
+                f"--pool {pattern} is none of the variables that are fitted; they are {', '.join(names[:20])}"
+            )
+            raise ModelError(message)
+        pools.append(pool)
+        left = [name for name in left if name not in pool]
+    return pools + [[name] for name in left]

@@ -1,0 +1,297 @@
+"""What was learnt from recordings, as a file: `.toml` of normals or `.npz` of counted tables, and a model with it."""
+
+from __future__ import annotations
+
+import json
+import math
+import zipfile
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Final, Literal
+
+import numpy as np
+import tomli_w
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from toolchain.errors import ModelError
+from toolchain.models.conditional import normal_table, wrapped_normal_table
+from toolchain.models.model import Known, Model, Normal
+from toolchain.toml_file import parse_toml, read_text, validate
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+FORMAT: Final = 1
+MAX_TABLE_BYTES: Final = 1 << 28
+MAX_BYTES: Final = 1 << 30
+
+_HEADER: Final = (
+    "# Written by `toolchain fit`; read by toolchain.learning.fitted.with_fit. docs/models.md has the keys.\n"
+)
+_META: Final = "fit.json"
+_EPOCH: Final = (1980, 1, 1, 0, 0, 0)
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", strict=True, allow_inf_nan=False, validate_by_name=True
+    )
+
+
+class FittedRecording(_Section):
+    """`[[recording]]`: what was learnt from."""
+
+    file: str
+    sha256: str
+    rows: int = Field(ge=0)
+
+
+class FittedVariable(_Section):
+    """`[[variable]]`: one known variable; of counted ones only name and rows, for their tables are arrays."""
+
+    name: str
+    rows: int = Field(ge=0)
+    sigma: float = Field(default=0.0, ge=0)
+    bias: float = 0.0
+    outliers: float = Field(default=0.0, ge=0, le=1)
+
+
+class FitFile(_Section):
+    """What the file says."""
+
+    format: Literal[1] = FORMAT
+    method: Literal["normals", "counts"]
+    model: str
+    floor: float = Field(default=0.0, ge=0, lt=1)
+    recordings: tuple[FittedRecording, ...] = Field(default=(), validation_alias="recording", strict=False)
+    variables: tuple[FittedVariable, ...] = Field(default=(), validation_alias="variable", strict=False)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Fit:
+    """What was learnt.
+
+    Attributes:
+        file: Method, recordings and the variables' numbers.
+        tables: With the method `counts`, P(K | S) of each variable, float64[values, lines].
+    """
+
+    file: FitFile
+    tables: Mapping[str, NDArray[np.float64]]
+
+
+def with_fit(model: Model, path: Path | None) -> Model:
+    """Return a model with what was learnt in the place of what was set by hand; the model itself without a path.
+
+    Args:
+        model: The model that the fit was made for, or one of another grid whose tables are normals.
+        path: A file that `toolchain fit` wrote, or None.
+
+    Raises:
+        ModelError: No such file, or one that was made for other variables.
+    """
+    return model if path is None else apply_fit(model, read_fit(path), str(path))
+
+
+def apply_fit(model: Model, fit: Fit, where: str = "the fit") -> Model:
+    """Return a model with what was learnt; variables that the fit doesn't have stay as they are.
+
+    Raises:
+        ModelError: A fitted variable that the model doesn't have, or one whose table has another shape.
+    """
+    known = {each.name: each for each in model.known}
+    for variable in fit.file.variables:
+        if variable.name not in known:
+            message = f"{where} is of a model with {variable.name}; {model.name} has {', '.join(known) or 'no known variables'}"
+            raise ModelError(message)
+        before = known[variable.name]
+        if fit.file.method == "normals":
+            known[variable.name] = _with_normal(model, before, variable, fit.file.floor, where)
+        else:
+            table = fit.tables[variable.name]
+            if table.shape != before.table.shape:
+                message = (
+                    f"{where}: the table of {variable.name} has shape {table.shape}, the model's {before.table.shape}; "
+                    "fit again with this model"
+                )
+                raise ModelError(message)
+            known[variable.name] = replace(before, table=table, floor=0.0, normal=None)
+    return replace(model, known=tuple(known.values()))
+
+
+def cell_spread(model: Model, known: Known) -> NDArray[np.float64]:
+    """Return how much a variable's mean varies inside each line's cell, as a standard deviation: float64[lines].
+
+    A cell is a box in which the searched values are uniform; the mean is taken as linear in it.
+    """
+    slopes = mean_slopes(model, known)
+    spread: NDArray[np.float64] = np.sqrt((slopes**2).sum(axis=0) / 12)
+    return spread
+
+
+def mean_slopes(model: Model, known: Known) -> NDArray[np.float64]:
+    """Return how a variable's mean changes from cell to cell: float64[dimensions, lines], per cell."""
+    if known.normal is None:
+        message = f"{known.name} is not normal around a mean that the model says; fit it with --method counts"
+        raise ModelError(message)
+    sizes = tuple(dimension.size for dimension in model.searched)
+    mean = known.normal.mean.reshape(sizes)
+    turn = None if known.period is None else known.period * abs(known.step)
+    slopes = []
+    for axis, size in enumerate(sizes):
+        if size == 1:
+            slopes.append(np.zeros(model.lines))
+            continue
+        steps = np.diff(mean, axis=axis)
+        if turn is not None:
+            steps = wrapped(steps, turn)
+        first, last = np.take(steps, [0], axis=axis), np.take(steps, [-1], axis=axis)
+        before, after = np.concatenate([first, steps], axis=axis), np.concatenate([steps, last], axis=axis)
+        slopes.append(((before + after) / 2).ravel())
+    return np.array(slopes)
+
+
+def wrapped(away: NDArray[np.float64], turn: float) -> NDArray[np.float64]:
+    """Return differences on a circle: the shorter way round."""
+    shorter: NDArray[np.float64] = (away + turn / 2) % turn - turn / 2
+    return shorter
+
+
+def _with_normal(model: Model, known: Known, fitted: FittedVariable, floor: float, where: str) -> Known:
+    if not fitted.sigma > 0:
+        message = f"{where}: sigma of {known.name} is {fitted.sigma:g}, expected a positive number"
+        raise ModelError(message)
+    spread = cell_spread(model, known)
+    if known.normal is None:  # cell_spread has refused it
+        raise AssertionError
+    shape = Normal(
+        mean=known.normal.mean + fitted.bias,
+        sigma=np.hypot(fitted.sigma, spread),
+        floor=floor,
+        outliers=fitted.outliers,
+    )
+    make = normal_table if known.period is None else wrapped_normal_table
+    table = make(known.name, shape, values=known.values, offset=known.offset, step=known.step)
+    return replace(known, table=table, floor=floor, normal=replace(shape, mean=known.normal.mean))
+
+
+def write_fit(path: Path, fit: Fit) -> None:
+    """Write a fit: TOML of normals, NPZ of counts. The same fit gives the same bytes.
+
+    Raises:
+        ModelError: The file's suffix is not the method's, or it can't be written.
+    """
+    content: dict[str, Any] = fit.file.model_dump(mode="json", exclude_defaults=False)
+    suffix = ".toml" if fit.file.method == "normals" else ".npz"
+    if path.suffix != suffix:
+        message = f"{path}: the method {fit.file.method} writes a file that ends in {suffix}"
+        raise ModelError(message)
+    partial = path.with_name(path.name + ".part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if fit.file.method == "normals":
+            renamed = {
+                {"recordings": "recording", "variables": "variable"}.get(key, key): value
+                for key, value in content.items()
+            }
+            partial.write_text(_HEADER + tomli_w.dumps(renamed), encoding="utf-8")
+        else:
+            _write_tables(partial, content, fit.tables)
+        partial.replace(path)
+    except OSError as reason:
+        message = f"{path} can't be written: {reason.strerror or reason}"
+        raise ModelError(message) from None
+
+
+def read_fit(path: Path) -> Fit:
+    """Return what `toolchain fit` wrote.
+
+    Raises:
+        ModelError: Not there, damaged, or of another kind; one sentence with the file.
+    """
+    if path.suffix == ".npz":
+        return _read_tables(path)
+    text = read_text(path, ModelError)
+    tables = parse_toml(text, path, ModelError)
+    file = validate(FitFile, tables, text, path, ModelError)
+    if file.method != "normals":
+        message = f"{path} says method = {file.method!r}, whose tables `toolchain fit` writes as .npz"
+        raise ModelError(message)
+    return Fit(file=file, tables={})
+
+
+def _write_tables(path: Path, content: dict[str, Any], tables: Mapping[str, NDArray[np.float64]]) -> None:
+    """Write an NPZ file; np.savez would put the time of day into it."""
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        entry = zipfile.ZipInfo(_META, _EPOCH)
+        archive.writestr(entry, json.dumps(content, indent=1, sort_keys=True), zipfile.ZIP_DEFLATED)
+        for number, variable in enumerate(content["variables"]):
+            entry = zipfile.ZipInfo(f"table{number}.npy", _EPOCH)
+            entry.compress_type = zipfile.ZIP_DEFLATED
+            with archive.open(entry, "w", force_zip64=True) as file:
+                table = np.ascontiguousarray(tables[variable["name"]], dtype="<f8")
+                np.lib.format.write_array(file, table, version=(1, 0), allow_pickle=False)
+
+
+def _read_tables(path: Path) -> Fit:
+    try:
+        with zipfile.ZipFile(path) as archive:
+            if sum(entry.file_size for entry in archive.infolist()) > MAX_BYTES:
+                message = f"{path} is larger than {MAX_BYTES} bytes, unpacked; the most that is read"
+                raise ModelError(message)
+            content = json.loads(_member(archive, _META, MAX_TABLE_BYTES))
+            content = {
+                {"recordings": "recording", "variables": "variable"}.get(key, key): value
+                for key, value in content.items()
+            }
+            file = FitFile.model_validate(content, by_alias=True, by_name=False)
+            counted = file.variables if file.method == "counts" else ()
+            tables = {
+                variable.name: _array(archive, f"table{number}.npy")
+                for number, variable in enumerate(counted)
+            }
+    except OSError as reason:
+        message = f"{path} can't be read: {reason.strerror or reason}"
+        raise ModelError(message) from None
+    except (
+        zipfile.BadZipFile,
+        KeyError,
+        ValueError,
+        ValidationError,
+        AttributeError,
+        RecursionError,
+        EOFError,
+        NotImplementedError,
+        RuntimeError,
+    ) as reason:
+        message = f"{path} is no file of counted tables that `toolchain fit` wrote, or is damaged: {type(reason).__name__}"
+        raise ModelError(message) from None
+    if file.method != "counts":
+        message = f"{path} holds {file.method}, which `toolchain fit` writes as .toml"
+        raise ModelError(message)
+    return Fit(file=file, tables=tables)
+
+
+def _member(archive: zipfile.ZipFile, name: str, most: int) -> bytes:
+    with archive.open(name) as file:
+        data = file.read(most + 1)
+    if len(data) > most:
+        raise ValueError(name)
+    return data
+
+
+def _array(archive: zipfile.ZipFile, name: str) -> NDArray[np.float64]:
+    """Read an array; its header can't make us take more memory than the file has numbers."""
+    with archive.open(name) as file:
+        if np.lib.format.read_magic(file) != (1, 0):
+            raise ValueError(name)
+        shape, fortran, dtype = np.lib.format.read_array_header_1_0(file)
+        entries = math.prod(shape)
+        if fortran or dtype != np.dtype("<f8") or len(shape) != 2 or 8 * entries > MAX_TABLE_BYTES:
+            raise ValueError(name)
+        data = file.read(8 * entries + 1)
+    if len(data) != 8 * entries:
+        raise ValueError(name)
+    return np.frombuffer(data, dtype="<f8").reshape(shape).astype(np.float64)

@@ -1,0 +1,167 @@
+"""Loads a case study's `model.py` and calls its `model()` with the user's `--set key=value`s."""
+
+from __future__ import annotations
+
+import difflib
+import importlib.util
+import inspect
+import sys
+import traceback
+from contextlib import contextmanager
+from enum import Enum
+from pathlib import Path
+from types import UnionType
+from typing import TYPE_CHECKING, Any, Literal, Union, get_args, get_origin, get_type_hints
+
+from toolchain.errors import ModelError, ToolchainError
+from toolchain.models.joint import Question
+from toolchain.models.model import Model
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping
+    from types import ModuleType
+
+FILE_NAME = "model.py"
+
+
+def load_model(case: Path, settings: Mapping[str, str]) -> Model:
+    """Return the model of a case study's folder.
+
+    Args:
+        case: A folder with a `model.py` that defines `model(...)`, which returns a `toolchain.models.model.Model` or a
+            `toolchain.models.joint.Question`. Modules beside it can be imported by it.
+        settings: Values for `model()`'s parameters as a user writes them; each is read as the type that the
+            parameter is annotated with (int, float, bool, str, Path, an Enum, a Literal).
+
+    Raises:
+        ModelError: No such folder or file, a parameter that `model()` doesn't have or a value that it can't
+            take, a parameter without a value, an error inside `model.py`, or something else than a Model.
+    """
+    path = Path(case) / FILE_NAME
+    if not path.is_file():
+        what = f"has no {FILE_NAME}" if Path(case).is_dir() else "is no folder"
+        message = (
+            f"{case} {what}; expected a case study's folder with a {FILE_NAME} that defines model(), or a network's "
+            "file: .bif, .xmlbif, .uai or .net"
+        )
+        raise ModelError(message)
+    with _importing_from(path.parent.resolve()):
+        function = _model_function(path)
+        arguments = _arguments(path, function, settings)
+        model = _guarded(path, "model()", lambda: function(**arguments))
+    if isinstance(model, Question):
+        return model.model()
+    if not isinstance(model, Model):
+        message = (
+            f"{path}: model() returned {type(model).__name__}, expected a toolchain.models.model.Model or a "
+            "toolchain.models.joint.Question"
+        )
+        raise ModelError(message)
+    return model
+
+
+@contextmanager
+def _importing_from(folder: Path) -> Iterator[None]:
+    """Let `model.py` import the modules beside it; last on the path, so that they replace nothing."""
+    sys.path.append(str(folder))
+    try:
+        yield
+    finally:
+        sys.path.remove(str(folder))
+
+
+def _model_function(path: Path) -> Callable[..., object]:
+    spec = importlib.util.spec_from_file_location("rosbayes_case_study_model", path)
+    if spec is None or spec.loader is None:
+        message = f"{path} can't be loaded as a Python module"
+        raise ModelError(message)
+    module: ModuleType = importlib.util.module_from_spec(spec)
+    loader = spec.loader
+    sys.modules[spec.name] = module  # dataclasses and get_type_hints look their module up
+    try:
+        _guarded(path, "it", lambda: loader.exec_module(module))
+    finally:
+        del sys.modules[spec.name]
+    function = getattr(module, "model", None)
+    if not callable(function):
+        message = (
+            f"{path} defines no model(); expected a function that returns a toolchain.models.model.Model"
+        )
+        raise ModelError(message)
+    return function  # type: ignore[no-any-return]  # what a user's module holds has no type
+
+
+def _guarded(path: Path, what: str, call: Callable[[], object]) -> object:
+    """Call into the user's file; what it raises becomes one sentence with the line it came from."""
+    try:
+        return call()
+    except ToolchainError:
+        raise
+    except SyntaxError as error:
+        message = f"{error.filename or path}, line {error.lineno}: {error.msg}"
+        raise ModelError(message) from None
+    except Exception as error:
+        lines = [
+            frame.lineno
+            for frame in traceback.extract_tb(error.__traceback__)
+            if Path(frame.filename) == path or Path(frame.filename) == path.resolve()
+        ]
+        where = f"{path}, line {lines[-1]}" if lines else str(path)
+        text = " ".join(str(error).split())
+        raised = f"{type(error).__name__}: {text}" if text else type(error).__name__
+        message = f"{where}: {what} raised {raised}"
+        raise ModelError(message) from error
+
+
+def _arguments(path: Path, function: Callable[..., object], settings: Mapping[str, str]) -> dict[str, Any]:
+    parameters = inspect.signature(function).parameters
+    hints = _guarded(path, "an annotation", lambda: get_type_hints(function))
+    if not isinstance(hints, dict):  # never: get_type_hints returns one
+        raise TypeError
+    arguments: dict[str, Any] = {}
+    for key, text in settings.items():
+        if key not in parameters:
+            raise ModelError(f"{path}: {_unknown(key, list(parameters))}")
+        default = parameters[key].default
+        fallback = str if default in {inspect.Parameter.empty, None} else type(default)
+        arguments[key] = _value(key, text, hints.get(key, fallback))
+    for key, parameter in parameters.items():
+        if parameter.default is inspect.Parameter.empty and key not in arguments:
+            message = f"{path}: the model needs {key}: add --set {key}=VALUE"
+            raise ModelError(message)
+    return arguments
+
+
+def _unknown(key: str, known: list[str]) -> str:
+    if not known:
+        return f"the model has no parameters, so --set {key} means nothing"
+    close = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
+    nearest = f"did you mean '{close[0]}'?" if close else f"expected one of {', '.join(known)}"
+    return f"the model has no parameter '{key}'; {nearest}"
+
+
+def _value(key: str, text: str, wanted: Any) -> object:
+    """Read one value as the type its parameter is annotated with."""
+    if get_origin(wanted) in {Union, UnionType}:
+        kinds = [kind for kind in get_args(wanted) if kind is not type(None)]
+        wanted = kinds[0] if len(kinds) == 1 else str
+    if get_origin(wanted) is Literal:
+        choices = {str(choice): choice for choice in get_args(wanted)}
+    elif isinstance(wanted, type) and issubclass(wanted, Enum):
+        choices = {str(member.value): member for member in wanted}
+    elif wanted is bool:
+        choices = {"true": True, "false": False, "1": True, "0": False, "yes": True, "no": False}
+        text = text.lower()
+    elif wanted in {int, float, str, Path}:
+        try:
+            return wanted(text)
+        except ValueError:
+            message = f"--set {key}={text}: expected {'an integer' if wanted is int else 'a number'}"
+            raise ModelError(message) from None
+    else:
+        message = f"--set {key}={text}: the model's {key} can't be given on the command line"
+        raise ModelError(message)
+    if text not in choices:
+        message = f"--set {key}={text}: expected one of {', '.join(choices)}"
+        raise ModelError(message)
+    return choices[text]

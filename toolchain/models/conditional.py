@@ -1,0 +1,223 @@
+"""Conditional distributions P(K | S) by formula: normals over the bins of a reading, wrapped for bearings.
+
+A reading's address stands for the bin of half a step around it. Its probability is the Gaussian's integral
+over the bin, not the density at its middle, so that coarse bins stay right.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final, Literal
+
+import numpy as np
+
+from toolchain.errors import ModelError
+from toolchain.models.model import Known, Normal
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
+
+# Copies of a wrapped normal whose nearest point is further than this many sigma add less than 1e-32.
+_FARTHEST_COPY: Final = 12.0
+# A wrapped normal whose sigma is two turns is uniform to 1e-34, and so is any wider one.
+_UNIFORM: Final = 2.0
+
+
+def normal(
+    name: str,
+    *,
+    mean: NDArray[np.float64],
+    sigma: ArrayLike,
+    values: int,
+    offset: float = 0.0,
+    step: float = 1.0,
+    bits: int = 0,
+    floor: float = 0.0,
+    outliers: float = 0.0,
+    on_range: Literal["error", "clamp", "missing"] = "clamp",
+    on_missing: Literal["error", "missing"] = "error",
+    path: str = "",
+) -> Known:
+    """Return a known variable that is normal given S; the end bins hold the tails, as clamped readings do.
+
+    Args:
+        name: The variable's name.
+        mean: float64[lines], its mean on every line, in the reading's unit.
+        sigma: Its standard deviation, float64[lines] or one for all, in the reading's unit.
+        values: How many bins (addresses).
+        offset: The middle of the first bin.
+        step: The width of a bin.
+        bits: Address bits; 0 for as few as will do.
+        floor: What an outlier's bin gets everywhere, relative to the bin likelihood's peak.
+        outliers: Share of readings that have nothing to do with S: it is spread over all bins.
+        on_range: What a reading beyond the end bins is.
+        on_missing: Whether a reading may be missing.
+        path: Where in the message it is.
+
+    Raises:
+        ModelError: A sigma, step, floor, share or number of values that is not positive.
+    """
+    shape = Normal(mean=mean, sigma=sigma, floor=floor, outliers=outliers)
+    table = normal_table(name, shape, values=values, offset=offset, step=step)
+    return Known(
+        name=name,
+        table=table,
+        bits=bits,
+        offset=offset,
+        step=step,
+        on_range=on_range,
+        on_missing=on_missing,
+        path=path,
+        floor=floor,
+        normal=shape,
+    )
+
+
+def wrapped_normal(
+    name: str,
+    *,
+    mean: NDArray[np.float64],
+    sigma: ArrayLike,
+    values: int,
+    offset: float = 0.0,
+    step: float = 1.0,
+    bits: int = 0,
+    floor: float = 0.0,
+    outliers: float = 0.0,
+    on_missing: Literal["error", "missing"] = "error",
+    path: str = "",
+) -> Known:
+    """Return a known variable on a circle of `values * step` that is a wrapped normal given S.
+
+    Args:
+        name: The variable's name.
+        mean: float64[lines], its mean direction on every line, in the reading's unit, any turn.
+        sigma: Its standard deviation, float64[lines] or one for all, in the reading's unit.
+        values: How many bins (addresses) in a turn.
+        offset: The middle of the first bin.
+        step: The width of a bin.
+        bits: Address bits; 0 for as few as will do.
+        floor: What an outlier's bin gets everywhere, relative to the bin likelihood's peak.
+        outliers: Share of readings that have nothing to do with S: it is spread over all bins.
+        on_missing: Whether a reading may be missing.
+        path: Where in the message it is.
+
+    Raises:
+        ModelError: A sigma, step, floor, share or number of values that is not positive.
+    """
+    shape = Normal(mean=mean, sigma=sigma, floor=floor, outliers=outliers)
+    table = wrapped_normal_table(name, shape, values=values, offset=offset, step=step)
+    return Known(
+        name=name,
+        table=table,
+        bits=bits,
+        offset=offset,
+        step=step,
+        period=values,
+        on_missing=on_missing,
+        path=path,
+        floor=floor,
+        normal=shape,
+    )
+
+
+def normal_table(name: str, shape: Normal, *, values: int, offset: float, step: float) -> NDArray[np.float64]:
+    """Return P(K | S) of a normal over bins, float64[values, lines]; the end bins hold the tails.
+
+    Raises:
+        ModelError: A sigma, step, floor, share or number of values that is not positive.
+    """
+    mean, sigma = _checked(name, shape, values, step)
+    inner = offset + (np.arange(1, values) - 0.5) * step
+    edges = np.concatenate(([-np.inf], inner, [np.inf]))[:, np.newaxis]
+    z = (edges - mean) / sigma
+    tails = _upper_tail(np.abs(z))
+    table = _mass(z[:-1], z[1:], tails[:-1], tails[1:])
+    return _with_outliers(table, shape, step / sigma)
+
+
+def wrapped_normal_table(
+    name: str, shape: Normal, *, values: int, offset: float, step: float
+) -> NDArray[np.float64]:
+    """Return P(K | S) of a wrapped normal over a turn of `values` bins, float64[values, lines].
+
+    Raises:
+        ModelError: A sigma, step, floor, share or number of values that is not positive.
+    """
+    mean, sigma = _checked(name, shape, values, step)
+    turn = values * step
+    sigma = np.minimum(sigma, _UNIFORM * turn)
+    lower = offset + (np.arange(values) - 0.5)[:, np.newaxis] * step - mean
+    lower = (lower + turn / 2) % turn - turn / 2
+    upper = np.roll(lower, -1, axis=0)
+    over = upper <= lower  # the bin opposite the mean, where the circle was cut open
+    table = np.zeros_like(lower)
+    # The bin that was cut open reaches a step beyond half a turn.
+    copies = math.ceil((_FARTHEST_COPY * float(np.max(sigma)) + step) / turn - 0.5)
+    for copy in range(-max(copies, 0), max(copies, 0) + 1):
+        z_lower = (lower + copy * turn) / sigma
+        z_upper = (np.where(over, upper + turn, upper) + copy * turn) / sigma
+        tails_lower = _upper_tail(np.abs(z_lower))
+        tails_upper = np.roll(tails_lower, -1, axis=0)
+        tails_upper[over] = _upper_tail(np.abs(z_upper[over]))
+        table += _mass(z_lower, z_upper, tails_lower, tails_upper)
+    return _with_outliers(table, shape, step / sigma)
+
+
+def _checked(
+    name: str, shape: Normal, values: int, step: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    mean = np.asarray(shape.mean, dtype=np.float64)
+    if mean.ndim != 1 or not np.all(np.isfinite(mean)):
+        message = f"variable {name!r}: its mean must be one finite number for every line"
+        raise ModelError(message)
+    spread = np.asarray(shape.sigma, dtype=np.float64)
+    if spread.shape not in {(), mean.shape}:
+        message = f"variable {name!r}: sigma has shape {spread.shape}, expected one number or {mean.shape}"
+        raise ModelError(message)
+    if not (np.all(spread > 0) and np.all(np.isfinite(spread))):
+        message = f"variable {name!r}: sigma must be positive on every line"
+        raise ModelError(message)
+    if values < 1 or not step > 0 or not math.isfinite(step):
+        message = f"variable {name!r}: {values} bins of width {step:g}; both must be positive"
+        raise ModelError(message)
+    if not 0 <= shape.floor < math.inf:
+        message = f"variable {name!r}: a floor of {shape.floor:g}, expected a share of the peak from 0"
+        raise ModelError(message)
+    if not 0 <= shape.outliers <= 1:
+        message = f"variable {name!r}: {shape.outliers:g} of its readings are outliers, expected 0 to 1"
+        raise ModelError(message)
+    return mean, np.broadcast_to(spread, mean.shape)
+
+
+def _upper_tail(z: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return 1 - Phi(z) for z >= 0, accurate far into the tail (NumPy has no erfc)."""
+    scaled = (z / math.sqrt(2)).ravel().tolist()
+    return np.fromiter(map(math.erfc, scaled), np.float64, len(scaled)).reshape(z.shape) / 2
+
+
+def _mass(
+    lower: NDArray[np.float64],
+    upper: NDArray[np.float64],
+    tails_lower: NDArray[np.float64],
+    tails_upper: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Return Phi(upper) - Phi(lower) from the tails beyond |lower| and |upper|, without cancelling."""
+    same_side = np.abs(tails_lower - tails_upper)
+    return np.where((lower < 0) & (upper > 0), 1 - tails_lower - tails_upper, same_side)
+
+
+def _with_outliers(
+    table: NDArray[np.float64], shape: Normal, bin_in_sigmas: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Spread the outliers' share over all bins, add the floor, and normalise every line.
+
+    The floor is a share of a bin's mass where the mean is at its middle.
+    """
+    if shape.outliers:
+        table = (1 - shape.outliers) * table + shape.outliers / len(table)
+    if shape.floor:
+        peak = 1 - 2 * _upper_tail(bin_in_sigmas / 2)
+        table = table + shape.floor * peak
+    normalised: NDArray[np.float64] = table / table.sum(axis=0)
+    return normalised

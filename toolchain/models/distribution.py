@@ -1,0 +1,250 @@
+"""Factors of a joint distribution: tables, normals and functions of one symbol given others, and potentials.
+
+What is continuous becomes a table here: a normal's integral over each value of its symbol, a function's value.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, TypeAlias
+
+import numpy as np
+
+from toolchain.errors import ModelError
+from toolchain.models.conditional import normal_table, wrapped_normal_table
+from toolchain.models.model import Normal
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from numpy.typing import ArrayLike, NDArray
+
+    from toolchain.models.symbol import Symbol
+
+    Formula: TypeAlias = Callable[..., ArrayLike] | ArrayLike
+    """Of the given symbols' values, one float64 array each of the same shape; or numbers that need none."""
+
+MAX_ENTRIES: Final = 2**24
+"""The largest table, in entries (128 MiB as float64): larger ones are refused by name."""
+
+_SUM_TOLERANCE: Final = 1e-6
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Distribution:
+    """P(symbol | given) as a table.
+
+    Attributes:
+        symbol: The symbol that it is a distribution of.
+        given: What it depends on.
+        table: float64[symbol's size, size of each given], summing to 1 over the first axis.
+        normal: What it was made of, where it is one of normals; its arrays run over the given symbols' values,
+            the last fastest.
+    """
+
+    symbol: Symbol
+    given: tuple[Symbol, ...]
+    table: NDArray[np.float64]
+    normal: Normal | None = None
+
+    @property
+    def scope(self) -> tuple[Symbol, ...]:
+        """The symbols of its table's axes."""
+        return (self.symbol, *self.given)
+
+    @property
+    def title(self) -> str:
+        """As it is written: P(A | B, C)."""
+        return _title(self.symbol, self.given)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Potential:
+    """A function of some symbols that is a factor of the joint distribution and no distribution by itself.
+
+    Attributes:
+        scope: The symbols of its table's axes.
+        table: float64[size of each symbol], from 0.
+    """
+
+    scope: tuple[Symbol, ...]
+    table: NDArray[np.float64]
+
+
+Factor: TypeAlias = Distribution | Potential
+
+
+def table(symbol: Symbol, values: ArrayLike, *, given: Sequence[Symbol] = ()) -> Distribution:
+    """Return P(symbol | given) from its numbers.
+
+    Args:
+        symbol: The symbol.
+        values: float64[symbol's size, size of each given].
+        given: What it depends on.
+
+    Raises:
+        ModelError: Another shape, a number that is no probability, or a column that doesn't sum to 1.
+    """
+    given = tuple(given)
+    scope = _scope(symbol, given)
+    numbers = np.array(values, dtype=np.float64)
+    shape = tuple(each.size for each in scope)
+    if numbers.shape != shape:
+        message = f"{_title(symbol, given)} has shape {numbers.shape}, expected {shape}"
+        raise ModelError(message)
+    if not np.all(np.isfinite(numbers)) or np.any(numbers < 0):
+        message = f"{_title(symbol, given)} holds a number that is no probability: negative, infinite or NaN"
+        raise ModelError(message)
+    sums = numbers.sum(axis=0)
+    wrong = np.argwhere(np.abs(sums - 1) > _SUM_TOLERANCE)
+    if len(wrong):
+        place = tuple(wrong[0])
+        where = ", ".join(f"{each.name} = {_shown(each, at)}" for each, at in zip(given, place, strict=True))
+        message = (
+            f"{_title(symbol, given)} sums to {float(sums[place]):.9g}"
+            + (f" for {where}" if where else "")
+            + "; a distribution sums to 1"
+        )
+        raise ModelError(message)
+    numbers.flags.writeable = False
+    return Distribution(symbol=symbol, given=given, table=numbers)
+
+
+def uniform(symbol: Symbol) -> Distribution:
+    """Return the P(symbol) in which every value is as probable as any other."""
+    return table(symbol, np.full(symbol.size, 1 / symbol.size))
+
+
+def conditional_normal(
+    symbol: Symbol,
+    given: Sequence[Symbol],
+    *,
+    mean: Formula,
+    sigma: Formula,
+    floor: float = 0.0,
+    outliers: float = 0.0,
+) -> Distribution:
+    """Return P(symbol | given), normal around a function of the given symbols; wrapped where the symbol's type wraps.
+
+    Args:
+        symbol: An integer or interval symbol; each value gets the normal's integral over its interval.
+        given: What it depends on; none for a plain normal.
+        mean: Of the given symbols' values, or numbers that broadcast to their shape.
+        sigma: Likewise, the standard deviation.
+        floor: What every value gets at least, relative to the peak.
+        outliers: Share of readings that have nothing to do with the given symbols.
+
+    Raises:
+        ModelError: A symbol with named values, a mean or sigma of another shape, a sigma that is not positive.
+    """
+    given = tuple(given)
+    scope = _scope(symbol, given)
+    title = _title(symbol, given)
+    if symbol.type.labels:
+        message = f"{title}: a normal is over numbers, and {symbol.name} has named values"
+        raise ModelError(message)
+    shape = Normal(
+        mean=_evaluated(title, "mean", mean, given),
+        sigma=_evaluated(title, "sigma", sigma, given),
+        floor=floor,
+        outliers=outliers,
+    )
+    make = wrapped_normal_table if symbol.type.wraps else normal_table
+    flat = make(symbol.name, shape, values=symbol.size, offset=symbol.type.offset, step=symbol.type.step)
+    flat.flags.writeable = False
+    sizes = tuple(each.size for each in scope)
+    return Distribution(symbol=symbol, given=given, table=flat.reshape(sizes), normal=shape)
+
+
+def function(symbol: Symbol, given: Sequence[Symbol], value: Formula) -> Distribution:
+    """Return P(symbol | given) of a symbol that is a function of the others: 1 at its value, 0 elsewhere.
+
+    Args:
+        symbol: The symbol; its `on_range = clamp` takes values beyond its ends to the ends.
+        given: What it is a function of.
+        value: The function, of the given symbols' values as numbers.
+
+    Raises:
+        ModelError: A value that the symbol doesn't have.
+    """
+    given = tuple(given)
+    scope = _scope(symbol, given)
+    title = _title(symbol, given)
+    numbers = _evaluated(title, "the function", value, given)
+    if not np.all(np.isfinite(numbers)):
+        message = f"{title}: the function gives {numbers[~np.isfinite(numbers)][0]}"
+        raise ModelError(message)
+    place = np.floor((numbers - symbol.type.offset) / symbol.type.step + 0.5)
+    if symbol.type.wraps:
+        place %= symbol.size
+    elif symbol.on_range == "clamp":
+        place = np.clip(place, 0, symbol.size - 1)
+    outside = (place < 0) | (place >= symbol.size)
+    if np.any(outside):
+        last = symbol.type.offset + (symbol.size - 1) * symbol.type.step
+        message = (
+            f"{title}: the function gives {numbers[outside][0]:g}, but {symbol.name} is {symbol.type.offset:g} to "
+            f"{last:g}; widen its type, or give it on_range = clamp"
+        )
+        raise ModelError(message)
+    flat = (np.arange(symbol.size)[:, np.newaxis] == place).astype(np.float64)
+    flat.flags.writeable = False
+    return Distribution(symbol=symbol, given=given, table=flat.reshape(tuple(each.size for each in scope)))
+
+
+def potential(symbols: Sequence[Symbol], values: ArrayLike) -> Potential:
+    """Return a factor that is no distribution by itself, such as a Markov network's.
+
+    Args:
+        symbols: The symbols that it is a function of.
+        values: float64[size of each symbol], from 0.
+
+    Raises:
+        ModelError: Another shape, or a number that is negative, infinite or NaN.
+    """
+    scope = _scope(symbols[0], tuple(symbols[1:])) if symbols else ()
+    numbers = np.array(values, dtype=np.float64)
+    names = ", ".join(each.name for each in scope)
+    if numbers.shape != tuple(each.size for each in scope):
+        message = f"the potential of {names} has shape {numbers.shape}, expected {tuple(each.size for each in scope)}"
+        raise ModelError(message)
+    if not np.all(np.isfinite(numbers)) or np.any(numbers < 0):
+        message = f"the potential of {names} holds a number that is negative, infinite or NaN"
+        raise ModelError(message)
+    numbers.flags.writeable = False
+    return Potential(scope=scope, table=numbers)
+
+
+def _scope(symbol: Symbol, given: tuple[Symbol, ...]) -> tuple[Symbol, ...]:
+    scope = (symbol, *given)
+    if len({each.name for each in scope}) < len(scope):
+        message = f"{_title(symbol, given)} names a symbol twice"
+        raise ModelError(message)
+    entries = math.prod(each.size for each in scope)
+    if entries > MAX_ENTRIES:
+        message = f"{_title(symbol, given)} would be a table of {entries} entries; the most is {MAX_ENTRIES}"
+        raise ModelError(message)
+    return scope
+
+
+def _evaluated(title: str, what: str, formula: Formula, given: tuple[Symbol, ...]) -> NDArray[np.float64]:
+    """Return a formula's values over the given symbols', float64[product of their sizes]."""
+    grids = np.meshgrid(*(each.values() for each in given), indexing="ij") if given else []
+    values = formula(*grids) if callable(formula) else formula
+    sizes = tuple(each.size for each in given)
+    try:
+        numbers = np.broadcast_to(np.asarray(values, dtype=np.float64), sizes)
+    except (TypeError, ValueError):
+        message = f"{title}: {what} has shape {np.shape(values)}, expected {sizes}"
+        raise ModelError(message) from None
+    return numbers.ravel().copy()
+
+
+def _title(symbol: Symbol, given: tuple[Symbol, ...]) -> str:
+    names = ", ".join(each.name for each in given)
+    return f"P({symbol.name} | {names})" if names else f"P({symbol.name})"
+
+
+def _shown(symbol: Symbol, at: int) -> str:
+    return symbol.type.labels[at] if symbol.type.labels else f"{symbol.values()[at]:g}"

@@ -1,0 +1,115 @@
+"""Variable elimination: what is summed over disappears from a product of tables, one name after the other.
+
+Exact, in float64. The next name is always the one whose table is the smallest; a table above the limit is refused.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import count
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from toolchain.errors import ModelError
+from toolchain.models.distribution import MAX_ENTRIES
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+_NAMED = 6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Term:
+    """A factor of a product: a table, float64, and the names of its axes."""
+
+    scope: tuple[str, ...]
+    table: NDArray[np.float64]
+
+
+def reduced(term: Term, values: Mapping[str, int]) -> Term:
+    """Return the term with some of its names at the values that they have."""
+    if not any(name in values for name in term.scope):
+        return term
+    at = tuple(values.get(name, slice(None)) for name in term.scope)
+    return Term(tuple(name for name in term.scope if name not in values), np.asarray(term.table[at]))
+
+
+def product(terms: Sequence[Term], scope: Sequence[str], sizes: Mapping[str, int]) -> NDArray[np.float64]:
+    """Return the terms' product over a scope that holds all their names, float64[size of each name].
+
+    Raises:
+        ModelError: It would be larger than the limit.
+    """
+    _check_size(scope, sizes, "the answer")
+    found = np.ones(tuple(sizes[name] for name in scope))
+    for term in terms:
+        order = sorted(range(len(term.scope)), key=lambda axis: scope.index(term.scope[axis]))
+        shape = tuple(sizes[name] if name in term.scope else 1 for name in scope)
+        found *= np.transpose(term.table, order).reshape(shape)
+    return found
+
+
+def eliminate(terms: Iterable[Term], names: Iterable[str], sizes: Mapping[str, int]) -> list[Term]:
+    """Return terms whose product is the given terms' product, summed over some names.
+
+    Tables are scaled by their maxima on the way, so that long products don't underflow: the result is right up to a
+    factor.
+
+    Args:
+        terms: The product.
+        names: What is summed over.
+        sizes: How many values each name of the terms has.
+
+    Raises:
+        ModelError: A table on the way would be larger than the limit.
+    """
+    left = dict(enumerate(terms))
+    fresh = count(len(left))
+    holding: dict[str, set[int]] = {name: set() for name in names}
+    for number, term in left.items():
+        for name in holding.keys() & set(term.scope):
+            holding[name].add(number)
+    unions = {name: _union(left[number] for number in sorted(holding[name])) for name in holding}
+    costs = {name: math.prod(sizes[other] for other in unions[name]) for name in holding}
+    while holding:
+        # The name breaks ties: the same question gives the same sums, to the bit.
+        name = min(holding, key=lambda each: (costs[each], each))
+        touched = [left.pop(number) for number in sorted(holding.pop(name))]
+        scope = unions[name]
+        if not touched:
+            continue
+        _check_size(scope, sizes, f"summing over {name}")
+        summed = product(touched, scope, sizes).sum(axis=scope.index(name))
+        largest = summed.max()
+        made = Term(
+            tuple(other for other in scope if other != name), summed / largest if largest > 0 else summed
+        )
+        number = next(fresh)
+        left[number] = made
+        for other in holding.keys() & set(made.scope):
+            holding[other] = {each for each in holding[other] if each in left} | {number}
+            unions[other] = _union(left[each] for each in sorted(holding[other]))
+            costs[other] = math.prod(sizes[each] for each in unions[other])
+    return list(left.values())
+
+
+def _union(terms: Iterable[Term]) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(name for term in terms for name in term.scope))
+
+
+def _check_size(scope: Sequence[str], sizes: Mapping[str, int], what: str) -> None:
+    entries = math.prod(sizes[name] for name in scope)
+    if entries > MAX_ENTRIES:
+        names = ", ".join(scope[:_NAMED]) + (
+            f" and {len(scope) - _NAMED} more" if len(scope) > _NAMED else ""
+        )
+        message = (
+            f"{what} needs a table of {entries} entries over {names}; the most is {MAX_ENTRIES}: search or know fewer "
+            "variables, or ones that are nearer to each other"
+        )
+        raise ModelError(message)

@@ -1,0 +1,74 @@
+"""Exact naive Bayesian fusion in float64 (equation 2.2): what a machine's posterior is measured against."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from toolchain.errors import ModelError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    from numpy.typing import NDArray
+
+    from toolchain.models.model import Model
+
+
+def exact_posterior(
+    model: Model, addresses: Sequence[int | None], *, prior_address: int | None = None
+) -> NDArray[np.float64]:
+    """Return P(S | readings) of the unquantised model.
+
+    Args:
+        model: The model.
+        addresses: One per known variable, in the columns' order; None for a missing reading.
+        prior_address: Which row of the selected prior; None for the prior without a selection.
+
+    Returns:
+        float64[lines], summing to 1.
+
+    Raises:
+        ModelError: Another number of addresses, an address that is not served, or readings that are
+            impossible on every line.
+    """
+    if len(addresses) != len(model.known):
+        message = f"{len(addresses)} readings for the {len(model.known)} known variables of {model.name!r}"
+        raise ModelError(message)
+    factors = []
+    for known, address in zip(model.known, addresses, strict=True):
+        if address is None:
+            continue
+        if not 0 <= address < known.values:
+            message = f"variable {known.name}: address {address} is not one of its {known.values}"
+            raise ModelError(message)
+        factors.append(known.table[address])
+    if prior_address is None:
+        return fuse(model.prior_distribution, factors)
+    rows = None if model.prior_select is None else model.prior_select.table
+    if rows is None or not 0 <= prior_address < len(rows):
+        message = f"model {model.name!r} has no prior of address {prior_address}"
+        raise ModelError(message)
+    return fuse(rows[prior_address], factors)
+
+
+def fuse(prior: NDArray[np.float64], likelihoods: Iterable[NDArray[np.float64]]) -> NDArray[np.float64]:
+    """Return the normalised product of a prior and likelihoods, float64[lines] each, up to factors.
+
+    The product is made of logarithms, so that thirty small likelihoods don't underflow.
+
+    Raises:
+        ModelError: The product is 0 on every line.
+    """
+    with np.errstate(divide="ignore"):  # log 0 = -inf is what an impossible line is
+        logarithm = np.log(prior)
+        for likelihood in likelihoods:
+            logarithm = logarithm + np.log(likelihood)
+    largest = logarithm.max()
+    if largest == -np.inf:
+        message = "these readings are impossible on every line: there is no posterior"
+        raise ModelError(message)
+    weights = np.exp(logarithm - largest)
+    posterior: NDArray[np.float64] = weights / weights.sum()
+    return posterior

@@ -1,0 +1,474 @@
+"""Joint distributions as products of factors, and questions to them: searched and known (in the manner of ProBT).
+
+A question that has naive fusion's form, P(S) P(k_1 | S) ... P(k_N | S) (equation 2.2), becomes a `Model`, which a BM1
+computes. What is neither searched nor known is summed over exactly; a question of another form is refused, with
+the path that joins two known symbols.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass, field, replace
+from itertools import combinations, pairwise
+from typing import TYPE_CHECKING, Final, TypeAlias
+
+import numpy as np
+
+from toolchain.errors import ModelError
+from toolchain.models.distribution import MAX_ENTRIES, Distribution, Factor
+from toolchain.models.elimination import Term, eliminate, product, reduced
+from toolchain.models.model import Known, Model, Normal, PriorSelect, dimension
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from toolchain.deployment import Dimension
+    from toolchain.models.symbol import Symbol
+
+    Named: TypeAlias = Symbol | str
+
+_LISTED: Final = 20
+
+
+@dataclass(frozen=True, eq=False)
+class JointDistribution:
+    """A product of factors: a Bayesian network, or with potentials a Markov network.
+
+    Attributes:
+        name: What a deployment of it is called.
+        factors: The distributions P(A | B, C) and potentials; every symbol that is given has a factor too.
+    """
+
+    name: str
+    factors: tuple[Factor, ...]
+    symbols: tuple[Symbol, ...] = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Check that the factors belong together.
+
+        Raises:
+            ModelError: Two symbols of one name, two distributions of one symbol, one that has none, or a circle.
+        """
+        object.__setattr__(self, "factors", tuple(self.factors))
+        symbols: dict[str, Symbol] = {}
+        for factor in self.factors:
+            for symbol in factor.scope:
+                if symbols.setdefault(symbol.name, symbol) != symbol:
+                    message = f"{self.name}: there are two different symbols {symbol.name!r}"
+                    raise ModelError(message)
+        children: dict[str, tuple[str, ...]] = {}
+        bare = set(symbols)
+        for factor in self.factors:
+            if isinstance(factor, Distribution):
+                if factor.symbol.name in children:
+                    message = f"{self.name}: {factor.symbol.name} has two distributions"
+                    raise ModelError(message)
+                children[factor.symbol.name] = tuple(each.name for each in factor.given)
+                bare.discard(factor.symbol.name)
+            else:
+                bare.difference_update(each.name for each in factor.scope)
+        if bare:
+            message = (
+                f"{self.name}: {min(bare)} has no distribution; give it one, such as uniform({min(bare)})"
+            )
+            raise ModelError(message)
+        if circle := _circle(children):
+            message = f"{self.name}: {' -> '.join(circle)} is a circle; a joint distribution has none"
+            raise ModelError(message)
+        object.__setattr__(self, "symbols", tuple(symbols.values()))
+
+    def symbol(self, name: Named) -> Symbol:
+        """Return a symbol by its name.
+
+        Raises:
+            ModelError: There is none; lists those there are.
+        """
+        wanted = name if isinstance(name, str) else name.name
+        for symbol in self.symbols:
+            if symbol.name == wanted:
+                return symbol
+        names = [symbol.name for symbol in self.symbols]
+        more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
+        message = f"{self.name} has no variable {wanted!r}; it has {', '.join(names[:_LISTED])}{more}"
+        raise ModelError(message)
+
+    def ask(
+        self,
+        searched: Sequence[Named],
+        known: Sequence[Named] = (),
+        *,
+        given: Mapping[str, str] | None = None,
+        prior_select: Named | None = None,
+    ) -> Question:
+        """Return the question P(searched | known).
+
+        Args:
+            searched: What is searched, the slowest dimension first: a line of the machine for each combination.
+            known: What is known in every frame, in the order of the machine's columns.
+            given: What is known for ever, by name: the label or number that it has.
+            prior_select: What is known too, but selects the prior instead of being a column (thesis 2.1.2).
+
+        Raises:
+            ModelError: A symbol that isn't there, or one that is asked for twice.
+        """
+        fixed = {
+            self.symbol(name).name: self.symbol(name).index(label) for name, label in (given or {}).items()
+        }
+        question = Question(
+            joint=self,
+            searched=tuple(self.symbol(each) for each in searched),
+            known=tuple(self.symbol(each) for each in known),
+            given=fixed,
+            prior_select=None if prior_select is None else self.symbol(prior_select),
+        )
+        names = [each.name for each in (*question.searched, *question.observed)] + list(fixed)
+        for name in names:
+            if names.count(name) > 1:
+                message = f"{self.name}: {name} is in the question twice; it can be searched, known or given"
+                raise ModelError(message)
+        if not question.searched:
+            message = f"{self.name}: the question searches nothing"
+            raise ModelError(message)
+        return question
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Question:
+    """P(searched | known) of a joint distribution; `JointDistribution.ask` makes it.
+
+    Attributes:
+        joint: The joint distribution.
+        searched: What is searched, the slowest dimension first.
+        known: What is known, in the columns' order.
+        given: What is known for ever: each name's value.
+        prior_select: What selects the prior, or None.
+    """
+
+    joint: JointDistribution
+    searched: tuple[Symbol, ...]
+    known: tuple[Symbol, ...]
+    given: Mapping[str, int]
+    prior_select: Symbol | None
+
+    @property
+    def observed(self) -> tuple[Symbol, ...]:
+        """All that has a reading in every frame."""
+        return self.known if self.prior_select is None else (*self.known, self.prior_select)
+
+    def model(self) -> Model:
+        """Return the model that a BM1 computes.
+
+        Raises:
+            ModelError: The question has no such form (says which known symbols are joined by which path), is
+                impossible, or needs a table above the limit.
+        """
+        observed = [symbol.name for symbol in self.observed]
+        active = [_without_idle(factor) for factor in self.joint.factors]
+        factors, terms = self._factors(active, observed)
+        searched = [symbol.name for symbol in self.searched]
+        sizes = {symbol.name: symbol.size for symbol in self.joint.symbols}
+        lines = math.prod(symbol.size for symbol in self.searched)
+        widest = max((symbol.size for symbol in self.observed), default=1)
+        if lines * widest > MAX_ENTRIES:
+            message = (
+                f"{self.joint.name}: {lines} lines with {widest} values each are a table of {lines * widest} entries; the "
+                f"most is {MAX_ENTRIES}: search fewer variables"
+            )
+            raise ModelError(message)
+        links = _Links(terms, factors, {*searched, *self.given})
+        if links.joined(observed):
+            raise self._refusal(active, observed)
+        own: dict[str, list[Term]] = {symbol.name: [] for symbol in self.observed}
+        common: list[Term] = []
+        for component in links.components():
+            here = [term for term in terms if component.intersection(term.scope)]
+            kept = component.intersection(own)
+            left = eliminate(here, component - kept, sizes)
+            if kept:
+                own[kept.pop()] += left
+            else:
+                common += left
+        common += [term for term in terms if set(term.scope) <= set(searched)]
+        return self._fusion(own, product(common, searched, sizes).ravel(), sizes)
+
+    def _factors(self, active: Sequence[Factor], observed: Sequence[str]) -> tuple[list[Factor], list[Term]]:
+        """Return what matters for some observed symbols, and the same as terms with what is given put in."""
+        asked = {symbol.name for symbol in self.searched} | set(observed) | set(self.given)
+        factors = _relevant(active, asked)
+        terms = [
+            reduced(Term(tuple(symbol.name for symbol in factor.scope), factor.table), self.given)
+            for factor in factors
+        ]
+        return factors, terms
+
+    def _refusal(self, active: Sequence[Factor], observed: Sequence[str]) -> ModelError:
+        """Return why this is no naive fusion: two observed symbols, the shortest path between them, and a way out.
+
+        Where not all are independent, some two are not, whatever the others do (d-separation has this property).
+        """
+        cut = {symbol.name for symbol in self.searched} | set(self.given)
+        found: tuple[list[str], str] | None = None
+        for one, other in combinations(observed, 2):
+            factors, terms = self._factors(active, [one, other])
+            links = _Links(terms, factors, cut)
+            path = links.path(one, other)
+            if path and (found is None or len(path) < len(found[0])):
+                found = path, links.drawn(path)
+        if found is None:  # then the observed ones would not be joined
+            raise AssertionError
+        path, drawn = found
+        ends = f"{path[0]} or {path[-1]}"
+        way_out = f"search {path[1]} too, or leave {ends} out" if len(path) > 2 else f"leave {ends} out"
+        names = ", ".join(each.name for each in self.searched)
+        return ModelError(
+            f"{path[0]} and {path[-1]} are not independent given {names}: {drawn} joins them; {way_out} of the known "
+            "variables"
+        )
+
+    def _fusion(
+        self, own: Mapping[str, Sequence[Term]], weight: NDArray[np.float64], sizes: Mapping[str, int]
+    ) -> Model:
+        """Put the model together: each observed symbol's terms, and the searched ones' own weight, float64[lines]."""
+        searched = [symbol.name for symbol in self.searched]
+        tables = {
+            name: product(terms, (name, *searched), sizes).reshape(sizes[name], -1)
+            for name, terms in own.items()
+        }
+        sums = {name: table.sum(axis=0) for name, table in tables.items()}
+        prior = _scaled(weight)
+        for total in sums.values():
+            prior = _scaled(prior * total)
+        if not prior.sum() > 0:
+            message = f"{self.joint.name}: what is given is impossible, so there is nothing to search"
+            raise ModelError(message)
+        prior /= prior.sum()
+        select = None
+        if self.prior_select is not None:
+            name = self.prior_select.name
+            select = self._select(
+                self.prior_select, _given_line(tables[name], sums[name], prior) * prior, prior
+            )
+        return Model(
+            name=self.joint.name,
+            searched=tuple(_dimension(symbol) for symbol in self.searched),
+            known=tuple(
+                _known(
+                    symbol, _given_line(tables[symbol.name], sums[symbol.name], prior), self._normal(symbol)
+                )
+                for symbol in self.known
+            ),
+            prior=prior,
+            prior_select=select,
+        )
+
+    def _select(
+        self, symbol: Symbol, together: NDArray[np.float64], prior: NDArray[np.float64]
+    ) -> PriorSelect:
+        """Return P(S | A) from P(A, S), float64[values, lines]; an impossible value selects the plain prior."""
+        total = together.sum(axis=1, keepdims=True)
+        rows = np.where(total > 0, together / np.where(total > 0, total, 1), prior)
+        return PriorSelect(
+            name=symbol.name,
+            table=rows / rows.sum(axis=1, keepdims=True),
+            bits=symbol.bits,
+            offset=symbol.type.offset,
+            step=symbol.type.step,
+            period=symbol.period,
+            on_range=symbol.on_range,
+            on_missing=symbol.on_missing,
+            path=symbol.path,
+            states=symbol.type.labels,
+        )
+
+    def _normal(self, symbol: Symbol) -> Normal | None:
+        """Return what a known symbol's table was made of over all lines, where it is one of normals given S alone."""
+        for factor in self.joint.factors:
+            if isinstance(factor, Distribution) and factor.symbol == symbol and factor.normal is not None:
+                break
+        else:
+            return None
+        if not set(factor.given) <= set(self.searched):
+            return None
+        names = [each.name for each in self.searched]
+        sizes = {each.name: each.size for each in self.searched}
+        scope = tuple(each.name for each in factor.given)
+        shape = tuple(each.size for each in factor.given)
+        mean, sigma = (
+            product([Term(scope, np.asarray(values, dtype=np.float64).reshape(shape))], names, sizes).ravel()
+            for values in (factor.normal.mean, factor.normal.sigma)
+        )
+        return Normal(mean=mean, sigma=sigma, floor=factor.normal.floor, outliers=factor.normal.outliers)
+
+
+class _Links:
+    """Which symbols stand in a factor together, what is searched and given being cut out: the question's shape.
+
+    After cutting, symbols of different components are independent given what was cut (the moral graph's criterion).
+    """
+
+    def __init__(self, terms: Sequence[Term], factors: Sequence[Factor], cut: set[str]) -> None:
+        self._neighbours: dict[str, dict[str, Factor]] = {}
+        for term, factor in zip(terms, factors, strict=True):
+            inside = [name for name in term.scope if name not in cut]
+            for name in inside:
+                beside = self._neighbours.setdefault(name, {})
+                for other in inside:
+                    # A distribution that has one as the other's parent says more than a common child does.
+                    if other != name and (other not in beside or _is_arc(factor, name, other)):
+                        beside[other] = factor
+
+    def components(self) -> list[set[str]]:
+        """Return the sets of symbols that are joined, in a fixed order."""
+        left = dict.fromkeys(self._neighbours)
+        found = []
+        while left:
+            component = set(self._paths_from(next(iter(left))))
+            found.append(component)
+            left = {name: None for name in left if name not in component}
+        return found
+
+    def joined(self, observed: Sequence[str]) -> bool:
+        """Return whether two of some symbols are joined."""
+        return any(len(component.intersection(observed)) > 1 for component in self.components())
+
+    def path(self, start: str, end: str) -> list[str]:
+        """Return the shortest path between two symbols; empty where they are not joined."""
+        return self._paths_from(start).get(end, [])
+
+    def _paths_from(self, start: str) -> dict[str, list[str]]:
+        paths = {start: [start]}
+        waiting = deque([start])
+        while waiting:
+            name = waiting.popleft()
+            for other in self._neighbours.get(name, ()):
+                if other not in paths:
+                    paths[other] = [*paths[name], other]
+                    waiting.append(other)
+        return paths
+
+    def drawn(self, path: Sequence[str]) -> str:
+        """Return a path as arrows; a common child stands between its two parents."""
+        text = path[0]
+        for before, after in pairwise(path):
+            factor = self._neighbours[before][after]
+            if not isinstance(factor, Distribution):
+                text += f" -- {after}"
+            elif factor.symbol.name == after:
+                text += f" -> {after}"
+            elif factor.symbol.name == before:
+                text += f" <- {after}"
+            else:
+                text += f" -> {factor.symbol.name} <- {after}"
+        return text
+
+
+def _is_arc(factor: Factor, name: str, other: str) -> bool:
+    return isinstance(factor, Distribution) and factor.symbol.name in {name, other}
+
+
+def _relevant(factors: Iterable[Factor], asked: set[str]) -> list[Factor]:
+    """Leave out what sums to 1: distributions of symbols that nothing left depends on and nobody asks for."""
+    left = list(factors)
+    uses: dict[str, int] = {}
+    for factor in left:
+        for symbol in factor.scope:
+            uses[symbol.name] = uses.get(symbol.name, 0) + 1
+    while True:
+        kept: list[Factor] = []
+        for factor in left:
+            name = factor.symbol.name if isinstance(factor, Distribution) else ""
+            if isinstance(factor, Distribution) and name not in asked and uses[name] == 1:
+                for symbol in factor.scope:
+                    uses[symbol.name] -= 1
+            else:
+                kept.append(factor)
+        if len(kept) == len(left):
+            return kept
+        left = kept
+
+
+def _without_idle(factor: Factor) -> Factor:
+    """Return the factor without the symbols that change nothing in it: an arc in name alone joins nothing."""
+    scope, table = list(factor.scope), factor.table
+    for axis in range(len(scope) - 1, 0, -1):
+        first = np.take(table, [0], axis=axis)
+        if np.array_equal(np.broadcast_to(first, table.shape), table):
+            table = first.squeeze(axis=axis)
+            del scope[axis]
+    if isinstance(factor, Distribution):
+        return replace(factor, given=tuple(scope[1:]), table=table, normal=None)
+    return replace(factor, scope=tuple(scope), table=table)
+
+
+def _given_line(
+    together: NDArray[np.float64], total: NDArray[np.float64], prior: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return P(K | S) from any multiple of it, float64[values, lines].
+
+    A line that is impossible by itself gets P(K): no other line's code changes by it.
+    """
+    safe = np.where(total > 0, total, 1)
+    table: NDArray[np.float64] = together / safe
+    marginal = table @ np.where(total > 0, prior, 0)
+    table = np.where(total > 0, table, (marginal / marginal.sum())[:, np.newaxis])
+    normalised: NDArray[np.float64] = table / table.sum(axis=0)
+    return normalised
+
+
+def _scaled(weights: NDArray[np.float64]) -> NDArray[np.float64]:
+    largest = weights.max()
+    scaled: NDArray[np.float64] = weights / largest if largest > 0 else weights
+    return scaled
+
+
+def _dimension(symbol: Symbol) -> Dimension:
+    return dimension(
+        symbol.name,
+        size=symbol.size,
+        offset=symbol.type.offset,
+        step=symbol.type.step,
+        states=symbol.type.labels,
+    )
+
+
+def _known(symbol: Symbol, table: NDArray[np.float64], normal: Normal | None) -> Known:
+    return Known(
+        name=symbol.name,
+        table=table,
+        bits=symbol.bits,
+        offset=symbol.type.offset,
+        step=symbol.type.step,
+        period=symbol.period,
+        on_range=symbol.on_range,
+        on_missing=symbol.on_missing,
+        path=symbol.path,
+        floor=0.0 if normal is None else normal.floor,
+        states=symbol.type.labels,
+        normal=normal,
+    )
+
+
+def _circle(parents: Mapping[str, Sequence[str]]) -> list[str]:
+    """Return names along a directed circle, the first one again at the end; none: an empty list."""
+    state: dict[str, bool] = {}  # False: on the way, True: done
+    for start in parents:
+        if start in state:
+            continue
+        way = [(start, iter(parents[start]))]
+        state[start] = False
+        while way:
+            name, rest = way[-1]
+            parent = next(rest, None)
+            if parent is None:
+                state[name] = True
+                way.pop()
+            elif state.get(parent) is False:
+                names = [each for each, _ in way]
+                return [parent, *reversed(names[names.index(parent) :])]
+            elif parent in parents and parent not in state:
+                state[parent] = False
+                way.append((parent, iter(parents[parent])))
+    return []

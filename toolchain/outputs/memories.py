@@ -1,0 +1,197 @@
+"""Which memories a machine has on each board, and the MIF of each: priors, tiles, random numbers (thesis 3.2).
+
+A column's tiles all see the same reading, so a column is one memory: its address is the reading's, and a word
+holds the code of every line of the board, line 0 in the lowest bits. The same goes for the prior elements.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from machines.parameters import PriorMode, RngKind
+from machines.rng import LFSR, POLYNOMIALS, generator_numbers, random_numbers
+from toolchain.outputs.mif import mif_lines
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator, Sequence
+
+    from numpy.typing import NDArray
+
+    from machines.bm1 import BM1Machine
+    from machines.parameters import BM1Parameters
+    from pcie_shim.programming_file import Image
+    from toolchain.deployment import Deployment
+
+FOLDER: Final = "bm_arch/Memory_MIFs"
+
+_ROWS_AT_ONCE: Final = 64
+
+
+@dataclass(frozen=True, slots=True)
+class Memory:
+    """A memory of a board, or one that all boards have alike.
+
+    Attributes:
+        name: Its file's name.
+        width: Bits of a word.
+        depth: How many words.
+        words: Returns every word, from address 0.
+        comments: What it is, a line each.
+    """
+
+    name: str
+    width: int
+    depth: int
+    words: Callable[[], Iterable[int]]
+    comments: tuple[str, ...]
+
+    def lines(self) -> Iterator[str]:
+        """Yield the MIF, in canonical form."""
+        return mif_lines(self.width, self.depth, self.words(), self.comments)
+
+
+def memories(deployment: Deployment, images: Sequence[Image]) -> tuple[Memory, ...]:
+    """Return every memory of a deployment's machine, board by board and then what all boards share.
+
+    Generators that exist emulated only (`rng = ideal`) have no memories.
+    """
+    found: list[Memory] = []
+    for board, image in enumerate(images):
+        found += [_prior(deployment, board, image), *_columns(deployment, board, image)]
+        if not image.machine.parameters.shared:
+            found += _seeds(image.machine, f"board{board}_")
+    if images[0].machine.parameters.shared:
+        found += _seeds(images[0].machine, "")
+    table = images[0].machine.rng_table
+    if table is not None:
+        found.append(_rng_table(table, images[0].machine.parameters.prob_bits))
+    return tuple(found)
+
+
+def prior_name(board: int) -> str:
+    """Return the file's name of a board's prior."""
+    return f"board{board}_prior.mif"
+
+
+def column_name(board: int, column: int, sensors: int) -> str:
+    """Return the file's name of a board's column, 1 to `sensors`; all are equally long, so that they sort."""
+    return f"board{board}_column{column:0{len(str(sensors))}d}.mif"
+
+
+def seed_words(machine: BM1Machine) -> NDArray[np.uint64]:
+    """Return where every generator starts in every bank: uint64[banks, columns] or [banks, lines, columns]."""
+    parameters = machine.parameters
+    if (
+        parameters.rng in POLYNOMIALS
+    ):  # all banks at once: bank b's generators are numbered on from bank b - 1's
+        shape = generator_numbers(parameters, 0).shape
+        every = np.arange(parameters.rng_banks * generators(parameters), dtype=np.uint64)
+        return LFSR(parameters.rng).seeds(every.reshape(-1, *shape))
+    numbers = random_numbers(machine)
+    return np.stack([numbers.restart(bank) for bank in range(parameters.rng_banks)])
+
+
+def seed_width(machine: BM1Machine) -> int:
+    """Return the bits of a seed: of an LFSR's state, or of an index into the table of random numbers."""
+    if machine.rng_table is not None:
+        return max(1, (machine.rng_table.size - 1).bit_length())
+    return machine.parameters.rng.lfsr_bits or 64
+
+
+def packed_words(codes: NDArray[np.uint16], prob_bits: int) -> Iterator[int]:
+    """Yield a word for every row of uint16[rows, lines]: line 0's code in the lowest bits, `prob_bits` each."""
+    weights = np.arange(prob_bits - 1, -1, -1, dtype=np.uint16)
+    for start in range(0, len(codes), _ROWS_AT_ONCE):
+        rows = codes[start : start + _ROWS_AT_ONCE, ::-1]
+        if prob_bits == 8:
+            packed = rows.astype(np.uint8)
+        elif prob_bits == 16:
+            packed = rows.astype(">u2").view(np.uint8)
+        else:
+            bits = ((rows[:, :, np.newaxis] >> weights) & np.uint16(1)).astype(np.uint8)
+            bits = bits.reshape(len(rows), -1)
+            packed = np.packbits(np.pad(bits, ((0, 0), (-bits.shape[1] % 8, 0))), axis=1)
+        for row in packed:
+            yield int.from_bytes(row.tobytes(), "big")
+
+
+def _prior(deployment: Deployment, board: int, image: Image) -> Memory:
+    parameters, select = image.machine.parameters, deployment.prior_select
+    if select is not None:
+        what = (
+            f"P(S | {select.name}): address = the value of {select.name}; the top one is the prior without it"
+        )
+    elif parameters.prior_mode is PriorMode.WRITTEN:
+        what = "P(S), until the host writes another"
+    else:
+        what = "P(S)"
+    return _codes(prior_name(board), f"prior elements, {what}", image, image.machine.prior)
+
+
+def _columns(deployment: Deployment, board: int, image: Image) -> Iterator[Memory]:
+    sensors = len(image.machine.tables)
+    for column, (variable, table) in enumerate(
+        zip(deployment.sensors, image.machine.tables, strict=True), start=1
+    ):
+        what = (
+            f"column {column}, tiles, P({variable.name} | S): address = the value of {variable.name}, {variable.values} "
+            "are served; the top one is a missing reading"
+        )
+        yield _codes(column_name(board, column, sensors), what, image, table)
+
+
+def _codes(name: str, what: str, image: Image, codes: NDArray[np.uint16]) -> Memory:
+    bits, part = image.machine.parameters.prob_bits, image.partition
+    lines = codes.shape[1]
+    return Memory(
+        name=name,
+        width=lines * bits,
+        depth=len(codes),
+        words=lambda: packed_words(codes, bits),
+        comments=(
+            what,
+            (
+                f"a word is the codes, {bits} bits each, of lines {part.line_offset} to {part.line_offset + lines - 1}, "
+                "the first in the lowest bits"
+            ),
+        ),
+    )
+
+
+def _seeds(machine: BM1Machine, prefix: str) -> list[Memory]:
+    parameters = machine.parameters
+    if parameters.rng is RngKind.IDEAL:
+        return []
+    return [
+        Memory(
+            name=f"{prefix}rng_seeds.mif",
+            width=seed_width(machine),
+            depth=parameters.rng_banks * generators(parameters),
+            words=lambda: (int(word) for word in seed_words(machine).ravel()),
+            comments=(
+                f"where the generators ({parameters.rng}) start",
+                f"address = bank * {parameters.columns} + column"
+                if parameters.shared
+                else f"address = (bank * {parameters.lines} + line of the board) * {parameters.columns} + column",
+            ),
+        )
+    ]
+
+
+def generators(parameters: BM1Parameters) -> int:
+    """Return how many generators a board has: one a column, or one a cell."""
+    return parameters.columns * (1 if parameters.shared else parameters.lines)
+
+
+def _rng_table(table: NDArray[np.uint32], prob_bits: int) -> Memory:
+    mask = (1 << prob_bits) - 1
+    return Memory(
+        name="rng_table.mif",
+        width=prob_bits,
+        depth=table.size,
+        words=lambda: (int(number) & mask for number in table),
+        comments=("the random numbers that all generators play in a ring",),
+    )

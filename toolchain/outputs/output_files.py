@@ -1,0 +1,198 @@
+"""Files that follow from a deployment, written together, with a word about each: unchanged, changed, new, removed."""
+
+from __future__ import annotations
+
+import filecmp
+import re
+from contextlib import suppress
+from dataclasses import dataclass
+from enum import StrEnum
+from functools import partial
+from itertools import zip_longest
+from typing import TYPE_CHECKING, Final
+
+from machines.parameters import RngKind
+from pcie_shim.programming_file import image_bytes
+from toolchain.errors import BuildError
+from toolchain.outputs.memories import FOLDER as MEMORIES_FOLDER
+from toolchain.outputs.memories import memories
+from toolchain.outputs.quartus import PROJECT, project_files
+from toolchain.outputs.vhdl_parameters import FILE as PARAMETERS_FILE
+from toolchain.outputs.vhdl_parameters import parameters_vhd
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator, Sequence
+    from pathlib import Path
+
+    from pcie_shim.programming_file import Image
+    from toolchain.deployment import Deployment
+    from toolchain.outputs.memories import Memory
+
+
+class Change(StrEnum):
+    """What writing did to a file."""
+
+    UNCHANGED = "unchanged"
+    CHANGED = "changed"
+    NEW = "new"
+    REMOVED = "removed"
+
+
+@dataclass(frozen=True, slots=True)
+class OutputFiles:
+    """A part of a deployment: all its files, and how to know one that is left from an earlier build.
+
+    Attributes:
+        contents: By path from the deployment's folder, what to write, in pieces.
+        own: Paths that are this part's: those of them that are not in `contents` are removed.
+    """
+
+    contents: dict[str, Callable[[], Iterable[bytes]]]
+    own: re.Pattern[str]
+
+
+_MEMORIES: Final = re.compile(
+    rf"{re.escape(PARAMETERS_FILE)}|{re.escape(MEMORIES_FOLDER)}/(board\d+_(prior|column\d+|rng_seeds)|rng_(seeds|table))\.mif"
+)
+_COMMENT: Final = re.compile(rb"(--|#).*", re.DOTALL)
+_LONGEST_LINE: Final = 1 << 20
+_IMAGES: Final = re.compile(r"boards/board\d+\.bm")
+_PROJECT: Final = re.compile(rf"{PROJECT}\.(qpf|tcl)|{PROJECT}_board\d+\.qsf")
+
+
+def memory_files(deployment: Deployment, images: Sequence[Image]) -> OutputFiles:
+    """Return `bm1_parameters.vhd` and the MIFs (thesis 3.2)."""
+    contents: dict[str, Callable[[], Iterable[bytes]]] = {
+        PARAMETERS_FILE: lambda: [parameters_vhd(deployment, images).encode()]
+    }
+    for memory in memories(deployment, images):
+        contents[f"{MEMORIES_FOLDER}/{memory.name}"] = partial(_encoded, memory)
+    return OutputFiles(contents, _MEMORIES)
+
+
+def quartus_files(deployment: Deployment, images: Sequence[Image]) -> OutputFiles:
+    """Return the Quartus project; none for generators that exist emulated only."""
+    if deployment.machine.rng is RngKind.IDEAL:
+        return OutputFiles({}, _PROJECT)
+    mifs = [f"{MEMORIES_FOLDER}/{memory.name}" for memory in memories(deployment, images)]
+    contents: dict[str, Callable[[], Iterable[bytes]]] = {}
+    for name, text in project_files(deployment, mifs).items():
+        contents[name] = partial(iter, [text.encode()])
+    return OutputFiles(contents, _PROJECT)
+
+
+def image_files(deployment: Deployment, images: Sequence[Image]) -> OutputFiles:
+    """Return the boards' programming files."""
+    contents: dict[str, Callable[[], Iterable[bytes]]] = {
+        board.image: partial(_image, image) for board, image in zip(deployment.boards, images, strict=True)
+    }
+    return OutputFiles(contents, _IMAGES)
+
+
+def text_file(name: str, text: str) -> OutputFiles:
+    """Return one file of text."""
+    return OutputFiles({name: partial(iter, [text.encode()])}, re.compile(re.escape(name)))
+
+
+def write_files(directory: Path, files: OutputFiles) -> list[tuple[str, Change]]:
+    """Write a part of a deployment into its folder, each file whole or not at all.
+
+    Returns:
+        Every path from the folder, sorted, and what happened to it.
+
+    Raises:
+        BuildError: The folder can't be written.
+    """
+    changes: dict[str, Change] = {}
+    for name, pieces in files.contents.items():
+        changes[name] = _write(directory / name, pieces)
+    for name in _existing(directory, files.own):
+        if name not in files.contents:
+            _remove(directory / name)
+            changes[name] = Change.REMOVED
+    return sorted(changes.items())
+
+
+def compare_files(directory: Path, files: OutputFiles) -> list[tuple[str, Change]]:
+    """Return what `write_files` would do, without doing it; files that differ in comments alone are unchanged."""
+    changes: dict[str, Change] = {}
+    for name, pieces in files.contents.items():
+        path = directory / name
+        if not path.is_file():
+            changes[name] = Change.NEW
+        else:
+            changes[name] = Change.UNCHANGED if _says_the_same(path, pieces()) else Change.CHANGED
+    for name in _existing(directory, files.own):
+        if name not in files.contents:
+            changes[name] = Change.REMOVED
+    return sorted(changes.items())
+
+
+def _existing(directory: Path, own: re.Pattern[str]) -> list[str]:
+    folders = [
+        directory,
+        directory / "boards",
+        directory / PARAMETERS_FILE.partition("/")[0],
+        directory / MEMORIES_FOLDER,
+    ]
+    names = [
+        path.relative_to(directory).as_posix()
+        for folder in folders
+        if folder.is_dir()
+        for path in folder.iterdir()
+    ]
+    return sorted(name for name in names if own.fullmatch(name))
+
+
+def _write(path: Path, pieces: Callable[[], Iterable[bytes]]) -> Change:
+    part = path.with_name(path.name + ".part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with part.open("wb") as file:
+            file.writelines(pieces())
+        there = path.is_file()
+        if there and filecmp.cmp(path, part, shallow=False):
+            part.unlink()
+            return Change.UNCHANGED
+        part.replace(path)
+    except OSError as reason:
+        with suppress(OSError):
+            part.unlink(missing_ok=True)
+        raise _not_writable(path, reason) from None
+    return Change.CHANGED if there else Change.NEW
+
+
+def _remove(path: Path) -> None:
+    try:
+        path.unlink()
+    except OSError as reason:
+        raise _not_writable(path, reason) from None
+
+
+def _says_the_same(path: Path, pieces: Iterable[bytes]) -> bool:
+    """Compare a file with what it should be, line by line but for comments and empty lines."""
+    expected = (line for piece in pieces for line in piece.splitlines())
+    try:
+        with path.open("rb") as file:
+            # a line that is much too long is read in parts, which then differ from what they should be
+            found = iter(partial(file.readline, _LONGEST_LINE), b"")
+            pairs = zip_longest(filter(None, map(_plain, found)), filter(None, map(_plain, expected)))
+            return all(one == other for one, other in pairs)
+    except OSError:
+        return False
+
+
+def _plain(line: bytes) -> bytes:
+    return _COMMENT.sub(b"", line).strip()
+
+
+def _encoded(memory: Memory) -> Iterator[bytes]:
+    return (line.encode() for line in memory.lines())
+
+
+def _image(image: Image) -> Iterator[bytes]:
+    yield image_bytes(image)
+
+
+def _not_writable(path: Path, reason: OSError) -> BuildError:
+    return BuildError(f"{path} can't be written: {reason.strerror or reason}")

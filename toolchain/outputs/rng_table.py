@@ -1,0 +1,46 @@
+"""The table of random numbers that `rng = table` plays (thesis 3.2): made here, or read from a MIF of the user's."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from machines.rng import GOLDEN, mix
+from toolchain.errors import BuildError
+from toolchain.outputs.mif import read_mif
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+LENGTH: Final = 1 << 16
+"""Numbers of a table that is made here: a multiple of every number of codes."""
+
+
+def random_table(prob_bits: int) -> NDArray[np.uint32]:
+    """Return numbers of `prob_bits` bits in a random order, uint32[65536], each equally often.
+
+    So every code's probability is exact over the ring's length. The order is that of splitmix64's numbers: always
+    the same.
+    """
+    keys = mix(np.arange(1, LENGTH + 1, dtype=np.uint64) * np.uint64(GOLDEN))
+    numbers: NDArray[np.uint32] = (np.argsort(keys, kind="stable") % (1 << prob_bits)).astype(np.uint32)
+    return numbers
+
+
+def read_table(path: Path) -> NDArray[np.uint32]:
+    """Return the random numbers in a user's MIF, uint32[length].
+
+    Raises:
+        MifError: The file can't be read, or is no MIF.
+        BuildError: Its words have more than 32 bits.
+    """
+    mif = read_mif(path)
+    if mif.width > 32:
+        message = (
+            f"{path} has words of {mif.width} bits; expected random numbers of at most 32, the codes' or more"
+        )
+        raise BuildError(message)
+    return np.array(mif.words, dtype=np.uint32)

@@ -1,0 +1,190 @@
+"""`bm1_parameters.vhd`: all that the machine's VHDL must know of a model, in one package (thesis 3.2)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from machines.parameters import BM1Parameters, PriorMode, RngKind, RngReset
+from machines.rng import POLYNOMIALS
+from toolchain.outputs.memories import column_name, generators, seed_width, seed_words
+from toolchain.outputs.mif import printable
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    from pcie_shim.programming_file import Image
+    from toolchain.deployment import Deployment
+
+FILE: Final = "bm_arch/bm1_parameters.vhd"
+
+_MOST_SEEDS: Final = 4096
+"""More are in the memory file alone."""
+
+_TYPES: Final = """\
+  type rng_kind_t is (RNG_LFSR8, RNG_LFSR16, RNG_LFSR24, RNG_LFSR32, RNG_TABLE, RNG_IDEAL);
+  type natural_array_t is array (natural range <>) of natural;
+
+  -- Lines of the model that a board holds, and what identifies its image.
+  type partition_t is record
+    lines       : positive;
+    line_offset : natural;
+    image_hash  : std_logic_vector(255 downto 0);
+  end record partition_t;
+  type partition_array_t is array (natural range <>) of partition_t;
+"""
+
+
+def parameters_vhd(deployment: Deployment, images: Sequence[Image]) -> str:
+    """Return the text of the package: VHDL-2008, printable ASCII, the same bytes for the same machine."""
+    image = images[0]
+    parameters = image.machine.parameters
+    return "".join(
+        [
+            _head(deployment),
+            "library ieee;\nuse ieee.std_logic_1164.all;\n\npackage bm1_parameters is\n\n",
+            _TYPES,
+            _section("The matrix: column 0 is the prior, columns 1 to SENSORS the known variables"),
+            _constant("LINES", "positive", deployment.machine.lines, "of the whole model"),
+            _constant("SENSORS", "natural", parameters.sensors),
+            _constant("COLUMNS", "positive", parameters.columns),
+            _sensor_widths(deployment, parameters),
+            _section("Resolutions, in bits"),
+            _constant("PROB_BITS", "positive", parameters.prob_bits, "of a code in the probability tables"),
+            _constant("PRIOR_BITS", "natural", parameters.prior_bits, "of the prior's address; 0: one row"),
+            _constant("COUNTER_BITS", "positive", parameters.counter_bits),
+            _section("The prior"),
+            _flag("PRIOR_WRITTEN", parameters.prior_mode is PriorMode.WRITTEN, "the host writes it"),
+            _generators(parameters),
+            _seeds(image),
+            _section("When a machine stops, until the host writes other values"),
+            _constant("TARGET_COUNT", _vector(32), _hexadecimal(deployment.machine.target_count, 32)),
+            _constant("MAX_CYCLES", _vector(64), _hexadecimal(deployment.machine.max_cycles, 64)),
+            _section("The PCIe interface"),
+            _constant("INTERFACE_SENSORS", "positive", image.interface_sensors, "inputs"),
+            _constant("INTERFACE_RESULTS", "positive", image.interface_results, "outputs"),
+            _constant("MAP_HASH", _vector(256), _hexadecimal(int(image.map_hash, 16), 256)),
+            _section("The boards, and which lines each one holds"),
+            _constant("BOARDS", "positive", len(images)),
+            _constant("MODEL_HASH", _vector(256), _hexadecimal(int(image.model_hash, 16), 256)),
+            _partitions(images),
+            _memory_files(images),
+            "\nend package bm1_parameters;\n",
+        ]
+    )
+
+
+def _head(deployment: Deployment) -> str:
+    searched = ", ".join(f"{dimension.label} ({dimension.size})" for dimension in deployment.searched)
+    return (
+        f"-- Parameters of the Bayesian machine of the model {printable(deployment.name)}, VHDL-2008.\n"
+        f"-- It searches {printable(searched)}; the first is the slowest in the lines' order.\n"
+        "-- Written by 'toolchain build', and again by 'toolchain regenerate memories'; not to be edited.\n\n"
+    )
+
+
+def _section(title: str) -> str:
+    return f"\n  -- {title}.\n"
+
+
+def _constant(name: str, kind: str, value: object, comment: str = "") -> str:
+    note = f"  -- {comment}" if comment else ""
+    return f"  constant {name:17} : {kind} := {value};{note}\n"
+
+
+def _flag(name: str, value: bool, comment: str) -> str:
+    return _constant(name, "boolean", str(value).lower(), comment)
+
+
+def _vector(bits: int) -> str:
+    return f"std_logic_vector({bits - 1} downto 0)"
+
+
+def _hexadecimal(value: int, bits: int) -> str:
+    """Return a bit string literal: hexadecimal where the digits fit, else binary."""
+    return f'x"{value:0{bits // 4}X}"' if bits % 4 == 0 else f'"{value:0{bits}b}"'
+
+
+def _array(name: str, kind: str, rows: Iterable[tuple[int, str, str]], range_: str) -> str:
+    """Return an array constant with a row a line: index, value, comment."""
+    listed = list(rows)
+    if not listed:
+        return f"  constant {name:17} : {kind}({range_}) := (others => 0);\n"
+    lines = [
+        f"    {index} => {value}{',' if place < len(listed) - 1 else ''}{f'  -- {comment}' if comment else ''}\n"
+        for place, (index, value, comment) in enumerate(listed)
+    ]
+    return f"  constant {name:17} : {kind}({range_}) := (\n{''.join(lines)}  );\n"
+
+
+def _sensor_widths(deployment: Deployment, parameters: BM1Parameters) -> str:
+    rows = [
+        (column, str(bits), f"{printable(variable.name)}, {variable.values} values")
+        for column, (bits, variable) in enumerate(
+            zip(parameters.sensor_bits, deployment.sensors, strict=True), start=1
+        )
+    ]
+    title = "\n  -- Address bits of every column; its top address is a missing reading.\n"
+    return title + _array("SENSOR_BITS", "natural_array_t", rows, f"1 to {parameters.sensors}")
+
+
+def _generators(parameters: BM1Parameters) -> str:
+    exponents = POLYNOMIALS.get(parameters.rng)
+    text = _section("The random number generators") + _constant(
+        "RNG_KIND", "rng_kind_t", f"RNG_{parameters.rng.upper()}"
+    )
+    if exponents is not None:
+        taps = sum(1 << (exponent - 1) for exponent in exponents)
+        polynomial = " + ".join(f"x^{exponent}" for exponent in exponents) + " + 1"
+        text += _constant("RNG_BITS", "positive", exponents[0], "of a generator's state")
+        text += _constant("RNG_TAPS", _vector(exponents[0]), _hexadecimal(taps, exponents[0]), polynomial)
+    return (
+        text
+        + _flag("RNG_SHARED", parameters.shared, "one a column, shared by its lines; else one a cell")
+        + _constant("STEPS_PER_CLOCK", "positive", parameters.steps_per_clock)
+        + _flag("RNG_RESET_BANK", parameters.rng_reset is RngReset.BANK, "a frame restarts the generators")
+        + _constant("RNG_BANKS", "positive", parameters.rng_banks, "sets of seeds")
+    )
+
+
+def _seeds(image: Image) -> str:
+    parameters = image.machine.parameters
+    if parameters.rng is RngKind.IDEAL:
+        return "\n  -- RNG_IDEAL exists emulated only: there are no seeds.\n"
+    width = seed_width(image.machine)
+    text = "\n" + _constant("SEED_BITS", "positive", width)
+    if not parameters.shared or parameters.rng_banks * generators(parameters) > _MOST_SEEDS:
+        return text + "  -- The seeds are in Memory_MIFs alone, since they are many.\n"
+    kind = f"  type seed_array_t is array (natural range <>, natural range <>) of {_vector(width)};\n"
+    rows = [
+        f"    {bank} => ({', '.join(f'{column} => {_hexadecimal(int(seed), width)}' for column, seed in enumerate(row))})"
+        for bank, row in enumerate(seed_words(image.machine))
+    ]
+    bounds = f"0 to {parameters.rng_banks - 1}, 0 to {parameters.columns - 1}"
+    return (
+        f"{text}  -- By bank and column, as in Memory_MIFs/rng_seeds.mif.\n{kind}"
+        f"  constant RNG_SEEDS         : seed_array_t({bounds}) := (\n" + ",\n".join(rows) + "\n  );\n"
+    )
+
+
+def _partitions(images: Sequence[Image]) -> str:
+    rows = [
+        (
+            board,
+            (
+                f"(lines => {image.machine.parameters.lines}, line_offset => {image.partition.line_offset}, "
+                f"image_hash => {_hexadecimal(int(image.image_hash, 16), 256)})"
+            ),
+            "",
+        )
+        for board, image in enumerate(images)
+    ]
+    return _array("PARTITIONS", "partition_array_t", rows, f"0 to {len(images) - 1}")
+
+
+def _memory_files(images: Sequence[Image]) -> str:
+    sensors = images[0].machine.parameters.sensors
+    columns = f", board<b>_{column_name(0, sensors, sensors).removeprefix('board0_')}" if sensors else ""
+    seeds = "rng_seeds.mif" if images[0].machine.parameters.shared else "board<b>_rng_seeds.mif"
+    return (
+        f"\n  -- Contents of the memories, in Memory_MIFs: board<b>_prior.mif{columns} and so on, {seeds}.\n"
+    )
