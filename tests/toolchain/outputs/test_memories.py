@@ -300,7 +300,7 @@ ELSEWHERE = """
 import sys
 from dataclasses import replace
 from pathlib import Path
-from tests.toolchain.test_memories import OPTIONS, model
+from tests.toolchain.outputs.test_memories import OPTIONS, model
 from toolchain.build import build_deployment
 build_deployment(model(), Path(sys.argv[1]), replace(OPTIONS, partitions=2, build_date="2020-02-02T02:02:02Z"))
 """
