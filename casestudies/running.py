@@ -12,6 +12,7 @@ import uvloop
 
 from bridge.errors import BridgeError
 from casestudies.errors import CaseStudyError
+from toolchain.commands.usage import CommandLine
 
 _ENDING_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -21,16 +22,7 @@ def say(sentence: str) -> None:
     print(sentence, file=sys.stderr, flush=True)
 
 
-def make_app() -> typer.Typer:
-    """A command line without typer's own tracebacks."""
-    return typer.Typer(
-        pretty_exceptions_enable=False,
-        rich_markup_mode="markdown",
-        context_settings={"help_option_names": ["-h", "--help"]},
-    )
-
-
-def command(app: typer.Typer) -> None:
+def command(app: CommandLine) -> None:
     """Run a command line as a process of its own: what `main()` of each case study's module does.
 
     SIGINT ends it with 130, SIGTERM with 143 and a closed terminal with 129, whatever it is doing.

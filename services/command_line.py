@@ -17,6 +17,7 @@ import uvloop
 from services.errors import ExitCode, ReportedError, StoppedError, exit_code_of
 from services.logs import say
 from services.supervision import PARENT_VARIABLE
+from toolchain.commands.usage import CommandLine
 
 Parameters = ParamSpec("Parameters")
 
@@ -27,15 +28,9 @@ _SIGNALS = {
 }
 
 
-def make_app(help_text: str) -> typer.Typer:
-    """A command's typer application, without tracebacks of typer's own."""
-    return typer.Typer(
-        help=help_text,
-        add_completion=True,
-        pretty_exceptions_enable=False,
-        rich_markup_mode="markdown",
-        context_settings={"help_option_names": ["-h", "--help"]},
-    )
+def make_app(help_text: str) -> CommandLine:
+    """A command's typer application."""
+    return CommandLine(help=help_text)
 
 
 def ends_well(command: Callable[Parameters, int | None]) -> Callable[Parameters, None]:

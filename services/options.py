@@ -26,16 +26,22 @@ Listen = Annotated[
     ),
 ]
 RosVersion = Annotated[
-    str | None, typer.Option("--ros-version", help="How stamps and types are written: auto, 1 or 2.")
+    str | None,
+    typer.Option("--ros-version", help="How stamps and types are written.", metavar="auto|1|2"),
 ]
 Queue = Annotated[
     str | None,
     typer.Option(
-        "--queue", help="What waits while a frame is computed: latest, or all (in order, 256 deep)."
+        "--queue",
+        help="What waits while a frame is computed: latest, or all (in order, 256 deep).",
+        metavar="latest|all",
     ),
 ]
 Stop = Annotated[
-    str | None, typer.Option("--stop", help="When boards stop: slices (together) or own (each by itself).")
+    str | None,
+    typer.Option(
+        "--stop", help="When boards stop: slices (together) or own (each by itself).", metavar="slices|own"
+    ),
 ]
 Boards = Annotated[
     str | None,
@@ -63,6 +69,10 @@ StopTimeout = Annotated[
 ]
 LogLevel = Annotated[
     str | None,
-    typer.Option("--log-level", help="What is logged: info, warning, or debug (a line for every frame)."),
+    typer.Option(
+        "--log-level",
+        help="What is logged: info, warning, or debug (a line for every frame).",
+        metavar="info|warning|debug",
+    ),
 ]
 Count = Annotated[int | None, typer.Option("--count", "-n", min=1, help="End after this many.")]

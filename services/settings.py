@@ -117,7 +117,7 @@ def load_settings(**flags: Any) -> Settings:
             if name in given
             else f"environment variable {ENV_PREFIX}{name.upper()}"
         )
-        reason = str(first["msg"]).removeprefix("Value error, ")
+        reason = str(first["msg"]).removeprefix("Value error, ").replace("Input should be", "expected", 1)
         msg = f"{where}: {reason} (got {first.get('input')!r})"
         raise SettingsError(msg) from error
     if "uri" in flags and settings.uri is not None and settings.uri.startswith("robot:"):

@@ -11,16 +11,12 @@ import typer
 from machines.parameters import PriorMode, RngKind, RngReset
 from toolchain.commands import design, flags, regenerate
 from toolchain.commands.refusals import one_sentence
+from toolchain.commands.usage import CommandLine
 from toolchain.deployment import Queue, Stop
 from toolchain.learning.fit_options import FitMethod, FitOptions, FitPrior
 from toolchain.options import BuildOptions, OnMissing, Scale, SensorMode
 
-app = typer.Typer(
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    rich_markup_mode="markdown",
-    context_settings={"help_option_names": ["-h", "--help"]},
-)
+app = CommandLine(no_args_is_help=True)
 
 
 app.add_typer(regenerate.app, name="regenerate")
@@ -243,7 +239,7 @@ def fit(
     ],
     recordings: Annotated[
         list[Path],
-        typer.Argument(help="CSV, MCAP or bag, with readings and the truth.", metavar="RECORDING..."),
+        typer.Argument(help="CSV, MCAP or bag, with readings and the truth.", metavar="RECORDING"),
     ],
     output: Annotated[
         Path,

@@ -19,7 +19,8 @@ from casestudies.boat.messages import (
     read_raw,
     readings_message,
 )
-from casestudies.running import command, make_app, run, say
+from casestudies.running import command, run, say
+from toolchain.commands.usage import CommandLine
 
 
 def normalise_distance(raw: float) -> int:
@@ -69,7 +70,7 @@ async def serve(uri: str, *, raw_topic: str, sensors_topic: str, array: bool) ->
                 readiness.did()
 
 
-app = make_app()
+app = CommandLine()
 
 
 @app.command(epilog="Example: `boat-normaliser --uri ws://127.0.0.1:9090`")

@@ -27,7 +27,8 @@ from casestudies.boat.messages import (
     readings_message,
     true_pose,
 )
-from casestudies.running import command, make_app, run, say
+from casestudies.running import command, run, say
+from toolchain.commands.usage import CommandLine
 
 _SHORE = 2.0  # waypoints keep this far from the map's edge
 _SEEDS = 1_000_000
@@ -131,7 +132,7 @@ async def simulate(
             await asyncio.sleep(begin + step / rate - time.monotonic())
 
 
-app = make_app()
+app = CommandLine()
 
 
 @app.command(epilog="Example: `boat-simulator --uri ws://127.0.0.1:9090 --seed 7 --rate 10`")

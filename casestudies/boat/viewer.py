@@ -15,7 +15,8 @@ import typer
 from bridge.errors import NoResultError
 from casestudies.boat.messages import TRUE_POSE_TOPIC
 from casestudies.errors import CaseStudyError, OutputError
-from casestudies.running import command, fail, make_app, run, say
+from casestudies.running import command, fail, run, say
+from toolchain.commands.usage import CommandLine
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
@@ -282,7 +283,7 @@ def _results(number: int) -> str:
     return "1 result" if number == 1 else f"{number} results"
 
 
-app = make_app()
+app = CommandLine()
 
 
 @app.command(epilog="Example: `boat-viewer --uri ws://127.0.0.1:9090 --count 25 --out out`")

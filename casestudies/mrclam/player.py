@@ -27,7 +27,8 @@ from casestudies.mrclam.recording import (
     read_recording,
     sightings_message,
 )
-from casestudies.running import command, fail, make_app, run, say
+from casestudies.running import command, fail, run, say
+from toolchain.commands.usage import CommandLine
 
 if TYPE_CHECKING:
     from bridge.client import Publication
@@ -218,7 +219,7 @@ def _write_numbers(path: Path, played: Sequence[PlayedFrame]) -> None:
         raise OutputError(f"{path} cannot be written: {error.strerror or error}") from None
 
 
-app = make_app()
+app = CommandLine()
 
 
 @app.command(epilog="Example: `python -m casestudies.mrclam.player data/ds1_robot3.csv --count 20`")

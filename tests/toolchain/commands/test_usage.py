@@ -1,0 +1,119 @@
+"""Mistakes in a command line: one sentence that says what, where, what was expected, and where to read on."""
+
+import importlib
+import sys
+from enum import StrEnum
+from typing import Annotated
+
+import pytest
+import typer
+
+from toolchain.commands.usage import CommandLine
+
+
+class Colour(StrEnum):
+    RED = "red"
+    BLUE = "blue"
+
+
+def make_app():
+    app = CommandLine(no_args_is_help=True)
+
+    @app.callback()
+    def top():
+        """Several commands."""
+
+    @app.command()
+    def paint(
+        wall: Annotated[str, typer.Argument(help="The wall to paint.")],
+        colour: Annotated[Colour, typer.Option("--colour", "-c", help="Its colour.")] = Colour.RED,
+        coats: Annotated[int, typer.Option(min=1, max=9)] = 1,
+        thickness: Annotated[float, typer.Option(min=0.1)] = 1.0,
+        *,
+        dry: Annotated[bool, typer.Option("--dry")] = False,
+    ):
+        print("painted", wall, colour, coats, thickness, dry)
+        raise typer.Exit(7)
+
+    return app
+
+
+def run(capsys, *arguments):
+    """(exit code, stdout, stderr)"""
+    with pytest.raises(SystemExit) as ended:
+        make_app()(list(arguments))
+    out, err = capsys.readouterr()
+    return ended.value.code, out, err
+
+
+@pytest.fixture(autouse=True)
+def called_painter(monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["/usr/bin/painter"])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["paint", "w", "--colour", "green"], "--colour green: expected red or blue; painter paint --help"),
+        (["paint", "w", "-c", "green"], "--colour green: expected red or blue;"),
+        (["paint", "w", "--coats", "x"], "--coats x: expected a whole number from 1 to 9;"),
+        (["paint", "w", "--coats", "10"], "--coats 10: expected a whole number from 1 to 9;"),
+        (["paint", "w", "--coats", "1.5"], "--coats 1.5: expected a whole number from 1 to 9;"),
+        (["paint", "w", "--thickness", "nan"], "--thickness nan: expected a number from 0.1;"),
+        (["paint", "w", "--coats", "\x1b[1m"], r"--coats '\x1b[1m': expected a whole number"),
+        (["paint"], "WALL is missing: the wall to paint;"),
+        (["paint", "w", "--colou", "red"], "painter paint has no --colou (did you mean --colour?);"),
+        (["paint", "w", "--coats"], "--coats needs a value;"),
+        (["paint", "w", "--dry=1"], "--dry takes no value;"),
+        (["paint", "a", "b"], "painter paint: got unexpected extra argument(s) (b);"),
+        (["pant"], "painter: no such command 'pant'. Did you mean 'paint'?; painter --help says more"),
+    ],
+)
+def test_a_mistake_is_one_sentence(capsys, arguments, sentence):
+    code, out, err = run(capsys, *arguments)
+    assert (code, out) == (2, "")
+    assert err.startswith(f"error: {sentence}")
+    assert err.endswith(" --help says more\n")
+    assert err.count("\n") == 1
+
+
+def test_what_is_right_runs_and_its_exit_code_counts(capsys):
+    assert run(capsys, "paint", "w", "--coats", "2") == (7, "painted w red 2 1.0 False\n", "")
+
+
+def test_help_says_what_flags_take(capsys):
+    code, out, _ = run(capsys, "paint", "-h")
+    assert code == 0
+    assert "red|blue" in out
+    assert "NUMBER [1<=x<=9]" in out
+    assert "WALL" in out
+    assert "<" not in out.replace("<=", "")
+
+
+def test_no_command_is_answered_with_help(capsys):
+    code, out, err = run(capsys)
+    assert code == 2
+    assert "paint" in out + err
+    assert "error" not in out + err
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *(
+            f"services.{name}"
+            for name in ("master", "subscriber", "publisher", "pcie_app", "board", "loader")
+        ),
+        *(f"services.{name}" for name in ("hub", "discover", "listen", "status")),
+        *(f"casestudies.boat.{name}" for name in ("simulator", "normaliser", "viewer")),
+        "casestudies.mrclam.player",
+        "toolchain.command",
+    ],
+)
+def test_every_command_has_it(capsys, name):
+    app = importlib.import_module(name).app
+    assert isinstance(app, CommandLine)
+    with pytest.raises(SystemExit) as ended:
+        app(["--qqq"])
+    assert ended.value.code == 2
+    assert capsys.readouterr().err == "error: painter has no --qqq; painter --help says more\n"
