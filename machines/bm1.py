@@ -1,5 +1,6 @@
 """A BM1 as data: its tables, what a frame starts with, why it stopped, and what every kernel can do."""
 
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final, Protocol, TypeVar
@@ -7,8 +8,8 @@ from typing import Final, Protocol, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from machines.errors import ParameterError, StartError
-from machines.parameters import BM1Parameters, PriorMode, RngKind
+from machines.errors import MachineError, ParameterError, StartError
+from machines.parameters import BM1Parameters, PriorMode, RngKind, SensorMode
 
 CYCLES_MAX: Final = 2**63 - 1
 """Highest `max_cycles` and `run_until`: both are 64-bit registers that a signed number must hold."""
@@ -25,7 +26,7 @@ class BM1Machine:
         prior: uint16[2**prior_bits, lines], the prior's codes; its row 0 is also what a written prior is
             until the host writes one.
         tables: One uint16[2**sensor_bits, lines] per sensor column; the top row is all-ones codes (a
-            missing reading).
+            missing reading). None of them where `sensor_mode` is `threshold`.
         rng_table: uint32[length], the numbers that all columns play where `rng` is `table`; else None.
 
     Raises:
@@ -40,7 +41,12 @@ class BM1Machine:
     def __post_init__(self) -> None:
         """Check shapes and codes, and keep copies that nobody can write to."""
         parameters = self.parameters
-        if len(self.tables) != parameters.sensors:
+        if not parameters.has_tables and self.tables:
+            raise ParameterError(
+                f"There are {len(self.tables)} sensor tables; with sensor_mode = threshold cells are given codes, "
+                "so there must be none."
+            )
+        if parameters.has_tables and len(self.tables) != parameters.sensors:
             raise ParameterError(
                 f"There are {len(self.tables)} sensor tables; "
                 f"these parameters have {parameters.sensors} sensor columns."
@@ -50,7 +56,7 @@ class BM1Machine:
         )
         tables = []
         for column, (table, bits) in enumerate(
-            zip(self.tables, parameters.sensor_bits, strict=True), start=1
+            zip(self.tables, parameters.sensor_bits, strict=parameters.has_tables), start=1
         ):
             name = f"The table of column {column}"
             codes = _codes(name, table, (1 << bits, parameters.lines), parameters)
@@ -117,9 +123,12 @@ class Start:
 
     Attributes:
         addresses: One address per sensor column, columns 1..N; a missing reading is the column's top address.
-        prior_address: Row of the prior's table.
-        prior_codes: uint16[lines], a written prior (`prior_mode` = `written` only); None leaves the
-            table's row.
+            Where cells have inputs of their own, or there are replicas: an array of integers of the shape
+            `parameters.input_shape`, addresses or (`threshold`) codes; all lines of a missing reading have the
+            top value.
+        prior_address: Row of the prior's table; with replicas one row for all, or a tuple of one each.
+        prior_codes: uint16[lines], a written prior (`prior_mode` = `written` only); with replicas the same for all,
+            or uint16[replicas, lines]. None leaves the table's row.
         target_count: The count at which a line stops the machine, 1 to 2**counter_bits - 1.
         max_cycles: The frame's last cycle, 1 or more.
         bank: Set of seeds that the generators restart from (`rng_reset` = `bank`); without effect where
@@ -127,8 +136,8 @@ class Start:
         run_until: Cycle at which the first slice ends; 0 for no slices.
     """
 
-    addresses: tuple[int, ...]
-    prior_address: int = 0
+    addresses: tuple[int, ...] | npt.NDArray[np.integer]
+    prior_address: int | tuple[int, ...] = 0
     prior_codes: npt.NDArray[np.uint16] | None = None
     target_count: int
     max_cycles: int
@@ -137,7 +146,7 @@ class Start:
 
 
 class BM1Kernel(Protocol):
-    """A machine that runs: the same to the bit, whichever kernel it is."""
+    """A machine, or replicas of one that share their generators: the same to the bit, whichever kernel runs them."""
 
     @property
     def machine(self) -> BM1Machine:
@@ -145,15 +154,23 @@ class BM1Kernel(Protocol):
 
     @property
     def counts(self) -> npt.NDArray[np.uint32]:
-        """uint32[lines]: the counters as they stand, a copy."""
+        """uint32[lines], with replicas uint32[replicas, lines]: the counters as they stand, a copy."""
 
     @property
     def cycles(self) -> int:
-        """Cycles run in this frame."""
+        """Cycles run in this frame; with replicas those of the one that ran longest, which the generators stepped."""
 
     @property
     def reason(self) -> StopReason:
-        """Why the machine stands still."""
+        """Why the machine stands still; with replicas what `joint_reason` makes of theirs."""
+
+    @property
+    def replica_cycles(self) -> tuple[int, ...]:
+        """Cycles that each replica ran in this frame; one machine is one replica."""
+
+    @property
+    def replica_reasons(self) -> tuple[StopReason, ...]:
+        """Why each replica stands still."""
 
     @property
     def rng_state(self) -> npt.NDArray[np.uint64]:
@@ -169,12 +186,17 @@ class BM1Kernel(Protocol):
             StartError: The start asks for what the machine does not have; nothing has changed then.
         """
 
-    def resume(self, run_until: int) -> StopReason:
+    def resume(self, run_until: int, halted: Collection[int] = ()) -> StopReason:
         """Run the next slice of the same frame, to cycle `run_until` at most; 0 for no further slices.
 
+        Args:
+            run_until: Where the slice ends.
+            halted: Numbers of replicas that are left where they stand, for the rest of the frame: they keep the
+                reason `SLICE`.
+
         Raises:
-            StartError: The frame is over or there is none, or `run_until` is no later cycle; nothing has
-                changed then.
+            StartError: The frame is over or there is none, or `run_until` is no later cycle, or no replica is left
+                that could go on; nothing has changed then.
         """
 
     def prepare(self) -> None:
@@ -184,6 +206,30 @@ class BM1Kernel(Protocol):
         """Counters and cycles to 0, reason `NONE`, generators to the start of bank 0."""
 
 
+def check_one_machine(machine: BM1Machine) -> None:
+    """Refuse replicas where a kernel runs one machine.
+
+    Raises:
+        MachineError: Says how many there are, and which kernel to use.
+    """
+    if machine.parameters.replicas != 1:
+        raise MachineError(
+            f"This kernel runs one machine; there are {machine.parameters.replicas} replicas: use make_kernel."
+        )
+
+
+def joint_reason(reasons: Sequence[StopReason], halted: Collection[int] = ()) -> StopReason:
+    """Why several replicas stand still together.
+
+    It is `SLICE` while one of them can go on, which a halted one can't; else the first of `OVERFLOW`, `MAX_CYCLES` and
+    `IMPOSSIBLE` that one of them has.
+    """
+    if any(reason is StopReason.SLICE and at not in halted for at, reason in enumerate(reasons)):
+        return StopReason.SLICE
+    order = (StopReason.OVERFLOW, StopReason.MAX_CYCLES, StopReason.IMPOSSIBLE)
+    return next((reason for reason in order if reason in reasons), StopReason.NONE)
+
+
 def check_start(machine: BM1Machine, start: Start) -> None:
     """Refuse a start that asks for what the machine does not have.
 
@@ -191,18 +237,34 @@ def check_start(machine: BM1Machine, start: Start) -> None:
         StartError: Says which part, and what it may be.
     """
     parameters = machine.parameters
-    if len(start.addresses) != parameters.sensors:
-        raise StartError(
-            f"There are {len(start.addresses)} addresses; "
-            f"this machine has {parameters.sensors} sensor columns."
-        )
-    for column, (address, bits) in enumerate(
-        zip(start.addresses, parameters.sensor_bits, strict=True), start=1
-    ):
-        # said in full only of what is refused: this is done for every frame
-        if type(address) is not int or not 0 <= address < 1 << bits:
-            _check(f"The address of column {column}", address, 0, (1 << bits) - 1)
-    _check("prior_address", start.prior_address, 0, parameters.prior_addresses - 1)
+    if parameters.replicas > 1 or parameters.sensor_mode is not SensorMode.COLUMN:
+        _check_inputs(parameters, start.addresses)
+    else:
+        if len(start.addresses) != parameters.sensors:
+            raise StartError(
+                f"There are {len(start.addresses)} addresses; "
+                f"this machine has {parameters.sensors} sensor columns."
+            )
+        for column, (address, bits) in enumerate(
+            zip(start.addresses, parameters.sensor_bits, strict=True), start=1
+        ):
+            # said in full only of what is refused: this is done for every frame
+            if type(address) is not int or not 0 <= address < 1 << bits:
+                _check(f"The address of column {column}", address, 0, (1 << bits) - 1)
+    if isinstance(start.prior_address, tuple):
+        if parameters.replicas == 1 or len(start.prior_address) != parameters.replicas:
+            raise StartError(
+                f"There are {len(start.prior_address)} prior addresses; this machine takes one"
+                + (
+                    "."
+                    if parameters.replicas == 1
+                    else f", or one for each of its {parameters.replicas} replicas."
+                )
+            )
+        for replica, address in enumerate(start.prior_address):
+            _check(f"prior_address of replica {replica}", address, 0, parameters.prior_addresses - 1)
+    else:
+        _check("prior_address", start.prior_address, 0, parameters.prior_addresses - 1)
     _check("target_count", start.target_count, 1, parameters.target_count_max)
     _check("max_cycles", start.max_cycles, 1, CYCLES_MAX)
     _check("bank", start.bank, 0, parameters.rng_banks - 1)
@@ -212,19 +274,30 @@ def check_start(machine: BM1Machine, start: Start) -> None:
             raise StartError(
                 "The start brings prior codes, but this machine's prior is a table (prior_mode = table)."
             )
+        shape = np.shape(start.prior_codes) if parameters.replicas > 1 else ()
+        shape = shape if shape == parameters.count_shape else (parameters.lines,)
         try:
-            _codes("The written prior", start.prior_codes, (parameters.lines,), parameters)
+            _codes("The written prior", start.prior_codes, shape, parameters)
         except ParameterError as error:
             raise StartError(str(error)) from None
 
 
-def check_resume(reason: StopReason, cycles: int, run_until: int) -> None:
+def check_resume(
+    reason: StopReason, cycles: int, run_until: int, halted: Collection[int] = (), replicas: int = 1
+) -> None:
     """Refuse a resume of a frame that is over (or is not there), or one that ends at no later cycle.
 
     Raises:
         StartError: Says which.
     """
+    if halted and (replicas == 1 or not all(0 <= at < replicas for at in halted)):
+        raise StartError(
+            f"Replicas {', '.join(map(str, sorted(halted)))} are to be halted; "
+            + (f"this machine's are 0 to {replicas - 1}." if replicas > 1 else "this machine has only one.")
+        )
     if reason is not StopReason.SLICE:
+        if halted:
+            raise StartError("There is no slice to resume: no replica is left that could go on.")
         raise StartError(
             f"There is no slice to resume: the machine stands still with reason {reason.name.lower()}."
         )
@@ -233,12 +306,60 @@ def check_resume(reason: StopReason, cycles: int, run_until: int) -> None:
 
 
 def addressed_codes(machine: BM1Machine, start: Start) -> npt.NDArray[np.uint16]:
-    """The codes that a valid start's addresses select: uint16[columns, lines], row 0 the prior's."""
+    """The codes that a valid start's inputs select: uint16[columns, lines], row 0 the prior's; replicas before these."""
+    if machine.parameters.replicas > 1 or machine.parameters.sensor_mode is not SensorMode.COLUMN:
+        return _codes_of_inputs(machine, start)
     codes = np.empty((machine.parameters.columns, machine.parameters.lines), dtype=np.uint16)
     codes[0] = machine.prior[start.prior_address] if start.prior_codes is None else start.prior_codes
     for column, (table, address) in enumerate(zip(machine.tables, start.addresses, strict=True), start=1):
         codes[column] = table[address]
     return codes
+
+
+def _codes_of_inputs(machine: BM1Machine, start: Start) -> npt.NDArray[np.uint16]:
+    """The codes that are selected where an input is not simply a column's: as `addressed_codes`."""
+    parameters = machine.parameters
+    codes = np.empty((parameters.replicas, parameters.columns, parameters.lines), dtype=np.uint16)
+    if start.prior_codes is None:
+        rows = np.broadcast_to(np.asarray(start.prior_address), (parameters.replicas,))
+        codes[:, 0] = machine.prior[rows]
+    else:
+        codes[:, 0] = start.prior_codes
+    if not parameters.sensors:
+        return codes if parameters.replicas > 1 else codes[0]
+    inputs = np.asarray(start.addresses).reshape(parameters.replicas, parameters.sensors, -1)
+    if not parameters.has_tables:
+        codes[:, 1:] = inputs
+    lines = np.arange(parameters.lines)
+    for column, table in enumerate(machine.tables):
+        codes[:, column + 1] = (
+            table[inputs[:, column, 0]]
+            if parameters.sensor_mode is SensorMode.COLUMN
+            else table[inputs[:, column], lines]
+        )
+    return codes if parameters.replicas > 1 else codes[0]
+
+
+def _check_inputs(parameters: BM1Parameters, given: tuple[int, ...] | npt.NDArray[np.integer]) -> None:
+    """Refuse inputs of another shape than the machine's, and values that its columns do not have."""
+    inputs, shape = np.asarray(given), parameters.input_shape
+    if inputs.size == 0 and not parameters.sensors:
+        return
+    if inputs.shape != shape:
+        raise StartError(f"The inputs have the shape {inputs.shape}; this machine takes {shape}.")
+    if inputs.dtype.kind not in "ui":
+        raise StartError(f"The inputs are {inputs.dtype}; they must be integers.")
+    by_column = inputs.reshape(parameters.replicas, parameters.sensors, -1)
+    tops = (1 << np.array(parameters.sensor_bits, dtype=np.int64)) - 1
+    wrong = np.argwhere((by_column < 0) | (by_column > tops[:, np.newaxis]))
+    if len(wrong):
+        replica, column, line = (int(at) for at in wrong[0])
+        name = "The code" if not parameters.has_tables else "The address"
+        where = f" at line {line}" if parameters.sensor_mode is not SensorMode.COLUMN else ""
+        where += f" of replica {replica}" if parameters.replicas > 1 else ""
+        _check(
+            f"{name} of column {column + 1}{where}", by_column[replica, column, line], 0, int(tops[column])
+        )
 
 
 def _codes(

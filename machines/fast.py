@@ -10,7 +10,7 @@ Where frames restart from a bank, the words of a frame's first cycles are consta
 were needed once are kept, and a later frame from that bank finds them ready.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from functools import cache
 from typing import Any, Final, NamedTuple, TypeVar, cast
 
@@ -21,7 +21,16 @@ from numba import njit, types
 from numba.core import cgutils as untyped_cgutils
 from numba.extending import intrinsic
 
-from machines.bm1 import BM1Machine, Start, StopReason, addressed_codes, check_resume, check_start
+from machines.bm1 import (
+    BM1Machine,
+    Start,
+    StopReason,
+    addressed_codes,
+    check_one_machine,
+    check_resume,
+    check_start,
+    joint_reason,
+)
 from machines.errors import MachineError
 from machines.parameters import BM1Parameters, PriorMode, RngKind, RngReset
 from machines.rng import LFSR, LFSRNumbers, Words, apply_map, jump_tables
@@ -39,6 +48,7 @@ _WORD_BITS: Final = 64
 _BLOCK_WORDS: Final = 8  # one register of AVX-512, two of AVX2, four of NEON
 _BLOCK_CYCLES: Final = _WORD_BITS * _BLOCK_WORDS
 _NO_ROW: Final = -1
+_LIVE, _USED, _CYCLES, _OVERFLOWED = range(4)  # in a replica's outcome
 _NO_CYCLE: Final = cast(
     "int", np.int64(0)
 )  # a plain 0 is a type of its own to numba: it would compile `_run` twice
@@ -88,6 +98,22 @@ class _Frame(NamedTuple):
     mask: Words  # [_BLOCK_WORDS]: the cycles of a block that are run
 
 
+class _Replicas(NamedTuple):
+    """What the frames of all replicas use: `_Frame`'s arrays, one for each replica but for the working space."""
+
+    lines: npt.NDArray[np.int64]  # [replicas, lines]
+    places: npt.NDArray[np.uint32]  # [replicas, lines, columns]
+    widths: npt.NDArray[np.int64]  # [replicas, lines]
+    counts: npt.NDArray[np.int64]  # [replicas, lines]
+    added: npt.NDArray[np.int64]  # [lines]
+    used: npt.NDArray[np.int64]  # [replicas, rows]
+    starts: Words  # [columns]
+    states: Words  # [columns]
+    inverted: Words  # [columns, prob_bits, _BLOCK_WORDS]
+    mask: Words  # [_BLOCK_WORDS]
+    outcome: npt.NDArray[np.int64]  # [replicas, 4]: live lines, rows used, cycles, whether one overflowed
+
+
 class FastBM1:
     """A machine (`machines.bm1.BM1Kernel`) with shared LFSRs that runs many cycles at a time (thesis 2.1.2).
 
@@ -96,16 +122,13 @@ class FastBM1:
         kept_bytes: Most memory for kept words; 0 keeps none.
 
     Raises:
-        MachineError: The machine's generators are no LFSRs, or are not shared.
+        MachineError: The machine's generators are no LFSRs, or are not shared, or it has replicas.
     """
 
     def __init__(self, machine: BM1Machine, *, kept_bytes: int = KEPT_BYTES) -> None:
+        check_one_machine(machine)
+        _check_generators(machine)
         parameters = machine.parameters
-        if not parameters.shared or parameters.rng.lfsr_bits is None:
-            raise MachineError(
-                f"The fast kernel runs shared LFSRs only; this machine has rng = {parameters.rng}, "
-                f"shared = {str(parameters.shared).lower()}: use the reference."
-            )
         self._machine = machine
         self._period = LFSR(parameters.rng).period
         self._random_numbers = LFSRNumbers(parameters)
@@ -116,7 +139,10 @@ class FastBM1:
         )
         occurring = _occurring_codes(machine)
         self._kept_blocks = _kept_blocks(parameters, int(occurring.sum()), kept_bytes)
-        self._store = _store(parameters, occurring, self._kept_blocks)
+        if self._kept_blocks:
+            self._store = _store_of_codes(occurring, parameters.rng_banks * self._kept_blocks)
+        else:
+            self._store = _store_of_frame(occurring, parameters.lines * parameters.columns, 0)
         self._frame = _frame(parameters, len(self._store.row_code))
         self._frames = 0
         self._live = 0
@@ -147,6 +173,16 @@ class FastBM1:
     def reason(self) -> StopReason:
         """Why the machine stands still."""
         return self._reason
+
+    @property
+    def replica_cycles(self) -> tuple[int, ...]:
+        """The only one's."""
+        return (self._cycles,)
+
+    @property
+    def replica_reasons(self) -> tuple[StopReason, ...]:
+        """The only one's."""
+        return (self._reason,)
 
     @property
     def rng_state(self) -> npt.NDArray[np.uint64]:
@@ -213,14 +249,14 @@ class FastBM1:
         self._reason = StopReason.IMPOSSIBLE if self._live == 0 else self._why_stopped(overflow)
         return self._reason
 
-    def resume(self, run_until: int) -> StopReason:
+    def resume(self, run_until: int, halted: Collection[int] = ()) -> StopReason:
         """Run the next slice of the same frame, to cycle `run_until` at most; 0 for no further slices.
 
         Raises:
             StartError: The frame is over or there is none, or `run_until` is no later cycle; nothing has
                 changed then.
         """
-        check_resume(self._reason, self._cycles, run_until)
+        check_resume(self._reason, self._cycles, run_until, halted)
         self._cycles, overflow = _run(
             self._generators,
             self._store,
@@ -255,6 +291,208 @@ class FastBM1:
         return StopReason.MAX_CYCLES if self._cycles == self._max_cycles else StopReason.SLICE
 
 
+class FastReplicas:
+    """Replicas of a machine (`machines.bm1.BM1Kernel`) with shared LFSRs, many cycles at a time (thesis 4.4).
+
+    A cell's bits depend on its column, its code and the cycle, not on the replica. So each replica is run to its own
+    end, one after the other, and what one has needed of the streams the next ones find ready.
+
+    Args:
+        machine: What to run.
+        kept_bytes: Most memory for kept words; 0 keeps none.
+
+    Raises:
+        MachineError: The machine's generators are no LFSRs, or are not shared.
+    """
+
+    def __init__(self, machine: BM1Machine, *, kept_bytes: int = KEPT_BYTES) -> None:
+        _check_generators(machine)
+        parameters = machine.parameters
+        self._machine = machine
+        self._period = LFSR(parameters.rng).period
+        self._random_numbers = LFSRNumbers(parameters)
+        self._bank_starts: dict[int, Words] = {}
+        self._generators = _Generators(
+            jumps=jump_tables(parameters.rng, parameters.steps_per_clock).copy(),
+            bits=_bit_tables(parameters.rng, parameters.steps_per_clock, parameters.prob_bits).copy(),
+        )
+        occurring = _occurring_codes(machine)
+        rows = int(occurring.sum())
+        self._kept_blocks = _kept_blocks(parameters, rows, kept_bytes)
+        # Where a bank's words cannot be kept from frame to frame, the replicas still share the frame's.
+        self._of_frame = self._kept_blocks == 0
+        if self._of_frame:
+            cells = parameters.replicas * parameters.lines * parameters.columns
+            self._kept_blocks = _blocks_in(kept_bytes, min(rows, cells))
+            self._store = _store_of_frame(occurring, cells, self._kept_blocks)
+        else:
+            self._store = _store_of_codes(occurring, parameters.rng_banks * self._kept_blocks)
+        self._replicas = _replicas(parameters, len(self._store.row_code))
+        self._frames = 0
+        self._rows = 0
+        self._first_slot = 0
+        self._target_count = 1
+        self._max_cycles = 1
+        self.reset()
+
+    @property
+    def machine(self) -> BM1Machine:
+        """The machine that this kernel runs."""
+        return self._machine
+
+    @property
+    def counts(self) -> npt.NDArray[np.uint32]:
+        """uint32[lines], or uint32[replicas, lines]: the counters as they stand, a copy."""
+        parameters = self._machine.parameters
+        counts = np.zeros((parameters.replicas, parameters.lines), dtype=np.uint32)
+        _copy_counts(self._replicas, counts)
+        return counts.reshape(parameters.count_shape)
+
+    @property
+    def cycles(self) -> int:
+        """Cycles that the replica ran that ran longest."""
+        return int(self._replicas.outcome[:, _CYCLES].max())
+
+    @property
+    def reason(self) -> StopReason:
+        """Why the board stands still."""
+        return joint_reason(self._reasons, self._halted)
+
+    @property
+    def replica_cycles(self) -> tuple[int, ...]:
+        """Cycles that each replica ran."""
+        return tuple(self._replicas.outcome[:, _CYCLES].tolist())
+
+    @property
+    def replica_reasons(self) -> tuple[StopReason, ...]:
+        """Why each replica stands still."""
+        return tuple(self._reasons)
+
+    @property
+    def rng_state(self) -> npt.NDArray[np.uint64]:
+        """uint64[columns]: the generators' states, a copy."""
+        states = np.empty_like(self._replicas.starts)
+        _jump(self._generators.jumps, self._replicas.starts, self.cycles % self._period, states)
+        return states
+
+    @property
+    def kept_cycles(self) -> int:
+        """How many of a frame's first cycles, of every bank, have their words kept for the frames that follow."""
+        return 0 if self._of_frame else self._kept_blocks * _BLOCK_CYCLES
+
+    def prepare(self) -> None:
+        """Make the words of every bank's first `PREPARED_CYCLES` cycles that are kept: a tenth of a second at most."""
+        blocks = 0 if self._of_frame else min(self._kept_blocks, PREPARED_CYCLES // _BLOCK_CYCLES)
+        for bank in range(self._machine.parameters.rng_banks if blocks else 0):
+            self._restart(bank)
+            first = _first_frame(self._replicas)
+            _fill_blocks(self._generators, self._store, first, self._first_slot, blocks, self._period)
+        self.reset()
+
+    def reset(self) -> None:
+        """Counters and cycles to 0, reasons `NONE`, generators to the start of bank 0."""
+        self._forget_words()
+        self._replicas.outcome[:] = 0
+        self._reasons = [StopReason.NONE] * self._machine.parameters.replicas
+        self._halted: set[int] = set()
+        self._restart(0)
+
+    def start(self, start: Start) -> StopReason:
+        """Run a new frame to its end, or to the end of its first slice.
+
+        Raises:
+            StartError: The start asks for what the machine does not have; nothing has changed then.
+        """
+        check_start(self._machine, start)
+        parameters = self._machine.parameters
+        states = self.rng_state if parameters.rng_reset is RngReset.FREE else None
+        self._forget_words()
+        if states is None:
+            self._restart(int(start.bank))
+        else:
+            self._replicas.starts[:] = states
+        self._target_count = int(start.target_count)
+        self._max_cycles = int(start.max_cycles)
+        codes = addressed_codes(self._machine, start)
+        self._rows = _begin_replicas(
+            codes.reshape(parameters.replicas, parameters.columns, parameters.lines),
+            parameters.ones_code,
+            self._generators,
+            self._store,
+            self._replicas,
+            self._frames + 1,
+            self._limit(int(start.run_until)),
+            self._target_count,
+            self._first_slot,
+            self._kept_blocks,
+            self._period,
+            self._of_frame,
+        )
+        self._frames += parameters.replicas
+        self._halted = set()
+        self._reasons = [self._why_stopped(*row) for row in self._replicas.outcome.tolist()]
+        return self.reason
+
+    def resume(self, run_until: int, halted: Collection[int] = ()) -> StopReason:
+        """Run the next slice of the same frame, to cycle `run_until` at most; 0 for no further slices.
+
+        Raises:
+            StartError: The frame is over or there is none, or `run_until` is no later cycle, or no replica is left
+                that could go on; nothing has changed then.
+        """
+        halts = self._halted | set(halted)
+        reason = joint_reason(self._reasons, halts)
+        check_resume(reason, self.cycles, run_until, halted, len(self._reasons))
+        self._halted = halts
+        going = np.array(
+            [at for at, reason in enumerate(self._reasons) if reason is StopReason.SLICE and at not in halts],
+            dtype=np.int64,
+        )
+        _resume_replicas(
+            self._generators,
+            self._store,
+            self._replicas,
+            going,
+            self._limit(int(run_until)),
+            self._target_count,
+            self._first_slot,
+            self._kept_blocks,
+            self._period,
+        )
+        for at in going.tolist():
+            self._reasons[at] = self._why_stopped(*self._replicas.outcome[at].tolist())
+        return self.reason
+
+    def _forget_words(self) -> None:
+        """Take back the rows that the last frame was given; bank's words stay."""
+        if not self._of_frame or not self._rows:
+            return
+        given = self._store.row_column[: self._rows], self._store.row_code[: self._rows]
+        self._store.row_of_code[given] = _NO_ROW
+        blocks = min(-(-self.cycles // _BLOCK_CYCLES), self._kept_blocks)
+        self._store.filled[:blocks, : self._rows] = False
+        self._rows = 0
+
+    def _restart(self, bank: int) -> None:
+        """Put the generators to the start of a bank."""
+        starts = self._bank_starts.get(bank)
+        if starts is None:
+            starts = self._bank_starts[bank] = self._random_numbers.restart(bank)
+        self._replicas.starts[:] = starts
+        self._first_slot = 0 if self._of_frame else bank * self._kept_blocks
+
+    def _limit(self, run_until: int) -> int:
+        """The cycle at which a slice ends."""
+        return min(run_until, self._max_cycles) if run_until else self._max_cycles
+
+    def _why_stopped(self, live: int, _used: int, cycles: int, overflow: int) -> StopReason:
+        if live == 0:
+            return StopReason.IMPOSSIBLE
+        if overflow:
+            return StopReason.OVERFLOW
+        return StopReason.MAX_CYCLES if cycles == self._max_cycles else StopReason.SLICE
+
+
 def warm_up() -> None:
     """Compile, or load from the cache, all that runs in machine code: some 5 s the first time, then 0.2 s."""
     parameters = BM1Parameters(lines=1, sensor_bits=(), rng=RngKind.LFSR16)
@@ -271,34 +509,62 @@ def _occurring_codes(machine: BM1Machine) -> npt.NDArray[np.bool_]:
     occurring = np.zeros((parameters.columns, 1 << parameters.prob_bits), dtype=np.bool_)
     if parameters.prior_mode is PriorMode.WRITTEN:
         occurring[0] = True
+    if not parameters.has_tables:
+        occurring[1:] = True
     for column, table in enumerate((machine.prior, *machine.tables)):
         occurring[column, table.ravel()] = True
     occurring[:, [0, parameters.ones_code]] = False
     return occurring
 
 
+def _check_generators(machine: BM1Machine) -> None:
+    """Refuse generators that the fast kernels do not know."""
+    parameters = machine.parameters
+    if not parameters.shared or parameters.rng.lfsr_bits is None:
+        raise MachineError(
+            f"The fast kernel runs shared LFSRs only; this machine has rng = {parameters.rng}, "
+            f"shared = {str(parameters.shared).lower()}: use the reference."
+        )
+
+
 def _kept_blocks(parameters: BM1Parameters, rows: int, kept_bytes: int) -> int:
     """How many blocks of every bank fit into the memory for kept words."""
     if parameters.rng_reset is RngReset.FREE:
         return 0  # a frame's states are not a bank's, and hardly ever come again
+    return _blocks_in(kept_bytes, rows * parameters.rng_banks)
+
+
+def _blocks_in(kept_bytes: int, rows: int) -> int:
+    """How many blocks of so many rows fit into a memory."""
     block_bytes = max(rows, 1) * (_BLOCK_WORDS * _WORD_BITS // 8 + 1)
-    return min(kept_bytes // (block_bytes * parameters.rng_banks), KEPT_CYCLES // _BLOCK_CYCLES)
+    return min(kept_bytes // block_bytes, KEPT_CYCLES // _BLOCK_CYCLES)
 
 
-def _store(parameters: BM1Parameters, occurring: npt.NDArray[np.bool_], kept_blocks: int) -> _Store:
-    """The memory for words, none of them there yet."""
-    slots = parameters.rng_banks * kept_blocks + 1
+def _store_of_codes(occurring: npt.NDArray[np.bool_], slots: int) -> _Store:
+    """The memory for words of all codes that may occur, none of them there yet."""
     row_of_code = np.full(occurring.shape, _NO_ROW, dtype=np.int32)
-    if kept_blocks:
-        row_column, row_code = np.nonzero(occurring)
-        row_of_code[occurring] = np.arange(len(row_code), dtype=np.int32)
-    else:
-        rows = min(int(occurring.sum()), parameters.lines * parameters.columns)
-        row_column = row_code = np.zeros(rows, dtype=np.int64)
+    row_column, row_code = np.nonzero(occurring)
+    row_of_code[occurring] = np.arange(len(row_code), dtype=np.int32)
+    return _store(row_of_code, row_column, row_code, slots)
+
+
+def _store_of_frame(occurring: npt.NDArray[np.bool_], cells: int, slots: int) -> _Store:
+    """The memory for words of the codes that a frame of so many cells uses: rows are given out as it begins."""
+    none = np.zeros(min(int(occurring.sum()), cells), dtype=np.int64)
+    return _store(np.full(occurring.shape, _NO_ROW, dtype=np.int32), none, none, slots)
+
+
+def _store(
+    row_of_code: npt.NDArray[np.int32],
+    row_column: npt.NDArray[np.int64],
+    row_code: npt.NDArray[np.int64],
+    slots: int,
+) -> _Store:
+    """The memory for words in so many slots, and one for scratch."""
     rows = len(row_code)
     return _Store(
-        words=_aligned((slots, rows * _BLOCK_WORDS)),
-        filled=np.zeros((slots, rows), dtype=np.uint8),
+        words=_aligned((slots + 1, rows * _BLOCK_WORDS)),
+        filled=np.zeros((slots + 1, rows), dtype=np.uint8),
         row_column=row_column.astype(np.int64),
         row_code=row_code.astype(np.int64),
         row_of_code=row_of_code,
@@ -329,6 +595,40 @@ def _frame(parameters: BM1Parameters, rows: int) -> _Frame:
         states=np.zeros(columns, dtype=np.uint64),
         inverted=np.zeros((columns, parameters.prob_bits, _BLOCK_WORDS), dtype=np.uint64),
         mask=np.zeros(_BLOCK_WORDS, dtype=np.uint64),
+    )
+
+
+def _replicas(parameters: BM1Parameters, rows: int) -> _Replicas:
+    """The memory for the frames of all replicas."""
+    replicas, lines, columns = parameters.replicas, parameters.lines, parameters.columns
+    return _Replicas(
+        lines=np.zeros((replicas, lines), dtype=np.int64),
+        places=np.zeros((replicas, lines, columns), dtype=np.uint32),
+        widths=np.zeros((replicas, lines), dtype=np.int64),
+        counts=np.zeros((replicas, lines), dtype=np.int64),
+        added=np.zeros(lines, dtype=np.int64),
+        used=np.zeros((replicas, min(rows, lines * columns)), dtype=np.int64),
+        starts=np.zeros(columns, dtype=np.uint64),
+        states=np.zeros(columns, dtype=np.uint64),
+        inverted=np.zeros((columns, parameters.prob_bits, _BLOCK_WORDS), dtype=np.uint64),
+        mask=np.zeros(_BLOCK_WORDS, dtype=np.uint64),
+        outcome=np.zeros((replicas, 4), dtype=np.int64),
+    )
+
+
+def _first_frame(replicas: _Replicas) -> _Frame:
+    """The first replica's frame, for what needs any."""
+    return _Frame(
+        lines=replicas.lines[0],
+        places=replicas.places[0],
+        widths=replicas.widths[0],
+        counts=replicas.counts[0],
+        added=replicas.added,
+        used=replicas.used[0],
+        starts=replicas.starts,
+        states=replicas.states,
+        inverted=replicas.inverted,
+        mask=replicas.mask,
     )
 
 
@@ -474,11 +774,18 @@ def _jump(jumps: Words, states: Words, clocks: int, later: Words) -> None:
 
 @_jit
 def _select(
-    codes: npt.NDArray[np.uint16], ones: int, store: _Store, frame: _Frame, frame_number: int, new_rows: bool
-) -> tuple[int, int]:
+    codes: npt.NDArray[np.uint16],
+    ones: int,
+    store: _Store,
+    frame: _Frame,
+    frame_number: int,
+    new_rows: bool,
+    rows: int,
+) -> tuple[int, int, int]:
     """Find the lines that can count and the rows that each ANDs, and put their counters to 0.
 
-    Returns the numbers of such lines and of rows in use. `new_rows` gives codes rows as they come.
+    Returns the numbers of such lines, of rows in use and of rows given out. `new_rows` gives codes rows as they come,
+    from `rows` on.
     """
     columns, lines = codes.shape
     live = 0
@@ -496,7 +803,8 @@ def _select(
                 continue
             row = int(store.row_of_code[column, code])
             if new_rows and row == _NO_ROW:
-                row = used
+                row = rows
+                rows += 1
                 store.row_of_code[column, code] = row
                 store.row_column[row] = column
                 store.row_code[row] = code
@@ -510,7 +818,7 @@ def _select(
         frame.lines[live] = line
         frame.counts[live] = 0
         live += 1
-    return live, used
+    return live, used, rows
 
 
 @_jit
@@ -650,10 +958,119 @@ def _begin(
 
     A frame in which no line can count runs no cycle.
     """
-    live, used = _select(codes, ones, store, frame, frame_number, kept_blocks == 0)
+    live, used, _ = _select(codes, ones, store, frame, frame_number, kept_blocks == 0, _NO_CYCLE)
     if live == 0:
         return live, used, _NO_CYCLE, False
     cycles, overflow = _run(
         generators, store, frame, live, used, _NO_CYCLE, limit, target_count, first_slot, kept_blocks, period
     )
     return live, used, cycles, overflow
+
+
+@_jit
+def _frame_of(replicas: _Replicas, at: int) -> _Frame:
+    """A replica's frame."""
+    return _Frame(
+        replicas.lines[at],
+        replicas.places[at],
+        replicas.widths[at],
+        replicas.counts[at],
+        replicas.added,
+        replicas.used[at],
+        replicas.starts,
+        replicas.states,
+        replicas.inverted,
+        replicas.mask,
+    )
+
+
+@_jit
+def _begin_replicas(
+    codes: npt.NDArray[np.uint16],
+    ones: int,
+    generators: _Generators,
+    store: _Store,
+    replicas: _Replicas,
+    frame_number: int,
+    limit: int,
+    target_count: int,
+    first_slot: int,
+    kept_blocks: int,
+    period: int,
+    new_rows: bool,
+) -> int:
+    """Select every replica's lines and run its first cycles; what became of it is in `outcome`.
+
+    Returns the number of rows given out. All rows are given out before the first block is run: a slot has the words of
+    one and the same row from the first replica to the last.
+    """
+    rows = _NO_CYCLE
+    for at in range(codes.shape[0]):
+        frame = _frame_of(replicas, at)
+        live, used, rows = _select(codes[at], ones, store, frame, frame_number + at, new_rows, rows)
+        replicas.outcome[at, _LIVE] = live
+        replicas.outcome[at, _USED] = used
+        replicas.outcome[at, _CYCLES] = _NO_CYCLE
+        replicas.outcome[at, _OVERFLOWED] = False
+    for at in range(codes.shape[0]):
+        if replicas.outcome[at, _LIVE]:
+            _run_replica(
+                generators, store, replicas, at, limit, target_count, first_slot, kept_blocks, period
+            )
+    return rows
+
+
+@_jit
+def _resume_replicas(
+    generators: _Generators,
+    store: _Store,
+    replicas: _Replicas,
+    going: npt.NDArray[np.int64],
+    limit: int,
+    target_count: int,
+    first_slot: int,
+    kept_blocks: int,
+    period: int,
+) -> None:
+    """Run the replicas that go on, each from where it stands."""
+    for at in going:
+        _run_replica(generators, store, replicas, at, limit, target_count, first_slot, kept_blocks, period)
+
+
+@_jit
+def _run_replica(
+    generators: _Generators,
+    store: _Store,
+    replicas: _Replicas,
+    at: int,
+    limit: int,
+    target_count: int,
+    first_slot: int,
+    kept_blocks: int,
+    period: int,
+) -> None:
+    """Run a replica from its cycle to `limit`, or to its own overflow."""
+    outcome = replicas.outcome[at]
+    cycles, overflow = _run(
+        generators,
+        store,
+        _frame_of(replicas, at),
+        outcome[_LIVE],
+        outcome[_USED],
+        outcome[_CYCLES],
+        limit,
+        target_count,
+        first_slot,
+        kept_blocks,
+        period,
+    )
+    outcome[_CYCLES] = cycles
+    outcome[_OVERFLOWED] = overflow
+
+
+@_jit
+def _copy_counts(replicas: _Replicas, counts: npt.NDArray[np.uint32]) -> None:
+    """Put the counters of the lines that can count where they belong."""
+    for at in range(counts.shape[0]):
+        for i in range(replicas.outcome[at, _LIVE]):
+            counts[at, replicas.lines[at, i]] = replicas.counts[at, i]

@@ -21,6 +21,9 @@ STEPS_PER_CLOCK_MAX: Final = 256
 RNG_BANKS_MAX: Final = 65536
 """Most sets of seeds."""
 
+REPLICAS_MAX: Final = 256
+"""Most machines on a board: the register map has room for the outcomes of so many."""
+
 
 class RngKind(StrEnum):
     """How a column makes its random numbers. `machines.rng` says how each one works."""
@@ -55,6 +58,17 @@ class PriorMode(StrEnum):
     WRITTEN = "written"
 
 
+class SensorMode(StrEnum):
+    """What a sensor column's cells are given (thesis 4.4).
+
+    One address for the whole column, an address for each cell, or (`threshold`) each cell's code itself.
+    """
+
+    COLUMN = "column"
+    CELL = "cell"
+    THRESHOLD = "threshold"
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BM1Parameters:
     """Parameters of a BM1: a matrix of `lines` lines and `sensors` + 1 columns, column 0 being the prior.
@@ -77,6 +91,9 @@ class BM1Parameters:
         rng_banks: Sets of seeds that a start can choose from.
         rng_reset: Whether a start restarts the generators.
         ideal_seed: Seed of the `ideal` generator, 64 bits.
+        sensor_mode: `column`: one address serves a whole sensor column; `cell`: every cell has its own;
+            `threshold`: every cell is given its code, there are no tables, and `sensor_bits` are `prob_bits`.
+        replicas: Machines that share the generators, each with its own inputs, counters, stop and cycles.
 
     Raises:
         ParameterError: No such machine can be built.
@@ -94,12 +111,19 @@ class BM1Parameters:
     rng_banks: int = 16
     rng_reset: RngReset = RngReset.BANK
     ideal_seed: int = 0
+    sensor_mode: SensorMode = SensorMode.COLUMN
+    replicas: int = 1
 
     def __post_init__(self) -> None:
         """Refuse what can't be built, and put the default in the place of `steps_per_clock = 0`."""
         # A plain string from a file is as good as the member it names; everything after this line sees
         # members.
-        for name, kind in (("prior_mode", PriorMode), ("rng", RngKind), ("rng_reset", RngReset)):
+        for name, kind in (
+            ("prior_mode", PriorMode),
+            ("rng", RngKind),
+            ("rng_reset", RngReset),
+            ("sensor_mode", SensorMode),
+        ):
             given = getattr(self, name)
             try:
                 object.__setattr__(self, name, kind(given))
@@ -116,6 +140,14 @@ class BM1Parameters:
         _check("steps_per_clock", self.steps_per_clock, 0, STEPS_PER_CLOCK_MAX)
         _check("rng_banks", self.rng_banks, 1, RNG_BANKS_MAX)
         _check("ideal_seed", self.ideal_seed, 0, 2**64 - 1)
+        _check("replicas", self.replicas, 1, REPLICAS_MAX)
+        if self.sensor_mode is SensorMode.THRESHOLD:
+            for column, bits in enumerate(self.sensor_bits, start=1):
+                if bits != self.prob_bits:
+                    raise ParameterError(
+                        f"sensor_bits of column {column} is {bits} with sensor_mode = threshold; "
+                        f"a cell's input is its code then, so it must be prob_bits = {self.prob_bits}."
+                    )
         if self.prior_mode is PriorMode.WRITTEN and self.prior_bits != 0:
             raise ParameterError(
                 f"prior_bits is {self.prior_bits} with prior_mode = written; "
@@ -141,6 +173,22 @@ class BM1Parameters:
     def columns(self) -> int:
         """Number of columns that make bits: the prior and the sensors (N + 1)."""
         return len(self.sensor_bits) + 1
+
+    @property
+    def has_tables(self) -> bool:
+        """Whether sensor columns hold tables: not where their cells are given codes."""
+        return self.sensor_mode is not SensorMode.THRESHOLD
+
+    @property
+    def input_shape(self) -> tuple[int, ...]:
+        """Shape of a frame's sensor inputs: [sensors], with lines behind it for inputs per cell, replicas before it."""
+        shape = (self.sensors,) if self.sensor_mode is SensorMode.COLUMN else (self.sensors, self.lines)
+        return shape if self.replicas == 1 else (self.replicas, *shape)
+
+    @property
+    def count_shape(self) -> tuple[int, ...]:
+        """Shape of a frame's counts: [lines], or [replicas, lines] where there are several machines."""
+        return (self.lines,) if self.replicas == 1 else (self.replicas, self.lines)
 
     @property
     def prior_addresses(self) -> int:

@@ -1,12 +1,14 @@
 """From counts to probabilities: over all boards of a model, and in one call for a notebook."""
 
 from collections.abc import Sequence
+from typing import TypeAlias, cast
 
 import numpy as np
 import numpy.typing as npt
 
 from machines.bm1 import BM1Machine, Start, StopReason
 from machines.errors import MachineError, NoPosteriorError, StartError
+from machines.parameters import BM1Parameters, SensorMode
 
 
 def joint_posterior(
@@ -63,11 +65,15 @@ def posterior_of_lines(
     return np.divide(joint, total, out=joint) if total > 0 else None
 
 
+Reading: TypeAlias = int | Sequence[int] | npt.NDArray[np.integer] | None
+"""One sensor column's reading: an address, an address or code per line (`sensor_mode`), or None for a missing one."""
+
+
 def posterior(
     machine: BM1Machine,
-    readings: Sequence[int | None],
+    readings: Sequence[Reading] | Sequence[Sequence[Reading]] | npt.NDArray[np.integer],
     *,
-    prior_address: int = 0,
+    prior_address: int | tuple[int, ...] = 0,
     prior_codes: npt.NDArray[np.uint16] | None = None,
     target_count: int = 255,
     max_cycles: int = 2**17,
@@ -77,39 +83,43 @@ def posterior(
 
     Args:
         machine: What to run.
-        readings: One address per sensor column, columns 1..N; None for a missing reading.
-        prior_address: Row of the prior's table.
-        prior_codes: uint16[lines], a written prior, where the machine takes one.
+        readings: One address per sensor column, columns 1..N; None for a missing reading. Where cells have inputs
+            of their own (`sensor_mode`), a column's reading is a row of one address, or one code, per line. With
+            replicas there is one such set of readings for each; integers without a missing reading may be one array of
+            the shape `machine.parameters.input_shape`.
+        prior_address: Row of the prior's table; with replicas one for all, or a tuple of one each.
+        prior_codes: uint16[lines], a written prior, where the machine takes one; with replicas the same for all, or
+            uint16[replicas, lines].
         target_count: The count at which the best line stops the machine.
         max_cycles: The cycle at which it stops at the latest.
         bank: Set of seeds; another one gives another draw of the same distribution.
 
     Returns:
-        float64[lines] with the sum 1.
+        float64[lines] with the sum 1. With replicas float64[replicas, lines], where the row of one that has no
+        posterior is 0.
 
     Raises:
-        NoPosteriorError: No line can count for these readings, or none did before `max_cycles`.
+        NoPosteriorError: No line (of any replica) can count for these readings, or none did before `max_cycles`.
         StartError: A reading or another argument is not what this machine can take.
     """
     from machines.kernel import make_kernel
 
-    if len(readings) != machine.parameters.sensors:
+    parameters = machine.parameters
+    addresses: tuple[int, ...] | npt.NDArray[np.integer]
+    if parameters.replicas == 1 and parameters.sensor_mode is SensorMode.COLUMN:
+        addresses = _addresses(parameters, cast("Sequence[int | None]", readings))
+    elif parameters.replicas == 1:
+        addresses = _inputs(parameters, cast("Sequence[Reading]", readings))
+    elif len(readings) != parameters.replicas:
         raise StartError(
-            f"There are {len(readings)} readings; this machine has {machine.parameters.sensors} sensor columns."
+            f"There are readings of {len(readings)} machines; this machine has {parameters.replicas} replicas."
         )
-    addresses = []
-    for column, reading in enumerate(readings, start=1):
-        missing = machine.parameters.missing_address(column)
-        if reading == missing:
-            raise StartError(
-                f"The reading of column {column} is {reading}, the address that stands for a missing one: "
-                "give None for that."
-            )
-        addresses.append(missing if reading is None else reading)
+    else:
+        addresses = np.stack([_inputs(parameters, cast("Sequence[Reading]", own)) for own in readings])
     kernel = make_kernel(machine)
-    reason = kernel.start(
+    kernel.start(
         Start(
-            addresses=tuple(addresses),
+            addresses=addresses,
             prior_address=prior_address,
             prior_codes=prior_codes,
             target_count=target_count,
@@ -117,12 +127,67 @@ def posterior(
             bank=bank,
         )
     )
-    joint = joint_posterior([kernel.counts], [kernel.cycles])
-    if joint is None:
+    counts = kernel.counts.reshape(parameters.replicas, parameters.lines)
+    joints = [
+        joint_posterior([own], [cycles]) for own, cycles in zip(counts, kernel.replica_cycles, strict=True)
+    ]
+    if all(joint is None for joint in joints):
         cause = (
             "every line has a code 0 among these readings' codes"
-            if reason is StopReason.IMPOSSIBLE
+            if kernel.reason is StopReason.IMPOSSIBLE
             else f"no line counted in {kernel.cycles} cycles"
         )
         raise NoPosteriorError(f"There is no posterior: {cause}.")
-    return joint
+    rows = [np.zeros(parameters.lines) if joint is None else joint for joint in joints]
+    return rows[0] if parameters.replicas == 1 else np.stack(rows)
+
+
+def _addresses(parameters: BM1Parameters, readings: Sequence[int | None]) -> tuple[int, ...]:
+    """One address per column: the top one where a reading is missing."""
+    _check_number(parameters, readings)
+    addresses = []
+    for column, reading in enumerate(readings, start=1):
+        missing = parameters.missing_address(column)
+        if reading == missing:
+            raise _reserved(f"The reading of column {column}", missing)
+        addresses.append(missing if reading is None else reading)
+    return tuple(addresses)
+
+
+def _inputs(parameters: BM1Parameters, readings: Sequence[Reading]) -> npt.NDArray[np.integer]:
+    """The inputs of one machine: int64[sensors], or int64[sensors, lines]."""
+    _check_number(parameters, readings)
+    per_cell = parameters.sensor_mode is not SensorMode.COLUMN
+    shape = (parameters.lines,) if per_cell else ()
+    inputs = np.empty((parameters.sensors, *shape), dtype=np.int64)
+    for column, reading in enumerate(readings, start=1):
+        missing = parameters.missing_address(column)
+        if reading is None:
+            inputs[column - 1] = missing
+            continue
+        try:
+            row = np.asarray(reading)
+        except ValueError:  # rows of different lengths
+            row = np.empty(0, dtype=object)
+        if row.shape != shape or row.dtype.kind not in "ui":
+            wanted = f"{parameters.lines} integers, one per line" if per_cell else "one integer"
+            raise StartError(
+                f"The reading of column {column} has the shape {row.shape} and holds {row.dtype}; "
+                f"this machine takes {wanted}, or None."
+            )
+        # as a code the top value is 1 for certain, like any other probability
+        if parameters.has_tables and (row == missing).any():
+            raise _reserved(f"The reading of column {column}", missing)
+        inputs[column - 1] = row
+    return inputs
+
+
+def _check_number(parameters: BM1Parameters, readings: Sequence[Reading]) -> None:
+    if len(readings) != parameters.sensors:
+        raise StartError(
+            f"There are {len(readings)} readings; this machine has {parameters.sensors} sensor columns."
+        )
+
+
+def _reserved(what: str, missing: int) -> StartError:
+    return StartError(f"{what} is {missing}, the address that stands for a missing one: give None for that.")

@@ -53,6 +53,10 @@ def test_machines_are_equal_by_what_they_hold():
             {"tables": (np.full((2, 3), 255), np.full((4, 3), 254))},
             "The table of column 2 has other codes than all-ones (255) at its top address 3",
         ),
+        (
+            {"sensor_mode": "threshold", "sensor_bits": (8, 8)},
+            "There are 2 sensor tables; with sensor_mode = threshold cells are given codes, so there must be none.",
+        ),
         ({"rng_table": np.arange(5)}, "rng = lfsr32 plays none"),
         ({"rng": RngKind.TABLE}, "needs a table of random numbers"),
         ({"rng": RngKind.TABLE, "rng_table": np.zeros((2, 2), int)}, "has the shape (2, 2)"),

@@ -64,6 +64,13 @@ def test_an_lfsr_must_be_wider_than_a_code(kind, prob_bits):
         ({"prior_bits": -1}, "prior_bits is -1"),
         ({"prior_bits": 1, "prior_mode": "written"}, "a written prior has no address"),
         ({"prior_mode": "guessed"}, "prior_mode is 'guessed'; it must be one of table, written"),
+        ({"sensor_mode": "pixel"}, "sensor_mode is 'pixel'; it must be one of column, cell, threshold"),
+        (
+            {"sensor_mode": "threshold", "sensor_bits": (8, 7)},
+            "is 7 with sensor_mode = threshold; a cell's input is its code then, so it must be prob_bits = 8.",
+        ),
+        ({"replicas": 0}, "replicas is 0; it must be from 1 to 256"),
+        ({"replicas": 257}, "replicas is 257"),
         ({"counter_bits": 33}, "counter_bits is 33; it must be from 1 to 32"),
         ({"steps_per_clock": -1}, "steps_per_clock is -1"),
         ({"steps_per_clock": 257}, "steps_per_clock is 257"),
@@ -92,3 +99,17 @@ def test_names_from_a_file_become_members():
 def test_only_sensor_columns_can_miss_a_reading(column):
     with pytest.raises(ParameterError, match=f"There is no sensor column {column}"):
         BM1Parameters(lines=1, sensor_bits=(2,)).missing_address(column)
+
+
+@pytest.mark.parametrize(
+    ("changes", "inputs", "counts"),
+    [
+        ({}, (2,), (5,)),
+        ({"replicas": 3}, (3, 2), (3, 5)),
+        ({"sensor_mode": "cell"}, (2, 5), (5,)),
+        ({"sensor_mode": "threshold", "prob_bits": 4, "replicas": 3}, (3, 2, 5), (3, 5)),
+    ],
+)
+def test_shapes_of_inputs_and_counts(changes, inputs, counts):
+    parameters = BM1Parameters(lines=5, sensor_bits=(4, 4), **changes)
+    assert (parameters.input_shape, parameters.count_shape) == (inputs, counts)

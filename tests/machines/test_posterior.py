@@ -1,5 +1,7 @@
 """Posteriors from counts, over boards, and in one call."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -8,7 +10,7 @@ from hypothesis import strategies as st
 from machines.bm1 import BM1Machine
 from machines.encode import decode_code
 from machines.errors import MachineError, NoPosteriorError, StartError
-from machines.parameters import BM1Parameters, PriorMode
+from machines.parameters import BM1Parameters, PriorMode, SensorMode
 from machines.posterior import joint_posterior, posterior
 
 
@@ -119,3 +121,100 @@ def test_a_posterior_can_become_the_next_prior(machine):
     codes = np.array([0, 255, 0], dtype=np.uint16)
     assert posterior(written, [0, 0], prior_codes=codes).tolist() == [0, 1, 0]
     assert posterior(written, [0, 0]).tolist() == posterior(machine, [0, 0]).tolist()
+
+
+def of(machine, **parameters):
+    return replace(machine, parameters=replace(machine.parameters, **parameters))
+
+
+def test_replicas_give_a_leading_axis(machine):
+    readings = [(0, 0), (None, 1), (2, None), (None, None)]
+    rows = posterior(of(machine, replicas=4), readings, bank=3)
+    assert rows.shape == (4, 3)
+    for row, reading in zip(rows, readings, strict=True):
+        assert row.tolist() == posterior(machine, reading, bank=3).tolist()
+
+
+def test_replicas_may_be_one_array_and_have_priors_of_their_own(machine):
+    two = of(
+        BM1Machine(
+            replace(machine.parameters, prior_bits=1),
+            np.vstack([machine.prior, [[0, 255, 0]]]),
+            machine.tables,
+        ),
+        replicas=2,
+    )
+    rows = posterior(two, np.array([[0, 0], [0, 0]]), prior_address=(0, 1))
+    assert rows[0].tolist() == posterior(machine, (0, 0)).tolist()
+    assert rows[1].tolist() == [0, 1, 0]
+
+
+def test_a_replica_without_a_posterior_is_zeros_unless_none_has_one(machine):
+    rows = posterior(of(machine, replicas=2), [(1, 0), (0, 0)])
+    assert rows[0].tolist() == [0, 0, 0]
+    assert rows[1].sum() == pytest.approx(1)
+    with pytest.raises(NoPosteriorError, match="every line has a code 0"):
+        posterior(of(machine, replicas=2), [(1, 0), (1, 1)])
+
+
+def test_a_cell_sensor_takes_one_value_per_line(machine):
+    cells = of(machine, sensor_mode=SensorMode.CELL)
+    # line 1 reads other rows than lines 0 and 2
+    mixed = BM1Machine(
+        machine.parameters,
+        machine.prior,
+        tuple(np.vstack([[[table[0, 0], table[2, 1], table[0, 2]]], table[1:]]) for table in machine.tables),
+    )
+    assert posterior(cells, [[0, 2, 0], [0, 2, 0]]).tolist() == posterior(mixed, [0, 0]).tolist()
+    assert posterior(cells, [[0, 0, 0], None]).tolist() == posterior(machine, [0, None]).tolist()
+    both = posterior(of(cells, replicas=2), [[[0, 2, 0], [0, 2, 0]], [np.array([0, 0, 0]), None]])
+    assert both[0].tolist() == posterior(mixed, [0, 0]).tolist()
+    assert both[1].tolist() == posterior(machine, [0, None]).tolist()
+
+
+def test_a_threshold_is_the_code_itself(machine):
+    bare = BM1Machine(
+        BM1Parameters(lines=3, sensor_bits=(8, 8), sensor_mode=SensorMode.THRESHOLD), machine.prior, ()
+    )
+    given = [[255, 128, 32], [64, 128, 255]]
+    assert posterior(bare, given).tolist() == posterior(machine, [0, 0]).tolist()
+    assert posterior(bare, [given[0], None]).tolist() == posterior(machine, [0, None]).tolist()
+
+
+@pytest.mark.parametrize(
+    ("change", "readings", "sentence"),
+    [
+        ({"replicas": 2}, [(0, 0)], "There are readings of 1 machines; this machine has 2 replicas."),
+        ({"replicas": 2}, [(0, 0), (0,)], "There are 1 readings; this machine has 2 sensor columns."),
+        ({"replicas": 2}, [(0, 0), (0, 3)], "The reading of column 2 is 3, the address that stands for"),
+        (
+            {"replicas": 2},
+            [(0, 0), (0, 4)],
+            "The address of column 2 of replica 1 is 4; it must be from 0 to 3.",
+        ),
+        (
+            {"sensor_mode": SensorMode.CELL},
+            [0, 0],
+            "The reading of column 1 has the shape () and holds int64; this machine takes 3 integers, one per line",
+        ),
+        (
+            {"sensor_mode": SensorMode.CELL},
+            [[0, 0, 0], [0, [1], 2]],
+            "The reading of column 2 has the shape (0,) and holds object",
+        ),
+        (
+            {"sensor_mode": SensorMode.CELL},
+            [[0, 0, 0], [0, 3, 0]],
+            "The reading of column 2 is 3, the address",
+        ),
+        (
+            {"sensor_mode": SensorMode.CELL},
+            [[0, 0, 0], [0, 9, 0]],
+            "The address of column 2 at line 1 is 9; it must be from 0 to 3.",
+        ),
+    ],
+)
+def test_what_cells_and_replicas_can_not_take_is_refused(machine, change, readings, sentence):
+    with pytest.raises(StartError) as refusal:
+        posterior(of(machine, **change), readings)
+    assert sentence in str(refusal.value)
