@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Self, TypeVar
 import tomli_w
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from machines.parameters import PriorMode, RngKind, RngReset
+from machines.parameters import COUNTER_BITS_MAX, PriorMode, RngKind, RngReset
 from toolchain.errors import DamagedDeploymentError, DeploymentError, DeploymentVersionError
 from toolchain.toml_file import parse_toml, read_text, validate
 
@@ -50,6 +50,11 @@ def _websocket_uri(uri: str) -> str:
 def _topic(topic: str) -> str:
     if not _TOPIC.fullmatch(topic):
         message = f"{topic!r} is no topic name; expected one like '/boat/sensors'"
+        raise ValueError(message)
+    if not topic.startswith("/"):
+        message = (
+            f"{topic!r} has no slash at its beginning; write '/{topic}', which means the same on every server"
+        )
         raise ValueError(message)
     return topic
 
@@ -213,6 +218,8 @@ class MachineSection(_Section):
                 f"target_count = {self.target_count} does not fit counters of {self.counter_bits} bits; "
                 f"expected 1 to {2**self.counter_bits - 1}"
             )
+            if (enough := self.target_count.bit_length()) <= COUNTER_BITS_MAX:
+                message += f", or counters of {enough} bits (--counter-bits {enough})"
             raise ValueError(message)
         return self
 
@@ -450,7 +457,7 @@ def load_deployment(directory: Path, *, images: bool = True, edited: bool = Fals
     if computed != file.hash and not edited:
         message = (
             f"{path} is not as it was built: its hash is {computed[:16]}, "
-            f"it says {file.hash[:16] or 'nothing'}; only URIs and endpoints may be edited: "
+            f"it says {file.hash[:16] or 'nothing'}; only URIs, endpoints and compression may be edited: "
             "build it again with 'toolchain build', or keep the edit with 'toolchain regenerate deployment'"
         )
         raise DamagedDeploymentError(message)

@@ -19,8 +19,7 @@ from casestudies.boat.geometry import (
     distance_sigma,
 )
 from toolchain.errors import ModelError
-from toolchain.models.conditional import normal, wrapped_normal
-from toolchain.models.model import Known, Model, cell_centres, interval
+from toolchain.models import Known, Model, cell_centres, interval, normal, wrapped_normal
 
 DISTANCE_BITS = 7
 BEARING_BITS = 9

@@ -11,8 +11,7 @@ import numpy as np
 from casestudies.mrclam.landmarks import read_landmarks
 from toolchain.errors import ModelError
 from toolchain.learning.fitted import with_fit
-from toolchain.models.conditional import normal, wrapped_normal
-from toolchain.models.model import Known, Model, cell_centres, interval
+from toolchain.models import Known, Model, cell_centres, interval, normal, wrapped_normal
 
 X_LIMITS = (-2.0, 7.0)
 Y_LIMITS = (-7.0, 7.0)

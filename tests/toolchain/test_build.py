@@ -149,7 +149,10 @@ def test_the_interface_grows_with_the_model_and_says_so(tmp_path):
         ({"prob_bits": 17}, "prob_bits is 17"),
         ({"prob_bits": 8, "rng": RngKind.LFSR8}, "lfsr8 is too narrow"),
         ({"rng_table": np.arange(4, dtype=np.uint32)}, "rng = lfsr32 plays none"),
-        ({"target_count": 256}, "target_count = 256 does not fit counters of 8 bits; expected 1 to 255"),
+        (
+            {"target_count": 256},
+            "target_count = 256 does not fit counters of 8 bits; expected 1 to 255, or counters of 9 bits (--counter-bits 9)",
+        ),
         ({"target_count": 0}, "--target-count is 0, expected greater than or equal to 1"),
         ({"max_cycles": 0}, "--max-cycles is 0"),
         ({"counter_bits": 0}, "counter_bits is 0"),
@@ -158,6 +161,7 @@ def test_the_interface_grows_with_the_model_and_says_so(tmp_path):
         ({"topic": ""}, "--topic: '' is no topic name"),
         ({"type": "Float64"}, "--type: 'Float64' is no message type"),
         ({"output": "/a b"}, "--output: '/a b' is no topic name"),
+        ({"output": "results"}, "--output: 'results' has no slash at its beginning; write '/results'"),
         ({"tolerance_s": -1.0}, "--tolerance is -1.0"),
     ],
 )

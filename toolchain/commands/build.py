@@ -21,7 +21,7 @@ from toolchain.build import (
 )
 from toolchain.deployment import parse_interface
 from toolchain.errors import BuildError
-from toolchain.models.case_study import FILE_NAME, load_model
+from toolchain.models.case_study import load_model, model_path
 from toolchain.networks import is_network, read_network
 from toolchain.outputs.rng_table import read_table
 from toolchain.settings import key_values
@@ -172,7 +172,7 @@ def read_options(options: BuildOptions, unread: Unread) -> BuildOptions:
 
 def model_file(path: Path) -> Path:
     """Return the file that a model is read from: a network's own, or a folder's `model.py`."""
-    return path if is_network(path) else path / FILE_NAME
+    return path if is_network(path) else model_path(path)
 
 
 def read_model(path: Path, question: NetworkQuestion, unread: Unread) -> Model:

@@ -76,7 +76,7 @@ def run_check(
 def _findings(
     path: Path, question: NetworkQuestion, options: BuildOptions, unread: Unread, said: Sequence[str]
 ) -> list[Finding]:
-    if not is_network(path) and not (path / case_study.FILE_NAME).is_file():
+    if not is_network(path) and not case_study.model_path(path).is_file():
         if not (path / FILE_NAME).is_file():
             message = (
                 f"{path} holds neither a model ({case_study.FILE_NAME}) nor a deployment ({FILE_NAME}), and is no "

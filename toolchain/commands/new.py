@@ -32,8 +32,13 @@ def new_model(folder: Path) -> str:
         if (folder / file).exists():
             message = f"{folder / file} is there already; choose another name"
             raise BuildError(message)
+    if not folder.parent.is_dir():
+        message = (
+            f"{folder.parent} is no folder, so {name} can't be made in it: make it first, or correct the path"
+        )
+        raise BuildError(message)
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        folder.mkdir(exist_ok=True)
         for file in _FILES:
             text = files("toolchain.commands").joinpath("template", file + ".txt").read_text(encoding="utf-8")
             (folder / file).write_text(text.replace("NAME", name), encoding="utf-8")

@@ -1,1 +1,60 @@
-"""Models: what is searched, what is known given it, and the exact posterior (thesis 2.1.2, 3.4)."""
+"""Models: what is searched, what is known given it, and the exact posterior (thesis 2.1.2, 3.4).
+
+What a `model.py` is written with can be imported from here; each name is loaded when it is first asked for, so that a
+command's `--help` needs no NumPy.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from toolchain.models.conditional import normal, wrapped_normal
+    from toolchain.models.distribution import conditional_normal, function, potential, table, uniform
+    from toolchain.models.fusion import exact_posterior
+    from toolchain.models.joint import JointDistribution, Question
+    from toolchain.models.model import Known, Model, PriorSelect, cell_centres, dimension, interval
+    from toolchain.models.symbol import IntegerType, IntervalType, LabelType, Symbol
+
+__all__ = [
+    "IntegerType",
+    "IntervalType",
+    "JointDistribution",
+    "Known",
+    "LabelType",
+    "Model",
+    "PriorSelect",
+    "Question",
+    "Symbol",
+    "cell_centres",
+    "conditional_normal",
+    "dimension",
+    "exact_posterior",
+    "function",
+    "interval",
+    "normal",
+    "potential",
+    "table",
+    "uniform",
+    "wrapped_normal",
+]
+
+_HOMES: Final = {
+    "conditional": ("normal", "wrapped_normal"),
+    "distribution": ("conditional_normal", "function", "potential", "table", "uniform"),
+    "fusion": ("exact_posterior",),
+    "joint": ("JointDistribution", "Question"),
+    "model": ("Known", "Model", "PriorSelect", "cell_centres", "dimension", "interval"),
+    "symbol": ("IntegerType", "IntervalType", "LabelType", "Symbol"),
+}
+_HOME_OF: Final = {name: module for module, names in _HOMES.items() for name in names}
+
+
+def __getattr__(name: str) -> object:
+    """Return what one of the modules here offers, or say that it is not among that (PEP 562)."""
+    if name not in _HOME_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_HOME_OF[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -22,14 +22,15 @@ if TYPE_CHECKING:
     from types import ModuleType
 
 FILE_NAME = "model.py"
+_TOOLCHAIN = Path(__file__).parent.parent
 
 
 def load_model(case: Path, settings: Mapping[str, str]) -> Model:
     """Return the model of a case study's folder.
 
     Args:
-        case: A folder with a `model.py` that defines `model(...)`, which returns a `toolchain.models.model.Model` or a
-            `toolchain.models.joint.Question`. Modules beside it can be imported by it.
+        case: A folder with a `model.py`, or that file itself. It defines `model(...)`, which returns a `toolchain.models.Model` or a
+            `toolchain.models.Question`. Modules beside it can be imported by it.
         settings: Values for `model()`'s parameters as a user writes them; each is read as the type that the
             parameter is annotated with (int, float, bool, str, Path, an Enum, a Literal).
 
@@ -37,7 +38,7 @@ def load_model(case: Path, settings: Mapping[str, str]) -> Model:
         ModelError: No such folder or file, a parameter that `model()` doesn't have or a value that it can't
             take, a parameter without a value, an error inside `model.py`, or something else than a Model.
     """
-    path = Path(case) / FILE_NAME
+    path = model_path(case)
     if not path.is_file():
         what = f"has no {FILE_NAME}" if Path(case).is_dir() else "is no folder"
         message = (
@@ -53,11 +54,17 @@ def load_model(case: Path, settings: Mapping[str, str]) -> Model:
         return model.model()
     if not isinstance(model, Model):
         message = (
-            f"{path}: model() returned {type(model).__name__}, expected a toolchain.models.model.Model or a "
-            "toolchain.models.joint.Question"
+            f"{path}: model() returned {type(model).__name__}, expected a toolchain.models.Model or a "
+            "toolchain.models.Question"
         )
         raise ModelError(message)
     return model
+
+
+def model_path(case: Path) -> Path:
+    """Return where a case study's model is: in its folder, or at the very file that was named."""
+    case = Path(case)
+    return case if case.name == FILE_NAME and case.is_file() else case / FILE_NAME
 
 
 @contextmanager
@@ -84,33 +91,42 @@ def _model_function(path: Path) -> Callable[..., object]:
         del sys.modules[spec.name]
     function = getattr(module, "model", None)
     if not callable(function):
-        message = (
-            f"{path} defines no model(); expected a function that returns a toolchain.models.model.Model"
-        )
+        message = f"{path} defines no model(); expected a function that returns a toolchain.models.Model"
         raise ModelError(message)
     return function  # type: ignore[no-any-return]  # what a user's module holds has no type
 
 
 def _guarded(path: Path, what: str, call: Callable[[], object]) -> object:
-    """Call into the user's file; what it raises becomes one sentence with the line it came from."""
+    """Call into the user's file; what it raises becomes one sentence with the line it came from.
+
+    What the file itself refuses it says in its own words; what the toolchain refuses of it gets the line too.
+    """
     try:
         return call()
+    except ModelError as error:
+        frames = traceback.extract_tb(error.__traceback__)
+        if Path(frames[-1].filename).is_relative_to(_TOOLCHAIN) and (line := _line(path, frames)):
+            message = f"{path}, line {line}: {error}"
+            raise ModelError(message) from None
+        raise
     except ToolchainError:
         raise
     except SyntaxError as error:
         message = f"{error.filename or path}, line {error.lineno}: {error.msg}"
         raise ModelError(message) from None
     except Exception as error:
-        lines = [
-            frame.lineno
-            for frame in traceback.extract_tb(error.__traceback__)
-            if Path(frame.filename) == path or Path(frame.filename) == path.resolve()
-        ]
-        where = f"{path}, line {lines[-1]}" if lines else str(path)
+        line = _line(path, traceback.extract_tb(error.__traceback__))
+        where = f"{path}, line {line}" if line else str(path)
         text = " ".join(str(error).split())
         raised = f"{type(error).__name__}: {text}" if text else type(error).__name__
         message = f"{where}: {what} raised {raised}"
         raise ModelError(message) from error
+
+
+def _line(path: Path, frames: traceback.StackSummary) -> int | None:
+    """Return the line of the user's file in which something was raised, or None."""
+    lines = [frame.lineno for frame in frames if Path(frame.filename) in {path, path.resolve()}]
+    return lines[-1] if lines else None
 
 
 def _arguments(path: Path, function: Callable[..., object], settings: Mapping[str, str]) -> dict[str, Any]:

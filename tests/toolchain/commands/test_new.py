@@ -3,6 +3,9 @@
 import ast
 import re
 import shlex
+import signal
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -13,6 +16,21 @@ from toolchain.command import app
 from toolchain.deployment import load_deployment
 from toolchain.models.case_study import load_model
 from toolchain.models.fusion import exact_posterior
+
+# runs a program with a server that never answers in the place of the robot's
+WAITING = """
+import asyncio, contextlib, runpy, sys
+import bridge.client
+
+@contextlib.asynccontextmanager
+async def connect(uri):
+    print("connecting", flush=True)
+    await asyncio.sleep(60)
+    yield
+
+bridge.client.connect = connect
+runpy.run_path(sys.argv[1])
+"""
 
 
 def run(*arguments):
@@ -40,6 +58,7 @@ def test_what_it_prints_builds(here):
 
 
 def test_the_robot_says_what_the_model_reads(here):
+    (here / "deep" / "er").mkdir(parents=True)
     made = run("new", "deep/er/mymodel")
     folder = here / "deep" / "er" / "mymodel"
     text = (folder / "robot.py").read_text()
@@ -59,6 +78,29 @@ def test_the_robot_says_what_the_model_reads(here):
     ]
     posterior = exact_posterior(model, addresses)
     assert model.searched[0].value(int(np.argmax(posterior))) == pytest.approx(6.5, abs=0.2)
+
+
+def test_the_robot_ends_quietly_at_ctrl_c(here):
+    run("new", "mymodel")
+    robot = subprocess.Popen(
+        [sys.executable, "-c", WAITING, here / "mymodel" / "robot.py"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    )
+    try:
+        assert robot.stdout.readline() == b"connecting\n"
+        robot.send_signal(signal.SIGINT)
+        _, said = robot.communicate(timeout=30)
+    finally:
+        robot.kill()
+    assert (robot.returncode, said) == (0, b"")
+
+
+def test_a_folder_in_no_folder(here):
+    refused = run("new", "nowhere/mymodel")
+    assert refused.exit_code == 2
+    assert "nowhere is no folder, so mymodel can't be made in it: make it first" in refused.stderr
+    assert not list(here.iterdir())
 
 
 def test_it_overwrites_nothing(here):
@@ -82,4 +124,4 @@ def test_a_folder_that_cannot_be_written(here):
     (here / "file").write_text("")
     refused = run("new", "file/mymodel")
     assert refused.exit_code == 2
-    assert "can't be written" in refused.stderr
+    assert "file is no folder" in refused.stderr

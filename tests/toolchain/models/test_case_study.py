@@ -14,7 +14,7 @@ from enum import Enum
 from pathlib import Path
 from typing import Literal
 import numpy as np
-from toolchain.models.model import Known, Model, dimension
+from toolchain.models import Known, Model, dimension
 
 class Kind(Enum):
     COARSE = "coarse"
@@ -93,9 +93,13 @@ def test_wrong_settings(case, settings, sentence):
         ("def model(:\n", "line 1: invalid syntax"),
         ("x = 1", "defines no model()"),
         ("model = 1", "defines no model()"),
-        ("def model():\n    return 5", "model() returned int, expected a toolchain.models.model.Model"),
+        ("def model():\n    return 5", "model() returned int, expected a toolchain.models.Model"),
         ("def model():\n    pass", "model() returned NoneType"),
         ("def model(x: 'Nonsense' = 1):\n    pass", "an annotation raised NameError"),
+        (
+            "import numpy as np\nfrom toolchain.models import normal\ndef model():\n    return normal('d', mean=np.zeros(2), sigma=-1, values=2)",
+            "line 4: variable 'd': sigma must be positive on every line",
+        ),
     ],
 )
 def test_mistakes_in_the_file(case, text, sentence):
@@ -105,6 +109,14 @@ def test_mistakes_in_the_file(case, text, sentence):
     assert sentence in str(caught.value)
     assert str(folder / "model.py") in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_what_the_file_itself_refuses_is_said_in_its_own_words(case):
+    folder = case(
+        "from toolchain.errors import ModelError\ndef model():\n    raise ModelError('size is odd')"
+    )
+    with pytest.raises(ModelError, match=r"^size is odd$"):
+        load_model(folder, {})
 
 
 def test_no_parameters_at_all(case):
@@ -119,9 +131,23 @@ def test_no_folder_and_no_model(tmp_path):
         load_model(tmp_path / "nowhere", {})
 
 
+def test_the_file_instead_of_its_folder(case):
+    assert load_model(case() / "model.py", {}).lines == 4
+
+
 def test_a_module_beside_the_model_can_be_imported_and_nothing_stays_behind(case):
     folder = case("import beside_the_model\n" + MODEL)
     (folder / "beside_the_model.py").write_text("")
     before = list(sys.path)
     assert load_model(folder, {}).lines == 4
     assert sys.path == before
+
+
+def test_what_a_model_is_written_with_comes_from_one_place():
+    import toolchain.models
+
+    for name in toolchain.models.__all__:
+        assert getattr(toolchain.models, name).__name__ == name
+    assert set(toolchain.models.__all__) <= set(dir(toolchain.models))
+    with pytest.raises(ImportError, match="nothing_such"):
+        from toolchain.models import nothing_such  # noqa: F401 - it isn't there
