@@ -8,6 +8,7 @@ import signal
 import socket
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, NoReturn
 
@@ -18,7 +19,7 @@ from pcie_shim.emulated_board import EmulatedBoard
 from pcie_shim.endpoint import Endpoint
 from pcie_shim.misbehaviour import Misbehaviour
 from services import options
-from services.command_line import ends_well, make_app, raise_on_signals
+from services.command_line import ends_well, make_app, raise_on_signals, stopped_by
 from services.errors import BoardFailedError, SettingsError, exit_code_of
 from services.logs import say
 from services.serving import endpoint_from
@@ -36,9 +37,15 @@ from services.supervision import (
 
 
 def serve_one(
-    endpoint: Endpoint, index: int, misbehave: Misbehaviour | None, directory: Path | None, restarts: int = 0
+    endpoint: Endpoint,
+    index: int,
+    misbehave: Misbehaviour | None,
+    directory: Path | None,
+    *,
+    restarts: int = 0,
+    on_ready: Callable[[], None],
 ) -> int:
-    """Serve one board in this process until a signal; gives the signal's exit code.
+    """Serve one board in this process until a signal; gives the signal's number.
 
     Args:
         endpoint: where its registers are.
@@ -46,12 +53,13 @@ def serve_one(
         misbehave: what it does wrong, for tests.
         directory: where its status socket goes, if anywhere.
         restarts: how often it was started again before.
+        on_ready: is called once both its sockets listen.
     """
     stop = StopSignal()
     ended_by: list[int] = []
 
     def end(number: int, _frame: object) -> None:
-        ended_by.append(128 + number)
+        ended_by.append(number)
         stop.set()
 
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
@@ -68,15 +76,37 @@ def serve_one(
         where = f"listening at {endpoint}, {state}" if listening else f"starting at {endpoint}"
         return ProcessStatus(ready=bool(listening), why=where, boards=[board])
 
+    def ready(board: EmulatedBoard) -> None:
+        listening.append(board)
+        on_ready()
+
     with status_thread(directory, f"board{index}", tell):
-        serve_board(
-            endpoint,
-            index=index,
-            stop=stop,
-            misbehave=misbehave,
-            on_ready=listening.append,
-        )
+        serve_board(endpoint, index=index, stop=stop, misbehave=misbehave, on_ready=ready)
     return ended_by[0] if ended_by else 0
+
+
+def _say_if_alone(sentence: str) -> None:
+    """Say what a person who started the boards wants to know; a master has its own ways to find out."""
+    if PARENT_VARIABLE not in os.environ:
+        say(sentence)
+
+
+class _Arrivals:
+    """Finds the last of several processes to arrive: all take from a pipe, and only the last finds it empty."""
+
+    def __init__(self, count: int) -> None:
+        self._left, write = os.pipe()
+        os.set_blocking(self._left, False)
+        os.write(write, bytes(count - 1))
+        self._kept_open = write  # else an empty pipe would be an ended one
+
+    def is_last(self) -> bool:
+        """Arrive; True in the last process, and in any that arrives again after it."""
+        try:
+            os.read(self._left, 1)
+        except BlockingIOError:
+            return True
+        return False
 
 
 def _check_free(endpoint: Endpoint) -> None:
@@ -96,6 +126,8 @@ class BoardProcesses:
         self._endpoints = [endpoint_in(directory, f"board{at}") for at in range(count)]
         self._restarts = restarts
         self._run_directory = run_directory
+        self._told = PARENT_VARIABLE not in os.environ
+        self._arrivals = _Arrivals(count)
         self._started: dict[int, int] = {}
         self._starts = [0] * count
         self._ends: list[float] = []
@@ -135,9 +167,15 @@ class BoardProcesses:
         try:
             os.environ[PARENT_VARIABLE] = str(parent)
             end_with_parent()
-            code = serve_one(
-                self._endpoints[at], at, None, self._run_directory, restarts=self._starts[at] - 1
+            ended_by = serve_one(
+                self._endpoints[at],
+                at,
+                None,
+                self._run_directory,
+                restarts=self._starts[at] - 1,
+                on_ready=lambda: self._ready(at),
             )
+            code = 128 + ended_by if ended_by else 0
         except BaseException as error:  # the fork must never run on in its parent's code
             code = exit_code_of(error)
             say(f"error: board {at}: {error}")
@@ -145,6 +183,17 @@ class BoardProcesses:
             with contextlib.suppress(Exception):
                 sys.stderr.flush()
             os._exit(code)
+
+    def _ready(self, at: int) -> None:
+        """In a board's own process: say when all are there, and when one is back."""
+        if not self._arrivals.is_last() or not self._told:
+            return
+        if self._starts[at] > 1:
+            say(f"board {at} listens again at {self._endpoints[at]}")
+        elif len(self._endpoints) == 1:
+            say(f"board 0 listens at {self._endpoints[0]}")
+        else:
+            say(f"{len(self._endpoints)} boards listen at {self._endpoints[0]} ... {self._endpoints[-1]}")
 
     def _ended(self, at: int, code: int) -> None:
         now = time.monotonic()
@@ -232,7 +281,17 @@ def board(
     from machines.kernel import warm_up
 
     warm_up()
-    return serve_one(endpoint_from(listen or "", "--listen"), index, wrong, run_directory)
+    endpoint = endpoint_from(listen or "", "--listen")
+    ended_by = serve_one(
+        endpoint,
+        index,
+        wrong,
+        run_directory,
+        on_ready=lambda: _say_if_alone(f"board {index} listens at {endpoint}"),
+    )
+    if ended_by:
+        raise stopped_by(ended_by)
+    return 0
 
 
 def main() -> None:

@@ -122,10 +122,15 @@ def run_async(main: Coroutine[Any, Any, int | None]) -> int:
         else:
             if not stopped:
                 return int(code or 0)
-        raise StoppedError(*_SIGNALS[stopped[0]])
+        raise stopped_by(stopped[0])
 
     with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
         return runner.run(guarded())
+
+
+def stopped_by(number: int) -> StoppedError:
+    """The end that a signal asks for, as an error with its exit code and its words."""
+    return StoppedError(*_SIGNALS[signal.Signals(number)])
 
 
 def raise_on_signals() -> None:
@@ -137,7 +142,7 @@ def raise_on_signals() -> None:
     def stop(number: int, _frame: object) -> NoReturn:
         for each in _SIGNALS:
             signal.signal(each, signal.SIG_IGN)
-        raise StoppedError(*_SIGNALS[signal.Signals(number)])
+        raise stopped_by(number)
 
     for number in _SIGNALS:
         signal.signal(number, stop)

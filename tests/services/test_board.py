@@ -1,0 +1,74 @@
+"""Boards that a person starts: they say when they are there, when one is back, and how they ended."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+
+BOARD = str(Path(sys.executable).parent / "board")
+
+
+@pytest.fixture
+def start(tmp_path):
+    started = []
+
+    def start(*arguments, **environment):
+        process = subprocess.Popen(
+            [BOARD, *arguments],
+            stderr=subprocess.PIPE,
+            text=True,
+            env={**os.environ, "TMPDIR": str(tmp_path), **environment},
+        )
+        started.append(process)
+        return process
+
+    yield start
+    for process in started:
+        process.kill()
+        process.communicate()
+
+
+def test_several_say_once_that_they_are_there_and_that_one_is_back(start, tmp_path):
+    boards = start("--boards", "3", "--directory", str(tmp_path))
+    assert (
+        boards.stderr.readline()
+        == f"3 boards listen at unix:{tmp_path}/board0.sock ... unix:{tmp_path}/board2.sock\n"
+    )
+    children = psutil.Process(boards.pid).children()
+    assert len(children) == 3
+    children[1].kill()
+    assert re.fullmatch(r"board \d was killed by SIGKILL; restarting it\n", boards.stderr.readline())
+    assert re.fullmatch(r"board \d listens again at unix:.*/board\d\.sock\n", boards.stderr.readline())
+    boards.send_signal(signal.SIGINT)
+    _, rest = boards.communicate(timeout=30)
+    assert (boards.returncode, rest) == (130, "interrupted (Ctrl-C)\n")
+
+
+@pytest.mark.parametrize("several", [True, False])
+def test_one_alone(start, tmp_path, several):
+    one = (
+        ("--boards", "1", "--directory", str(tmp_path))
+        if several
+        else ("--listen", f"unix:{tmp_path}/board0.sock")
+    )
+    board = start(*one)
+    assert board.stderr.readline() == f"board 0 listens at unix:{tmp_path}/board0.sock\n"
+    board.send_signal(signal.SIGTERM)
+    _, rest = board.communicate(timeout=30)
+    assert (board.returncode, rest) == (143, "asked to end (SIGTERM)\n")
+
+
+def test_a_masters_boards_say_nothing(start, tmp_path):
+    boards = start("--boards", "2", "--directory", str(tmp_path), ROSBAYES_PARENT=str(os.getpid()))
+    while len(list(tmp_path.glob("board*.sock"))) < 4:
+        assert boards.poll() is None
+        time.sleep(0.02)
+    boards.send_signal(signal.SIGTERM)
+    _, said = boards.communicate(timeout=30)
+    assert said == ""
