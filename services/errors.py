@@ -84,6 +84,24 @@ class OverflowedQueueError(ServiceError):
     exit_code = ExitCode.CHILD
 
 
+class NotPreparedError(ServiceError):
+    """A service was asked to switch to a deployment that it does not have, or could not have."""
+
+
+class ShapeError(ServiceError):
+    """A deployment can't take the place of the one in force: boards or topics were made for another."""
+
+
+class NotReloadedError(ServiceError):
+    """A reload that could not be finished now; the run goes on with the deployment that it had."""
+
+    exit_code = ExitCode.CHILD
+
+
+class ControlError(ServiceError):
+    """What came over a control socket is no order, or the answer is none."""
+
+
 class StoppedError(ServiceError):
     """A signal asked the process to end; not a failure, but no success either."""
 

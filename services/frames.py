@@ -205,6 +205,12 @@ class FrameAssembler:
         last = max(chosen.values(), key=lambda each: each.received_tick)
         return CompleteReading(addresses, latest.stamp_ns, last.received_ns, last.received_tick, prior_codes)
 
+    def forget(self) -> None:
+        """Wait for no partners any more: messages that have none yet are counted as unpaired."""
+        for queue in self._fresh:
+            self.unpaired += len(queue)
+            queue.clear()
+
     def needs(self, source: int) -> bool:
         """Whether no frame is complete without a message of this source."""
         return self._needed[source]

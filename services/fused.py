@@ -19,7 +19,7 @@ from services.pcie_app import ROLE as PCIE_APP
 from services.pcie_app import TICK, Boards, Progress, frame_failed, result_record
 from services.publisher import ROLE as PUBLISHER
 from services.publisher import Publisher
-from services.records import AnyRecord, Frame, Notice, Ready, Record, Trouble
+from services.records import AnyRecord, Frame, Notice, Prepare, Ready, Record, Switch, Trouble
 from services.serving import Link, MakeLink, board_endpoints
 from services.settings import Settings
 from services.status_socket import status_served
@@ -72,6 +72,9 @@ class FusedLink:
         """Tell the master something that ends nothing."""
         self.send(Notice(level, sentence))
 
+    def serve(self, deployment_hash: str) -> None:
+        """There is no other master to greet."""
+
 
 class FusedEnd:
     """The master's end of such a link: what a local socket's connection is to it otherwise."""
@@ -92,18 +95,20 @@ class FusedEnd:
 class FusedBoards:
     """The PCIe application in an event loop: a frame is posted, and collected when the last board's answer is there.
 
-    What takes long, opening boards and looking for those that are gone, is done by a thread; meanwhile no frame is posted.
+    What takes long, opening boards, looking for those that are gone, and reloading, is done by a thread; meanwhile no frame is posted.
     """
 
-    def __init__(self, boards: Boards, deployment: Deployment, settings: Settings, link: MakeLink) -> None:
+    def __init__(self, boards: Boards, settings: Settings, link: MakeLink) -> None:
         self._boards = boards
         self._run_directory = settings.run_directory
-        self._progress = Progress(boards, deployment.hash, settings.log_level)
+        self._progress = Progress(boards, settings.log_level)
         self._link = link(self._take)
         self._number: int | None = None
         self._watched: int | None = None
         self._loop = asyncio.get_running_loop()
         self._looking: asyncio.Task[None] | None = None
+        self._one_thread = asyncio.Lock()
+        self._reloading: asyncio.Task[None] | None = None
 
     async def run(self) -> int:
         """Serve until cancelled.
@@ -121,20 +126,38 @@ class FusedBoards:
                         if self._boards.is_late:
                             self._collect()
                     elif self._boards.gone and self._looking is None:
-                        for board in await _in_thread(self._boards.mend):
+                        async with self._one_thread:
+                            back = await _in_thread(self._boards.mend)
+                        for board in back:
                             self._link.send(Notice("info", f"board {board} is back, programmed"))
             except PcieShimError as error:
                 self._link.send(Trouble(exit_code_of(error), str(error)))
                 raise
             finally:
                 self._unwatch()
-                if self._looking is not None:
-                    self._looking.cancel()
+                for task in (self._looking, self._reloading):
+                    if task is not None:
+                        task.cancel()
                 self._boards.close()
 
     def _take(self, record: AnyRecord) -> None:
-        if not isinstance(record, Frame):
-            return
+        if isinstance(record, Frame):
+            self._post(record)
+        elif isinstance(record, Prepare | Switch):
+            self._reloading = self._loop.create_task(self._reload(record))
+
+    async def _reload(self, record: Prepare | Switch) -> None:
+        """Read images, or program boards: the master posts no frame meanwhile."""
+        boards = self._boards
+        answer: Record
+        if isinstance(record, Prepare):
+            answer = await _in_thread(lambda: boards.generations.prepare(record))
+        else:
+            async with self._one_thread:
+                answer = await _in_thread(lambda: boards.switch(record))
+        self._link.send(answer)
+
+    def _post(self, record: Frame) -> None:
         self._progress.asked += 1
         try:
             self._boards.post(record)
@@ -183,7 +206,8 @@ class FusedBoards:
 
     async def _look(self, number: int, error: BoardError) -> None:
         try:
-            await _in_thread(lambda: self._boards.look(error))
+            async with self._one_thread:
+                await _in_thread(lambda: self._boards.look(error))
         finally:
             self._looking = None
         self._link.send(frame_failed(number, error))
@@ -242,6 +266,6 @@ def fused_services(
     running = {
         SUBSCRIBER: Subscriber(settings, deployment, link_of(SUBSCRIBER)).run(),
         PUBLISHER: Publisher(settings, deployment, link_of(PUBLISHER)).run(),
-        PCIE_APP: FusedBoards(boards, deployment, settings, link_of(PCIE_APP)).run(),
+        PCIE_APP: FusedBoards(boards, settings, link_of(PCIE_APP)).run(),
     }
     return {role: (ends[role], coroutine) for role, coroutine in running.items()}

@@ -76,9 +76,9 @@ class RecordSplitter:
         return records
 
 
-def own_hello(role: str, deployment_hash: str) -> Hello:
-    """The greeting of this process."""
-    return Hello(role=role, version=VERSION, deployment_hash=deployment_hash)
+def own_hello(role: str, deployment_hash: str, generation: int = 0) -> Hello:
+    """The greeting of this process; a master says which generation of its run the deployment is."""
+    return Hello(role=role, version=VERSION, deployment_hash=deployment_hash, generation=generation)
 
 
 def check_hello(record: AnyRecord, expected_role: str, deployment_hash: str, where: str) -> None:

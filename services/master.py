@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import shutil
+import functools
 import sys
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Coroutine
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Concatenate, ParamSpec
 
 import orjson
 import typer
@@ -18,11 +18,13 @@ import typer
 from pcie_shim.endpoint import Endpoint
 from services import options
 from services.command_line import ends_well, make_app, run_async
+from services.control_socket import ReloadOrder, control_served, control_socket, give_order
 from services.errors import (
     BoardFailedError,
     ChildDiedError,
     ExitCode,
     NoDataError,
+    NotReloadedError,
     OtherPeerError,
     ReportedError,
     RosbridgeLostError,
@@ -33,17 +35,24 @@ from services.errors import (
 from services.frames import WaitingFrames
 from services.local_socket import RecordProtocol, check_hello, open_connection, own_hello
 from services.logs import get_logger, say
+from services.new_deployment import forget, keep, read_new
 from services.records import (
     AnyRecord,
     Begin,
     Frame,
     FrameFailed,
     FrameResult,
+    Hello,
     Notice,
+    NotReloaded,
+    Prepare,
+    Prepared,
     Publish,
     Published,
     Reading,
     Ready,
+    Switch,
+    Switched,
     Trouble,
     Unusable,
 )
@@ -61,9 +70,9 @@ from services.supervision import (
     RESTARTS,
     RESTARTS_WITHIN,
     Child,
+    PrivateDirectory,
     end_all,
     end_with_parent,
-    make_private_directory,
     own_command,
 )
 from toolchain.deployment import Deployment
@@ -75,12 +84,22 @@ ROLE = "master"
 RESULTS_UNDER_WAY = 8
 """Results that the publisher may have unanswered; then frames wait, and `queue` says which."""
 
+LOST_IN_RELOAD = "lost in a reload"
+
 _CONNECT_EVERY = 0.01
 _RECONNECT_PATIENCE = 60.0
 _PROGRESS_EVERY = 1.0
 _ANSWER_TIME = 60.0
 """Seconds that pcie-app or the publisher may take beyond their own limits, before they count as stuck."""
 _GRACE = 2.0
+_DRAIN_TIME = 30.0
+"""Seconds that the frames under way may take, once a reload waits for them."""
+
+_PROGRAM_TIME = 30.0
+"""Seconds that programming one board may take in a reload, at most."""
+
+RELOAD_TIME = 600.0
+"""Seconds that `master reload` waits for its answer."""
 
 
 class Peer:
@@ -101,6 +120,9 @@ class Peer:
         self.reason: Exception | None = None
         self.since = 0.0
         self.missed = False
+        self.generation = 0
+        self.answer: asyncio.Future[Prepared | Switched | NotReloaded] | None = None
+        self.outdated = False
 
 
 class Master:
@@ -117,6 +139,14 @@ class Master:
         self._log = get_logger(ROLE, settings.log_level)
         self._follows = settings.log_level == "debug"
         self._waiting: WaitingFrames[tuple[Reading, int]] = WaitingFrames(settings.queue or deployment.queue)
+        self._generation = 0
+        self._former_hash = ""
+        self._folder = Path(settings.deployment or deployment.directory).absolute()
+        self._kept = self._folder
+        self._reloads = asyncio.Lock()
+        self._coming: WaitingFrames[tuple[Reading, int]] | None = None
+        self._held = False
+        self._keeping: asyncio.Task[None] | None = None
         self._computing: tuple[Frame, Reading, int, int] | None = None
         self._under_way = 0
         self._number = 0
@@ -131,7 +161,7 @@ class Master:
         self._heard = False
         self._expecting: asyncio.Task[None] | None = None
         self._published_at = 0.0
-        self._directory: Path | None = None
+        self._private: PrivateDirectory | None = None
         self._boards: Child | None = None
         self._board_endpoints: tuple[str, ...] = ()
         self._peers: dict[str, Peer] = {}
@@ -151,6 +181,8 @@ class Master:
             self._prepare()
             run_directory = self._settings.run_directory or self._directory
             await status.enter_async_context(status_served(run_directory, ROLE, self.status))
+            if not self._once:
+                await status.enter_async_context(control_served(run_directory, self._ordered))
             if self._boards is not None:
                 self._boards.start()
                 tasks.append(asyncio.ensure_future(self._keep_boards(self._boards)))
@@ -165,13 +197,18 @@ class Master:
                 tasks.append(asyncio.ensure_future(self._show_progress()))
             await self._end
         finally:
-            for task in (*tasks, *inside, *([self._expecting] if self._expecting else [])):
+            others = [task for task in (self._expecting, self._keeping) if task is not None]
+            for task in (*tasks, *inside, *others):
                 task.cancel()
             if inside:
                 await asyncio.wait(inside, timeout=self._settings.stop_timeout)
             await status.aclose()
             await self._finish()
         return ExitCode.DONE
+
+    @property
+    def _directory(self) -> Path | None:
+        return None if self._private is None else self._private.path
 
     # --- starting and ending -------------------------------------------------------------------
 
@@ -183,7 +220,7 @@ class Master:
             "pcie-app": settings.pcie_app,
         }
         if not all(given.values()):
-            self._directory = make_private_directory()
+            self._private = PrivateDirectory()
         directory = self._directory
         if settings.boards or any(board.endpoint for board in deployment.boards):
             board_endpoints(settings, deployment)  # a wrong list is told before anything starts
@@ -224,6 +261,8 @@ class Master:
                 str(settings.peer_timeout),
                 "--board-timeout",
                 str(settings.board_timeout),
+                # nobody else can have programmed boards of this run
+                *(["--reprogram"] if self._boards is not None else []),
             ],
         }
         self._board_endpoints = tuple(boards)
@@ -253,8 +292,8 @@ class Master:
             say(
                 f"{' and '.join(killed)} did not end within {self._settings.stop_timeout:g} s and had to be killed"
             )
-        if self._directory is not None:
-            shutil.rmtree(self._directory, ignore_errors=True)
+        if self._private is not None:
+            self._private.remove()
         if not self._once:
             say(self._summary())
 
@@ -287,6 +326,8 @@ class Master:
             ready=not why,
             why=why or "results flow",
             deployment=self._deployment.hash,
+            generation=self._generation,
+            folder=str(self._folder),
             peers=peers,
             frames=FrameCounts(
                 received=self._received,
@@ -451,6 +492,9 @@ class Master:
                 return
 
     def _lost(self, peer: Peer) -> None:
+        peer.outdated = False
+        if peer.answer is not None and not peer.answer.done():
+            peer.answer.set_exception(NotReloadedError(f"{peer.role} ended meanwhile"))
         if peer.role == "pcie-app" and self._computing is not None:
             self._losses["lost with pcie-app"] += 1
             if self._follows:
@@ -490,7 +534,7 @@ class Master:
 
     def _opened(self, peer: Peer, protocol: RecordProtocol) -> None:
         peer.protocol = protocol
-        protocol.send(own_hello(ROLE, self._deployment.hash))
+        protocol.send(own_hello(ROLE, self._deployment.hash, self._generation))
 
     def _closed(self, peer: Peer, protocol: RecordProtocol, why: Exception | None) -> None:
         if peer.protocol in (protocol, None):
@@ -506,12 +550,17 @@ class Master:
             self._fail(error)
 
     def _handle(self, peer: Peer, protocol: RecordProtocol | FusedEnd | None, record: AnyRecord) -> None:
+        if peer.outdated:
+            return
         if isinstance(record, Trouble):
             self._fail(ReportedError(record.exit_code, f"{peer.role}: {record.sentence}"))
             return
         if not peer.greeted:
+            if self._is_outdated(peer, record):
+                return
             check_hello(record, peer.role, self._deployment.hash, f"{peer.role} at {peer.where}")
             peer.greeted = True
+            peer.generation = self._generation
             peer.missed = False
             return
         match record:
@@ -529,6 +578,9 @@ class Master:
                 self._frame_failed(record)
             case Published():
                 self._was_published(record)
+            case Prepared() | Switched() | NotReloaded():
+                if peer.answer is not None and not peer.answer.done():
+                    peer.answer.set_result(record)
             case _:
                 self._log.warning(
                     f"{protocol.where if protocol else peer.role} sent a {type(record).__name__}, which is not its to send"
@@ -542,6 +594,8 @@ class Master:
         if not self._began and all(each.ready for each in self._peers.values()):
             self._began = True
             self._expecting = asyncio.ensure_future(self._expect_data())
+            if not self._once:
+                self._keeping = asyncio.ensure_future(self._keep_first())
             for each in self._peers.values():
                 if each.role != "pcie-app" and each.protocol is not None:
                     each.protocol.send(Begin(self._once))
@@ -563,12 +617,26 @@ class Master:
         self._received += 1
         self._losses["passed over"] += reading.passed_over
         self._losses["unpaired"] += reading.unpaired
+        waits = reading, time.monotonic_ns()
+        if reading.generation != self._generation:
+            self._wait_for_reload(waits)
+            return
         try:
-            self._waiting.put((reading, time.monotonic_ns()))
+            self._waiting.put(waits)
         except ServiceError as error:
             self._fail(error)
             return
         self._next()
+
+    def _wait_for_reload(self, waits: tuple[Reading, int]) -> None:
+        """A reading of the deployment that comes next waits until the boards have its tables."""
+        if self._coming is None or waits[0].generation != self._generation + 1:
+            self._losses[LOST_IN_RELOAD] += 1
+            return
+        try:
+            self._coming.put(waits)
+        except ServiceError:  # the boards are no slow part while they are programmed
+            self._losses[LOST_IN_RELOAD] += 1
 
     def _unusable(self, record: Unusable) -> None:
         self._heard = True
@@ -582,7 +650,7 @@ class Master:
 
     def _next(self) -> None:
         app = self._peers["pcie-app"]
-        if self._computing is not None or not app.ready or app.protocol is None:
+        if self._computing is not None or self._held or not app.ready or app.protocol is None:
             return
         if self._under_way >= RESULTS_UNDER_WAY or not self._peers["publisher"].ready:
             return
@@ -689,6 +757,214 @@ class Master:
         else:
             self._next()
 
+    # --- another deployment --------------------------------------------------------------------
+
+    async def _ordered(self, order: ReloadOrder) -> str:
+        """Reload; gives a sentence about it.
+
+        Raises:
+            ServiceError, ToolchainError: why the run goes on with the deployment that it had.
+        """
+        if self._reloads.locked():
+            msg = "another reload is under way; try again when it is done"
+            raise NotReloadedError(msg)
+        folder = Path(order.folder or self._folder)
+        async with self._reloads:
+            try:
+                sentence = await self._reload(folder)
+            except Exception as error:
+                hash_ = self._deployment.hash[:12]
+                self._log.warning(f"not reloaded: {error}; deployment {hash_} goes on")
+                raise
+            self._log.info(sentence)
+            return sentence
+
+    async def _reload(self, folder: Path) -> str:
+        """Have everybody read the new deployment, wait for the frames of the old one, and switch.
+
+        The subscriber switches first: what it sends from then on waits here. Then the boards, when no frame is under
+        way; from there on there is no way back, and the publisher follows.
+        """
+        waiting = [peer.role for peer in self._peers.values() if not peer.ready]
+        if waiting or not self._began:
+            msg = f"the run is not ready: it waits for {' and '.join(waiting) or 'its processes'}; try again when it has begun"
+            raise NotReloadedError(msg)
+        if not folder.is_absolute():
+            msg = f"the folder {folder} is not absolute, and the master may stand somewhere else; give the whole path"
+            raise SettingsError(msg)
+        started = time.monotonic()
+        number = self._generation + 1
+        new = await asyncio.to_thread(read_new, folder, self._deployment, self._as_used)
+        kept = await self._keep_copy(new, number)
+        subscriber, publisher, app = (self._peers[role] for role in ("subscriber", "publisher", "pcie-app"))
+        limit = self._settings.peer_timeout + _ANSWER_TIME
+        for peer in (subscriber, publisher, app):
+            where = kept if peer.child is not None else folder
+            await self._ask(peer, Prepare(number, str(where), new.hash), limit, kept, folder)
+        in_flight = 0
+        try:
+            self._coming = WaitingFrames(self._settings.queue or self._deployment.queue)
+            await self._ask(subscriber, Switch(number), limit)
+            in_flight = len(self._waiting) + (self._computing is not None) + self._under_way
+            await self._drain()
+            self._held = True
+            if app.child is not None:
+                app.child.give("--reprogram")  # if it is restarted in between, boards hold either image
+            boards = len(new.boards) * max(_PROGRAM_TIME, self._settings.peer_timeout)
+            await self._ask(app, Switch(number), limit + boards)
+        except BaseException:
+            await self._go_back()
+            raise
+        self._adopt(new, number, folder, kept)
+        for peer in (publisher, subscriber):
+            if peer.generation != number and peer.protocol is not None:
+                try:
+                    await self._ask(peer, Switch(number), limit)
+                except ServiceError as error:
+                    self._renew(peer, f"{error}; ending it")
+        elapsed = (time.monotonic() - started) * 1000
+        frames = "1 frame was" if in_flight == 1 else f"{in_flight} frames were"
+        return (
+            f"generation {number} is in force, deployment {new.hash[:12]} of {folder}; "
+            f"{frames} in flight and finished before, {elapsed:.0f} ms"
+        )
+
+    async def _ask(
+        self,
+        peer: Peer,
+        record: Prepare | Switch,
+        limit: float,
+        kept: Path | None = None,
+        folder: Path | None = None,
+    ) -> None:
+        """Have a service prepare or switch.
+
+        Raises:
+            NotReloadedError: It is not there, ended, or did not answer in time (then it is ended).
+            ReportedError: It could not, in its own words.
+        """
+        if peer.protocol is None or not peer.ready:
+            msg = f"{peer.role} is not there now; try again when it is back"
+            raise NotReloadedError(msg)
+        what = "read the new deployment" if isinstance(record, Prepare) else "switch to it"
+        peer.answer = asyncio.get_running_loop().create_future()
+        try:
+            if not peer.protocol.send(record):
+                msg = f"{peer.role} ended meanwhile"
+                raise NotReloadedError(msg)
+            answer = await asyncio.wait_for(peer.answer, limit)
+        except TimeoutError as error:
+            msg = f"{peer.role} at {peer.where} did not {what} within {limit:g} s"
+            self._renew(peer, f"{msg}; ending it")
+            raise NotReloadedError(msg) from error
+        finally:
+            peer.answer = None
+        if isinstance(answer, NotReloaded):
+            # a copy's path says nothing to who made the folder
+            said = answer.sentence.replace(str(kept), str(folder)) if kept else answer.sentence
+            raise ReportedError(answer.exit_code, f"{peer.role}: {said}")
+        if isinstance(answer, Switched):
+            peer.generation = answer.generation
+
+    async def _drain(self) -> None:
+        """Wait for the frames of the deployment that is in force; those that still wait after that are lost.
+
+        Raises:
+            NotReloadedError: A frame or a result is under way for too long.
+        """
+        deadline = time.monotonic() + _DRAIN_TIME
+        while self._waiting or self._computing is not None or self._under_way:
+            if time.monotonic() > deadline:
+                if self._computing is not None or self._under_way:
+                    what = "a frame on the boards" if self._computing else "results at the publisher"
+                    msg = f"{what} took longer than {_DRAIN_TIME:g} s; try again"
+                    raise NotReloadedError(msg)
+                return
+            await asyncio.sleep(_CONNECT_EVERY)
+
+    async def _go_back(self) -> None:
+        """Have whoever switched already work by the deployment in force again."""
+        coming, self._coming = self._coming, None
+        if coming is not None:
+            self._losses[LOST_IN_RELOAD] += len(coming)
+            self._losses["passed over"] += coming.passed_over
+        for peer in self._peers.values():
+            if peer.generation != self._generation and peer.protocol is not None and peer.ready:
+                try:
+                    limit = _ANSWER_TIME + len(self._deployment.boards) * _PROGRAM_TIME
+                    await self._ask(peer, Switch(self._generation), limit)
+                except ServiceError as error:
+                    self._renew(peer, f"{error}; ending it")
+        self._held = False
+        self._next()
+
+    def _adopt(self, new: Deployment, number: int, folder: Path, kept: Path) -> None:
+        """The boards have the new tables: hand on the readings that were made for them."""
+        self._former_hash = self._deployment.hash
+        self._deployment, self._generation, self._folder, self._kept = new, number, folder, kept
+        for peer in self._peers.values():
+            if peer.child is not None:
+                peer.child.give("--deployment", str(kept))
+        self._losses[LOST_IN_RELOAD] += len(self._waiting)
+        self._losses["passed over"] += self._waiting.passed_over
+        if self._coming is not None:
+            self._waiting, self._coming = self._coming, None
+        self._peers["pcie-app"].generation = number
+        self._held = False
+        if self._directory is not None:
+            forget(self._directory, number - 2)  # a child may be reading the last one's just now
+        self._next()
+
+    def _renew(self, peer: Peer, sentence: str) -> None:
+        """Have a service begin anew: by the deployment in force, if it is the master's own."""
+        self._log.warning(sentence)
+        if peer.child is not None:
+            peer.child.kill()
+        elif peer.protocol is not None:
+            peer.protocol.close()
+
+    def _is_outdated(self, peer: Peer, record: AnyRecord) -> bool:
+        """Whether this is a child that was started before a reload and greets after it: it is started once more."""
+        peer.outdated = (
+            peer.child is not None
+            and isinstance(record, Hello)
+            and record.deployment_hash == self._former_hash != self._deployment.hash
+        )
+        if peer.outdated:
+            self._renew(peer, f"{peer.role} was started before the reload; starting it anew")
+        return peer.outdated
+
+    def _as_used(self, deployment: Deployment) -> Deployment:
+        """A deployment without what this run's flags override: it need not be the same in the next one."""
+        update: dict[str, Any] = {}
+        if self._settings.uri:
+            uri = self._settings.uri
+            update["sources"] = tuple(each.model_copy(update={"uri": uri}) for each in deployment.sources)
+            update["outputs"] = tuple(each.model_copy(update={"uri": uri}) for each in deployment.outputs)
+        if self._settings.queue:
+            update["queue"] = self._settings.queue
+        if self._board_endpoints:
+            update["boards"] = tuple(each.model_copy(update={"endpoint": ""}) for each in deployment.boards)
+        return deployment.model_copy(update=update)
+
+    async def _keep_copy(self, deployment: Deployment, number: int) -> Path:
+        """Copy a deployment for children; gives the folder that they are to read."""
+        if self._directory is None or not any(peer.child for peer in self._peers.values()):
+            return deployment.directory
+        return await asyncio.to_thread(keep, deployment, self._directory, number)
+
+    async def _keep_first(self) -> None:
+        """Children that are restarted find the deployment of the run's beginning, whatever is built into its folder since."""
+        try:
+            kept = await self._keep_copy(self._deployment, 0)
+        except Exception as error:  # without a copy, they read the folder itself
+            self._log.warning(f"restarted services will read {self._folder} as it is then: {error}")
+            return
+        if self._generation == 0:
+            for peer in self._peers.values():
+                if peer.child is not None:
+                    peer.child.give("--deployment", str(kept))
+
     # --- what the user sees --------------------------------------------------------------------
 
     def _print(self, record: Published) -> None:
@@ -750,14 +1026,33 @@ async def run_master(
 app = make_app(
     "Move readings to the boards and posteriors back to the robot.\n\n"
     "`master --once -d build/boat --uri ws://robot:9090` computes one frame; `master --loop` goes on until Ctrl-C.\n\n"
+    "`master reload -d build/boat2` has a running one take another deployment of the same shape.\n\n"
     "It starts what is not running (subscriber, publisher, pcie-app, emulated boards) and ends it again. "
     "Exit codes: 0 done, 2 usage or deployment, 3 rosbridge, 4 a variable, 5 a board, 6 a process, 130, 143."
 )
 
 
-@app.command(help=app.info.help)
-@ends_well
+Parameters = ParamSpec("Parameters")
+
+
+def _unless_another(
+    command: Callable[Concatenate[typer.Context, Parameters], int],
+) -> Callable[..., None]:
+    """Run a command that has commands of its own, where none of those was given."""
+    run = ends_well(command)
+
+    @functools.wraps(command)
+    def unless(context: typer.Context, *args: Parameters.args, **kwargs: Parameters.kwargs) -> None:
+        if context.invoked_subcommand is None:
+            run(context, *args, **kwargs)
+
+    return unless
+
+
+@app.callback(help=app.info.help, invoke_without_command=True)
+@_unless_another
 def master(
+    context: typer.Context,
     once: Annotated[bool, typer.Option("--once", help="Compute the first complete frame, then end.")] = False,
     loop: Annotated[bool, typer.Option("--loop", help="Go on until Ctrl-C, or --count.")] = False,
     count: options.Count = None,
@@ -792,6 +1087,7 @@ def master(
     ] = False,
 ) -> int:
     """Move readings to the boards and posteriors back to the robot."""
+    del context  # it says whether there is something to do here at all
     end_with_parent()
     connected = {}
     if connect is not None:
@@ -824,6 +1120,37 @@ def master(
         raise SettingsError(msg)
     loaded = deployment_for(settings)
     return run_async(run_master(settings, loaded, once=once, count=count, json=json))
+
+
+@app.command("reload")
+@ends_well
+def reload_(
+    deployment: options.Deployment = None,
+    directory: Annotated[
+        Path | None,
+        typer.Option(
+            "--directory", help="Run folder of the master (BM_RUN_DIRECTORY), as for `status`.", metavar="DIR"
+        ),
+    ] = None,
+) -> int:
+    """Have a running `master --loop` take another deployment of the same shape, or the same folder as it is now.
+
+    `toolchain regenerate memories build/boat --model casestudies/boat`, then `master reload -d build/boat`: readings and results go on. If
+    it can't be taken, the run goes on with what it has, and the sentence says why. Exit codes: 0 done, 2 another shape
+    or damaged, 5 a board, 6 not now.
+    """
+    end_with_parent()
+    settings = load_settings(deployment=deployment, run_directory=directory)
+    folder = "" if settings.deployment is None else str(settings.deployment.absolute())
+
+    async def order() -> int:
+        from services.status import find_run
+
+        run = settings.run_directory or await find_run()
+        print(await give_order(control_socket(run), ReloadOrder(folder), timeout=RELOAD_TIME))
+        return ExitCode.DONE
+
+    return run_async(order())
 
 
 def main() -> None:

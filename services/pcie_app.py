@@ -16,11 +16,22 @@ from typing import Annotated
 import msgspec
 import numpy as np
 import orjson
+import typer
 
 from machines.bm1 import StopReason
-from pcie_shim.driver import FrameInput, FrameOutput, MiniCluster
+from pcie_shim.driver import PROGRAMMING_S, FrameInput, FrameOutput, MiniCluster
 from pcie_shim.endpoint import Endpoint, listen, remove_listener
-from pcie_shim.errors import BoardError, BoardMismatchError, PcieShimError
+from pcie_shim.errors import (
+    BoardError,
+    BoardHeldError,
+    BoardLinkError,
+    BoardMismatchError,
+    GreetingMismatchError,
+    HeldError,
+    ImageError,
+    PcieShimError,
+)
+from pcie_shim.loader import program
 from pcie_shim.programming_file import Image, read_image
 from services import options
 from services.command_line import ends_well, make_app, raise_on_signals
@@ -29,12 +40,29 @@ from services.errors import (
     InputLineError,
     LocalSocketError,
     OtherPeerError,
+    ServiceError,
     SettingsError,
     exit_code_of,
 )
+from services.generations import Generations
 from services.local_socket import BlockingRecordSocket, check_hello, own_hello
 from services.logs import get_logger, say
-from services.records import BoardOutcome, Frame, FrameFailed, FrameResult, Notice, Ready, Record, Trouble
+from services.records import (
+    AnyRecord,
+    BoardOutcome,
+    Frame,
+    FrameFailed,
+    FrameResult,
+    Hello,
+    Notice,
+    NotReloaded,
+    Prepare,
+    Ready,
+    Record,
+    Switch,
+    Switched,
+    Trouble,
+)
 from services.results import REASON_WORDS, counts_of
 from services.serving import board_endpoints, deployment_for, endpoint_from
 from services.settings import Settings, load_settings
@@ -55,16 +83,33 @@ TICK = 0.2
 
 
 class Boards:
-    """A deployment's boards, opened and programmed; a board that restarts is opened and programmed again."""
+    """A deployment's boards, opened and programmed; a board that restarts is opened and programmed again.
 
-    def __init__(self, settings: Settings, deployment: Deployment, endpoints: Sequence[Endpoint]) -> None:
+    Attributes:
+        generations: The deployments that the boards can be given, with their images.
+        gone: Why a board can't be used, by its number.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        deployment: Deployment,
+        endpoints: Sequence[Endpoint],
+        *,
+        reprogram: bool = False,
+    ) -> None:
+        """Read the images.
+
+        Args:
+            settings: The settings.
+            deployment: The deployment.
+            endpoints: Where the boards are.
+            reprogram: Whether a board that holds another image is programmed; else it is somebody else's.
+        """
         self._settings = settings
-        self._deployment = deployment
-        self._machine = deployment.machine
-        self._selects = deployment.prior_select is not None
-        self._images: list[Image] = [
-            read_image(deployment.image_path(at)) for at in range(len(deployment.boards))
-        ]
+        self.generations = Generations(deployment, _images_of, images=True)
+        self._reprogram = reprogram
+        self._use()
         self._endpoints = list(endpoints)
         self._cluster: MiniCluster | None = None
         self.gone: dict[int, str] = {}
@@ -76,14 +121,97 @@ class Boards:
         Raises:
             PcieShimError: a board is not there, holds another image, or does not behave.
         """
-        self._cluster = MiniCluster.open(
+        mended: set[int] = set()
+        while self._cluster is None:
+            try:
+                self._cluster = self._opened(self._images)
+            except BoardMismatchError as error:
+                if not self._reprogram or error.board in mended:
+                    raise
+                mended.add(error.board)
+                self._program(error.board, self._images[error.board])
+        count = len(self._endpoints)
+        return f"{count} {'board' if count == 1 else 'boards'} programmed and open"
+
+    def _opened(self, images: Sequence[Image]) -> MiniCluster:
+        return MiniCluster.open(
             self._endpoints,
-            self._images,
+            images,
             timeout=self._settings.peer_timeout,
             slack=self._settings.board_timeout,
         )
-        count = len(self._endpoints)
-        return f"{count} {'board' if count == 1 else 'boards'} programmed and open"
+
+    def _use(self) -> None:
+        """Take what is needed for every frame from the deployment in force."""
+        self._deployment = self.generations.deployment
+        self._images: list[Image] = self.generations.made
+        self._machine = self._deployment.machine
+        self._selects = self._deployment.prior_select is not None
+
+    # --- another deployment --------------------------------------------------------------------
+
+    def switch(self, record: Switch) -> Switched | NotReloaded:
+        """Give the boards the images of another generation, or none of them: a failure has the old ones put back.
+
+        No frame may be under way. It takes as long as programming does; boards that hold the right image already
+        are left alone.
+        """
+        try:
+            _, images = self.generations.of(record.generation)
+            cluster = self._whole_cluster()
+            self._reprogram = True  # from here on a board may hold either image
+            try:
+                self._cluster = self._given(cluster, images)
+            except PcieShimError:
+                self._put_back(cluster)
+                raise
+        except (PcieShimError, ServiceError) as error:
+            return NotReloaded(record.generation, exit_code_of(error), str(error))
+        answer = self.generations.switch(record)
+        self._use()
+        return answer
+
+    def _given(self, cluster: MiniCluster, images: Sequence[Image]) -> MiniCluster:
+        """Boards that hold these images, open."""
+        cluster.close()
+        for board, (held, wanted) in enumerate(zip(self._images, images, strict=True)):
+            if held.image_hash != wanted.image_hash:
+                self._program(board, wanted)
+        return self._opened(images)
+
+    def _put_back(self, cluster: MiniCluster) -> None:
+        """Use the boards as before; those that do not come back in time stay in `gone`, to be mended later."""
+        self._cluster = cluster
+        cluster.close()
+        self.gone = dict.fromkeys(range(len(self._endpoints)), "it gets its old image back")
+        deadline = time.monotonic() + self._settings.peer_timeout
+        while self.gone and time.monotonic() < deadline:
+            self.mend()
+            time.sleep(TICK / 4 if self.gone else 0)
+
+    def _program(self, board: int, image: Image) -> None:
+        """Program a board that this process does not have open.
+
+        Raises:
+            BoardError: It can't be programmed.
+        """
+        deadline = time.monotonic() + self._settings.peer_timeout
+        while True:
+            try:
+                program(
+                    self._endpoints[board], image, timeout=max(self._settings.peer_timeout, PROGRAMMING_S)
+                )
+            except HeldError as error:
+                # over TCP a board may hear of our own link's end after the loader's beginning
+                if time.monotonic() > deadline:
+                    raise BoardHeldError(f"Board {board}: {error}", board=board) from error
+                time.sleep(TICK / 4)
+            except (GreetingMismatchError, ImageError) as error:
+                raise BoardMismatchError(f"Board {board}: {error}", board=board) from error
+            except PcieShimError as error:
+                raise BoardLinkError(f"Board {board}: {error}", board=board) from error
+            else:
+                return
 
     def status(self, output: FrameOutput | None) -> list[BoardStatus]:
         """What is known of each board, with its part of the last output; may be called by another thread."""
@@ -191,7 +319,7 @@ class Boards:
             if self._cluster is None:
                 break
             try:
-                self._cluster.reopen(board, timeout=TICK)
+                self._reopen(self._cluster, board)
             except BoardMismatchError:
                 raise
             except BoardError as error:
@@ -201,10 +329,23 @@ class Boards:
                 back.append(board)
         return back
 
+    def _reopen(self, cluster: MiniCluster, board: int) -> None:
+        try:
+            cluster.reopen(board, timeout=TICK)
+        except BoardMismatchError:
+            if not self._reprogram:
+                raise
+            self._program(board, self._images[board])
+            cluster.reopen(board, timeout=TICK)
+
     def close(self) -> None:
         """Let go of all boards."""
         if self._cluster is not None:
             self._cluster.close()
+
+
+def _images_of(deployment: Deployment) -> list[Image]:
+    return [read_image(deployment.image_path(at)) for at in range(len(deployment.boards))]
 
 
 def result_record(number: int, output: FrameOutput) -> FrameResult:
@@ -227,9 +368,8 @@ def frame_failed(number: int, error: BoardError) -> FrameFailed:
 class Progress:
     """What was asked of the boards and what became of it: counts for the status, lines for the log."""
 
-    def __init__(self, boards: Boards, deployment_hash: str, log_level: str) -> None:
+    def __init__(self, boards: Boards, log_level: str) -> None:
         self._boards = boards
-        self._hash = deployment_hash
         self._follows = log_level == "debug"
         self._log = get_logger(ROLE, log_level)
         self._computed = 0
@@ -263,7 +403,8 @@ class Progress:
         return ProcessStatus(
             ready=self.ready is not None and gone is None,
             why=why,
-            deployment=self._hash,
+            deployment=self._boards.generations.deployment.hash,
+            generation=self._boards.generations.number,
             boards=self._boards.status(output),
             frames=FrameCounts(
                 received=self.asked,
@@ -278,17 +419,18 @@ class Progress:
 class PcieApp:
     """Serves one master at a time over a local socket."""
 
-    def __init__(
-        self, boards: Boards, deployment_hash: str, endpoint: Endpoint, log_level: str = "info"
-    ) -> None:
+    def __init__(self, boards: Boards, endpoint: Endpoint, log_level: str = "info") -> None:
         self._boards = boards
-        self._hash = deployment_hash
         self._endpoint = endpoint
         self._where = f"{ROLE} at {endpoint}"
         self._master: BlockingRecordSocket | None = None
         self._greeted = False
-        self._progress = Progress(boards, deployment_hash, log_level)
+        self._progress = Progress(boards, log_level)
         self._selector = selectors.DefaultSelector()
+
+    @property
+    def _hash(self) -> str:
+        return self._boards.generations.deployment.hash
 
     def serve(self) -> int:
         """Serve until a signal raises in this thread.
@@ -364,13 +506,27 @@ class PcieApp:
                 if not self._greeted:
                     check_hello(record, "master", self._hash, self._where)
                     self._greeted = True
+                    self._take(record)
                     if self._progress.ready is not None:
                         self._send(self._progress.ready)
-                elif isinstance(record, Frame):
-                    self._compute(record)
+                else:
+                    self._take(record)
         except (LocalSocketError, OtherPeerError) as error:
             master.send(Trouble(error.exit_code, str(error)))
             self._drop()
+
+    def _take(self, record: AnyRecord) -> None:
+        match record:
+            case Frame():
+                self._compute(record)
+            case Hello():
+                self._boards.generations.greeted(record)
+            case Prepare():
+                self._send(self._boards.generations.prepare(record))
+            case Switch():
+                self._send(self._boards.switch(record))
+            case _:
+                pass  # nothing else is for boards
 
     def status(self) -> ProcessStatus:
         """What this process knows; called by the status socket's thread."""
@@ -467,6 +623,10 @@ def pcie_app(
     stop: options.Stop = None,
     peer_timeout: options.PeerTimeout = None,
     board_timeout: options.BoardTimeout = None,
+    reprogram: Annotated[
+        bool,
+        typer.Option("--reprogram", help="Program boards that hold another image, instead of refusing them."),
+    ] = False,
     log_level: options.LogLevel = None,
 ) -> int:
     """Drive the boards of a mini-cluster."""
@@ -481,9 +641,9 @@ def pcie_app(
         log_level=log_level,
     )
     loaded = deployment_for(settings, images=True)
-    opened = Boards(settings, loaded, board_endpoints(settings, loaded))
+    opened = Boards(settings, loaded, board_endpoints(settings, loaded), reprogram=reprogram)
     if listen_at is not None:
-        pcie = PcieApp(opened, loaded.hash, endpoint_from(listen_at, "--listen"), settings.log_level)
+        pcie = PcieApp(opened, endpoint_from(listen_at, "--listen"), settings.log_level)
         with status_thread(settings.run_directory, ROLE, pcie.status):
             return pcie.serve()
     if sys.stdin.isatty():

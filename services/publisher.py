@@ -24,8 +24,21 @@ from machines.bm1 import StopReason
 from services import options
 from services.command_line import ends_well, make_app, run_async
 from services.errors import InputLineError, SettingsError, exit_code_of
+from services.generations import Generations
 from services.logs import get_logger, say
-from services.records import AnyRecord, Begin, BoardOutcome, FrameResult, Publish, Published, Ready, Trouble
+from services.records import (
+    AnyRecord,
+    Begin,
+    BoardOutcome,
+    FrameResult,
+    Hello,
+    Prepare,
+    Publish,
+    Published,
+    Ready,
+    Switch,
+    Trouble,
+)
 from services.results import (
     FrameReport,
     Inferred,
@@ -73,11 +86,13 @@ class ResultTopics:
     def __init__(self, settings: Settings, deployment: Deployment) -> None:
         self._settings = settings
         self._deployment = deployment
+        self._generation = 0
         self._layout = posterior_layout(deployment)
         self._outputs: list[tuple[Ros, Publication]] = []
         self._frames: Publication | None = None
         self._watched: Subscription | None = None
-        self._report = FrameReport(deployment, 2)
+        self._version: Literal[1, 2] = 2
+        self._report = FrameReport(deployment, self._version)
         self._previous_out_ns = 0
         self.rosbridges: dict[str, Ros] = {}
 
@@ -108,9 +123,17 @@ class ResultTopics:
             version: Literal[1, 2] = 1 if settings.ros_version == "1" else 2
             if settings.ros_version == "auto":
                 version = await first.detect_ros_version() or 2
-            self._report = FrameReport(deployment, version)
+            self._version = version
+            self._report = FrameReport(self._deployment, version, self._generation)
             topics = ", ".join(output.topic for output in deployment.outputs)
             yield f"publishing on {topics} at {', '.join(by_uri)}"
+
+    def use(self, deployment: Deployment, generation: int) -> None:
+        """Say results as those of another deployment, on the same topics."""
+        self._deployment = deployment
+        self._generation = generation
+        self._layout = posterior_layout(deployment)
+        self._report = FrameReport(deployment, self._version, generation)
 
     def watch(self) -> None:
         """Subscribe to the first output, so that a result can be seen on the wire."""
@@ -210,7 +233,7 @@ class Publisher:
         self._once = False
         self._busy = True  # there are no topics yet
         self._link = link(self._take)
-        self._deployment = deployment
+        self._generations = Generations(deployment, posterior_layout)
         self._follows = settings.log_level == "debug"
         self._log = get_logger(ROLE, settings.log_level)
         self._run_directory = settings.run_directory
@@ -228,7 +251,8 @@ class Publisher:
         return ProcessStatus(
             ready=not why,
             why=why or self._where,
-            deployment=self._deployment.hash,
+            deployment=self._generations.deployment.hash,
+            generation=self._generations.number,
             connections=connections(self._topics.rosbridges),
             frames=FrameCounts(
                 received=outcomes.total() + self._waiting.qsize(),
@@ -256,6 +280,17 @@ class Publisher:
             except asyncio.QueueFull:
                 self._outcomes["rosbridge away"] += 1
                 self._link.send(Published(record.result.number, "rosbridge away", None, -1, 0.0, 0, 0))
+        elif isinstance(record, Hello):
+            self._generations.greeted(record)
+            self._topics.use(self._generations.deployment, record.generation)
+        elif isinstance(record, Prepare):
+            self._link.send(self._generations.prepare(record))
+        elif isinstance(record, Switch):
+            # no result is under way: the master has waited for them
+            answer = self._generations.switch(record)
+            self._topics.use(self._generations.deployment, self._generations.number)
+            self._link.serve(self._generations.deployment.hash)
+            self._link.send(answer)
 
     def _tell(self, published: Published) -> None:
         """What became of a result."""

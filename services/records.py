@@ -14,11 +14,15 @@ class Record(msgspec.Struct, array_like=True, frozen=True):
 
 
 class Hello(Record, tag="hello", frozen=True):
-    """First record in each direction: who speaks, which version, for which model."""
+    """First record in each direction: who speaks, which version, for which model.
+
+    `generation` is the master's to say: how often the run has changed its deployment. The service counts on from there.
+    """
 
     role: str
     version: str
     deployment_hash: str
+    generation: int = 0
 
 
 class Begin(Record, tag="begin", frozen=True):
@@ -55,6 +59,7 @@ class Reading(Record, tag="reading", frozen=True):
 
     `addresses` holds None for a missing reading; `passed_over` counts the readings that the
     subscriber lost since the last one it sent, `unpaired` the messages whose partners on other topics did not come.
+    `generation` is that of the deployment by which the addresses were made: the boards' tables have to be of the same.
     """
 
     stamp_ns: int
@@ -65,6 +70,7 @@ class Reading(Record, tag="reading", frozen=True):
     passed_over: int
     unpaired: int = 0
     prior_codes: bytes = b""
+    generation: int = 0
 
 
 class Unusable(Record, tag="unusable", frozen=True):
@@ -139,6 +145,40 @@ class Published(Record, tag="published", frozen=True):
     total_ns: int
 
 
+class Prepare(Record, tag="prepare", frozen=True):
+    """Master to a service: read this deployment, check it, and keep it ready; nothing changes yet."""
+
+    generation: int
+    folder: str
+    deployment_hash: str
+
+
+class Prepared(Record, tag="prepared", frozen=True):
+    """A service to the master: it has the deployment of this generation."""
+
+    generation: int
+
+
+class Switch(Record, tag="switch", frozen=True):
+    """Master to a service: work by the deployment of this generation from now on (or again)."""
+
+    generation: int
+
+
+class Switched(Record, tag="switched", frozen=True):
+    """A service to the master: all that it sends from now on is of this generation."""
+
+    generation: int
+
+
+class NotReloaded(Record, tag="not reloaded", frozen=True):
+    """A service to the master: it could not prepare or switch, and goes on with what it had."""
+
+    generation: int
+    exit_code: int
+    sentence: str
+
+
 AnyRecord = (
     Hello
     | Begin
@@ -152,4 +192,9 @@ AnyRecord = (
     | FrameFailed
     | Publish
     | Published
+    | Prepare
+    | Prepared
+    | Switch
+    | Switched
+    | NotReloaded
 )

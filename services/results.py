@@ -99,7 +99,7 @@ class FrameReport:
     It goes out before every result, so its cost is every frame's.
     """
 
-    def __init__(self, deployment: Deployment, ros_version: Literal[1, 2]) -> None:
+    def __init__(self, deployment: Deployment, ros_version: Literal[1, 2], generation: int = 0) -> None:
         self._ros_version = ros_version
         name = orjson.dumps(deployment.name).decode().replace("%", "%%")
         self._frame = _status(
@@ -112,6 +112,7 @@ class FrameReport:
                 "published": "%s",
                 "cycles": "%d",
                 "counts_total": "%d",
+                "generation": str(generation),
                 "received_ns": "%d",
                 "sent_ns": "%d",
                 "rosbridge_in_us": "%.1f",

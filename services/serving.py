@@ -41,6 +41,9 @@ class Link(Protocol):
     def notice(self, level: str, sentence: str) -> None:
         """Tell the master something that ends nothing."""
 
+    def serve(self, deployment_hash: str) -> None:
+        """Greet later masters with another deployment from now on."""
+
     async def __aenter__(self) -> Self:
         """Begin to serve."""
 
@@ -51,7 +54,7 @@ class Link(Protocol):
 
 
 MakeLink = Callable[[Callable[[AnyRecord], None]], Link]
-"""Makes a service's link; the argument takes the master's records."""
+"""Makes a service's link; the argument takes the master's records, its greeting first."""
 
 
 class MasterLink:
@@ -124,6 +127,7 @@ class MasterLink:
                 protocol.send(Trouble(error.exit_code, str(error)))
                 raise
             self._greeted = True
+            self._on_record(record)
             for each in self._last.values():
                 protocol.send(each)
             return
@@ -156,6 +160,10 @@ class MasterLink:
     def notice(self, level: str, sentence: str) -> None:
         """Tell the master something that ends nothing."""
         self.send(Notice(level, sentence))
+
+    def serve(self, deployment_hash: str) -> None:
+        """Greet later masters with another deployment from now on."""
+        self._hash = deployment_hash
 
 
 def listening(endpoint: Endpoint, role: str, deployment_hash: str) -> MakeLink:

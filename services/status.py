@@ -209,6 +209,14 @@ def screen(stack: StackStatus) -> RenderableType:
         parts.append(Text(f"{stack.directory}: not ready", "bold red"))
         parts.extend(Text(f"  {_plain(sentence)}", "red") for sentence in stack.why)
 
+    parts.extend(
+        Text(
+            f"deployment {_plain(process.deployment[:12])} of {_plain(process.folder)}, generation {process.generation}"
+        )
+        for process in stack.processes
+        if process.folder
+    )
+
     table = Table(box=None, pad_edge=False)
     table.add_column("process")
     table.add_column("ready")

@@ -101,7 +101,11 @@ class HubStatus(msgspec.Struct, frozen=True):
 
 
 class ProcessStatus(msgspec.Struct, frozen=True, kw_only=True):
-    """One process. `why` says what is awaited while it is not ready, and what it has when it is."""
+    """One process. `why` says what is awaited while it is not ready, and what it has when it is.
+
+    `deployment` is the hash of the one in force, `generation` how often that has changed since the run began, and
+    `folder` where the master has it from.
+    """
 
     ready: bool
     why: str
@@ -110,6 +114,8 @@ class ProcessStatus(msgspec.Struct, frozen=True, kw_only=True):
     version: str = ""
     uptime_s: float = 0.0
     deployment: str = ""
+    generation: int = 0
+    folder: str = ""
     connections: list[ConnectionStatus] = msgspec.field(default_factory=list)
     frames: FrameCounts | None = None
     boards: list[BoardStatus] = msgspec.field(default_factory=list)

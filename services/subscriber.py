@@ -20,9 +20,23 @@ from services import options
 from services.command_line import ends_well, make_app, run_async
 from services.errors import RosbridgeLostError, SettingsError, VariableError, exit_code_of
 from services.frames import CompleteReading, FrameAssembler
+from services.generations import Generations
 from services.local_socket import MAX_RECORD
 from services.logs import get_logger, say
-from services.records import AnyRecord, Begin, Notice, Reading, Ready, Trouble, Unusable
+from services.records import (
+    AnyRecord,
+    Begin,
+    Hello,
+    Notice,
+    NotReloaded,
+    Prepare,
+    Reading,
+    Ready,
+    Switch,
+    Switched,
+    Trouble,
+    Unusable,
+)
 from services.serving import MakeLink, deployment_for, endpoint_from, listening
 from services.settings import Settings, load_settings
 from services.status_socket import (
@@ -66,8 +80,7 @@ class Subscriber:
 
     def __init__(self, settings: Settings, deployment: Deployment, link: MakeLink) -> None:
         self._settings = settings
-        self._deployment = deployment
-        self._assembler = FrameAssembler(deployment)
+        self._generations = Generations(deployment, FrameAssembler)
         self._queue_all = (settings.queue or deployment.queue) == "all"
         self._begun = asyncio.Event()
         self._once = False
@@ -80,7 +93,19 @@ class Subscriber:
         self._received = self._completed = self._unusable = self._passed_over_before = 0
         self._last_tick = 0
         self._told_apart = False
-        self._unpaired_before = 0
+        self._unpaired_told = self._unpaired_before = 0
+
+    @property
+    def _deployment(self) -> Deployment:
+        return self._generations.deployment
+
+    @property
+    def _assembler(self) -> FrameAssembler:
+        return self._generations.made
+
+    @property
+    def _unpaired(self) -> int:
+        return self._unpaired_before + self._assembler.unpaired
 
     def _take(self, record: AnyRecord) -> None:
         if isinstance(record, Begin):
@@ -89,6 +114,22 @@ class Subscriber:
         elif isinstance(record, Notice) and self._follows:
             # a frame has its number from the master, once it is neither passed over nor unusable
             self._log.debug(record.sentence)
+        elif isinstance(record, Hello):
+            self._generations.greeted(record)
+        elif isinstance(record, Prepare):
+            self._link.send(self._generations.prepare(record))
+        elif isinstance(record, Switch):
+            self._link.send(self._switch(record))
+
+    def _switch(self, record: Switch) -> Switched | NotReloaded:
+        """Make addresses by another deployment."""
+        # messages that wait for partners were read by the old one
+        self._assembler.forget()
+        unpaired = self._unpaired
+        answer = self._generations.switch(record)
+        self._unpaired_before = unpaired - self._assembler.unpaired
+        self._link.serve(self._deployment.hash)
+        return answer
 
     def status(self) -> ProcessStatus:
         """What this process knows."""
@@ -105,6 +146,7 @@ class Subscriber:
             ready=not why,
             why=why or f"connected to {', '.join(self._rosbridges)}",
             deployment=self._deployment.hash,
+            generation=self._generations.number,
             connections=connections(self._rosbridges),
             frames=FrameCounts(
                 received=self._received,
@@ -113,7 +155,7 @@ class Subscriber:
                     {
                         "passed over": self._passed_over + self._passed_over_before,
                         "with an unusable variable": self._unusable,
-                        "unpaired": self._assembler.unpaired,
+                        "unpaired": self._unpaired,
                     }
                 ),
                 last_number=None,
@@ -234,10 +276,13 @@ class Subscriber:
         if self._link.backlog > _BACKLOG_LIMIT and not self._queue_all:
             self._passed_over += 1
             return
-        unpaired = self._assembler.unpaired
-        if self._link.send(_reading_record(reading, self._passed_over, unpaired - self._unpaired_before)):
+        unpaired = self._unpaired
+        record = _reading_record(
+            reading, self._passed_over, unpaired - self._unpaired_told, self._generations.number
+        )
+        if self._link.send(record):
             self._completed += 1
-            self._unpaired_before = unpaired
+            self._unpaired_told = unpaired
             self._passed_over_before += self._passed_over
             self._passed_over = 0
             self._once = (
@@ -245,7 +290,7 @@ class Subscriber:
             )
 
 
-def _reading_record(reading: CompleteReading, passed_over: int, unpaired: int) -> Reading:
+def _reading_record(reading: CompleteReading, passed_over: int, unpaired: int, generation: int) -> Reading:
     return Reading(
         stamp_ns=reading.stamp_ns,
         received_ns=reading.received_ns,
@@ -255,6 +300,7 @@ def _reading_record(reading: CompleteReading, passed_over: int, unpaired: int) -
         passed_over=passed_over,
         unpaired=unpaired,
         prior_codes=reading.prior_codes,
+        generation=generation,
     )
 
 

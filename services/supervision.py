@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import ctypes
+import fcntl
 import os
 import shutil
 import signal
@@ -28,6 +29,11 @@ DIRECTORY_VARIABLE = "ROSBAYES_DIRECTORY"
 
 RUN_DIRECTORY_VARIABLE = "BM_RUN_DIRECTORY"
 """Where status sockets go (the setting `run_directory`); a run of the user's own choice, else the private one."""
+
+STATUS_SUFFIX = ".status.sock"
+CONTROL_SUFFIX = ".control.sock"
+KEPT = "deployment-"
+"""How the folders begin in which a run keeps the deployments of its children (`services.reload`)."""
 
 RESTARTS = 3
 RESTARTS_WITHIN = 60.0
@@ -74,18 +80,52 @@ def end_with_parent() -> None:
         _end_early(signal.SIGTERM, None)
 
 
+class PrivateDirectory:
+    """A run's directory while its master lives: locked, so that its children can see when that is over."""
+
+    def __init__(self) -> None:
+        self.path = make_private_directory()
+        # the kernel lets go of it when the process ends, however that happens
+        self._lock = os.open(self.path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        fcntl.flock(self._lock, fcntl.LOCK_EX)
+
+    def remove(self) -> None:
+        """Take it away with all that is in it."""
+        shutil.rmtree(self.path, ignore_errors=True)
+        os.close(self._lock)
+
+
+def _is_abandoned(directory: Path) -> bool:
+    """Whether the master whose directory it was is gone."""
+    try:
+        handle = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except OSError:
+        return False
+    else:
+        return True
+    finally:
+        os.close(handle)
+
+
 def leave_private_directory() -> None:
     """In a child that ends: take the run's directory away if it is empty and the parent did not."""
     directory = os.environ.get(DIRECTORY_VARIABLE)
     if directory:
         remove_dead_sockets(Path(directory))
+        if _is_abandoned(Path(directory)):
+            for kept in Path(directory).glob(f"{KEPT}*"):
+                shutil.rmtree(kept, ignore_errors=True)
         with contextlib.suppress(OSError):
             Path(directory).rmdir()
 
 
 def remove_dead_sockets(directory: Path) -> None:
-    """Take the status sockets away that processes left which were killed."""
-    for path in directory.glob("*.status.sock"):
+    """Take the status and control sockets away that processes left which were killed."""
+    for path in (*directory.glob(f"*{STATUS_SUFFIX}"), *directory.glob(f"*{CONTROL_SUFFIX}")):
         with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX) as probe:
             probe.settimeout(0.2)
             try:
@@ -179,6 +219,14 @@ class Child:
                 self._errors.append(text.removeprefix("error: "))
             elif text:
                 say(text)
+
+    def give(self, flag: str, value: str | None = None) -> None:
+        """Start it with another value of a flag from now on, or with a flag that takes none."""
+        if flag not in self._command:
+            self._command = [*self._command, flag, *([] if value is None else [value])]
+        elif value is not None:
+            at = self._command.index(flag) + 1
+            self._command = [*self._command[:at], value, *self._command[at + 1 :]]
 
     def exit_code(self) -> int | None:
         """Its exit code, negative for a signal; None while it runs."""

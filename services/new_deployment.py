@@ -1,0 +1,79 @@
+"""A deployment that is to take the place of the one in force: read, compared in shape, and kept for the run's children."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+from services.errors import NotReloadedError, ShapeError
+from services.supervision import KEPT
+from toolchain.deployment import Deployment, load_deployment
+from toolchain.same_shape import differences
+
+_LARGEST_FILE = 1 << 28
+_NAMED = 4
+"""Differences that a refusal names; the rest it counts."""
+
+
+def read_new(folder: Path, in_force: Deployment, as_used: Callable[[Deployment], Deployment]) -> Deployment:
+    """Read a deployment of the shape of the one in force. Its images are for pcie-app to check.
+
+    Args:
+        folder: Where it is.
+        in_force: What it is to replace.
+        as_used: A deployment as this run uses it: what flags override counts for nothing.
+
+    Raises:
+        ToolchainError: It is damaged, of another version, or not there.
+        ShapeError: It differs in what has to stay; names the fields.
+    """
+    loaded = load_deployment(folder, images=False)
+    found = differences(as_used(in_force), as_used(loaded))
+    if found:
+        rest = f"; {len(found) - _NAMED} more" if len(found) > _NAMED else ""
+        msg = (
+            f"{loaded.path} is of another shape: {'; '.join(map(str, found[:_NAMED]))}{rest}. "
+            "A run takes other tables, priors, targets and ways to read messages; for this one, end it and start it anew"
+        )
+        raise ShapeError(msg)
+    return loaded
+
+
+def keep(deployment: Deployment, directory: Path, generation: int) -> Path:
+    """Copy what the services read of a deployment, so that a child that is restarted finds it whatever becomes of the folder.
+
+    Args:
+        deployment: The deployment.
+        directory: The run's own.
+        generation: Its number in the run.
+
+    Returns:
+        The folder with the copy.
+
+    Raises:
+        NotReloadedError: It can't be copied, or was changed meanwhile.
+        ToolchainError: The copy is none.
+    """
+    kept = directory / f"{KEPT}{generation}"
+    shutil.rmtree(kept, ignore_errors=True)
+    for source in (deployment.path, *(deployment.image_path(at) for at in range(len(deployment.boards)))):
+        copy = kept / source.relative_to(deployment.directory)
+        try:
+            if source.stat().st_size > _LARGEST_FILE:
+                msg = f"{source} has more than {_LARGEST_FILE >> 20} MiB: it belongs to no deployment"
+                raise NotReloadedError(msg)
+            copy.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            shutil.copyfile(source, copy)
+        except OSError as error:
+            msg = f"{source} can't be copied to {kept}, for services that are restarted: {error.strerror or error}"
+            raise NotReloadedError(msg) from error
+    if load_deployment(kept, images=False).hash != deployment.hash:
+        msg = f"{deployment.path} was changed while it was read; reload again when that is done"
+        raise NotReloadedError(msg)
+    return kept
+
+
+def forget(directory: Path, generation: int) -> None:
+    """Take a copy away that no child reads any more."""
+    shutil.rmtree(directory / f"{KEPT}{generation}", ignore_errors=True)

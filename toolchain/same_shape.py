@@ -1,0 +1,102 @@
+"""Whether a deployment can take another's place in a run that goes on: what boards and topics were made for must stay.
+
+A run's shape is what a board is synthesised for (lines, partitions, widths, generators, registers) and what the
+processes are connected to (servers, topics, types). Tables, priors and seeds, when a machine stops, and how readings
+become addresses belong to one deployment alone, and may change. A field that is not named below as free must stay, so
+that a new one is safe before anybody thinks of it here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from pydantic import BaseModel
+
+    from toolchain.deployment import Deployment
+
+_DEPLOYMENT_FREE: Final = {"name", "hash", "tolerance_s", "prior", "directory"}
+_VARIABLE_FREE: Final = {
+    *("source", "path", "offset", "step", "period", "values", "on_range", "on_missing", "states"),
+}
+_DIMENSION_FREE: Final = {"offset", "step", "states"}
+_MACHINE_FREE: Final = {"scale", "target_count", "max_cycles", "stop"}
+_BOARD_FREE: Final = {"image", "image_hash"}
+_TABLES: Final = {"sources", "variables", "searched", "machine", "boards", "outputs"}
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """A field that would have to stay.
+
+    Attributes:
+        field: Its place in `deployment.toml`.
+        before: Its value in the deployment that is in force.
+        after: Its value in the new one.
+    """
+
+    field: str
+    before: str
+    after: str
+
+    def __str__(self) -> str:
+        return f"{self.field} is {self.before} in the run and {self.after} in the new one"
+
+
+def differences(before: Deployment, after: Deployment) -> list[Difference]:
+    """What keeps `after` from taking the place of `before`, in the order of `deployment.toml`; empty where nothing does."""
+    old, new = dict(_shape(before)), dict(_shape(after))
+    fields = [*old, *(field for field in new if field not in old)]
+    found = [
+        Difference(field, old.get(field, "not there"), new.get(field, "not there"))
+        for field in fields
+        if old.get(field) != new.get(field)
+    ]
+    counts = [difference for difference in found if difference.field.endswith(_COUNTS)]
+    # where a table has other rows, what its rows say is no news
+    tables = tuple(
+        f"{difference.field.split(']]')[0]}]]" for difference in counts if "]]" in difference.field
+    )
+    return [each for each in found if each in counts or not each.field.startswith(tables or ("\0",))]
+
+
+_COUNTS: Final = ("number", "names")
+
+
+def _shape(deployment: Deployment) -> Iterator[tuple[str, str]]:
+    yield from _fields("", deployment, _DEPLOYMENT_FREE | _TABLES)
+    yield from _rows("[[source]]", deployment.sources, set())
+    yield "[[variable]] names", _text(sorted(variable.name for variable in deployment.variables))
+    for variable in sorted(deployment.variables, key=lambda each: each.name):
+        yield from _fields(f"[[variable]] {variable.name} ", variable, _VARIABLE_FREE | {"name", "bits"})
+    # columns are what a board has; which variable they are read from may be mended
+    for column, variable in enumerate(deployment.sensors, start=1):
+        yield f"[[variable]] bits of column {column}", _text(variable.bits)
+    yield from _rows("[[searched]]", deployment.searched, _DIMENSION_FREE)
+    yield from _fields("[machine] ", deployment.machine, _MACHINE_FREE)
+    yield from _rows("[[board]]", deployment.boards, _BOARD_FREE)
+    yield from _rows("[[output]]", deployment.outputs, set())
+
+
+def _rows(table: str, rows: tuple[BaseModel, ...], free: set[str]) -> Iterator[tuple[str, str]]:
+    yield f"{table} number", _text(len(rows))
+    for at, row in enumerate(rows):
+        yield from _fields(f"{table} {at} ", row, free)
+
+
+def _fields(before: str, section: BaseModel, free: set[str]) -> Iterator[tuple[str, str]]:
+    for name in type(section).model_fields:
+        if name not in free:
+            yield before + name, _text(getattr(section, name))
+
+
+def _text(value: object) -> str:
+    if isinstance(value, Enum):
+        value = value.value
+    if isinstance(value, list):
+        return ", ".join(map(str, value))
+    return str(value) if value != "" else "empty"
