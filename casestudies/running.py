@@ -1,6 +1,7 @@
 """One way to start and end a case study's process: event loop, signals, exit codes, errors in a sentence."""
 
 import asyncio
+import logging
 import signal
 import sys
 from collections.abc import Callable, Coroutine
@@ -14,7 +15,11 @@ from bridge.errors import BridgeError
 from casestudies.errors import CaseStudyError
 from toolchain.commands.usage import CommandLine
 
-_ENDING_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_ENDING_SIGNALS = {
+    signal.SIGINT: "interrupted (Ctrl-C)",
+    signal.SIGTERM: "asked to end (SIGTERM)",
+    signal.SIGHUP: "the terminal was closed (SIGHUP)",
+}
 
 
 def say(sentence: str) -> None:
@@ -52,6 +57,8 @@ def run(body: Callable[[], Coroutine[Any, Any, None]]) -> None:
         typer.Exit: with 128 and the signal's number, or the error's own exit code after one sentence
             on stderr.
     """
+    # what the client warns of, `connection.told` says in words; only its errors are news
+    logging.basicConfig(level=logging.ERROR, stream=sys.stderr, format="%(name)s: %(message)s")
     try:
         with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
             received = runner.run(_until_signal(body))
@@ -60,6 +67,7 @@ def run(body: Callable[[], Coroutine[Any, Any, None]]) -> None:
     finally:
         _end_at_signals()  # closing the loop has put the system's own handlers back
     if received is not None:
+        say(_ENDING_SIGNALS[received])
         raise typer.Exit(128 + received)
 
 

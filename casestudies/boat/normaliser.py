@@ -51,11 +51,12 @@ async def serve(uri: str, *, raw_topic: str, sensors_topic: str, array: bool) ->
     """
     from bridge.client import connect
     from casestudies.boat.lossy import LossyPublication
+    from casestudies.connection import told
     from casestudies.readiness import Readiness, readiness_told
 
     said: set[str] = set()
     readiness = Readiness("a reading was normalised")
-    async with readiness_told("boat-normaliser", readiness), connect(uri) as ros:
+    async with readiness_told("boat-normaliser", readiness), connect(uri, on_state=told(uri)) as ros:
         sensors = LossyPublication(await ros.advertise(sensors_topic, ARRAY_TYPE if array else SENSORS_TYPE))
         raw = ros.subscribe(raw_topic, ARRAY_TYPE if array else RAW_TYPE)
         async for message in raw:

@@ -1,6 +1,5 @@
 """Shows the boat's posteriors beside the truth: hears three topics, and knows nothing else of the stack."""
 
-import json
 import math
 import signal
 import sys
@@ -14,8 +13,9 @@ import typer
 
 from bridge.errors import NoResultError
 from casestudies.boat.messages import TRUE_POSE_TOPIC
-from casestudies.errors import CaseStudyError, OutputError
+from casestudies.errors import CaseStudyError
 from casestudies.running import command, fail, run, say
+from casestudies.written import check_writable, write_numbers
 from toolchain.commands.usage import CommandLine
 
 if TYPE_CHECKING:
@@ -141,13 +141,14 @@ class Viewer:
             BridgeError: no rosbridge server answers at the URI.
         """
         from bridge.client import connect
+        from casestudies.connection import told
         from casestudies.listening import listen
         from casestudies.readiness import Readiness, readiness_told
 
         readiness = Readiness("a result was shown")
         async with (
             readiness_told("boat-viewer", readiness),
-            connect(uri) as ros,
+            connect(uri, on_state=told(uri)) as ros,
             listen(ros, truth_topic=truth_topic, truth_tolerance_s=truth_tolerance_s) as listener,
         ):
             say(f"boat-viewer: listening to {uri}")
@@ -209,11 +210,7 @@ class Viewer:
                 for line, instance in zip(self.lines, self.instances, strict=True)
             ],
         }
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text(json.dumps(numbers, indent=1) + "\n")
-        except OSError as error:
-            raise OutputError(f"{path} cannot be written: {error.strerror or error}") from None
+        write_numbers(path, numbers)
 
 
 class _Shown:
@@ -325,6 +322,9 @@ def boat_viewer(
     try:
         if out is not None:
             check_pictures_possible()
+            check_writable(out)
+        if numbers is not None:
+            check_writable(numbers.parent)
         try:
             run(
                 lambda: viewer.watch(

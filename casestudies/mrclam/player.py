@@ -4,7 +4,6 @@ python -m casestudies.mrclam.player DATA_DIR/ds1_robot3.csv --uri ws://127.0.0.1
 """
 
 import contextlib
-import json
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -16,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 from bridge.errors import BadResultError, NoResultError
-from casestudies.errors import CaseStudyError, OutputError
+from casestudies.errors import CaseStudyError
 from casestudies.mrclam.recording import (
     MAP_FRAME,
     SIGHTINGS_MSG,
@@ -28,6 +27,7 @@ from casestudies.mrclam.recording import (
     sightings_message,
 )
 from casestudies.running import command, fail, run, say
+from casestudies.written import check_writable, write_numbers
 from toolchain.commands.usage import CommandLine
 
 if TYPE_CHECKING:
@@ -111,10 +111,11 @@ async def play(
         BridgeError: no rosbridge server answers at the URI, or it was lost.
     """
     from bridge.client import connect
+    from casestudies.connection import told
     from casestudies.listening import listen
 
     played: list[PlayedFrame] = []
-    async with connect(uri) as ros, listen(ros) as listener:
+    async with connect(uri, on_state=told(uri)) as ros, listen(ros) as listener:
         version = await ros.detect_ros_version()
         publication = await ros.advertise(topic, SIGHTINGS_TYPE)
         for frame in frames:
@@ -212,11 +213,7 @@ def _write_numbers(path: Path, played: Sequence[PlayedFrame]) -> None:
         "distances_m": [frame.distance() for frame in played],
         "cycles": [frame.cycles for frame in played],
     }
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(numbers, indent=1) + "\n")
-    except OSError as error:
-        raise OutputError(f"{path} cannot be written: {error.strerror or error}") from None
+    write_numbers(path, numbers)
 
 
 app = CommandLine()
@@ -250,6 +247,8 @@ def player(
         raise typer.BadParameter("name a file like ds1_robot3.csv", param_hint="RECORDING")
     try:
         frames = read_recording(recording)[:count]
+        if numbers is not None:
+            check_writable(numbers.parent)
         played: list[PlayedFrame] = []
 
         def heard(frame: PlayedFrame) -> None:

@@ -144,7 +144,7 @@ async def test_arrays_are_paired_with_the_pose_before_them(tmp_path):
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 @pytest.mark.parametrize("module", ["simulator", "normaliser", "viewer"])
-async def test_a_signal_ends_a_process_without_a_word(module, number, code):
+async def test_a_signal_ends_a_process_and_it_says_so(module, number, code):
     async with FakeRosbridge() as fake, Process(module, "--uri", fake.uri) as process:
         await fake.wait_for_connections(1, timeout=LIMIT)
         process.signal(number)
@@ -152,6 +152,7 @@ async def test_a_signal_ends_a_process_without_a_word(module, number, code):
     assert returned == code
     assert "Traceback" not in err
     assert "error" not in out + err
+    assert err.splitlines()[-1] in {"interrupted (Ctrl-C)", "asked to end (SIGTERM)"}
 
 
 async def test_ctrl_c_ends_an_endless_viewer_with_its_pictures(tmp_path):
@@ -168,6 +169,21 @@ async def test_ctrl_c_ends_an_endless_viewer_with_its_pictures(tmp_path):
     assert code == 130
     assert (tmp_path / "figure-4.4.png").exists()
     assert "2 results" in out
+
+
+@pytest.mark.parametrize("flag", ["--out", "--json"])
+async def test_a_folder_that_cannot_be_written_is_said_at_the_start(flag, tmp_path):
+    (tmp_path / "file").write_text("")
+    name = "file/pictures" if flag == "--out" else "file/numbers.json"
+    async with (
+        FakeRosbridge() as fake,
+        Process("viewer", "--uri", fake.uri, flag, str(tmp_path / name)) as viewer,
+    ):
+        code, _out, err = await viewer.ended()
+        assert not fake.received
+    assert code == 2
+    assert err.startswith(f"error: {tmp_path}/file")
+    assert "cannot be written into: " in err
 
 
 @pytest.mark.parametrize("module", ["simulator", "normaliser", "viewer"])
@@ -215,8 +231,23 @@ async def test_a_simulator_sails_on_while_the_server_is_away():
         simulator.signal(signal.SIGINT)
         code, _out, err = await simulator.ended()
     assert code == 130
-    assert err.count("/boat/raw are dropped until it is back") == 1
-    assert "/boat/raw is published again" in err
+    assert err.count("is gone") == err.count("is connected again") == 1
+    assert err.splitlines()[-1] == "interrupted (Ctrl-C)"
+
+
+async def test_a_normaliser_says_that_the_server_went_and_came_back():
+    async with FakeRosbridge() as fake, Process("normaliser", "--uri", fake.uri) as normaliser:
+        await fake.wait_for_op("subscribe", topic="/boat/raw", timeout=LIMIT)
+        await fake.vanish()
+        fake.received.clear()
+        await fake.come_back()
+        await fake.wait_for_op("subscribe", topic="/boat/raw", timeout=LIMIT)
+        normaliser.signal(signal.SIGTERM)
+        _code, _out, err = await normaliser.ended()
+    _started, gone, back, ended = err.splitlines()
+    assert gone.startswith(f"warning: rosbridge at {fake.uri} is gone (")
+    assert gone.endswith("); waiting for it")
+    assert (back, ended) == (f"rosbridge at {fake.uri} is connected again", "asked to end (SIGTERM)")
 
 
 async def test_a_normaliser_says_each_kind_of_bad_reading_once():
