@@ -24,6 +24,8 @@ _PART_COLOURS: Final = {
 }
 _TRUTH_COLOUR: Final = "#ff4d4d"
 _DPI: Final = 130
+_EDGE: Final = 0.2
+"""So much of the map's width lies too near its edge for a label that is centred."""
 
 
 def check_pictures_possible() -> None:
@@ -169,12 +171,14 @@ def _draw_map(axes: Any, grid: Grid, instance: Instance, route: Sequence[Truth],
         clip_on=False,
         zorder=4,
     )
+    across = (truth.x - grid.x_low) / (grid.x_high - grid.x_low)
     axes.annotate(
         f"({truth.x:.1f}, {truth.y:.1f})",
         (truth.x, truth.y),
         xytext=(0, 9 if truth.y < 30 else -17),
         textcoords="offset points",
-        ha="center",
+        # near the map's edge it would cover the axis
+        ha="left" if across < _EDGE else "right" if across > 1 - _EDGE else "center",
         fontsize=8,
         zorder=3.5,
         bbox={"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": "none", "alpha": 0.8},

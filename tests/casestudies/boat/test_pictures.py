@@ -77,6 +77,17 @@ class TestPositions:
         draw_positions(tmp_path / "x.png", instances, route=[i.truth for i in instances])
         assert len(pixels_of(tmp_path / "x.png", VIRIDIS_LOW)) > 5000
 
+    @pytest.mark.parametrize("x", [-45, -35, 35, 45])
+    def test_the_label_covers_no_axis(self, tmp_path, x):
+        """What stands beside the map is the same, wherever the boat is."""
+        draw_positions(tmp_path / "middle.png", [instance(1, 0, 10)])
+        draw_positions(tmp_path / "edge.png", [instance(1, x, 10)])
+        water = np.bincount(pixels_of(tmp_path / "middle.png", (0.918, 0.949, 0.973))[:, 1])
+        left, right = np.flatnonzero(water > 100)[[0, -1]] + [-3, 3]
+        middle, edge = imread(tmp_path / "middle.png"), imread(tmp_path / "edge.png")
+        assert np.array_equal(middle[:, :left], edge[:, :left])
+        assert np.array_equal(middle[:, right : right + 40], edge[:, right : right + 40])
+
     def test_a_truth_that_is_not_known(self, tmp_path):
         draw_positions(tmp_path / "x.png", [instance(1, truth=False)])
         assert not len(pixels_of(tmp_path / "x.png", TRUTH_COLOUR))
