@@ -316,6 +316,18 @@ def addressed_codes(machine: BM1Machine, start: Start) -> npt.NDArray[np.uint16]
     return codes
 
 
+def missing_inputs(parameters: BM1Parameters) -> tuple[int, ...] | npt.NDArray[np.int64]:
+    """The inputs of a frame whose readings are all missing, as `Start.addresses` takes them."""
+    tops = tuple((1 << bits) - 1 for bits in parameters.sensor_bits)
+    shape = parameters.input_shape
+    if shape == (parameters.sensors,):
+        return tops
+    by_column = np.array(tops, dtype=np.int64)
+    if parameters.sensor_mode is not SensorMode.COLUMN:
+        by_column = by_column[:, np.newaxis]
+    return np.broadcast_to(by_column, shape).copy()
+
+
 def _codes_of_inputs(machine: BM1Machine, start: Start) -> npt.NDArray[np.uint16]:
     """The codes that are selected where an input is not simply a column's: as `addressed_codes`."""
     parameters = machine.parameters

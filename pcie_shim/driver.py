@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Final, Literal, NoReturn, Self
 
 import numpy as np
 
-from machines.bm1 import CYCLES_MAX, StopReason, first_slice
-from machines.parameters import PriorMode
+from machines.bm1 import CYCLES_MAX, StopReason, first_slice, joint_reason
+from machines.parameters import PriorMode, SensorMode
 from pcie_shim import register_map as rm
 from pcie_shim.doorbell import following
 from pcie_shim.endpoint import parse_endpoint
@@ -49,6 +49,7 @@ from pcie_shim.errors import (
 )
 from pcie_shim.link import ALL_ONES, LONGEST_POLL_S, Done, SocketLink
 from pcie_shim.loader import program
+from pcie_shim.programming_file import interface_words, is_plain
 from pcie_shim.register_map import BoardState
 
 if TYPE_CHECKING:
@@ -75,6 +76,8 @@ _RESUME: Final = struct.Struct("<QII")  # RUN_UNTIL, START (0: not rung), RESUME
 _BANK_AT: Final = rm.BANK - rm.TARGET_COUNT
 _REASONS: Final = frozenset(StopReason) - {StopReason.NONE}
 _PRIOR_AT: Final = rm.PRIOR_SELECT - rm.TARGET_COUNT
+_REPLICA: Final = np.dtype([("reason", "<u4"), ("zero", "<u4"), ("cycles", "<u8")])  # of OUTCOMES
+_CAPABILITIES: Final = range(rm.CAP_MACHINE, rm.CAP_INTERFACE + 4, 4)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -82,17 +85,20 @@ class FrameInput:
     """One frame's readings and settings.
 
     Attributes:
-        addresses: One table address per sensor column, in the model's order; None is a missing reading.
-        prior_address: Row of the prior's table (prior select).
-        prior_codes: uint16[total lines], a written prior; None: the image's own.
+        addresses: One table address per sensor column, in the model's order; None is a missing reading. For cells with
+            inputs of their own, and for replicas: an array of integers of the whole machine's ``input_shape``,
+            addresses or codes, with -1 in all lines of a missing reading.
+        prior_address: Row of the prior's table (prior select); with replicas one for all, or a tuple of one each.
+        prior_codes: uint16[total lines], a written prior; with replicas the same for all, or uint16[replicas, total
+            lines]; None: the image's own.
         target_count: Count that stops the machines (thesis figure 3.3: number of target samples).
         max_cycles: Most cycles, whatever the counts.
         bank: Set of seeds from which the RNGs restart.
         stop: ``slices``: all boards stop in the slice in which the first one overflows; ``own``: each for itself.
     """
 
-    addresses: tuple[int | None, ...]
-    prior_address: int = 0
+    addresses: tuple[int | None, ...] | npt.NDArray[np.integer]
+    prior_address: int | tuple[int, ...] = 0
     prior_codes: npt.NDArray[np.uint16] | None = None
     target_count: int
     max_cycles: int
@@ -105,21 +111,27 @@ class BoardResult:
     """What one board computed.
 
     Attributes:
-        words: One count per line of the board, 32 bits each, little-endian, as they came.
-        cycles: Cycles that its machine ran.
-        reason: Why it stopped; IMPOSSIBLE boards ran nothing and have no weight.
+        words: One count per line of the board, 32 bits each, little-endian, as they came; replica after replica.
+        cycles: Cycles that its machine ran; of replicas the one that ran longest.
+        reason: Why it stopped; IMPOSSIBLE boards ran nothing and have no weight. Of replicas what ``joint_reason``
+            makes of theirs, or SLICE where all of them were stopped by other boards'.
         compute_ns: Time that its machine took, in nanoseconds, as the board measured it.
+        replica_cycles: Cycles of each replica; empty where the board holds one machine.
+        replica_reasons: Why each replica stopped; empty likewise.
     """
 
     words: bytes
     cycles: int
     reason: StopReason
     compute_ns: int
+    replica_cycles: tuple[int, ...] = ()
+    replica_reasons: tuple[StopReason, ...] = ()
 
     @property
     def counts(self) -> npt.NDArray[np.uint32]:
-        """uint32[lines of the board], a copy."""
-        return np.frombuffer(self.words, "<u4").astype(np.uint32)
+        """uint32[lines of the board], with replicas uint32[replicas, lines of the board]; a copy."""
+        counts = np.frombuffer(self.words, "<u4").astype(np.uint32)
+        return counts.reshape(len(self.replica_cycles), -1) if self.replica_cycles else counts
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -151,7 +163,14 @@ class _Board:
         self.index = index
         self.endpoint = endpoint
         self.image = image
-        self.lines = image.machine.parameters.lines
+        parameters = image.machine.parameters
+        self.lines = parameters.lines
+        self.replicas = parameters.replicas
+        self.inputs_at = rm.SENSORS if is_plain(parameters) else rm.INPUTS
+        self.counts_bytes = 4 * self.replicas * self.lines
+        self.result_bytes = self.counts_bytes + (
+            self.replicas * _REPLICA.itemsize if self.replicas > 1 else 0
+        )
         self.link: SocketLink | None = None
         self.broken = "it was not opened"
         self.speed = _ASSUMED_SPEED
@@ -160,6 +179,8 @@ class _Board:
     def _forget(self) -> None:
         """Nothing is known of the registers."""
         self.settings = b""
+        self.selects = b""
+        self.outcomes: npt.NDArray[np.void] = np.zeros(0, _REPLICA)
         self.prior: npt.NDArray[np.uint16] | None = None
         self.number = 0
         self.waiting = False
@@ -181,6 +202,7 @@ class _Board:
                 link.close("the board was programmed")
                 link = self._identified(timeout, connect_timeout)
             self._check_image(link)
+            self._check_capabilities(link)
             link.write32(rm.CONTROL, rm.CONTROL_RESET_MASK | rm.CONTROL_INTERRUPT_ENABLE_MASK)
             self.number = link.read32(rm.DONE)
             self.speed = float(link.read32(rm.CAP_SPEED)) or _ASSUMED_SPEED
@@ -226,6 +248,31 @@ class _Board:
                 "programmed when it is opened)"
             )
 
+    def _check_capabilities(self, link: SocketLink) -> None:
+        """What the host is going to write and read must be there, whatever the hash of the image says."""
+        parameters = self.image.machine.parameters
+        words = struct.iter_unpack("<I", link.read_block(_CAPABILITIES.start, len(_CAPABILITIES)))
+        said = dict(zip(_CAPABILITIES, (word for (word,) in words), strict=True))
+        mode = (said[rm.CAP_MACHINE] & rm.CAP_MACHINE_SENSOR_MODE_MASK) >> rm.CAP_MACHINE_SENSOR_MODE_SHIFT
+        room = said[rm.CAP_INTERFACE] & 0xFFFF, said[rm.CAP_INTERFACE] >> 16
+        inputs, results = interface_words(parameters)
+        wanted = rm.SensorMode[parameters.sensor_mode.name]
+        for what, theirs, ours in (
+            ("replicas", said[rm.CAP_REPLICAS], parameters.replicas),
+            ("sensor mode", mode, int(wanted)),
+            ("lines", said[rm.CAP_LINES], parameters.lines),
+        ):
+            if theirs != ours:
+                raise ImageMismatchError(
+                    f"The board at {self.endpoint} says {what} {theirs}, the deployment's image has {ours}: "
+                    "program it with the loader, or restart it"
+                )
+        if inputs > room[0] or results > room[1]:
+            raise ImageMismatchError(
+                f"The board at {self.endpoint} has room for {room[0]} inputs and {room[1]} results, the deployment "
+                f"needs {inputs} and {results}: build it for this interface, with more partitions or fewer replicas"
+            )
+
     def close(self, reason: str) -> None:
         """End the link; the board stops what it was doing."""
         if self.link is not None:
@@ -236,11 +283,21 @@ class _Board:
 
     # ---- a frame --------------------------------------------------------------------------------------
 
-    def start(self, settings: bytes, sensors: bytes, prior: npt.NDArray[np.uint16] | None, end: int) -> None:
+    def start(
+        self,
+        settings: bytes,
+        sensors: bytes,
+        selects: bytes,
+        prior: npt.NDArray[np.uint16] | None,
+        end: int,
+    ) -> None:
         """Post a new frame: what changed of the settings, the sensors, the doorbell (figure 3.3)."""
         assert self.link is not None  # noqa: S101 - MiniCluster.run has checked
         self.waiting = True  # from here on, whatever interrupts the frame must interrupt the board
-        frames = self.link.posted_write(rm.SENSORS, sensors) if sensors else b""
+        frames = self.link.posted_write(self.inputs_at, sensors) if sensors else b""
+        if selects != self.selects:
+            frames += self.link.posted_write(rm.PRIOR_SELECTS, selects)
+            self.selects = selects
         if prior is not None and (self.prior is None or not np.array_equal(prior, self.prior)):
             frames += self.link.posted_write(rm.PRIOR_CODES, prior.astype("<u4").tobytes())
             self.prior = prior.copy()
@@ -258,9 +315,11 @@ class _Board:
         self.compute_ns = 0
         self._ring(frames, rm.TARGET_COUNT + at, settings[at:], _START, end)
 
-    def resume(self, end: int) -> None:
-        """Post the next slice of the frame."""
-        self._ring(b"", rm.RUN_UNTIL, b"", _RESUME, end, 0)
+    def resume(self, end: int, halted: bytes = b"") -> None:
+        """Post the next slice of the frame; ``halted`` are the words of HALT, where they change anything."""
+        assert self.link is not None  # noqa: S101 - MiniCluster.collect has checked
+        frames = self.link.posted_write(rm.HALT, halted) if halted else b""
+        self._ring(frames, rm.RUN_UNTIL, b"", _RESUME, end, 0)
 
     def _ring(self, frames: bytes, address: int, before: bytes, layout: struct.Struct, *words: int) -> None:
         assert self.link is not None  # noqa: S101 - MiniCluster.run has checked
@@ -280,15 +339,22 @@ class _Board:
             raise SequenceError(
                 f"The board at {self.endpoint} said done number {done.number} where {self.number} was due"
             )
-        if len(done.results) != 4 * self.lines:
+        if len(done.results) != self.result_bytes:
             raise ShortReadError(
                 f"The board at {self.endpoint} said done with {len(done.results) // 4} results where "
-                f"{self.lines} were due"
+                f"{self.result_bytes // 4} were due"
             )
         if done.state != BoardState.DONE or done.reason not in _REASONS:
             raise FramingError(
                 f"The board at {self.endpoint} said done with a status of {done.status:#010x}, which is none"
             )
+        if self.replicas > 1:
+            outcomes = np.frombuffer(done.results, _REPLICA, self.replicas, self.counts_bytes)
+            if not _REASONS.issuperset(outcomes["reason"].tolist()):
+                raise FramingError(
+                    f"The board at {self.endpoint} said done with a replica's reason that is none"
+                )
+            self.outcomes = outcomes.copy()
         self.waiting = False
         self.done = done
         self.compute_ns += done.compute_ns
@@ -302,6 +368,17 @@ class _Board:
     def result(self) -> BoardResult:
         """The frame's result; the counts are copied out of the link's buffer."""
         assert self.done is not None  # noqa: S101 - every board has said done
+        if self.replicas > 1:
+            reasons = tuple(StopReason(reason) for reason in self.outcomes["reason"].tolist())
+            joint = joint_reason(reasons, range(self.replicas))
+            return BoardResult(
+                words=bytes(self.done.results[: self.counts_bytes]),
+                cycles=self.done.cycles,
+                reason=joint if joint is not StopReason.NONE else StopReason.SLICE,
+                compute_ns=self.compute_ns,
+                replica_cycles=tuple(self.outcomes["cycles"].tolist()),
+                replica_reasons=reasons,
+            )
         return BoardResult(
             words=bytes(self.done.results),
             cycles=self.done.cycles,
@@ -318,6 +395,7 @@ class _Course:
         self.begun = 0  # where the slice began
         self.end = end  # where it ends; 0: where the frame does
         self.running = boards
+        self.halted: frozenset[int] = frozenset()
         self.left = 0  # boards of the slice that have not said done
         self.cycles = 0
         self.limit = 0.0
@@ -340,6 +418,8 @@ class MiniCluster:
         self._course: _Course | None = None
         self._poll = select.poll()
         self._by_descriptor: dict[int, _Board] = {}
+        self._replicas = self._parameters.replicas
+        self._is_plain = is_plain(self._parameters)
         self._sensor_words = struct.Struct(f"<{self._parameters.sensors}I")
         self._missing = tuple((1 << bits) - 1 for bits in self._parameters.sensor_bits)
 
@@ -436,17 +516,17 @@ class MiniCluster:
         """Start a frame on all boards without waiting for any; :meth:`collect` has its result. Errors as :meth:`run`."""
         if self._course is not None:
             raise FrameInputError("A frame is under way; collect its result before the next is posted")
-        settings, sensors = self._words(frame)
+        settings, sensors, selects = self._words(frame)
         priors = self._priors(frame)
         self._make_ready()
         end = first_slice(frame.target_count) if frame.stop == "slices" else 0
-        if end >= frame.max_cycles:
+        if end >= frame.max_cycles or (self._replicas > 1 and len(self._boards) == 1):
             end = 0  # one slice, which ends where the frame does
         course = self._course = _Course(frame.max_cycles, end, self._boards)
         try:
-            for board, prior in zip(self._boards, priors, strict=True):
+            for board, own, prior in zip(self._boards, sensors, priors, strict=True):
                 try:
-                    board.start(settings, sensors, prior, end)
+                    board.start(settings, own, selects, prior, end)
                 except LinkError as error:
                     self._fail(board, error)
             self._posted(course)
@@ -538,15 +618,21 @@ class MiniCluster:
         course.computing_ns += max(
             board.done.compute_ns for board in course.running if board.done is not None
         )
-        running = [board for board in course.running if board.reason == StopReason.SLICE]
-        if running and not any(board.reason == StopReason.OVERFLOW for board in self._boards):
+        halts = b""
+        if self._replicas > 1:
+            running, halts = self._going_on(course)
+        else:
+            running = [board for board in course.running if board.reason == StopReason.SLICE]
+            if any(board.reason == StopReason.OVERFLOW for board in self._boards):
+                running = []
+        if running:
             course.running = running
             course.begun, course.end = course.end, 2 * course.end
             if course.end >= course.max_cycles:
                 course.end = 0  # the last slice ends where the frame does
             for board in running:
                 try:
-                    board.resume(course.end)
+                    board.resume(course.end, halts)
                 except LinkError as error:
                     self._fail(board, error)
             self._posted(course)
@@ -560,6 +646,22 @@ class MiniCluster:
             boards_compute_ns=course.computing_ns,
             slices=course.slices,
         )
+
+    def _going_on(self, course: _Course) -> tuple[list[_Board], bytes]:
+        """Replicas stop by themselves: the boards on which one goes on, and the words of HALT for all that do not.
+
+        A replica goes on if no board's part of it has overflowed; where its own part has stopped there is nothing to halt.
+        """
+        reasons = np.stack([board.outcomes["reason"] for board in self._boards])
+        over = (reasons == StopReason.OVERFLOW).any(axis=0)
+        course.halted |= frozenset(np.flatnonzero(over).tolist())
+        running = [
+            board
+            for board in course.running
+            if bool(((board.outcomes["reason"] == StopReason.SLICE) & ~over).any())
+        ]
+        mask = sum(1 << replica for replica in course.halted)
+        return running, mask.to_bytes(4 * -(-self._replicas // 32), "little")
 
     def _abandon(self) -> None:
         """The frame is lost. What the other boards still compute is of no use: a closed link stops them."""
@@ -613,35 +715,94 @@ class MiniCluster:
 
     # ---- what goes into the registers -----------------------------------------------------------------
 
-    def _words(self, frame: FrameInput) -> tuple[bytes, bytes]:
-        """Settings and sensors as register words."""
+    def _words(self, frame: FrameInput) -> tuple[bytes, list[bytes], bytes]:
+        """Settings, each board's inputs, and the replicas' prior selects, as register words."""
         parameters = self._parameters
+        prior_address, selects = self._prior_selects(frame)
         for name, value, lowest, highest in (
             ("The target count", frame.target_count, 1, parameters.target_count_max),
             ("The most cycles", frame.max_cycles, 1, CYCLES_MAX),
             ("The RNG bank", frame.bank, 0, parameters.rng_banks - 1),
-            ("The prior's address", frame.prior_address, 0, parameters.prior_addresses - 1),
+            ("The prior's address", prior_address, 0, parameters.prior_addresses - 1),
         ):
             if not lowest <= value <= highest:
                 raise FrameInputError(f"{name} is {value}; this machine takes {lowest} to {highest}")
         if frame.stop not in {"slices", "own"}:
             raise FrameInputError(f"The boards cannot stop by '{frame.stop}': use slices or own")
-        if len(frame.addresses) != parameters.sensors:
+        settings = _SETTINGS.pack(frame.target_count, frame.max_cycles, frame.bank, prior_address)
+        if not self._is_plain:
+            return settings, self._input_words(np.asarray(frame.addresses)), selects
+        addresses = frame.addresses
+        if len(addresses) != parameters.sensors:
             raise FrameInputError(
-                f"The frame has {len(frame.addresses)} readings; this machine has {parameters.sensors} sensors"
+                f"The frame has {len(addresses)} readings; this machine has {parameters.sensors} sensors"
             )
         words = []
-        for column, (address, missing) in enumerate(
-            zip(frame.addresses, self._missing, strict=True), start=1
-        ):
+        for column, (address, missing) in enumerate(zip(addresses, self._missing, strict=True), start=1):
             if address is not None and not 0 <= address <= missing:
                 raise FrameInputError(
                     f"The address of sensor column {column} is {address}; this machine takes 0 to "
                     f"{missing - 1}, or none"
                 )
             words.append(missing if address is None else address)
-        settings = _SETTINGS.pack(frame.target_count, frame.max_cycles, frame.bank, frame.prior_address)
-        return settings, self._sensor_words.pack(*words)
+        return settings, [self._sensor_words.pack(*words)] * len(self._boards), selects
+
+    def _prior_selects(self, frame: FrameInput) -> tuple[int, bytes]:
+        """The prior's address (the worst of replicas', for the check of its range), and the words of PRIOR_SELECTS."""
+        given = frame.prior_address
+        if isinstance(given, tuple):
+            if self._replicas == 1 or len(given) != self._replicas:
+                raise FrameInputError(
+                    f"The frame has {len(given)} addresses of the prior; this machine takes "
+                    + (f"one, or {self._replicas}" if self._replicas > 1 else "one")
+                )
+        elif self._replicas == 1:
+            return given, b""
+        else:
+            given = (given,) * self._replicas
+        worst = min(given) if min(given) < 0 else max(given)
+        fits = 0 <= worst < self._parameters.prior_addresses
+        return worst, np.array(given, dtype="<u4").tobytes() if fits else b""
+
+    def _input_words(self, inputs: npt.NDArray[np.integer]) -> list[bytes]:
+        """Each board's words of INPUTS: where cells have inputs, those of its lines."""
+        parameters = self._parameters
+        per_cell = parameters.sensor_mode is not SensorMode.COLUMN
+        replicas, sensors, lines = self._replicas, parameters.sensors, self.total_lines
+        shape = (sensors, lines) if per_cell else (sensors,)
+        if replicas > 1:
+            shape = (replicas, *shape)
+        if not sensors:
+            return [b""] * len(self._boards)
+        if inputs.shape != shape or inputs.dtype.kind not in "ui":
+            raise FrameInputError(
+                f"The frame's readings have the shape {inputs.shape} and are {inputs.dtype}; this machine takes "
+                f"integers of the shape {shape}"
+            )
+        missing = np.array(self._missing, dtype=np.int64)[:, np.newaxis]
+        words = inputs.reshape(replicas, sensors, -1).astype(np.int64)
+        absent = words == -1
+        partly = absent.any(axis=2) & ~absent.all(axis=2)
+        wrong = np.argwhere((~absent & ((words < 0) | (words > missing))) | partly[:, :, np.newaxis] & absent)
+        if len(wrong):
+            replica, column, line = (int(at) for at in wrong[0])
+            where = f" at line {line}" if per_cell else ""
+            where += f" of replica {replica}" if replicas > 1 else ""
+            top = int(missing[column, 0])
+            value = int(words[replica, column, line])
+            raise FrameInputError(
+                f"The input of sensor column {column + 1}{where} is {value}; this machine takes 0 to "
+                f"{top - 1 if parameters.has_tables else top}"
+                + (", or -1 in all lines of a missing reading" if per_cell else ", or -1 for none")
+            )
+        words = np.where(absent, missing, words).astype("<u4")
+        if not per_cell:
+            return [words.tobytes()] * len(self._boards)
+        offsets = [board.image.partition.line_offset for board in self._boards]
+        return [
+            words[:, :, offset : offset + board.lines].tobytes()
+            for offset, board in zip(offsets, self._boards, strict=True)
+        ]
 
     def _priors(self, frame: FrameInput) -> list[npt.NDArray[np.uint16] | None]:
         """Each board's part of the written prior; None where the prior is a table."""
@@ -651,15 +812,23 @@ class MiniCluster:
                 raise FrameInputError("The frame has a prior to write, but the machine's prior is a table")
             return [None] * len(self._boards)
         if codes is None:
-            return [board.image.machine.prior[0] for board in self._boards]
-        if codes.shape != (self.total_lines,) or int(codes.max()) > self._parameters.ones_code:
+            own = [board.image.machine.prior[0] for board in self._boards]
+            return list(own) if self._replicas == 1 else [np.tile(codes, self._replicas) for codes in own]
+        several = codes.shape == (self._replicas, self.total_lines) and self._replicas > 1
+        if (
+            not (several or codes.shape == (self.total_lines,))
+            or int(codes.max()) > self._parameters.ones_code
+        ):
             raise FrameInputError(
                 f"The prior to write has shape {codes.shape} and codes up to {codes.max()}; this machine takes "
                 f"{self.total_lines} codes from 0 to {self._parameters.ones_code}"
+                + (f", or so many for each of its {self._replicas} replicas" if self._replicas > 1 else "")
             )
         offsets = [board.image.partition.line_offset for board in self._boards]
+        by_line = np.broadcast_to(codes, (self._replicas, self.total_lines))
         return [
-            codes[offset : offset + board.lines] for offset, board in zip(offsets, self._boards, strict=True)
+            by_line[:, offset : offset + board.lines].reshape(-1)
+            for offset, board in zip(offsets, self._boards, strict=True)
         ]
 
 

@@ -8,24 +8,25 @@ cycle and is resumed gives the same bits.
 
 from __future__ import annotations
 
+import math
 import struct
 import time
 from typing import TYPE_CHECKING, Final, NoReturn
 
 import numpy as np
 
-from machines.bm1 import CYCLES_MAX, Start, StopReason
+from machines.bm1 import CYCLES_MAX, Start, StopReason, missing_inputs
 from machines.errors import MachineError, StartError
 from machines.kernel import make_kernel
 from machines.parameters import PriorMode, RngReset
 from pcie_shim import register_map as rm
 from pcie_shim.doorbell import following
 from pcie_shim.errors import ImageError, PcieShimError
-from pcie_shim.programming_file import image_from_bytes
-from pcie_shim.register_map import BoardState, ErrorCode, MachineKind, RngKind
+from pcie_shim.programming_file import image_from_bytes, is_plain
+from pcie_shim.register_map import BoardState, ErrorCode, MachineKind, RngKind, SensorMode
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Collection
 
     import numpy.typing as npt
 
@@ -40,6 +41,7 @@ _NO_ACCESS, _READ, _READ_WRITE = 0, 1, 3
 _WORD: Final = struct.Struct("<I")
 _SETTINGS: Final = struct.Struct("<IQIIQ")  # TARGET_COUNT, MAX_CYCLES, BANK, PRIOR_SELECT, RUN_UNTIL
 _OUTCOME: Final = struct.Struct("<IIQQ")  # DONE, STATUS, CYCLES, COMPUTE_NS
+_REPLICA: Final = np.dtype([("reason", "<u4"), ("zero", "<u4"), ("cycles", "<u8")])  # of OUTCOMES
 _SHORTEST_CHUNK: Final = 64  # cycles, however slow the machine
 _ALIGNMENT: Final = 4096  # fast kernels work in blocks of so many cycles: chunks end between them
 
@@ -73,6 +75,7 @@ class EmulatedBoard:
         self._access = bytearray(rm.BAR_SIZE // 4)
         self._kernel: BM1Kernel | None = None
         self._results: npt.NDArray[np.uint32] = np.empty(0, np.uint32)
+        self._outcomes: npt.NDArray[np.void] = np.empty(0, _REPLICA)
         self._sensors = struct.Struct("")
         self._latched: dict[int, bytes] = {}
         self._error = ErrorCode.NONE
@@ -113,12 +116,8 @@ class EmulatedBoard:
         for block in rm.BLOCKS:
             access = _READ_WRITE if block.writable else _READ
             self._allow(block.address, block.words, access)
-        for address, words in (
-            (rm.SENSORS, rm.SENSORS_WORDS),
-            (rm.RESULTS, rm.RESULTS_WORDS),
-            (rm.PRIOR_CODES, rm.PRIOR_CODES_WORDS),
-        ):
-            self._allow(address, words, _NO_ACCESS)
+        for window in _DATA:
+            self._allow(window.start, len(window) // 4, _NO_ACCESS)
 
     def load(self, content: bytes) -> None:
         """Program the board with the bytes of a programming file, as the loader sends them.
@@ -157,7 +156,8 @@ class EmulatedBoard:
             | RngKind[parameters.rng.name] << rm.CAP_MACHINE_RNG_SHIFT
             | parameters.shared << rm.CAP_MACHINE_SHARED_SHIFT
             | (parameters.rng_reset is RngReset.FREE) << rm.CAP_MACHINE_FREE_SHIFT
-            | written << rm.CAP_MACHINE_PRIOR_WRITTEN_SHIFT,
+            | written << rm.CAP_MACHINE_PRIOR_WRITTEN_SHIFT
+            | SensorMode[parameters.sensor_mode.name] << rm.CAP_MACHINE_SENSOR_MODE_SHIFT,
         )
         self._put(rm.CAP_LINES, parameters.lines)
         self._put(rm.CAP_TOTAL_LINES, part.total_lines)
@@ -174,7 +174,7 @@ class EmulatedBoard:
             | parameters.prior_bits << rm.CAP_WIDTHS_PRIOR_BITS_SHIFT,
         )
         self._put(rm.CAP_BANKS, parameters.rng_banks)
-        self._put(rm.CAP_REPLICAS, 1)
+        self._put(rm.CAP_REPLICAS, parameters.replicas)
         self._put(
             rm.CAP_INTERFACE,
             image.interface_sensors << rm.CAP_INTERFACE_SENSORS_SHIFT
@@ -184,12 +184,19 @@ class EmulatedBoard:
         widths = bytes(parameters.sensor_bits)
         self._view[rm.CAP_SENSOR_BITS : rm.CAP_SENSOR_BITS + len(widths)] = widths
         self._sensors = struct.Struct(f"<{parameters.sensors}I")
-        self._results = np.frombuffer(self._memory, "<u4", parameters.lines, rm.RESULTS)
-        self._allow(rm.SENSORS, image.interface_sensors, _READ_WRITE)
+        lines = parameters.replicas * parameters.lines
+        results = np.frombuffer(self._memory, "<u4", lines, rm.RESULTS)
+        self._results = results.reshape(parameters.count_shape)
+        inputs = rm.SENSORS if is_plain(parameters) else rm.INPUTS
+        self._allow(inputs, image.interface_sensors, _READ_WRITE)
         self._allow(rm.RESULTS, image.interface_results, _READ)
+        several = parameters.replicas if parameters.replicas > 1 else 0
+        self._outcomes = np.frombuffer(self._memory, _REPLICA, several, rm.OUTCOMES)
+        self._allow(rm.OUTCOMES, 4 * several, _READ)
+        self._allow(rm.PRIOR_SELECTS, several, _READ_WRITE)
         if written:
-            self._allow(rm.PRIOR_CODES, parameters.lines, _READ_WRITE)
-            prior = image.machine.prior[0].astype("<u4").tobytes()
+            self._allow(rm.PRIOR_CODES, lines, _READ_WRITE)
+            prior = image.machine.prior[0].astype("<u4").tobytes() * parameters.replicas
             self._view[rm.PRIOR_CODES : rm.PRIOR_CODES + len(prior)] = prior
 
     # ---- registers ------------------------------------------------------------------------------------
@@ -283,6 +290,7 @@ class EmulatedBoard:
             return
         self._kernel.reset()
         self._results[:] = 0
+        self._outcomes[:] = np.zeros((), _REPLICA)
         self._publish(BoardState.IDLE, StopReason.NONE, 0)
 
     def release(self) -> None:
@@ -315,14 +323,17 @@ class EmulatedBoard:
         self._run_until = run_until
         self._number = number
         if doorbell == rm.RESUME:
-            self._run(kernel, None, self._chunk_end(kernel.cycles))
+            try:
+                self._run(kernel, None, self._chunk_end(kernel.cycles), self._halted())
+            except StartError as error:
+                self._refuse(ErrorCode.BAD_VALUE, str(error).rstrip("."))
         else:
             self._max_cycles = max_cycles
             self._chunk = self._first_chunk
             end = self._chunk_end(0)
             start = Start(
-                addresses=self._sensors.unpack_from(self._memory, rm.SENSORS),
-                prior_address=prior_address,
+                addresses=self._inputs(kernel.machine.parameters),
+                prior_address=self._prior_address(prior_address),
                 prior_codes=self._written_prior(kernel.machine.parameters),
                 target_count=target,
                 max_cycles=max_cycles,
@@ -335,10 +346,31 @@ class EmulatedBoard:
                 self._refuse(ErrorCode.BAD_VALUE, str(error).rstrip("."))
         self._put(doorbell, number)
 
+    def _inputs(self, parameters: BM1Parameters) -> tuple[int, ...] | npt.NDArray[np.int64]:
+        if is_plain(parameters):
+            return self._sensors.unpack_from(self._memory, rm.SENSORS)
+        shape = parameters.input_shape
+        words = np.frombuffer(self._memory, "<u4", math.prod(shape), rm.INPUTS)
+        return words.reshape(shape).astype(np.int64)
+
+    def _prior_address(self, of_one: int) -> int | tuple[int, ...]:
+        replicas = len(self._outcomes)
+        if not replicas:
+            return of_one
+        return tuple(np.frombuffer(self._memory, "<u4", replicas, rm.PRIOR_SELECTS).tolist())
+
+    def _halted(self) -> Collection[int]:
+        """The replicas that a resume leaves where they are."""
+        if not len(self._outcomes):
+            return ()
+        mask = int.from_bytes(self._view[rm.HALT : rm.HALT + 4 * rm.HALT_WORDS], "little")
+        return {at for at in range(mask.bit_length()) if mask >> at & 1}
+
     def _written_prior(self, parameters: BM1Parameters) -> npt.NDArray[np.uint16] | None:
         if parameters.prior_mode is PriorMode.TABLE:
             return None
-        words = np.frombuffer(self._memory, "<u4", parameters.lines, rm.PRIOR_CODES)
+        shape = parameters.count_shape
+        words = np.frombuffer(self._memory, "<u4", math.prod(shape), rm.PRIOR_CODES).reshape(shape)
         # a code has 16 bits at most: what is cut off must not make a valid code of a wrong one
         codes: npt.NDArray[np.uint16] = np.minimum(words, 0xFFFF).astype(np.uint16)
         return codes
@@ -349,14 +381,14 @@ class EmulatedBoard:
         if kernel is not None and self.running:
             self._run(kernel, None, self._chunk_end(kernel.cycles))
 
-    def _run(self, kernel: BM1Kernel, start: Start | None, end: int) -> None:
+    def _run(self, kernel: BM1Kernel, start: Start | None, end: int, halted: Collection[int] = ()) -> None:
         """One chunk, to cycle ``end``, of a new frame (``start``) or of the one that runs."""
         if self.stuck:
             self.running = True
             self._publish(BoardState.RUNNING, StopReason.NONE, 0)
             return
         began = time.perf_counter_ns()
-        reason = kernel.resume(end) if start is None else kernel.start(start)
+        reason = kernel.resume(end, halted) if start is None else kernel.start(start)
         elapsed = time.perf_counter_ns() - began
         self._compute_ns += elapsed
         cycles = kernel.cycles
@@ -366,6 +398,9 @@ class EmulatedBoard:
         elif elapsed > CHUNK_S * 1.5e9:
             self._chunk = max(int(self._chunk * CHUNK_S * 1e9 / elapsed), _SHORTEST_CHUNK)
         self._results[:] = kernel.counts
+        if len(self._outcomes):
+            self._outcomes["reason"] = kernel.replica_reasons
+            self._outcomes["cycles"] = kernel.replica_cycles
         self.running = reason is StopReason.SLICE and cycles != self._run_until
         if self.running:
             self._publish(BoardState.RUNNING, StopReason.NONE, cycles)
@@ -391,8 +426,9 @@ class EmulatedBoard:
         _OUTCOME.pack_into(self._memory, rm.DONE, self.done, status, cycles, self._compute_ns)
 
     def interrupt_words(self) -> bytes:
-        """What an interrupt carries: the registers from DONE to COMPUTE_NS, then one count per line."""
-        return self._view[rm.DONE : rm.DONE + _OUTCOME.size].tobytes() + self._results.tobytes()
+        """What an interrupt carries: the registers from DONE to COMPUTE_NS, one count per line, and replicas' outcomes."""
+        words = self._view[rm.DONE : rm.DONE + _OUTCOME.size].tobytes() + self._results.tobytes()
+        return words + self._outcomes.tobytes() if len(self._outcomes) else words
 
     # ---- memory ---------------------------------------------------------------------------------------
 
@@ -407,6 +443,9 @@ class EmulatedBoard:
 _LONG_LOW: Final = frozenset({rm.CYCLES, rm.COMPUTE_NS})
 _DATA: Final = (
     range(rm.SENSORS, rm.SENSORS + 4 * rm.SENSORS_WORDS),
+    range(rm.INPUTS, rm.INPUTS + 4 * rm.INPUTS_WORDS),
+    range(rm.PRIOR_SELECTS, rm.PRIOR_SELECTS + 4 * rm.PRIOR_SELECTS_WORDS),
+    range(rm.OUTCOMES, rm.OUTCOMES + 4 * rm.OUTCOMES_WORDS),
     range(rm.RESULTS, rm.RESULTS + 4 * rm.RESULTS_WORDS),
     range(rm.PRIOR_CODES, rm.PRIOR_CODES + 4 * rm.PRIOR_CODES_WORDS),
 )
@@ -419,7 +458,7 @@ def _measure_speed(kernel: BM1Kernel) -> float:
     """
     parameters = kernel.machine.parameters
     start = Start(
-        addresses=tuple(parameters.missing_address(column + 1) for column in range(parameters.sensors)),
+        addresses=missing_inputs(parameters),
         target_count=parameters.target_count_max,
         max_cycles=CYCLES_MAX,
         run_until=1,

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
 import struct
 import time
@@ -27,7 +28,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from machines.bm1 import BM1Machine
 from machines.errors import MachineError
-from machines.parameters import BM1Parameters  # noqa: TC001 - pydantic reads the annotation at run time
+from machines.parameters import BM1Parameters, SensorMode
 from pcie_shim import register_map
 from pcie_shim.errors import DamagedImageError, ImageError, ImageMismatchError
 
@@ -67,7 +68,7 @@ class Image:
     Attributes:
         machine: The board's lines of the machine.
         partition: Which part of the model they are.
-        interface_sensors: Sensor words of the interface (thesis 3.2: 20).
+        interface_sensors: Input words of the interface (thesis 3.2: 20).
         interface_results: Result words of the interface (thesis 3.2: 1200).
         model_hash: SHA-256 (hex) that names the model; the same for all boards of a deployment.
         build_date: When it was built, ISO 8601 (see :func:`build_date`).
@@ -88,18 +89,24 @@ class Image:
 
     def __post_init__(self) -> None:
         """Refuse what no board can hold."""
-        lines, sensors = self.machine.parameters.lines, self.machine.parameters.sensors
-        part, words = self.partition, (register_map.SENSORS_WORDS, register_map.RESULTS_WORDS)
+        parameters, part = self.machine.parameters, self.partition
+        lines, words = parameters.lines, interface_room(parameters)
+        inputs, results = interface_words(parameters)
         if not (0 < self.interface_sensors <= words[0] and 0 < self.interface_results <= words[1]):
             raise ImageError(
                 f"The interface {self.interface_sensors}x{self.interface_results} does not fit the register "
                 f"map, which has room for 1x1 to {words[0]}x{words[1]}"
             )
-        if sensors > self.interface_sensors or lines > self.interface_results:
+        if inputs > words[0] or results > words[1]:
             raise ImageError(
-                f"The machine has {sensors} sensors and {lines} lines; the interface "
+                f"The machine has {_sizes(parameters)}; the register map has room for {words[0]}x{words[1]}: "
+                "use more partitions" + (", or fewer replicas" if parameters.replicas > 1 else "")
+            )
+        if inputs > self.interface_sensors or results > self.interface_results:
+            raise ImageError(
+                f"The machine has {_sizes(parameters)}; the interface "
                 f"{self.interface_sensors}x{self.interface_results} is smaller: use --interface "
-                f"{max(sensors, self.interface_sensors)}x{max(lines, self.interface_results)}, "
+                f"{max(inputs, self.interface_sensors)}x{max(results, self.interface_results)}, "
                 "or more partitions"
             )
         if not (0 <= part.index < part.count < 1 << 16 and 0 <= part.line_offset <= part.total_lines - lines):
@@ -117,6 +124,31 @@ class Image:
     def image_hash(self) -> str:
         """SHA-256 (hex) that identifies what the board computes, whenever it was built."""
         return _manifest(self, _sections(self.machine)).image_hash
+
+
+def interface_words(parameters: BM1Parameters) -> tuple[int, int]:
+    """Input words and result words that a board with this machine has: those of all its replicas."""
+    return math.prod(parameters.input_shape), math.prod(parameters.count_shape)
+
+
+def interface_room(parameters: BM1Parameters) -> tuple[int, int]:
+    """Input words and result words that the register map has room for, with such inputs."""
+    inputs = register_map.SENSORS_WORDS if is_plain(parameters) else register_map.INPUTS_WORDS
+    return inputs, register_map.RESULTS_WORDS
+
+
+def is_plain(parameters: BM1Parameters) -> bool:
+    """Whether the machine is a single one with one input per column: its inputs lie in SENSORS, else in INPUTS."""
+    return parameters.replicas == 1 and parameters.sensor_mode is SensorMode.COLUMN
+
+
+def _sizes(parameters: BM1Parameters) -> str:
+    """What a sentence says of a machine's size."""
+    if is_plain(parameters):
+        return f"{parameters.sensors} sensors and {parameters.lines} lines"
+    inputs, results = interface_words(parameters)
+    several = f" in {parameters.replicas} replicas" if parameters.replicas > 1 else ""
+    return f"{inputs} inputs and {results} results ({parameters.sensors} sensors and {parameters.lines} lines{several})"
 
 
 class _Checked(BaseModel):

@@ -7,8 +7,8 @@ each register means is in docs/registers.md.
 from enum import IntEnum
 from typing import Final, NamedTuple
 
-MAP_SHA256: Final = "2cdd2286f58f3ce295fe9147e1f5fa3207314bd3a54bd5fdf458179cfe847d25"
-BAR_SIZE: Final = 0x10000
+MAP_SHA256: Final = "1f815974f7e70a1d3204f266a1cbcc87ff954020f422129857e6f13af5013786"
+BAR_SIZE: Final = 0x20000
 
 
 class MachineKind(IntEnum):
@@ -43,6 +43,20 @@ class RngKind(IntEnum):
     LFSR32 = 4
     TABLE = 5
     IDEAL = 6
+
+
+class SensorMode(IntEnum):
+    """Values of CAP_MACHINE.SENSOR_MODE.
+
+    Attributes:
+        COLUMN: one address for all cells of a sensor column.
+        CELL: an address for each cell.
+        THRESHOLD: a probability code for each cell; there are no tables.
+    """
+
+    COLUMN = 0
+    CELL = 1
+    THRESHOLD = 2
 
 
 class BoardState(IntEnum):
@@ -126,7 +140,7 @@ ID: Final = 0x0000
 ID_VALUE: Final = 0x31304d42
 
 MAP_VERSION: Final = 0x0004
-MAP_VERSION_VALUE: Final = 0x10000
+MAP_VERSION_VALUE: Final = 0x10001
 MAP_VERSION_MINOR_SHIFT: Final = 0
 MAP_VERSION_MINOR_MASK: Final = 0xffff
 MAP_VERSION_MAJOR_SHIFT: Final = 16
@@ -153,6 +167,8 @@ CAP_MACHINE_FREE_SHIFT: Final = 17
 CAP_MACHINE_FREE_MASK: Final = 0x20000
 CAP_MACHINE_PRIOR_WRITTEN_SHIFT: Final = 18
 CAP_MACHINE_PRIOR_WRITTEN_MASK: Final = 0x40000
+CAP_MACHINE_SENSOR_MODE_SHIFT: Final = 19
+CAP_MACHINE_SENSOR_MODE_MASK: Final = 0x180000
 
 CAP_LINES: Final = 0x0084
 
@@ -239,14 +255,26 @@ CYCLES_WORDS: Final = 2
 COMPUTE_NS: Final = 0x0150
 COMPUTE_NS_WORDS: Final = 2
 
+HALT: Final = 0x0180
+HALT_WORDS: Final = 8
+
 SENSORS: Final = 0x0200
 SENSORS_WORDS: Final = 64
+
+PRIOR_SELECTS: Final = 0x0400
+PRIOR_SELECTS_WORDS: Final = 256
+
+OUTCOMES: Final = 0x1000
+OUTCOMES_WORDS: Final = 1024
 
 RESULTS: Final = 0x4000
 RESULTS_WORDS: Final = 4096
 
 PRIOR_CODES: Final = 0x8000
 PRIOR_CODES_WORDS: Final = 4096
+
+INPUTS: Final = 0x10000
+INPUTS_WORDS: Final = 8192
 
 BLOCKS: Final = (
     Block("ID", ID, 1, writable=False),
@@ -280,7 +308,11 @@ BLOCKS: Final = (
     Block("STATUS", STATUS, 1, writable=False),
     Block("CYCLES", CYCLES, 2, writable=False),
     Block("COMPUTE_NS", COMPUTE_NS, 2, writable=False),
+    Block("HALT", HALT, 8, writable=True),
     Block("SENSORS", SENSORS, 64, writable=True),
+    Block("PRIOR_SELECTS", PRIOR_SELECTS, 256, writable=True),
+    Block("OUTCOMES", OUTCOMES, 1024, writable=False),
     Block("RESULTS", RESULTS, 4096, writable=False),
     Block("PRIOR_CODES", PRIOR_CODES, 4096, writable=True),
+    Block("INPUTS", INPUTS, 8192, writable=True),
 )

@@ -1,5 +1,6 @@
 """Machines, images and board processes for the tests of the boards."""
 
+import dataclasses
 import multiprocessing
 import os
 import select
@@ -12,11 +13,11 @@ import numpy as np
 
 from machines.bm1 import BM1Machine, Start, StopReason
 from machines.kernel import make_kernel
-from machines.parameters import BM1Parameters, RngKind
+from machines.parameters import BM1Parameters, RngKind, SensorMode
 from pcie_shim.board import StopSignal, serve_board
 from pcie_shim.driver import FrameInput
 from pcie_shim.misbehaviour import Misbehaviour
-from pcie_shim.programming_file import Image, Partition
+from pcie_shim.programming_file import Image, Partition, interface_words
 
 _FORK = multiprocessing.get_context("fork")
 
@@ -33,7 +34,7 @@ def machine(
         codes[random.random((rows, lines)) < zeros] = 0
         return codes.astype(np.uint16)
 
-    tables = [table(1 << bits) for bits in built.sensor_bits]
+    tables = [table(1 << bits) for bits in built.sensor_bits] if built.has_tables else []
     for each in tables:
         each[-1] = built.ones_code
     numbers = None
@@ -56,7 +57,7 @@ def image(of: BM1Machine, *, index: int = 0, count: int = 1, offset: int = 0, to
     return Image(
         machine=of,
         partition=Partition(index, count, offset, total or lines),
-        interface_sensors=20,
+        interface_sensors=max(20, interface_words(of.parameters)[0]),
         interface_results=1200,
         model_hash="ab" * 32,
         build_date="2026-01-02T03:04:05Z",
@@ -148,6 +149,65 @@ def expected(parts: Sequence[Image], frame: FrameInput) -> list[tuple[list[int],
         for kernel in going:
             kernel.resume(end if end < frame.max_cycles else 0)
     return [(kernel.counts.tolist(), kernel.cycles, kernel.reason) for kernel in kernels]
+
+
+def expected_of_replicas(
+    parts: Sequence[Image], frame: FrameInput
+) -> list[list[tuple[list[int], int, StopReason]]]:
+    """The same, for each replica: what machines of one replica each give, which know nothing of the others."""
+    total = sum(part.machine.parameters.lines for part in parts)
+    replicas = parts[0].machine.parameters.replicas
+    inputs = np.asarray(frame.addresses)
+    by_replica = []
+    for at in range(replicas):
+        own = inputs[at] if replicas > 1 else inputs
+        priors, codes = frame.prior_address, frame.prior_codes
+        alone = []
+        for part in parts:
+            parameters = part.machine.parameters
+            lines = slice(part.partition.line_offset, part.partition.line_offset + parameters.lines)
+            # what each cell is given becomes a table of one row: a machine of one input per column
+            rows = [
+                _codes_of(
+                    parameters, part.machine.tables[column] if parameters.has_tables else None, row, lines
+                )
+                for column, row in enumerate(own)
+            ]
+            plain = dataclasses.replace(
+                parameters,
+                replicas=1,
+                sensor_mode=SensorMode.COLUMN,
+                sensor_bits=(1,) * parameters.sensors,
+            )
+            top = np.full(parameters.lines, parameters.ones_code, np.uint16)
+            tables = tuple(np.stack([row, top]) for row in rows)
+            machine = BM1Machine(plain, part.machine.prior, tables, part.machine.rng_table)
+            alone.append(dataclasses.replace(part, machine=machine, interface_sensors=20))
+        by_replica.append(
+            expected(
+                alone,
+                dataclasses.replace(
+                    frame,
+                    addresses=(0,) * len(own),
+                    prior_address=priors[at] if isinstance(priors, tuple) else priors,
+                    prior_codes=codes[at]
+                    if codes is not None and codes.shape == (replicas, total)
+                    else codes,
+                ),
+            )
+        )
+    return by_replica
+
+
+def _codes_of(
+    parameters: BM1Parameters, table: np.ndarray | None, given: np.ndarray, lines: slice
+) -> np.ndarray:
+    """One code per line of a board, from a column's inputs (-1: missing)."""
+    own = given[lines] if np.ndim(given) else np.full(parameters.lines, given)
+    if own[0] == -1:
+        return np.full(parameters.lines, parameters.ones_code, np.uint16)
+    codes = own if table is None else table[own, np.arange(parameters.lines)]
+    return np.asarray(codes, np.uint16)
 
 
 def tcp_endpoint() -> str:

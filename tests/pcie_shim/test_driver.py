@@ -493,7 +493,7 @@ def test_a_refusing_board_fails_the_frame_and_stays_usable(
     parts = images(100, (3, 2))
     with MiniCluster.open(endpoints_of(boards), parts) as cluster:
         with monkeypatch.context() as patch:
-            patch.setattr(cluster, "_words", lambda _: (bytes(20), bytes(8)))
+            patch.setattr(cluster, "_words", lambda _: (bytes(20), [bytes(8)] * 2, b""))
             with pytest.raises(
                 BoardRefusedError, match=r"Board [01]: .*refused access.*\(BAD_VALUE\): target_count"
             ):

@@ -1,0 +1,293 @@
+#   MiniCluster ══ links ══ board processes, with replicas and with inputs for each cell
+# What the boards give is what machines give that run alone, to the bit; and what does not fit is said in one sentence.
+import dataclasses
+import struct
+import tempfile
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from machines.bm1 import StopReason
+from machines.parameters import PriorMode, SensorMode
+from pcie_shim import register_map as rm
+from pcie_shim.driver import FrameInput, FrameOutput, MiniCluster
+from pcie_shim.emulated_board import EmulatedBoard, RefusedError
+from pcie_shim.errors import BoardMismatchError, FrameInputError, ImageError
+from pcie_shim.programming_file import Image, image_bytes, image_from_bytes
+from pcie_shim.register_map import BoardState, ErrorCode
+from tests.pcie_shim.boards import (
+    BoardProcess,
+    expected_of_replicas,
+    image,
+    images,
+    machine,
+    words,
+)
+
+
+@dataclasses.dataclass
+class Case:
+    """Boards that hold the parts of one model with several machines, or with an input for each cell."""
+
+    parts: list[Image]
+    cluster: MiniCluster
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Of a frame's inputs, over all boards."""
+        parameters = self.parts[0].machine.parameters
+        return dataclasses.replace(parameters, lines=self.cluster.total_lines).input_shape
+
+    def frame(self, seed: int, **changed) -> FrameInput:
+        parameters = self.parts[0].machine.parameters
+        random = np.random.default_rng(seed)
+        tops = (1 << np.array(parameters.sensor_bits)) - parameters.has_tables
+        tops = tops if parameters.sensor_mode is SensorMode.COLUMN else tops[:, np.newaxis]
+        inputs = random.integers(0, tops, self.shape)
+        if not parameters.has_tables:
+            inputs = np.where(random.random(self.shape) < 0.8, inputs | 128, inputs)
+        columns = inputs.reshape(parameters.replicas * parameters.sensors, -1)
+        columns[random.random(len(columns)) < 0.3] = -1
+        settings_ = {"target_count": 100, "max_cycles": 3000} | changed
+        return FrameInput(addresses=inputs, **settings_)
+
+    def check(self, frame: FrameInput) -> FrameOutput:
+        output = self.cluster.run(frame)
+        wanted = expected_of_replicas(self.parts, frame)
+        for number, board in enumerate(output.boards):
+            if len(wanted) == 1:
+                assert (board.counts.tolist(), board.cycles, board.reason) == wanted[0][number]
+                continue
+            assert [
+                (board.counts[at].tolist(), board.replica_cycles[at], board.replica_reasons[at])
+                for at in range(len(wanted))
+            ] == [of_replica[number] for of_replica in wanted]
+            assert board.cycles == max(board.replica_cycles)
+        return output
+
+
+def opened(parts: list[Image]) -> Iterator[Case]:
+    with tempfile.TemporaryDirectory(prefix="bm") as base:
+        boards = [BoardProcess(f"unix:{base}/board{at}.sock", index=at) for at in range(len(parts))]
+        try:
+            with MiniCluster.open([board.endpoint for board in boards], parts) as cluster:
+                yield Case(parts, cluster)
+        finally:
+            for board in boards:
+                assert board.stop() == 0
+
+
+CASES = {
+    "three replicas on one board": images(1, (6,), replicas=3, zeros=0.2),
+    "40 replicas on two boards": images(2, (3, 2), replicas=40, zeros=0.25, prior_bits=1),
+    "cells on two boards": images(3, (4, 3), sensor_mode=SensorMode.CELL),
+    "cells in replicas": images(4, (4, 3), sensor_mode=SensorMode.CELL, replicas=3, rng="ideal"),
+    "thresholds": images(5, (5, 4), sensor_mode=SensorMode.THRESHOLD, sensor_bits=(8, 8), replicas=2),
+    "written priors": images(6, (3, 3), replicas=2, prior_mode=PriorMode.WRITTEN, zeros=0),
+}
+
+
+@pytest.fixture(scope="module", params=CASES, ids=str)
+def case(request: pytest.FixtureRequest) -> Iterator[Case]:
+    """Boards opened once for many frames."""
+    yield from opened(CASES[request.param])
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    st.integers(0, 2**31),
+    st.integers(1, 255) | st.just(255),
+    st.integers(1, 600) | st.sampled_from([256, 513, 4096, 2**16]),
+    st.integers(0, 15),
+    st.sampled_from(["slices", "own"]),
+)
+def test_frames_are_machines_that_run_alone(case: Case, seed, target, cycles, bank, stop) -> None:
+    parameters = case.parts[0].machine.parameters
+    random = np.random.default_rng(seed)
+    changed: dict = {}
+    if parameters.prior_bits:
+        changed["prior_address"] = tuple(random.integers(0, 2, parameters.replicas).tolist())
+    if parameters.prior_mode is PriorMode.WRITTEN and seed % 3:
+        shape = (parameters.replicas, 6) if seed % 3 == 1 else (6,)
+        changed["prior_codes"] = random.integers(0, 256, shape).astype(np.uint16)
+    case.check(case.frame(seed, target_count=target, max_cycles=cycles, bank=bank, stop=stop, **changed))
+
+
+def test_each_replica_stops_with_its_own_parts() -> None:
+    """Replicas that lie on two boards: one may be over in the first slice, another goes on."""
+    for case in opened(images(7, (3, 3), replicas=8, zeros=0)):
+        output = case.check(case.frame(3, target_count=255, max_cycles=2**17))
+        ends = {
+            board.replica_cycles[at]
+            for board in output.boards
+            for at in range(8)
+            if board.replica_reasons[at] is StopReason.SLICE
+        }
+        assert len(ends) > 1
+        assert output.slices > 1
+        assert {board.reason for board in output.boards} <= {StopReason.OVERFLOW, StopReason.SLICE}
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "sentence"),
+    [
+        (
+            "three replicas on one board",
+            {"addresses": (1, 2)},
+            r"shape \(2,\).* integers of the shape \(3, 2\)",
+        ),
+        (
+            "three replicas on one board",
+            {"addresses": np.zeros((3, 2))},
+            "are float64; this machine takes integers",
+        ),
+        (
+            "three replicas on one board",
+            {"addresses": np.array([[0, 0], [0, 16], [0, 0]])},
+            "input of sensor column 2 of replica 1 is 16; this machine takes 0 to 14, or -1 for none",
+        ),
+        (
+            "three replicas on one board",
+            {"prior_address": (0, 0)},
+            "has 2 addresses of the prior; .* one, or 3",
+        ),
+        ("three replicas on one board", {"prior_address": (0, 0, 1)}, "prior's address is 1; .* 0 to 0"),
+        ("three replicas on one board", {"prior_address": (0, -1, 0)}, "prior's address is -1"),
+        (
+            "cells on two boards",
+            {"addresses": np.array([[-1, -1, -1, -1, -1, -1, 0], [0] * 7])},
+            "input of sensor column 1 at line 0 is -1; this machine takes 0 to 6, or -1 in all lines",
+        ),
+        (
+            "thresholds",
+            {"addresses": np.full((2, 2, 9), 256)},
+            "input of sensor column 1 at line 0 of replica 0 is 256; this machine takes 0 to 255",
+        ),
+        (
+            "written priors",
+            {"prior_codes": np.zeros((3, 6), np.uint16)},
+            r"shape \(3, 6\).* each of its 2 replicas",
+        ),
+    ],
+)
+def test_a_frame_that_does_not_fit_is_refused(name: str, change: dict, sentence: str) -> None:
+    parts = CASES[name]
+    case = Case(parts, MiniCluster.__new__(MiniCluster))
+    from pcie_shim.driver import _Board
+    from pcie_shim.endpoint import parse_endpoint
+
+    boards = [_Board(at, parse_endpoint("unix:/tmp/x.sock"), part) for at, part in enumerate(parts)]
+    case.cluster.__init__(boards, timeout=1, slack=1)
+    with pytest.raises(FrameInputError, match=sentence):
+        case.cluster.post(dataclasses.replace(case.frame(1), **change))
+
+
+# ---- images and capabilities ----
+
+
+def test_capabilities_and_windows() -> None:
+    of = machine(1, lines=5, sensor_bits=(3, 2), replicas=3, sensor_mode=SensorMode.CELL, prior_bits=1)
+    board = EmulatedBoard()
+    with pytest.raises(RefusedError, match="blank; program it first"):
+        board.read(rm.INPUTS, 1)
+    board.load(image_bytes(dataclasses.replace(image(of), interface_sensors=40, interface_results=16)))
+    machine_word = struct.unpack("<I", board.read(rm.CAP_MACHINE, 1))[0]
+    assert (
+        machine_word & rm.CAP_MACHINE_SENSOR_MODE_MASK
+        == rm.SensorMode.CELL << rm.CAP_MACHINE_SENSOR_MODE_SHIFT
+    )
+    assert board.read(rm.CAP_REPLICAS, 1) == words(3)
+    assert board.read(rm.CAP_INTERFACE, 1) == words(40 | 16 << 16)
+    assert len(board.read(rm.INPUTS, 40)) == 160
+    assert len(board.read(rm.RESULTS, 16)) == 64
+    assert len(board.read(rm.PRIOR_SELECTS, 3)) == 12
+    for address, count in ((rm.INPUTS, 41), (rm.RESULTS, 17), (rm.PRIOR_SELECTS, 4), (rm.OUTCOMES, 13)):
+        with pytest.raises(RefusedError) as refused:
+            board.read(address, count)
+        assert refused.value.code is ErrorCode.TOO_LONG
+    with pytest.raises(RefusedError, match="nothing can be read at 0x0200"):
+        board.read(rm.SENSORS, 1)
+
+
+def test_a_frame_through_registers_alone() -> None:
+    """What a host in any language does: inputs, settings, start, outcomes, counts."""
+    of = machine(2, lines=4, sensor_bits=(3,), replicas=2, zeros=0)
+    board = EmulatedBoard()
+    board.load(image_bytes(image(of)))
+    board.write(rm.INPUTS, words(2, 5))
+    board.write(rm.TARGET_COUNT, struct.pack("<IQIIQ", 255, 2**17, 3, 0, 128))
+    board.write(rm.START, words(1))
+    status = struct.unpack("<I", board.read(rm.STATUS, 1))[0]
+    assert (status & 15, status >> 4 & 15) == (BoardState.DONE, StopReason.SLICE)
+    assert board.read(rm.OUTCOMES, 8) == words(3, 0, 128, 0, 3, 0, 128, 0)
+    board.write(rm.HALT, words(0b10))
+    board.write(rm.RUN_UNTIL, struct.pack("<Q", 0))
+    board.write(rm.RESUME, words(2))
+    while board.running:
+        board.step()
+    frame = FrameInput(addresses=np.array([[2], [5]]), target_count=255, max_cycles=2**17, bank=3, stop="own")
+    ((first,), _) = expected_of_replicas([image(of)], frame)
+    assert board.read(rm.OUTCOMES, 8) == words(1, 0, first[1], 0, 3, 0, 128, 0)
+    assert list(struct.unpack("<4I", board.read(rm.RESULTS, 4))) == first[0]
+    assert len(board.interrupt_words()) == 24 + 4 * 8 + 16 * 2
+    # of no replica that there is
+    board.write(rm.RUN_UNTIL, struct.pack("<Q", 128))
+    board.write(rm.START, words(3))
+    board.write(rm.HALT, words(0b1000))
+    board.write(rm.RUN_UNTIL, struct.pack("<Q", 0))
+    with pytest.raises(
+        RefusedError, match="Replicas 3 are to be halted; this machine's are 0 to 1"
+    ) as refused:
+        board.write(rm.RESUME, words(4))
+    assert refused.value.code is ErrorCode.BAD_VALUE
+    board.reset()
+    assert board.read(rm.OUTCOMES, 8) == bytes(32)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_programming_files_carry_the_parameters(name: str) -> None:
+    for part in CASES[name]:
+        found = image_from_bytes(image_bytes(part))
+        assert found.machine == part.machine
+        assert found.image_hash == part.image_hash
+
+
+def test_a_machine_larger_than_the_interface_is_refused() -> None:
+    several = image(machine(1, replicas=4))
+    with pytest.raises(
+        ImageError,
+        match=r"8 inputs and 32 results \(2 sensors and 8 lines in 4 replicas\); the interface 7x31 is smaller: "
+        r"use --interface 8x32",
+    ):
+        dataclasses.replace(several, interface_sensors=7, interface_results=31)
+    large = machine(1, lines=40, replicas=200, sensor_mode=SensorMode.CELL)
+    with pytest.raises(ImageError, match=r"register map has room for 8192x4096: .*fewer replicas"):
+        dataclasses.replace(several, machine=large)
+
+
+@pytest.mark.parametrize(
+    ("replicas", "inputs", "sentence"),
+    [
+        (2, 4, "says replicas 3, the deployment's image has 2"),
+        (3, 5000, "room for 20 inputs and 1200 results, the deployment needs 5000 and 18"),
+    ],
+)
+def test_a_board_of_other_capabilities_is_refused(
+    monkeypatch: pytest.MonkeyPatch, replicas: int, inputs: int, sentence: str
+) -> None:
+    """A board that shows the right image hash and has fewer machines or words all the same."""
+    (part,) = CASES["three replicas on one board"]
+    with tempfile.TemporaryDirectory(prefix="bm") as base:
+        board = BoardProcess(f"unix:{base}/board0.sock")
+        MiniCluster.open([board.endpoint], [part]).close()
+        parameters = dataclasses.replace(part.machine.parameters, replicas=replicas)
+        other = dataclasses.replace(part, machine=dataclasses.replace(part.machine, parameters=parameters))
+        known = part.image_hash
+        monkeypatch.setattr(Image, "image_hash", property(lambda _: known))
+        monkeypatch.setattr("pcie_shim.driver.interface_words", lambda _: (inputs, 18))
+        with pytest.raises(BoardMismatchError, match=sentence):
+            MiniCluster.open([board.endpoint], [other])
+        assert board.stop() == 0
