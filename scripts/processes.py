@@ -61,7 +61,8 @@ class Process:
                 log.flush()
                 self._lines.append(text)
                 self._news.set()
-                if self._shown:
+                # an error is said by whoever waits for this process, with the place of its log
+                if self._shown and not text.startswith("error: "):
                     print(text, flush=True)
         self._news.set()
 
