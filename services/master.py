@@ -1091,6 +1091,9 @@ def master(
     end_with_parent()
     connected = {}
     if connect is not None:
+        if not connect.is_dir():
+            msg = f"--connect {connect} is no folder; name the one with the sockets of the services that run already"
+            raise SettingsError(msg)
         for name in ("subscriber", "publisher", "pcie-app"):
             connected[name.replace("-", "_")] = str(endpoint_in(connect, name))
     settings = load_settings(

@@ -26,6 +26,7 @@ from pcie_shim.errors import (
     BoardHeldError,
     BoardLinkError,
     BoardMismatchError,
+    FrameInputError,
     GreetingMismatchError,
     HeldError,
     ImageError,
@@ -574,7 +575,7 @@ def compute_lines(boards: Boards, banks: int) -> int:
     """Alone: compute the readings that come on standard input, one JSON object a line.
 
     Raises:
-        InputLineError: a line is no reading.
+        InputLineError: a line is no reading, or none of this machine.
         BoardError: a board failed.
     """
     say(boards.open())
@@ -585,7 +586,11 @@ def compute_lines(boards: Boards, banks: int) -> int:
             reading = reading_from_line(line, number)
             codes = np.array(reading.prior_codes, "<u2").tobytes()
             frame = Frame(number, reading.addresses, number % banks, codes)
-            result = result_record(number, boards.run(frame))
+            try:
+                result = result_record(number, boards.run(frame))
+            except FrameInputError as error:
+                msg = f"line {number} of standard input: {error}"
+                raise InputLineError(msg) from error
             printed = {
                 "number": number,
                 "stamp_ns": reading.stamp_ns,

@@ -419,6 +419,10 @@ def subscriber(
         first_data_timeout=first_data_timeout,
         log_level=log_level,
     )
+    if settings.deployment is not None and (said := topic or type_ or variables):
+        flag = "--topic" if topic else "--type" if type_ else "--variables"
+        msg = f"{flag} {said} is for use without a deployment; {settings.deployment} has its own: leave one of them out"
+        raise SettingsError(msg)
     if listen is not None:
         loaded = deployment_for(settings)
         link = listening(endpoint_from(listen, "--listen"), ROLE, loaded.hash)

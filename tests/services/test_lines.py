@@ -1,10 +1,16 @@
 """What pcie-app and publisher read from standard input, alone: readings, results, probabilities."""
 
+import subprocess
+import sys
+from pathlib import Path
+
 import pytest
 
 from services.errors import InputLineError
 from services.pcie_app import reading_from_line
 from services.publisher import result_from_line
+
+BIN = Path(sys.executable).parent
 
 
 def test_a_reading():
@@ -54,3 +60,63 @@ def test_no_result(line, said):
         InputLineError, match=f"line 3 of standard input {said}.*expected a result of pcie-app"
     ):
         result_from_line(line, 3, 2)
+
+
+@pytest.fixture(scope="module")
+def deployment(tmp_path_factory):
+    where = tmp_path_factory.mktemp("deployment")
+    (where / "model.py").write_text(
+        "import numpy as np\n"
+        "from toolchain.models import Known, Model, dimension\n"
+        "def model():\n"
+        "    known = tuple(Known(name=name, table=np.full((2, 4), 0.5)) for name in 'ABC')\n"
+        "    return Model(name='tiny', searched=(dimension('s', size=4),), known=known)\n"
+    )
+    target = ("--uri", "ws://127.0.0.1:1", "--topic", "/r", "--type", "std_msgs/Float64")
+    command = [BIN / "toolchain", "build", where, "-o", where / "built", *target]
+    subprocess.run(command, check=True, capture_output=True, timeout=60)
+    return where / "built"
+
+
+def test_a_line_with_too_few_addresses_is_named(deployment, tmp_path):
+    socket = tmp_path / "b.sock"
+    board = subprocess.Popen([BIN / "board", "--listen", f"unix:{socket}"], stderr=subprocess.PIPE)
+    try:
+        assert b"listens" in board.stderr.readline()
+        done = subprocess.run(
+            [BIN / "pcie-app", "-d", deployment, "--boards", f"unix:{socket}"],
+            input='{"addresses": [0, 1, 0]}\n\n{"addresses": [0, 1]}\n',
+            capture_output=True,
+            text=True,
+            timeout=60,
+            check=False,
+        )
+    finally:
+        board.kill()
+        board.communicate()
+    assert done.returncode == 2
+    assert done.stdout.count("\n") == 1
+    assert done.stderr.splitlines()[-1] == (
+        "error: line 3 of standard input: The frame has 2 readings; this machine has 3 sensors"
+    )
+
+
+@pytest.mark.parametrize(
+    ("command", "said"),
+    [
+        (["subscriber", "--topic", "/t"], "--topic /t is for use without a deployment; "),
+        (["subscriber", "--variables", "A"], "--variables A is for use without a deployment; "),
+        (["master", "--once", "--connect", "/nowhere"], "--connect /nowhere is no folder; name the one with"),
+    ],
+)
+def test_flags_that_mean_nothing_are_refused_at_once(deployment, command, said):
+    done = subprocess.run(
+        [BIN / command[0], *command[1:], "-d", deployment],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == 2
+    assert done.stderr.startswith(f"error: {said}")
+    assert done.stderr.count("\n") == 1
