@@ -153,6 +153,7 @@ class FusedBoards:
         if isinstance(record, Prepare):
             answer = await _in_thread(lambda: boards.generations.prepare(record))
         else:
+            self._unwatch()  # its link is closed, and the next one may have its descriptor
             async with self._one_thread:
                 answer = await _in_thread(lambda: boards.switch(record))
         self._link.send(answer)

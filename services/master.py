@@ -702,11 +702,11 @@ class Master:
             reading_sent_tick=reading.sent_tick,
             waited_ns=sent - arrived,
         )
-        if publisher is not None and publisher.send(record):
-            if not self._under_way:
-                self._published_at = time.monotonic()
-            self._under_way += 1
-        else:
+        if not self._under_way:
+            self._published_at = time.monotonic()
+        self._under_way += 1  # before it goes: a publisher in this process answers at once
+        if publisher is None or not publisher.send(record):
+            self._under_way -= 1
             self._losses["lost with the publisher"] += 1
         self._next()
 

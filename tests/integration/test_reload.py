@@ -1,0 +1,372 @@
+"""`master reload`: a run takes another deployment, and every frame is computed by one of them, whole.
+
+robot ──▶ hub ──▶ master, subscriber, publisher, pcie-app, boards   ◀── master reload
+ └─ keeps what it sent, by stamp, and compares every result with what boards in this process count
+"""
+
+import asyncio
+import contextlib
+import json
+import shutil
+import signal
+import socket
+import subprocess
+import time
+from collections import Counter
+from functools import cache
+
+import pytest
+
+from pcie_shim.programming_file import read_image
+from tests.integration.conftest import BIN, READING, ROOT, Robot, build, build_boat
+from toolchain.address import to_address
+from toolchain.analysis.emulation import EmulatedBoards
+from toolchain.deployment import load_deployment
+
+LOOP = ("master", "--loop", "--connect-timeout", "3")
+
+
+@pytest.fixture(scope="session")
+def other_boat(tmp_path_factory):
+    """The boat with other tables, another target, and the first two readings in each other's column."""
+    made = build_boat(
+        tmp_path_factory.mktemp("other") / "deployment", "--scale", "column", "--target-count", "100"
+    )
+    regenerate("deployment", made, "--order", "D2,D1,D3,B1,B2,B3")
+    return made
+
+
+def regenerate(part, directory, *options):
+    command = [BIN / "toolchain", "regenerate", part, directory, *options]
+    subprocess.run(command, check=True, capture_output=True, timeout=60)
+
+
+class Witness(Robot):
+    """A robot that knows what it sent, and so what must come back."""
+
+    def __init__(self, uri, *folders):
+        super().__init__(uri)
+        self.sent = {}
+        self._deployments = [load_deployment(folder) for folder in folders]
+        self._counted = cache(self._count)
+
+    async def publish(self, **values):
+        at = len(self.sent)
+        values |= {"D1": 68 + at % 7, "D2": 48 + at % 5}
+        stamp = time.time_ns()
+        self.sent[stamp] = values
+        header = {
+            "stamp": dict(zip(("sec", "nanosec"), divmod(stamp, 10**9), strict=True)),
+            "frame_id": "map",
+        }
+        message = {"op": "publish", "topic": "/boat/sensors", "msg": {"header": header, **values}}
+        await self._socket.send(json.dumps(message))
+
+    def _count(self, at, addresses, bank):
+        deployment = self._deployments[at]
+        images = [read_image(deployment.image_path(board)) for board in range(len(deployment.boards))]
+        machine = deployment.machine
+        boards = EmulatedBoards(
+            [image.machine for image in images],
+            target_count=machine.target_count,
+            max_cycles=machine.max_cycles,
+            stop=machine.stop,
+        )
+        return boards.run(addresses, 0, bank).posterior
+
+    def generations(self):
+        """How many results there were of each generation; each must be that one's, to the bit."""
+        found = Counter()
+        numbers = []
+        published = [frame for frame in self.frames if frame["status"][0]["level"] == 0]
+        # the last frame may have come without its result yet
+        for frame, result in zip(published, self.results, strict=False):
+            values = {pair["key"]: pair["value"] for pair in frame["status"][0]["values"]}
+            number, generation = int(values["number"]), int(values["generation"])
+            stamp = frame["header"]["stamp"]
+            seconds, rest = stamp.get("sec", stamp.get("secs")), stamp.get("nanosec", stamp.get("nsecs"))
+            reading = self.sent[seconds * 10**9 + rest]
+            deployment = self._deployments[generation]
+            addresses = tuple(to_address(each, reading[each.name]) for each in deployment.variables)
+            bank = number % deployment.machine.rng_banks
+            expected = self._counted(generation, addresses, bank)
+            assert result["data"] == expected.tolist(), f"frame {number}, generation {generation}"
+            found[generation] += 1
+            numbers.append(number)
+        assert numbers == sorted(set(numbers))
+        return found
+
+
+async def looping(stage, boat, *options, witness=None, rate=40):
+    """A hub, a witness that publishes, a master in --loop, and its first results."""
+    hub, uri = await stage.hub()
+    robot = Witness(uri, *(witness or (boat,)))
+    await robot.connect()
+    await robot.keep_publishing(rate=rate, **READING)
+    runs = stage.where / "runs"
+    runs.mkdir(exist_ok=True)
+    environment = {"BM_RUN_DIRECTORY": str(runs)}
+    master = stage.start(*LOOP, "-d", str(boat), "--uri", uri, *options, environment=environment)
+    await robot.have(3)
+    return hub, robot, master, runs
+
+
+def reload_(stage, runs, *options):
+    return stage.start("master", "reload", "--directory", str(runs), *options)
+
+
+async def status_of(runs, name):
+    reader, writer = await asyncio.open_unix_connection(runs / f"{name}.status.sock")
+    try:
+        return json.loads(await reader.read())
+    finally:
+        writer.close()
+
+
+async def until(true, timeout=20):
+    deadline = time.monotonic() + timeout
+    while not await true():
+        assert time.monotonic() < deadline
+        await asyncio.sleep(0.02)
+
+
+def pids(stage):
+    return {name: {each.pid for each in found} for name, found in stage.processes().items()}
+
+
+@pytest.mark.parametrize("options", [(), ("--fused", "--queue", "all")], ids=["processes", "fused"])
+async def test_every_frame_is_of_one_deployment(stage, boat, other_boat, options):
+    folders = boat, other_boat, boat, other_boat
+    _, robot, master, runs = await looping(stage, boat, *options, witness=folders, rate=80)
+    before = pids(stage)
+    for generation in (1, 2, 3):
+        reloading = reload_(stage, runs, "-d", str(folders[generation]))
+        assert await reloading.end() == 0, reloading.err + master.err
+        assert f"generation {generation} is in force" in reloading.out
+        assert str(folders[generation]) in reloading.out
+        await robot.have(len(robot.results) + 10)
+    found = robot.generations()
+    assert sorted(found) == [0, 1, 2, 3]
+    assert pids(stage) == before
+    status = await status_of(runs, "master")
+    assert (status["generation"], status["folder"]) == (3, str(other_boat))
+    hashes = {
+        (await status_of(runs, name))["deployment"]
+        for name in ("master", "subscriber", "publisher", "pcie-app")
+    }
+    assert hashes == {load_deployment(other_boat, images=False).hash}
+    # nothing is lost without a word: what was received is published, waits, or is counted
+    await robot.stop_publishing()
+    frames = (await status_of(runs, "master"))["frames"]
+    accounted = frames["completed"] + sum(frames["lost"].values())
+    if options:
+        assert frames["received"] == accounted
+    else:
+        assert frames["received"] <= accounted  # the subscriber's losses were never received here
+    master.send(signal.SIGKILL)
+    await stage.nothing_left("hub")
+
+
+async def test_what_is_refused_changes_nothing(stage, boat, tmp_path):
+    _, robot, master, runs = await looping(stage, boat)
+    larger = build_boat(tmp_path / "larger", cells=12)
+    elsewhere = tmp_path / "elsewhere"
+    shutil.copytree(boat, elsewhere)
+    regenerate("deployment", elsewhere, "--topic", "/other/topic", "--output", "/other/results")
+    damaged = tmp_path / "damaged"
+    shutil.copytree(boat, damaged)
+    image = damaged / "boards/board2.bm"
+    data = bytearray(image.read_bytes())
+    data[len(data) // 2] ^= 1
+    image.write_bytes(data)
+    for folder, *said in (
+        (larger, "[machine] lines is 64 in the run and 144 in the new one"),
+        (elsewhere, "[[source]] 0 topic is /boat/sensors in the run and /other/topic", "[[output]] 0 topic"),
+        (damaged, f"{damaged}/boards/board2.bm"),
+        (tmp_path, "holds no deployment"),
+    ):
+        reloading = reload_(stage, runs, "-d", str(folder))
+        assert await reloading.end() == 2, reloading.err
+        assert reloading.err.count("\n") == 1
+        for each in said:
+            assert each in reloading.err
+        await master.says("not reloaded: ")
+    # who says nothing that is an order gets a sentence
+    for nonsense in (
+        b"\n",
+        b'{"order":"stop"}\n',
+        b"[" * 10**4 + b"\n",
+        b"x" * 10**5,
+        b'{"order":"reload","folder":7}\n',
+    ):
+        with socket.socket(socket.AF_UNIX) as asked, contextlib.suppress(ConnectionError):
+            asked.settimeout(20)
+            asked.connect(str(runs / "master.control.sock"))
+            with contextlib.suppress(BrokenPipeError):
+                await asyncio.to_thread(asked.sendall, nonsense)
+            answer = json.loads(await asyncio.to_thread(asked.recv, 65536))
+            assert answer["exit_code"] == 2
+            assert "order" in answer["sentence"]
+    await robot.have(len(robot.results) + 5)
+    assert set(robot.generations()) == {0}
+    master.send(signal.SIGINT)
+    assert await master.end(12) == 130
+    await stage.nothing_left("hub")
+
+
+async def test_the_second_of_two_at_once_is_refused(stage, boat, other_boat):
+    _, robot, _, runs = await looping(stage, boat, witness=(boat, other_boat))
+    order = json.dumps({"order": "reload", "folder": str(other_boat)}).encode() + b"\n"
+    answers = []
+    with socket.socket(socket.AF_UNIX) as one, socket.socket(socket.AF_UNIX) as two:
+        for each in (one, two):
+            each.settimeout(30)
+            each.connect(str(runs / "master.control.sock"))
+        for each in (one, two):
+            each.sendall(order)
+        answers = [json.loads(await asyncio.to_thread(each.recv, 65536)) for each in (one, two)]
+    assert sorted(answer["exit_code"] for answer in answers) == [0, 6]
+    refused = max(answers, key=lambda answer: answer["exit_code"])
+    assert refused["sentence"] == "another reload is under way; try again when it is done"
+    await robot.have(len(robot.results) + 5)
+    assert set(robot.generations()) == {0, 1}
+
+
+async def test_a_corrected_table_in_the_same_folder(stage, boat, tmp_path):
+    folder, before = tmp_path / "folder", tmp_path / "before"
+    model = tmp_path / "boat"
+    shutil.copytree(ROOT / "casestudies/boat", model)
+    size = ("--set", "width=8", "--set", "height=8")
+    build(model, folder, *size)
+    shutil.copytree(folder, before)
+    _, robot, master, runs = await looping(stage, folder, witness=(before, folder))
+    source = model / "model.py"
+    source.write_text(source.read_text().replace("sigma=BEARING_SIGMA", "sigma=2 * BEARING_SIGMA"))
+    regenerate("memories", folder, "--model", str(model), *size)
+    assert load_deployment(folder).hash != load_deployment(before).hash
+    # a service that dies now still finds the deployment that is in force
+    stage.processes()["subscriber"][0].kill()
+    await master.says("subscriber was killed by SIGKILL; restarting it")
+    await robot.have(len(robot.results) + 5)
+    robot._deployments[1] = load_deployment(folder)
+    reloading = reload_(stage, runs)
+    assert await reloading.end() == 0, reloading.err
+    await robot.have(len(robot.results) + 5)
+    # and after it, the new one
+    for victim in ("pcie-app", "subscriber"):
+        stage.processes()[victim][0].kill()
+        await master.says(
+            f"{victim} was killed by SIGKILL; restarting it", times=1 + (victim == "subscriber")
+        )
+        await robot.have(len(robot.results) + 5)
+    max(stage.processes()["board"], key=lambda each: each.pid).kill()
+    await master.says(r"board \d is back, programmed")
+    await robot.have(len(robot.results) + 5)
+    found = robot.generations()
+    assert set(found) == {0, 1}
+    assert min(found.values()) >= 5
+    master.send(signal.SIGINT)
+    assert await master.end(12) == 130
+    await stage.nothing_left("hub")
+
+
+@pytest.mark.parametrize(("victim", "options"), [("board", ()), ("pcie-app", ()), ("board", ("--fused",))])
+async def test_a_death_while_boards_are_programmed(stage, boat, other_boat, victim, options):
+    _, robot, master, runs = await looping(stage, boat, *options, witness=(boat, other_boat))
+    robot._publishing.cancel()
+    await asyncio.sleep(0.5)  # no frame may wait for the board that stops now
+    boards = sorted(stage.processes()["board"], key=lambda each: each.pid)[1:]  # the first is their parent
+    images = [board.image_hash for board in load_deployment(other_boat, images=False).boards]
+    victims = [boards[2] if victim == "board" else stage.processes()["pcie-app"][0]]
+    boards[2].suspend()
+    reloading = reload_(stage, runs, "-d", str(other_boat))
+
+    async def half_way():
+        return (await status_of(runs, "board1"))["boards"][0]["image"] == images[1]
+
+    await until(half_way)
+    victims[0].kill()
+    if victim != "board":
+        boards[2].resume()
+    assert await reloading.end() in {5, 6}, reloading.out
+    assert victim.removesuffix("-app") in reloading.err.lower()
+    assert "goes on" in master.err
+    before = len(robot.results)
+    await robot.keep_publishing(rate=40, **READING)
+    await robot.have(before + 5)
+    assert set(robot.generations()) == {0}
+    again = reload_(stage, runs, "-d", str(other_boat))
+    assert await again.end() == 0, again.err
+    await robot.have(len(robot.results) + 5)
+    assert set(robot.generations()) == {0, 1}
+    master.send(signal.SIGINT)
+    assert await master.end(12) == 130
+    await stage.nothing_left("hub")
+
+
+async def test_rosbridge_may_be_away(stage, boat, other_boat):
+    hub, robot, master, runs = await looping(stage, boat, witness=(boat, other_boat))
+    hub.send(signal.SIGKILL)
+    await hub.end()
+    await master.says("is gone")
+    reloading = reload_(stage, runs, "-d", str(other_boat))
+    assert await reloading.end() == 0, reloading.err
+    before = len(robot.results)
+    await stage.hub(int(robot.uri.rsplit(":", 1)[1]))
+    await robot.have(before + 5)
+    assert set(robot.generations()) == {0, 1}
+
+
+async def test_services_that_the_master_did_not_start(stage, boat, other_boat):
+    _, uri = await stage.hub()
+    sockets = stage.where / "s"
+    sockets.mkdir(mode=0o700)
+    boards = ",".join(f"unix:{sockets}/board{at}.sock" for at in range(4))
+    stage.start("board", "--boards", "4", "--directory", str(sockets))
+    stage.start("pcie-app", "-d", str(boat), "--boards", boards, "--listen", f"unix:{sockets}/pcie-app.sock")
+    for role in ("subscriber", "publisher"):
+        stage.start(role, "-d", str(boat), "--uri", uri, "--listen", f"unix:{sockets}/{role}.sock")
+    robot = Witness(uri, boat, other_boat)
+    await robot.connect()
+    await robot.keep_publishing(**READING)
+    environment = {"BM_RUN_DIRECTORY": str(sockets)}
+    started = (*LOOP, "--connect", str(sockets))
+    master = stage.start(*started, "-d", str(boat), environment=environment)
+    await robot.have(3)
+    reloading = reload_(stage, sockets, "-d", str(other_boat))
+    assert await reloading.end() == 0, reloading.err
+    await robot.have(len(robot.results) + 5)
+    assert set(robot.generations()) == {0, 1}
+    master.send(signal.SIGTERM)
+    assert await master.end(12) == 143
+    # the next master finds them with what they were given
+    refused = stage.start(*started, "-d", str(boat))
+    assert await refused.end() == 2
+    assert "runs deployment" in refused.err
+    last = stage.start(*started, "-d", str(other_boat), "--count", "2")
+    assert await last.end() == 0, last.err
+
+
+async def test_there_must_be_a_run(stage, boat, tmp_path):
+    environment = {"BM_RUN_DIRECTORY": str(tmp_path)}
+    reloading = stage.start("master", "reload", environment=environment)
+    assert await reloading.end() == 2
+    assert "no master takes orders at" in reloading.err
+    _, uri = await stage.hub()
+    # boards that are not there are waited for, and the run has not begun
+    boards = ",".join(f"unix:{tmp_path}/board{at}.sock" for at in range(4))
+    options = ("--boards", boards, "--peer-timeout", "60")
+    master = stage.start("master", "--loop", "-d", str(boat), "--uri", uri, *options, environment=environment)
+    control = tmp_path / "master.control.sock"
+
+    async def listens():
+        return control.exists()
+
+    await until(listens)
+    assert control.stat().st_mode & 0o777 == 0o600
+    reloading = reload_(stage, tmp_path)
+    assert await reloading.end() == 6
+    assert "the run is not ready: it waits for" in reloading.err
+    master.send(signal.SIGINT)
+    assert await master.end() == 130
+    assert not control.exists()
