@@ -69,7 +69,7 @@ class Built:
     report: str
 
 
-def build_deployment(model: Model, directory: Path, options: BuildOptions) -> Built:
+def build_deployment(model: Model, directory: Path, options: BuildOptions, *, remark: str = "") -> Built:
     """Write a model's deployment: `deployment.toml`, an image per board, a report, and the hardware project.
 
     The same model and options give the same bytes.
@@ -78,12 +78,15 @@ def build_deployment(model: Model, directory: Path, options: BuildOptions) -> Bu
         model: The model.
         directory: Where to; made if it is not there. A deployment that is there is replaced.
         options: Everything else.
+        remark: What the report says of how the options were chosen.
 
     Raises:
         BuildError: Options that don't fit each other, the model or the register map, or a folder that can't be
             written.
     """
     built = assemble(model, options)
+    if remark:
+        built = replace(built, report=f"{built.report}\n{remark}\n")
     written = _write(Path(directory), built.deployment, built.images)
     try:
         (written.directory / REPORT_NAME).write_text(built.report, encoding="utf-8")

@@ -253,18 +253,8 @@ def fit(
             help="Where a searched dimension's true value is; one for each.", metavar="LABEL=COLUMN"
         ),
     ],
-    readings: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--reading",
-            help="Where a known variable's readings are; * stands for the same in both. Default: its name.",
-            metavar="NAME=COLUMN",
-        ),
-    ] = None,
-    settings: Annotated[
-        list[str] | None,
-        typer.Option("--set", help="A parameter of the model; repeat for more.", metavar="KEY=VALUE"),
-    ] = None,
+    readings: flags.ReadingColumns = None,
+    settings: flags.Settings = None,
     method: Annotated[
         FitMethod, typer.Option(help="normals: sigma and the outliers' share; counts: whole tables.")
     ] = FitMethod.NORMALS,

@@ -99,29 +99,31 @@ def run_build(
     options = read_options(options, unread)
     typer.echo(f"Reading {model_file(path)}", err=True)
     model = read_model(path, question, unread)
-    options = on_device(options, model, unread.device)
+    options, why = on_device(options, model, unread.device)
     typer.echo(f"Quantising {model.name} and writing its images", err=True)
-    built = build_deployment(model, directory, replace(options, build_date=build_date(model_file(path))))
+    dated = replace(options, build_date=build_date(model_file(path)))
+    built = build_deployment(model, directory, dated, remark=why)
     typer.echo(built.report, nl=False)
     typer.echo(f"Wrote {built.deployment.path} and {directory / REPORT_NAME}", err=True)
 
 
-def on_device(options: BuildOptions, model: Model, name: str | None) -> BuildOptions:
-    """Return the options with as many boards as a device's size asks for, or more that were asked for; says why.
+def on_device(options: BuildOptions, model: Model, name: str | None) -> tuple[BuildOptions, str]:
+    """Return the options with as many boards as a device's size asks for, or more that were asked for, and why.
 
     Raises:
         BuildError: No such device, no such machine, or one of which not even a line fits.
     """
     if name is None:
-        return options
+        return options, ""
     device = device_named(name)
     try:
         parameters = machine_parameters(model, options)
     except MachineError as reason:
         raise BuildError(str(reason)) from None
     count, why = boards_needed(parameters, device, interface=options.interface or DEFAULT_INTERFACE)
-    typer.echo(why, err=True)
-    return replace(options, partitions=max(count, options.partitions))
+    if options.partitions > count:
+        why += f" --partitions {options.partitions} asks for more."
+    return replace(options, partitions=max(count, options.partitions)), why
 
 
 def with_sources(options: BuildOptions, path: Path | None) -> BuildOptions:

@@ -90,7 +90,9 @@ def _findings(
     try:
         options = read_options(options, unread)
         model = read_model(path, question, unread)
-        options = on_device(options, model, unread.device)
+        options, why = on_device(options, model, unread.device)
     except ToolchainError as reason:
         return [refusal(reason, "the model")]
+    if why:
+        typer.echo(why, err=True)
     return check_model(model, options)

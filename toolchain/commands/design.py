@@ -19,14 +19,6 @@ _Readings: TypeAlias = Annotated[
         "--readings", help="Recorded readings: CSV, MCAP or bag; else they are drawn.", metavar="RECORDING"
     ),
 ]
-_Columns: TypeAlias = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--reading",
-        help="Where a known variable's readings are; * stands for the same in both. Default: its name.",
-        metavar="NAME=COLUMN",
-    ),
-]
 _Tolerance: TypeAlias = Annotated[
     float, typer.Option(help="bags: seconds between readings that belong together.")
 ]
@@ -55,7 +47,7 @@ def inspect_(
     prior_select: flags.PriorSelectName = "",
     on_missing: flags.OnMissingFlag = OnMissing.ERROR,
     readings: _Readings = None,
-    reading: _Columns = None,
+    reading: flags.ReadingColumns = None,
     tolerance: _Tolerance = 0.1,
     frames: Annotated[
         int | None,
@@ -142,7 +134,7 @@ def explore(
     stop: flags.StopFlag = Stop.SLICES,
     max_cycles: flags.MaxCycles = 2**17,
     readings: _Readings = None,
-    reading: _Columns = None,
+    reading: flags.ReadingColumns = None,
     frames: _Frames = 50,
     banks: _Banks = 2,
     seed: _Seed = 1,

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import math
+import shlex
 from itertools import chain
 from statistics import fmean, median
 from typing import TYPE_CHECKING, Final
 
 from toolchain.address import to_address
+from toolchain.analysis.readings import reading_columns
 from toolchain.errors import BuildError, ModelError, ReadingError
 from toolchain.learning.fit import LEAST_READINGS, Support, fit_model, locate
 from toolchain.learning.fit_options import FitMethod
@@ -58,14 +60,14 @@ def run_fit(
             raise BuildError(message)
     model = load_model(case, key_values(settings))
     truth_columns = _truth_columns(model, options.truth)
-    reading_columns = _reading_columns(model, options.readings)
-    columns = list(dict.fromkeys([*reading_columns.values(), *truth_columns.values()]))
+    columns_of_readings = reading_columns([known.name for known in model.known], options.readings)
+    columns = list(dict.fromkeys([*columns_of_readings.values(), *truth_columns.values()]))
     read = [read_recording(path, columns, tolerance_s=options.tolerance_s) for path in recordings]
     truth = locate(model, _joined(read, truth_columns), sum(each.rows for each in read))
     fit, supports = fit_model(
         model,
         truth,
-        _joined(read, reading_columns),
+        _joined(read, columns_of_readings),
         [FittedRecording(file=each.path.name, sha256=_sha256(each.path), rows=each.rows) for each in read],
         options,
     )
@@ -78,7 +80,7 @@ def run_fit(
             fitted,
             read_recording(path, columns, tolerance_s=options.tolerance_s),
             truth_columns,
-            reading_columns,
+            columns_of_readings,
         )
         for path in checks
     ]
@@ -122,32 +124,6 @@ def _truth_columns(model: Model, given: Sequence[str]) -> dict[str, str]:
     for label in labels:
         if label not in columns:
             message = f"the model searches {label}: say where its true value is with --truth {label}=COLUMN"
-            raise BuildError(message)
-    return columns
-
-
-def _reading_columns(model: Model, given: Sequence[str]) -> dict[str, str]:
-    """Return the column of every variable that is learnt: the named ones, or all by their own names."""
-    if not given:
-        return {known.name: known.name for known in model.known}
-    columns: dict[str, str] = {}
-    for pattern, column in key_values(given, "--reading", "range=COLUMN").items():
-        before, star, after = pattern.partition("*")
-        found = False
-        for known in model.known:
-            name = known.name
-            fits = (
-                name.startswith(before) and name.endswith(after) and len(name) >= len(before) + len(after)
-                if star
-                else name == pattern
-            )
-            if fits:
-                same = name[len(before) : len(name) - len(after)] if star else ""
-                columns[name] = column.replace("*", same)
-                found = True
-        if not found:
-            names = ", ".join(known.name for known in model.known[:20])
-            message = f"--reading {pattern}: the model has no such known variable; it has {names}"
             raise BuildError(message)
     return columns
 
@@ -235,7 +211,10 @@ def _table(fit: Fit, supports: Sequence[Support], lines: int) -> str:
 
 
 def _how_to_load(output: Path) -> str:
-    return f"A model.py takes it with toolchain.learning.fitted.with_fit(model, Path({output.name!r}))."
+    return (
+        f"A model() with a parameter for it takes it with --set {shlex.quote(f'fit={output}')}; any other one with "
+        f"toolchain.learning.fitted.with_fit(model, Path({str(output.resolve())!r}))."
+    )
 
 
 def _sha256(path: Path) -> str:

@@ -33,6 +33,14 @@ PriorSelectName: TypeAlias = Annotated[
     str, typer.Option(help="Of a network: the variable with readings that selects the prior.", metavar="NAME")
 ]
 OnMissingFlag: TypeAlias = Annotated[OnMissing, typer.Option(help="Of a network: what an absent reading is.")]
+ReadingColumns: TypeAlias = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--reading",
+        help="Where a known variable's readings are; * stands for the same in both. Default: its name.",
+        metavar="NAME=COLUMN",
+    ),
+]
 
 Partitions: TypeAlias = Annotated[int, typer.Option(help="Boards to split the lines over.")]
 DeviceFlag: TypeAlias = Annotated[

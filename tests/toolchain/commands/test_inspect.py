@@ -153,7 +153,9 @@ def test_the_machines_are_those_that_were_built(case, deployment):
 
 def test_a_build_on_a_device_takes_its_own_number_of_boards(case):
     result = build(case, "--device", "proce-v-d8")
-    assert "All 12 lines fit one Gidel Proce V D8 (Stratix V GS D8):" in result.stderr
+    assert "\nAll 12 lines fit one Gidel Proce V D8 (Stratix V GS D8):" in result.stdout
+    assert "--partitions 2 asks for more.\n" in result.stdout
+    assert (case.parent / "out" / "report.txt").read_text() == result.stdout
     assert (
         len(load_deployment(case.parent / "out").boards) == 2
     )  # as many as were asked for, since they are more

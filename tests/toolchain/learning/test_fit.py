@@ -404,7 +404,8 @@ def test_the_command_fits_normals_and_a_model_loads_them(corridor):
     assert surprises[1] < surprises[0]
     fitted = load_model(corridor / "corridor", {"fit": str(out)})
     assert fitted.known[0].normal.sigma.max() < 0.25
-    assert f"Wrote {out}." in result.stdout
+    assert f"Wrote {out}. A model() with a parameter for it takes it with --set fit={out}; " in result.stdout
+    assert f"with_fit(model, Path({str(out.resolve())!r}))" in result.stdout
 
 
 def test_the_command_counts(corridor):
@@ -426,7 +427,7 @@ def test_the_command_counts(corridor):
         (["-o", "fit.toml"], "learn.csv has no column 'wall'; it has true_x, wall_m, back_m, door"),
         (
             ["-o", "fit.toml", "--reading", "wal=wall_m"],
-            "--reading wal: the model has no such known variable",
+            "--reading wal: there is no such known variable",
         ),
         (["-o", "fit.toml", "--reading", "wall"], "--reading wall: expected KEY=VALUE"),
         (["-o", "fit.toml", "--truth", "y=true_x"], "--truth y: the model searches x"),
