@@ -1,0 +1,368 @@
+"""Makes the case study's CSV files of the data set as it is downloaded: seconds in which a robot stood nearly still.
+
+python -m casestudies.mrclam.convert MRCLAM_Dataset1 -o DATA_DIR
+"""
+
+import csv
+import math
+import re
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Final
+
+import numpy as np
+import typer
+from numpy.typing import NDArray
+
+from casestudies.errors import CaseStudyError, DataFileError, OutputError
+from casestudies.mrclam.recording import LANDMARKS
+from casestudies.running import command, fail, say
+from casestudies.written import check_writable
+from toolchain.commands.usage import CommandLine
+
+LARGEST_FILE: Final = 1 << 28
+"""Bytes of a file that are read at most; the largest of the collection have some 20 million."""
+LEAST_LANDMARKS: Final = 3
+MOST_MOVED_M: Final = 0.12
+WINDOW_S: Final = 1.0
+_REFERENCE_GAP_S: Final = 0.2
+"""Between two positions further apart than this, a reference is not interpolated."""
+_REFERENCE_STD_M: Final = 0.001
+"""The motion capture's own precision, as the collection's page gives it."""
+_SUBJECTS: Final = range(1, 21)
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Track:
+    """Where a robot was, by motion capture: time (s), x and y (m), heading (rad, without jumps); float64[n] each."""
+
+    time: Floats
+    x: Floats
+    y: Floats
+    heading: Floats
+
+    def at(self, time: float) -> tuple[float, float, float]:
+        """Position and heading at a time, linearly between two samples."""
+        x, y, heading = (float(np.interp(time, self.time, each)) for each in (self.x, self.y, self.heading))
+        return x, y, heading
+
+    def known(self, begin: float, end: float) -> bool:
+        """Whether there are samples all the way from one time to another."""
+        inside = self.time[(self.time > begin) & (self.time < end)]
+        around = np.concatenate((self.time[self.time <= begin][-1:], inside, self.time[self.time >= end][:1]))
+        ends_known = len(around) > 1 and around[0] <= begin and around[-1] >= end
+        return bool(ends_known and np.diff(around).max() <= _REFERENCE_GAP_S)
+
+    def moved(self, begin: float, end: float) -> float:
+        """The diagonal of the smallest box around all positions between two times, in metres."""
+        inside = (self.time > begin) & (self.time < end)
+        (x_0, y_0, _), (x_1, y_1, _) = self.at(begin), self.at(end)
+        x, y = np.append(self.x[inside], (x_0, x_1)), np.append(self.y[inside], (y_0, y_1))
+        return math.hypot(np.ptp(x), np.ptp(y))
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """A sighting of the camera: time (s), landmark, range (m), and bearing (rad) from the robot's heading."""
+
+    time: float
+    landmark: int
+    range_m: float
+    bearing_rad: float
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """A second of a robot: its middle, the reference there, and the median sighting of each landmark."""
+
+    time: float
+    x: float
+    y: float
+    heading: float
+    seen: dict[int, tuple[float, float]]
+
+
+def read_columns(path: Path, names: Sequence[str]) -> Iterator[tuple[str, tuple[float, ...]]]:
+    """Read a file of the collection: numbers with spaces between them, comments after `#`.
+
+    Args:
+        path: The file.
+        names: What its columns are.
+
+    Yields:
+        Where a line is, for the sentences about it, and its numbers.
+
+    Raises:
+        DataFileError: it cannot be read, or a line has something else than these numbers.
+    """
+    try:
+        if path.stat().st_size > LARGEST_FILE:
+            raise DataFileError(f"{path} is larger than {LARGEST_FILE >> 20} MiB: it is none of the data set")
+        with path.open(encoding="utf-8") as file:
+            for number, line in enumerate(file, 1):
+                words = line.split("#", 1)[0].split()
+                if not words:
+                    continue
+                where = f"{path}, line {number}"
+                try:
+                    values = tuple(float(word) for word in words)
+                except ValueError:
+                    values = ()
+                if len(values) != len(names) or not all(map(math.isfinite, values)):
+                    raise DataFileError(f"{where}: expected {len(names)} numbers: {', '.join(names)}")
+                yield where, values
+    except OSError as error:
+        raise DataFileError(
+            f"{path} cannot be read: {error.strerror or error}; name the folder that the data set was unpacked into"
+        ) from None
+    except UnicodeDecodeError:
+        raise DataFileError(f"{path} is no text: it is none of the data set") from None
+
+
+def read_barcodes(folder: Path) -> dict[int, int]:
+    """Which subject (1 to 5 are robots, 6 to 20 landmarks) has which barcode, from `Barcodes.dat`.
+
+    Raises:
+        DataFileError: no such file, or an unknown subject.
+    """
+    subjects: dict[int, int] = {}
+    for where, (subject, barcode) in read_columns(folder / "Barcodes.dat", ("subject", "barcode")):
+        if subject not in _SUBJECTS or barcode != int(barcode):
+            raise DataFileError(
+                f"{where}: expected a subject from {_SUBJECTS[0]} to {_SUBJECTS[-1]} and its barcode"
+            )
+        subjects[int(barcode)] = int(subject)
+    return subjects
+
+
+def read_positions(folder: Path) -> dict[int, tuple[float, float]]:
+    """The landmarks' positions in metres, from `Landmark_Groundtruth.dat`.
+
+    Raises:
+        DataFileError: no such file, or a line about something else than a landmark.
+    """
+    path = folder / "Landmark_Groundtruth.dat"
+    names = ("subject", "x (m)", "y (m)", "deviation of x", "deviation of y")
+    positions = {}
+    for where, (subject, x, y, _, _) in read_columns(path, names):
+        if subject not in LANDMARKS:
+            raise DataFileError(f"{where}: expected a landmark's number, {LANDMARKS[0]} to {LANDMARKS[-1]}")
+        positions[int(subject)] = (x, y)
+    if not positions:
+        raise DataFileError(f"{path} holds no landmark")
+    return positions
+
+
+def read_track(folder: Path, robot: int) -> Track:
+    """A robot's way, from `RobotN_Groundtruth.dat`.
+
+    Raises:
+        DataFileError: no such file, no positions in it, or times that do not rise.
+    """
+    path = folder / f"Robot{robot}_Groundtruth.dat"
+    names = ("time (s)", "x (m)", "y (m)", "orientation (rad)")
+    rows = np.array([values for _, values in read_columns(path, names)], dtype=np.float64).reshape(-1, 4)
+    if not len(rows):
+        raise DataFileError(f"{path} holds no positions")
+    if np.any(np.diff(rows[:, 0]) < 0):
+        raise DataFileError(f"{path}: its times do not rise")
+    return Track(rows[:, 0], rows[:, 1], rows[:, 2], np.unwrap(rows[:, 3]))
+
+
+def read_measured(folder: Path, robot: int, subjects: dict[int, int]) -> tuple[list[Measured], int]:
+    """A robot's sightings of landmarks, from `RobotN_Measurement.dat`, and how many had a barcode of nothing.
+
+    Raises:
+        DataFileError: no such file.
+    """
+    path = folder / f"Robot{robot}_Measurement.dat"
+    found, misread = [], 0
+    for _, (time, barcode, away, bearing) in read_columns(
+        path, ("time (s)", "barcode", "range (m)", "bearing (rad)")
+    ):
+        subject = subjects.get(int(barcode))
+        if subject is None or away < 0:
+            misread += 1
+        elif subject in LANDMARKS:
+            found.append(Measured(time, subject, away, bearing))
+    return sorted(found, key=lambda each: each.time), misread
+
+
+def windows(
+    track: Track, measured: Sequence[Measured], *, length_s: float = WINDOW_S
+) -> tuple[list[Window], Counter[str]]:
+    """Cut a robot's way into windows, and keep those in which it stood nearly still and saw enough landmarks.
+
+    Args:
+        track: Where it was.
+        measured: What it saw, in the order of time.
+        length_s: Of a window, in seconds.
+
+    Returns:
+        The windows, and how many others there are for each reason.
+    """
+    kept: list[Window] = []
+    left_out: Counter[str] = Counter()
+    if not measured:
+        return kept, left_out
+    begin = measured[0].time
+    by_window: dict[int, list[Measured]] = {}
+    for each in measured:
+        by_window.setdefault(math.floor((each.time - begin) / length_s), []).append(each)
+    for number, inside in by_window.items():
+        start, end = begin + number * length_s, begin + (number + 1) * length_s
+        if not track.known(start, end):
+            left_out["without a reference"] += 1
+        elif track.moved(start, end) >= MOST_MOVED_M:
+            left_out["moving"] += 1
+        elif len({each.landmark for each in inside}) < LEAST_LANDMARKS:
+            left_out[f"with fewer than {LEAST_LANDMARKS} landmarks"] += 1
+        else:
+            middle = (start + end) / 2
+            x, y, heading = track.at(middle)
+            kept.append(Window(middle, x, y, _wrapped(heading), _medians(track, inside)))
+    return kept, left_out
+
+
+def _medians(track: Track, sightings: Sequence[Measured]) -> dict[int, tuple[float, float]]:
+    """Each landmark's median range and median absolute bearing: measured bearing plus the heading at that moment."""
+    seen = {}
+    for landmark in sorted({each.landmark for each in sightings}):
+        own = [each for each in sightings if each.landmark == landmark]
+        bearings = np.array([each.bearing_rad + track.at(each.time)[2] for each in own])
+        first = bearings[0]  # around it, a circle is a line
+        away = np.median((bearings - first + math.pi) % (2 * math.pi) - math.pi)
+        seen[landmark] = (float(np.median([each.range_m for each in own])), _wrapped(first + float(away)))
+    return seen
+
+
+def _wrapped(angle: float) -> float:
+    return (angle + math.pi) % (2 * math.pi) - math.pi
+
+
+def write_landmarks(path: Path, positions: dict[int, tuple[float, float]]) -> None:
+    """Write `landmarks.csv`.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    _write(
+        path,
+        ["landmark", "x_m", "y_m"],
+        [[str(number), f"{x:.4f}", f"{y:.4f}"] for number, (x, y) in sorted(positions.items())],
+    )
+
+
+def write_recording(path: Path, kept: Sequence[Window], landmarks: Sequence[int]) -> None:
+    """Write a file as `casestudies.mrclam.recording` reads it.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    heading = ["time_s", "ref_x_m", "ref_y_m", "ref_std_m", "heading_rad"]
+    heading += [name for number in landmarks for name in (f"range_{number}_m", f"bearing_{number}_rad")]
+    rows = []
+    for each in kept:
+        row = [
+            f"{each.time:.3f}",
+            f"{each.x:.4f}",
+            f"{each.y:.4f}",
+            f"{_REFERENCE_STD_M}",
+            f"{each.heading:.4f}",
+        ]
+        for number in landmarks:
+            seen = each.seen.get(number)
+            row += ["", ""] if seen is None else [f"{seen[0]:.3f}", f"{seen[1]:.4f}"]
+        rows.append(row)
+    _write(path, heading, rows)
+
+
+def _write(path: Path, heading: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    try:
+        with path.open("w", newline="", encoding="utf-8") as file:
+            csv.writer(file, lineterminator="\n").writerows([heading, *rows])
+    except OSError as error:
+        raise OutputError(f"{path} cannot be written: {error.strerror or error}") from None
+
+
+def robots_in(folder: Path) -> list[int]:
+    """The robots that the folder has measurements of.
+
+    Raises:
+        DataFileError: none.
+    """
+    found = sorted(
+        int(match[1])
+        for path in folder.glob("Robot*_Measurement.dat")
+        if (match := re.match(r"Robot(\d+)_", path.name))
+    )
+    if not found:
+        raise DataFileError(
+            f"{folder} holds no RobotN_Measurement.dat: name the folder that the data set was unpacked into"
+        )
+    return found
+
+
+def prefix_of(folder: Path) -> str:
+    """What the recordings' names begin with: `ds1` for a folder whose name ends in 1."""
+    number = re.search(r"(\d+)$", folder.resolve().name)
+    return f"ds{number[1]}" if number else "ds"
+
+
+app = CommandLine()
+
+
+@app.command(epilog="Example: `python -m casestudies.mrclam.convert MRCLAM_Dataset1 -o DATA_DIR`")
+def convert(
+    folder: Annotated[
+        Path, typer.Argument(help="The folder that the data set was unpacked into: Barcodes.dat, ...")
+    ],
+    output: Annotated[
+        Path,
+        typer.Option(
+            "--output-dir", "-o", help="Folder for landmarks.csv and ds1_robot1.csv, ...", metavar="DIR"
+        ),
+    ],
+    robot: Annotated[
+        list[int] | None,
+        typer.Option(help="Which robot; repeat for more. By default all.", metavar="NUMBER"),
+    ] = None,
+) -> None:
+    """Make the case study's CSV files of a data set as it is downloaded.
+
+    A line for each second in which a robot moved less than 0.12 m and saw at least three landmarks.
+    """
+    try:
+        subjects, positions = read_barcodes(folder), read_positions(folder)
+        robots = robot or robots_in(folder)
+        check_writable(output)
+        write_landmarks(output / "landmarks.csv", positions)
+        print(f"wrote {output / 'landmarks.csv'}: {len(positions)} landmarks", flush=True)
+        for number in robots:
+            measured, misread = read_measured(folder, number, subjects)
+            kept, left_out = windows(read_track(folder, number), measured)
+            reasons = ", ".join(f"{count} {reason}" for reason, count in sorted(left_out.items())) or "none"
+            said = f"{len(kept)} seconds; left out: {reasons}"
+            if misread:
+                said += f"; misread barcodes: {misread}"
+            if not kept:
+                say(f"warning: robot {number}: nothing to write, {said}")
+                continue
+            path = output / f"{prefix_of(folder)}_robot{number}.csv"
+            write_recording(path, kept, sorted(positions))
+            print(f"wrote {path}: {said}", flush=True)
+    except CaseStudyError as error:
+        fail(error)
+
+
+def main() -> None:
+    """The command line of this module."""
+    command(app)
+
+
+if __name__ == "__main__":
+    main()
