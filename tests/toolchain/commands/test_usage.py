@@ -106,6 +106,7 @@ def test_no_command_is_answered_with_help(capsys):
         ),
         *(f"services.{name}" for name in ("hub", "discover", "listen", "status")),
         *(f"casestudies.boat.{name}" for name in ("simulator", "normaliser", "viewer")),
+        "casestudies.mrclam.convert",
         "casestudies.mrclam.player",
         "toolchain.command",
     ],
