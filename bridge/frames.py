@@ -9,7 +9,8 @@ Source: RFC 6455, sections 5.2, 5.3 and 10.3.
 
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from functools import lru_cache
 from struct import Struct
 from typing import Final
 
@@ -20,6 +21,7 @@ except ImportError:  # a build of websockets without its C extension
 
 _TEXT: Final = 0x81
 _BINARY: Final = 0x82
+_WHOLE: Final = frozenset((_TEXT, _BINARY))
 _MASKED: Final = 0x80
 _BRACE: Final = ord("{")
 #: Payloads from these lengths on have a longer header.
@@ -55,25 +57,32 @@ def whole_messages(
         is not complete yet; the length of ``data`` if there is none.
     """
     found: list[bytes] = []
+    take, unmask = found.append, apply_mask
     size = len(data)
     last = min(size - 1, until)
     bit, key = (_MASKED, 4) if masked else (0, 0)
-    while at < last and len(found) < count:
-        first, length = data[at], data[at + 1] ^ bit
-        if first not in (_TEXT, _BINARY) or length >= _MASKED:
+    while at < last and count > 0:
+        length = data[at + 1] ^ bit
+        if data[at] not in _WHOLE or length >= _MASKED:
             break
-        body = at + 2
-        if length >= _MEDIUM:
-            body += 2 if length == _MEDIUM else 8
+        if length < _MEDIUM:
+            body = at + 2 + key
+        elif length == _MEDIUM:
+            body = at + 4 + key
             if body > size:
                 break
-            length = int.from_bytes(data[at + 2 : body], "big")
-        body += key
+            length = data[at + 2] << 8 | data[at + 3]
+        else:
+            body = at + 10 + key
+            if body > size:
+                break
+            length = int.from_bytes(data[at + 2 : at + 10], "big")
         end = body + length
         if end > size or length > largest:
             break
-        found.append(apply_mask(data[body:end], data[body - 4 : body]) if masked else data[body:end])
+        take(unmask(data[body:end], data[body - 4 : body]) if masked else data[body:end])
         at = end
+        count -= 1
     return found, at
 
 
@@ -101,10 +110,18 @@ def frame_end(data: bytes, at: int, *, masked: bool, largest: int) -> int:
     return body + (4 if masked else 0) + length
 
 
-def header(payload: bytes) -> bytes:
-    """The beginning of an unmasked frame of a whole message: text for JSON, binary for CBOR."""
-    first = _TEXT if payload[0] == _BRACE else _BINARY
-    length = len(payload)
+def unmasked(payloads: Iterable[bytes]) -> bytes:
+    """A server's frames of whole messages: text for JSON, binary for CBOR."""
+    parts: list[bytes] = []
+    for payload in payloads:
+        parts += _header(payload[0] == _BRACE, len(payload)), payload
+    return b"".join(parts)
+
+
+@lru_cache(maxsize=4096)
+def _header(is_text: bool, length: int) -> bytes:
+    """The beginning of an unmasked frame."""
+    first = _TEXT if is_text else _BINARY
     if length < _MEDIUM:
         return bytes((first, length))
     if length < _LONG:

@@ -5,6 +5,7 @@ import logging
 import time
 from collections import deque
 from collections.abc import Awaitable, Callable, Mapping
+from math import inf
 from typing import Any, Final, Self
 
 from bridge.errors import (
@@ -108,6 +109,10 @@ class Subscription(_Handle):
         self._size = queue_size
         self._queue: deque[Message] = deque(maxlen=queue_size)
         self._waiter: asyncio.Future[None] | None = None
+        self._asleep = False  # and not woken yet
+        self._deadline = inf  # of who waits
+        self._alarm: asyncio.TimerHandle | None = None
+        self._rings = inf
         self._number = session.core.subscribe(
             topic, type_name, throttle_rate=throttle_rate, queue_length=queue_length, delivery=delivery
         )
@@ -126,7 +131,7 @@ class Subscription(_Handle):
             if queue[0].blind_seconds:
                 message = self._keep_blind(message)
         queue.append(message)
-        if self._waiter is not None:
+        if self._asleep:
             self._wake()
 
     def _note_blind(self, seconds: float) -> None:
@@ -157,21 +162,46 @@ class Subscription(_Handle):
 
     async def _news(self) -> None:
         """Wait until something has come, the subscription has ended, or the time is over (see `next`)."""
+        self._check_alone()
+        self._waiter = asyncio.get_running_loop().create_future()
+        self._asleep = True
+        try:
+            await self._waiter
+        finally:
+            self._waiter, self._asleep = None, False
+
+    def _check_alone(self) -> None:
         if self._waiter is not None:
             raise ConcurrentReadError(
                 f"another task waits for messages of {self.topic} already: a second reader needs a "
                 "subscription of its own"
             )
-        self._waiter = asyncio.get_running_loop().create_future()
-        try:
-            await self._waiter
-        finally:
-            self._waiter = None
 
     def _wake(self) -> None:
-        waiter = self._waiter
+        waiter, self._asleep = self._waiter, False
         if waiter is not None and not waiter.done():
             waiter.set_result(None)
+
+    def _set_alarm(self) -> None:
+        """See that whoever waits is woken at the deadline.
+
+        An alarm that was set before and rings earlier serves too: it is set again then. So one is set now and then, not
+        for each message: that would take longer than all the rest.
+        """
+        if self._alarm is not None:
+            if self._rings <= self._deadline:
+                return
+            self._alarm.cancel()
+        self._rings = self._deadline
+        delay = max(self._deadline - time.monotonic(), 0)
+        self._alarm = asyncio.get_running_loop().call_later(delay, self._ring)
+
+    def _ring(self) -> None:
+        self._alarm = None
+        if self._deadline <= time.monotonic():
+            self._wake()
+        elif self._deadline != inf:
+            self._set_alarm()
 
     async def next(self, timeout: float) -> Message:  # noqa: ASYNC109  # the limit is part of the error
         """Wait for one message.
@@ -189,22 +219,18 @@ class Subscription(_Handle):
         if queue:
             return queue.popleft()
         begun = time.monotonic()
-        over = False
-
-        def end() -> None:
-            nonlocal over
-            over = True
-            self._wake()
-
-        # asyncio.timeout would take longer than all the rest.
-        timer = asyncio.get_running_loop().call_later(timeout, end)
+        self._check_alone()
+        self._deadline = begun + timeout
+        self._set_alarm()
         try:
-            while not queue and not over:
+            while not queue:
                 if self._closed:
                     raise DisconnectedError(f"the subscription of {self.topic} is closed")
+                if time.monotonic() >= self._deadline:
+                    break
                 await self._news()
         finally:
-            timer.cancel()
+            self._deadline = inf
         if queue:
             return queue.popleft()
         why = await self._why_silent() or self._session.said_since(begun)
@@ -239,6 +265,9 @@ class Subscription(_Handle):
     def end(self) -> None:
         """End the iteration, after what waits in the queue."""
         super().end()
+        if self._alarm is not None:
+            self._alarm.cancel()
+            self._alarm = None
         self._wake()
 
     def _take_back(self) -> None:

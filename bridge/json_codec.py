@@ -65,13 +65,18 @@ def decode(data: bytes | str, *, max_size: int = MAX_SIZE, max_depth: int = MAX_
         message = _decode_leniently(data, error)
     if type(message) is not dict:
         raise DecodeError(f"a message that is no JSON object arrived: {excerpt(data)}")
-    if _has_many_brackets(data, max_depth) and depth(message, max_depth) > max_depth:
+    if could_be_deeper(data, max_depth) and depth(message, max_depth) > max_depth:
         raise DecodeError(f"a message nested deeper than {max_depth} levels arrived: {excerpt(data)}")
     return message
 
 
-def _has_many_brackets(data: bytes | str, limit: int) -> bool:
-    """Whether ``data`` opens more objects and arrays than ``limit``: only then can it be deeper, and needs a walk."""
+def could_be_deeper(data: bytes | str, limit: int) -> bool:
+    """Whether JSON may have more than ``limit`` objects and arrays within each other: only then it needs a walk.
+
+    Each of them opens and closes: what has not so many bytes, or not so many opening brackets, is not so deep.
+    """
+    if len(data) <= 2 * limit:
+        return False
     if isinstance(data, str):
         return data.count("{") + data.count("[") > limit
     if len(data) <= _COUNTED:
@@ -175,7 +180,7 @@ def encode(
                 f"{place} is NaN or infinite, which JSON has not got and rosbridge servers drop without a "
                 "word: leave it out, or send None where the receiver takes null"
             )
-    if _has_many_brackets(data, max_depth) and depth(orjson.loads(data), max_depth) > max_depth:
+    if could_be_deeper(data, max_depth) and depth(orjson.loads(data), max_depth) > max_depth:
         raise EncodeError(f"the message is nested deeper than {max_depth} levels")
     return data
 

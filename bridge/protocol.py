@@ -15,11 +15,14 @@ servers really do (``docs/rosbridge-differences.md``).
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import count
-from typing import Any, Final, Literal, get_args
+from typing import Any, Final, Literal, NamedTuple, get_args
+
+import orjson
 
 from bridge import cbor_codec, png
 from bridge.arrays import with_arrays, with_lists
 from bridge.cbor_codec import Arrays
+from bridge.envelope import BRACE, envelope_of, topic_of
 from bridge.errors import BridgeError, DecodeError, EncodeError, OptionError, SlowPeerError, TypeConflictError
 from bridge.events import (
     CallAnswered,
@@ -33,7 +36,7 @@ from bridge.events import (
     Unusable,
 )
 from bridge.fragments import Reassembler, split
-from bridge.json_codec import MAX_DEPTH, MAX_SIZE, decode, encode, excerpt
+from bridge.json_codec import MAX_DEPTH, MAX_SIZE, could_be_deeper, decode, encode, excerpt
 from bridge.names import Kind, absolute, check_name, ros1_type, ros2_type, same_type, split_type
 from bridge.qos import Qos
 from bridge.stamps import ros_version_of_message
@@ -47,6 +50,10 @@ MAX_CALLS: Final = 1000
 MAX_REQUESTS: Final = 64
 #: Goals of actions that may be under way at once.
 MAX_GOALS: Final = 100
+#: Keys of an operation whose envelope can be known again: op, topic and msg.
+_OF_ENVELOPE: Final = 3
+#: Envelopes of one topic that are looked at: a server that never says the same twice is not tried on and on.
+_ENVELOPES: Final = 8
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -125,6 +132,7 @@ class _Subscribed:
     everyone: tuple[int, ...] = ()
     someone_is_slower: bool = False
     heard: bool = False
+    envelopes_tried: int = 0
 
     def settle(self) -> bool:
         """Find what to ask of the server for all: fastest rate, longest queue. True if that changed."""
@@ -147,6 +155,19 @@ class _Subscribed:
                 wanted.due = now + wanted.throttle_rate / 1000
             through.append(number)
         return tuple(through)
+
+
+class _Known(NamedTuple):
+    """An envelope that came before, and whose messages stand after it; ``topic`` is as the server names it."""
+
+    envelope: bytes
+    size: int
+    topic: str
+    subscribed: _Subscribed
+
+
+#: In place of an envelope, before the first is known: nothing begins so.
+_UNKNOWN: Final = _Known(b"\xff", 0, "", _Subscribed("", None, Delivery(), ""))
 
 
 class ClientCore:
@@ -189,6 +210,9 @@ class ClientCore:
         self._requests: dict[int, tuple[str, Any]] = {}
         self._goals: dict[str, str] = {}
         self._fragments = Reassembler(max_size=max_size)
+        # What stood before messages that came, and whose they were; the last of these.
+        self._envelopes: dict[bytes, _Known] = {}
+        self._known = _UNKNOWN
         self._binary = False  # some topic is to come as CBOR
         self._numpy = False  # some topic's arrays are wanted as NumPy's
 
@@ -204,6 +228,7 @@ class ClientCore:
                 self._outbox.append(advertised.latched)
         for service, type_name in self._services.items():
             self._send_advertise_service(service, type_name)
+        self._forget_envelopes()
         for subscribed in self._subscribed.values():
             subscribed.heard = False
             self._send_subscribe(subscribed)
@@ -390,6 +415,7 @@ class ClientCore:
             new = True
         subscribed.wanted[number] = _Wanted(throttle_rate, queue_length)
         self._subscriptions[number] = subscribed
+        self._forget_envelopes()
         if subscribed.settle() or new:
             self._send_subscribe(subscribed)
         return number
@@ -416,6 +442,7 @@ class ClientCore:
         """Stop wanting messages; the last subscription of a topic takes it off the wire."""
         subscribed = self._subscriptions.pop(subscription)
         del subscribed.wanted[subscription]
+        self._forget_envelopes()
         if subscribed.wanted:
             if subscribed.settle():
                 self._send_subscribe(subscribed)
@@ -584,10 +611,13 @@ class ClientCore:
             What it means; None for what was answered here, or comes too late to mean anything (a topic or a
             call given up).
         """
-        if (
-            self._binary and type(data) is bytes and data[:1] >= b"\x80"
-        ):  # no JSON begins so, a map of CBOR does
-            return self._receive_cbor(data, now)
+        if type(data) is bytes:
+            if self._envelopes:
+                event = self._receive_again(data)
+                if event is not None:
+                    return event
+            if self._binary and data[:1] >= b"\x80":  # no JSON begins so, a map of CBOR does
+                return self._receive_cbor(data, now)
         try:
             operation = decode(data, max_size=self._max_size, max_depth=self._max_depth)
         except DecodeError as error:
@@ -598,6 +628,44 @@ class ClientCore:
         if op in ("fragment", "png"):
             return self._receive_wrapped(operation, now, data)
         return self._receive_other(operation, data)
+
+    def _receive_again(self, data: bytes) -> MessageReceived | None:
+        """Take a message whose envelope is known; None if it is none such, or needs a closer look."""
+        known = self._known
+        if not data.startswith(known.envelope):
+            found = self._envelopes.get(envelope_of(data))
+            if found is None:
+                return None
+            self._known = known = found
+        subscribed = known.subscribed
+        if data[-1] != BRACE or len(data) > self._max_size or subscribed.someone_is_slower:
+            return None
+        message = data[known.size : -1]
+        try:
+            msg = orjson.loads(message)
+        except orjson.JSONDecodeError:
+            return None
+        if type(msg) is not dict or could_be_deeper(message, self._max_depth - 1):
+            return None
+        if self._numpy and subscribed.delivery.arrays == "numpy":
+            msg = with_arrays(msg)
+        # What a named tuple's own constructor does takes three times as long.
+        return tuple.__new__(MessageReceived, (known.topic, msg, subscribed.everyone))
+
+    def _learn_envelope(self, data: bytes, topic: str, subscribed: _Subscribed) -> None:
+        """Remember what stands before a topic's messages, if no more than that must be known of the next one."""
+        envelope = envelope_of(data)
+        if envelope not in self._envelopes:
+            subscribed.envelopes_tried += 1
+            if topic_of(envelope) == topic:
+                self._envelopes[envelope] = _Known(envelope, len(envelope), topic, subscribed)
+
+    def _forget_envelopes(self) -> None:
+        """Look at all messages closely again: who hears them may have changed, or the server."""
+        self._envelopes.clear()
+        self._known = _UNKNOWN
+        for subscribed in self._subscribed.values():
+            subscribed.envelopes_tried = 0
 
     def _receive_cbor(self, data: bytes, now: float) -> Event | None:
         try:
@@ -666,6 +734,13 @@ class ClientCore:
         if not subscribed.heard:
             subscribed.heard = True
             self.seen_version = self.seen_version or ros_version_of_message(msg)
+        if (
+            type(data) is bytes
+            and len(operation) == _OF_ENVELOPE
+            and not from_cbor
+            and subscribed.envelopes_tried < _ENVELOPES
+        ):
+            self._learn_envelope(data, topic, subscribed)
         receivers = subscribed.receivers(now)
         if not receivers:
             return None

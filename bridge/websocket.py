@@ -24,7 +24,6 @@ from websockets.client import ClientProtocol
 from websockets.exceptions import (
     InvalidHandshake,
     InvalidMessage,
-    InvalidState,
     InvalidStatus,
     InvalidURI,
     PayloadTooBig,
@@ -38,6 +37,8 @@ from bridge.frames import UNKNOWN, UNSOUND, frame_end, mask_keys, masked_text, w
 from bridge.json_codec import excerpt
 from bridge.route import Route, connect_along, shown
 
+#: An enumeration's member takes as long to look up as a frame to write.
+_OPEN: Final = State.OPEN
 #: Bytes that may wait for the peer before publishers have to wait too.
 WRITE_LIMIT: Final = 1 << 16
 #: Seconds that the closing handshake may take.
@@ -132,7 +133,7 @@ class WebSocket(ClientConnection):
     @property
     def is_open(self) -> bool:
         """Whether messages can be sent."""
-        return self.protocol.state is State.OPEN
+        return self.protocol.state is _OPEN
 
     def begin(self) -> None:
         """Take up the connection after its handshake."""
@@ -143,17 +144,22 @@ class WebSocket(ClientConnection):
             self.process_event(event)
         self._early.clear()
 
-    def send_now(self, data: bytes) -> None:
-        """Hand one text message to the socket (or to its buffer, without limit: see ``paused`` and ``drain``)."""
+    def send_now(self, data: bytes) -> bool:
+        """Hand one text message to the socket (or to its buffer, without limit: see ``paused`` and ``drain``).
+
+        Returns:
+            Whether there is a connection that it went to.
+        """
         protocol = self.protocol
-        if protocol.state is not State.OPEN:
-            raise InvalidState(f"connection is {protocol.state.name.lower()}")
+        if protocol.state is not _OPEN:
+            return False
         frame = masked_text(data, next(self._keys))
         if self._held or protocol.writes:
             protocol.writes.append(frame)
             self.send_data()
         else:
             self.transport.write(frame)
+        return True
 
     @contextmanager
     def together(self) -> Iterator[None]:
@@ -212,7 +218,7 @@ class WebSocket(ClientConnection):
         frames = end + len(_END_OF_HANDSHAKE) - len(before)
         self._give_library(data[:frames])
         # A refusal may have a body: that is the library's too.
-        self._framed = self.protocol.state is State.OPEN
+        self._framed = self.protocol.state is _OPEN
         if frames < len(data):
             (self._take_frames if self._framed else self._give_library)(data[frames:])
 
@@ -245,7 +251,7 @@ class WebSocket(ClientConnection):
                 end = size
             self._give_library(data[at:end])
             at = end
-            if self.protocol.state is not State.OPEN:
+            if self.protocol.state is not _OPEN:
                 self._framed = False
                 if at < size:
                     self._give_library(data[at:])
@@ -262,7 +268,7 @@ class WebSocket(ClientConnection):
     def _give_library(self, data: bytes) -> None:
         """Have the library read some bytes, and do what comes of it."""
         super().data_received(data)
-        if self.protocol.state is not State.OPEN:
+        if self.protocol.state is not _OPEN:
             if not self.opened and self.protocol.handshake_exc is not None:
                 self.abandon()  # a peer that speaks something else may never hang up
             elif self.opened and self.protocol.state is State.CLOSING:
@@ -322,7 +328,7 @@ class WebSocket(ClientConnection):
     def _look(self, due: float) -> None:
         self._watch = None
         now = self.loop.time()
-        if self.protocol.state is not State.OPEN:
+        if self.protocol.state is not _OPEN:
             self.abandon()
             return
         silent = now - self._last_heard

@@ -14,6 +14,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import orjson
 
 from bridge import cbor_codec, fields, json_codec, png
 from bridge.arrays import with_arrays, with_lists
@@ -28,6 +29,8 @@ from bridge.events import (
     Unusable,
 )
 from bridge.fragments import Reassembler, split
+from bridge.hub.broker import Broker
+from bridge.hub.limits import HubLimits
 from bridge.protocol import MAX_CALLS, MAX_GOALS, MAX_REQUESTS, ClientCore, Delivery
 from bridge.qos import Qos
 from bridge.serialised import MessageTypes
@@ -75,6 +78,44 @@ ODD = (
     [[[]]],
     {},
     {"a": [1]},
+)
+ENVELOPES = (
+    b'{"op":"publish","topic":"/a","msg":',
+    b'{"op":"publish","topic":"/a","msg":',
+    b'{"op": "publish", "topic": "/a", "msg": ',
+    b'{"op":"publish","topic":"a","msg":',
+    b'{"op":"publish","topic":"b","msg":',
+    b'{"topic":"\\/a","op":"publish","msg":',
+    b'{"op":"publish","topic":"/a","id":1,"msg":',
+    b'{"op":"publish","msg":{},"topic":"/a","msg":',
+    b'{"op":"publish","topic":"/a","msg":{"msg":',
+    b'{"op":"status","topic":"/a","msg":',
+    b'{"op":"publish","topic":"/a","topic":"b","msg":',
+    b'{"op":"publish","topic":"/a","msg":"',
+    b"",
+)
+PARTS = (
+    b"{}",
+    b'{"a":1}',
+    b'{"data":[1.5,-0.0,1e15,123456789012345678901234567890]}',
+    b'{"a":{"b":{"c":[]}}}',
+    b'{"a":[[[[[]]]]]}',
+    b'{"a":NaN}',
+    b'{"a":1e999}',
+    b'{"a":"\xff"}',
+    b'{"a":"\\ud800"}',
+    b'{"a":"\\u00e9\xc3\xa9"}',
+    b'{"a":1,"a":2}',
+    b',"topic":"b"',
+    b',"msg":{"z":1}',
+    b"}",
+    b"{",
+    b'"',
+    b" ",
+    b"null",
+    b"[1]",
+    b'{"long":"' + b"x" * 600 + b'"}',
+    b"",
 )
 EVENTS = (
     MessageReceived,
@@ -456,6 +497,72 @@ def fuzz_core(data: bytes) -> None:
     Play(Source(data)).run()
 
 
+def _published(source: Source) -> bytes:
+    """What may be a publish: an envelope or half of one, and what stands in place of its message."""
+    message = b"".join(source.pick(PARTS) or source.piece() for _ in range(source.byte() % 6))
+    return bytes(source.pick(ENVELOPES)) + message + bytes(source.pick((b"}", b"}", b"}", b"", b"} ", b"}}")))
+
+
+def fuzz_again(data: bytes) -> None:
+    """A client that knows an envelope understands whatever comes as one does that looks at all of it."""
+    source = Source(data)
+    cores = [ClientCore(max_size=200, max_depth=3), ClientCore(max_size=200, max_depth=3)]
+    delivery = source.pick((Delivery(), Delivery(arrays="numpy")))
+    for core in cores:
+        core.restore()
+        core.subscribe("/a", delivery=delivery)
+        core.subscribe("b")
+    while source:
+        heard = _published(source)
+        cores[1]._forget_envelopes()  # noqa: SLF001  # so that it looks closely
+        events = [repr(core.receive(heard, 0.0)) for core in cores]
+        assert events[0] == events[1], events
+        assert len(cores[0]._envelopes) <= 16  # noqa: SLF001  # no one else can see what it keeps
+
+
+def fuzz_hub(data: bytes) -> None:
+    """A hub that knows a publisher's envelopes passes on whatever comes as one does that looks at all of it."""
+    source = Source(data)
+    brokers = [Broker(HubLimits(depth=4)), Broker(HubLimits(depth=4))]
+    publishers, heard = [], []
+    for broker in brokers:
+        publishers.append(broker.connect("publisher"))
+        ears = [broker.connect("ears") for _ in range(3)]
+        for client, topic, form in zip(ears, ("/a", "a", "/a"), ("none", "none", "cbor"), strict=True):
+            client.outbox.wire = []
+            asked = {"op": "subscribe", "topic": topic, "compression": form, "queue_length": 1000}
+            broker.receive(client, json.dumps(asked).encode(), 0.0)
+        for topic, latch in (("/a", True), ("b", False)):
+            asked = {"op": "advertise", "topic": topic, "type": "p/T", "latch": latch}
+            broker.receive(publishers[-1], json.dumps(asked).encode(), 0.0)
+        heard.append(ears)
+    while source:
+        said = [_published(source) for _ in range(source.byte() % 4)]
+        if source.byte() % 8 == 0:
+            said.append(b'{"op":"unadvertise","topic":"/a"}')
+            said.append(b'{"op":"advertise","topic":"/a","type":"p/T"}')
+        brokers[0].receive_all(publishers[0], said, 0.0)
+        for one in said:
+            brokers[1].receive(publishers[1], one, 0.0)
+    for known, looked in zip(*heard, strict=True):
+        assert known.outbox.wire is not None
+        assert looked.outbox.wire is not None
+        assert [_read(payload) for payload in known.outbox.wire] == [
+            _read(payload) for payload in looked.outbox.wire
+        ]
+    assert publishers[0].refused == publishers[1].refused
+    latched = [
+        topic.latched for broker in brokers for name, topic in broker.graph.topics.items() if name == "/a"
+    ]
+    assert latched[0] is None or json.loads(latched[0]) == json.loads(latched[1] or b"")
+    assert len(publishers[0].envelopes) <= len(publishers[0].advertisements)
+
+
+def _read(payload: bytes) -> str:
+    """What a client of the hub reads: strict JSON, or CBOR."""
+    return repr(orjson.loads(payload)) if payload[:1] == b"{" else payload.hex()
+
+
 def _picture(text: bytes) -> bytes:
     return json.dumps({"op": "png", "data": png.encode(text)}).encode()
 
@@ -472,6 +579,8 @@ TARGETS: dict[str, Callable[[bytes], None]] = {
     "fields": fuzz_fields,
     "serialised": fuzz_serialised,
     "core": fuzz_core,
+    "again": fuzz_again,
+    "hub": fuzz_hub,
 }
 
 _PUBLISH = b'{"op":"publish","topic":"/a","msg":{"data":[1.5,null,2],"deep":{"x":[{}]}}}'
@@ -484,5 +593,7 @@ SEEDS: dict[str, tuple[bytes, ...]] = {
     "png": (png.encode(_PUBLISH).encode(),),
     "fields": (b"\x07a.b[10]" + _PUBLISH, b"\x01d" + _PUBLISH, b'\x04a[1]{"a":"AQID"}'),
     "serialised": (b"\x01\0\1\0\0\x04\0\0\0abc\0", b"\x02" + bytes(24), b"\x01\x03\0\0\0abc"),
+    "again": (bytes([0, *([1, 0, 0, 0] * 3), 2, 1, 3, 0, 0]), bytes(range(64))),
+    "hub": (bytes([*([3, 1, 0, 0, 0] * 4), 1, 1, 2, 0, 1]), bytes(range(64))),
     "core": (b"\0" + bytes(range(256)), bytes([0, 4, 6, 0, 0, 0, 1, *([1, 0] * 40)])),
 }

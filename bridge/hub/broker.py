@@ -33,7 +33,7 @@ from bridge.hub.operations import Operation, RefusedError, is_round, text
 from bridge.hub.outbox import Outbox
 from bridge.hub.rosapi import NODE, ROSOUT, Rosapi
 from bridge.hub.topics import Topics
-from bridge.json_codec import decode, depth
+from bridge.json_codec import could_be_deeper, decode, depth
 from bridge.stamps import stamp
 
 log = logging.getLogger(__name__)
@@ -42,9 +42,6 @@ log = logging.getLogger(__name__)
 _LEVELS: Final = {"info": True, "warning": True, "error": True, "none": False}
 #: ERROR of rosgraph_msgs/Log, and of rcl_interfaces/msg/Log.
 _LOG_ERROR: Final = {1: 8, 2: 40}
-
-#: Bytes of a message in which brackets are looked for, and not counted.
-_LARGE: Final = 1024
 
 _Handler = Callable[[Client, Operation, float], None]
 
@@ -151,13 +148,29 @@ class Broker:
         except (RefusedError, BridgeError) as error:
             self._refuse(client, str(error), self._operation_id, told=client.wants_status)
 
+    def receive_all(self, client: Client, messages: list[bytes], now: float) -> None:
+        """Do what messages of a client ask for, one after the other, as `receive` does for one of them.
+
+        Args:
+            client: who sent them.
+            messages: whole WebSocket messages, each of at most ``limits.message_bytes``.
+            now: monotonic seconds.
+        """
+        self._now, self._operation_id = now, None
+        publish_again = self._topics.publish_again
+        for data in messages:
+            if not publish_again(client, data, now):
+                self.receive(client, data, now)
+
     def _perform(self, client: Client, data: bytes, now: float, *, whole: bool) -> None:
         """Do what a message asks for, which is no fragment unless it came whole."""
         operation: Any = None
         raw: bytes | None = data
         if len(data) <= self.limits.message_bytes:
-            with contextlib.suppress(orjson.JSONDecodeError):
+            try:  # contextlib.suppress would take as long as a small message
                 operation = orjson.loads(data)
+            except orjson.JSONDecodeError:
+                operation = None
         if (
             type(operation) is not dict
         ):  # too large, no object, no JSON, or NaN in it: decode knows, and reads NaN
@@ -165,7 +178,7 @@ class Broker:
             raw = None
         # No message can be deeper than its opening brackets are many: most need no walk.
         elif (
-            _more_brackets(data, self.limits.depth)
+            could_be_deeper(data, self.limits.depth)
             and depth(operation, self.limits.depth) > self.limits.depth
         ):
             raise RefusedError(f"a message nested deeper than {self.limits.depth} levels")
@@ -232,21 +245,3 @@ class Broker:
         if self._ros_version == 2:
             return {"stamp": time_, **message}
         return {"header": {"seq": 0, "stamp": time_, "frame_id": ""}, **message, "topics": []}
-
-
-def _more_brackets(data: bytes, limit: int) -> bool:
-    """Whether a message has more than ``limit`` opening brackets."""
-    if len(data) <= limit:
-        return False
-    if len(data) < _LARGE:
-        return data.count(b"{") + data.count(b"[") > limit
-    found = 0
-    for bracket in (
-        b"{",
-        b"[",
-    ):  # to jump from one to the next is much faster than to count where there are few
-        at = data.find(bracket)
-        while at >= 0 and found <= limit:
-            found += 1
-            at = data.find(bracket, at + 1)
-    return found > limit

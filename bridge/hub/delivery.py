@@ -56,7 +56,8 @@ class Delivery:
         outbox.offer(lane, payload, now)
         if outbox.deadline != inf:
             self.note_throttle(client)
-        self.announce(client)
+        if not client.has_output:
+            self.announce(client)
 
     def note_throttle(self, client: Client) -> None:
         """See that a client whose throttle holds something back is woken for it."""

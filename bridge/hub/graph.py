@@ -37,6 +37,8 @@ class Client:
         fragments: what it sent in fragments and is not complete, once it did.
         wants_status: whether it asked to be told what is refused.
         status_lane: the way of its status messages, once there was one.
+        publishing: what it published last with a known envelope.
+        envelopes: what it publishes, by the envelopes that are known (see `bridge.envelope`).
         doomed: why it is to be disconnected, empty while it may stay.
         has_output: whether it is on the broker's list of those to be served.
     """
@@ -59,6 +61,8 @@ class Client:
     fragments: Reassembler | None = None
     wants_status: bool = False
     status_lane: Lane | None = None
+    publishing: "Advertisement | None" = None
+    envelopes: dict[bytes, "Advertisement"] = field(default_factory=dict)
     doomed: str = ""
     has_output: bool = False
 
@@ -70,12 +74,21 @@ class Client:
 
 @dataclass(eq=False, slots=True)
 class Advertisement:
-    """That a client publishes on a topic: one, however many advertise operations it sent."""
+    """That a client publishes on a topic: one, however many advertise operations it sent.
+
+    Attributes:
+        client: who publishes.
+        topic: where.
+        latching: whether the last message is to be kept.
+        ids: of the operations.
+        envelope: what stands before its messages, once that is known; empty until then.
+    """
 
     client: Client
     topic: "Topic"
     latching: bool = False
     ids: set[OperationId] = field(default_factory=set)
+    envelope: bytes = b""
 
 
 @dataclass(frozen=True, slots=True)

@@ -133,7 +133,11 @@ class Outbox:
                     self._hold(lane, payload)
                 return
             lane.next_time = now + lane.throttle
-        self._queue(lane, payload)
+        # What `_queue` would do first, at once: most messages go this way.
+        if self.wire is None or lane.fragment_size or self._entries or self._fragments is not None:
+            self._queue(lane, payload)
+        else:
+            self.wire.append(payload)
 
     def pop(self) -> bytes | None:
         """Take the next message or fragment for the wire, None when there is none."""

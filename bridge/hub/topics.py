@@ -6,6 +6,7 @@ from typing import Any, Final
 
 import orjson
 
+from bridge.envelope import BRACE, envelope_of, topic_of
 from bridge.errors import BridgeError
 from bridge.hub.definitions import Definitions
 from bridge.hub.delivery import Delivery, fragment_size_of
@@ -25,8 +26,11 @@ from bridge.hub.operations import (
     text,
 )
 from bridge.hub.rosapi import ROSOUT, rosout_type
+from bridge.json_codec import could_be_deeper
 from bridge.names import absolute, same_type, split_type
 
+#: Keys of an operation whose envelope can be known again: op, topic and msg.
+_OF_ENVELOPE: Final = 3
 #: A message is cut out of what arrived from this size on; smaller ones are written anew as quickly.
 _WORTH_CUTTING: Final = 512
 _KEY: Final = b'"msg"'
@@ -104,11 +108,56 @@ class Topics:
                 operation_id(operation),
                 latch=flag(operation, "latch"),
             )
+        elif raw is not None and len(operation) == _OF_ENVELOPE:
+            _learn_envelope(advertisement, name, raw)
         topic = advertisement.topic
         if topic.subscriptions or topic.latching:
             self.distribute(topic, parsed, _cut_out(operation, raw), now)
 
-    def distribute(self, topic: Topic, parsed: dict[str, Any], data: bytes | None, now: float) -> None:
+    def publish_again(self, client: Client, data: bytes, now: float) -> bool:
+        """Do a ``publish`` with an envelope that is known: only its message is read, and it goes on as it came.
+
+        Args:
+            client: who sent it.
+            data: what came, whatever it is.
+            now: monotonic seconds.
+
+        Returns:
+            Whether it was one. If not, nothing was done: it is for `publish`, or to be refused.
+        """
+        advertisement = client.publishing
+        if advertisement is None:
+            return False
+        if not data.startswith(advertisement.envelope):
+            known = client.envelopes.get(envelope_of(data))
+            if known is None:
+                return False
+            client.publishing = advertisement = known
+        envelope, topic = advertisement.envelope, advertisement.topic
+        if data[-1] != BRACE:
+            return False
+        message = data[len(envelope) : -1]
+        if len(topic.name) + len(message) + AROUND > self._limits.message_bytes:
+            return False
+        try:
+            parsed = orjson.loads(message)
+        except orjson.JSONDecodeError:
+            return False
+        if type(parsed) is not dict or could_be_deeper(message, self._limits.depth - 1):
+            return False
+        if topic.subscriptions or topic.latching:
+            self.distribute(topic, parsed, message, now, envelope, data)
+        return True
+
+    def distribute(
+        self,
+        topic: Topic,
+        parsed: dict[str, Any],
+        data: bytes | None,
+        now: float,
+        prefix: bytes = b"",
+        payload: bytes = b"",
+    ) -> None:
         """Hand a message to all who hear its topic.
 
         Args:
@@ -116,6 +165,8 @@ class Topics:
             parsed: the message.
             data: the same as JSON, None if that must be written first.
             now: monotonic seconds.
+            prefix: what stands before it, if it came written for the wire.
+            payload: as it came then.
         """
         data = orjson.dumps(parsed) if data is None else data
         # Rewriting can lengthen (1e15 becomes 1000000000000000.0), beyond what subscribers take.
@@ -127,7 +178,6 @@ class Topics:
             room = self._limits.latched_bytes - self._graph.latched_bytes + len(topic.latched or b"")
             self._graph.latch(topic, data if len(data) <= room else None)
         # One payload for all who know the topic by one name.
-        prefix, payload = b"", b""
         message: Message | None = None
         for subscription in topic.subscriptions.values():
             if subscription.compression == "none":
@@ -260,6 +310,7 @@ class Topics:
         client.open_advertisements -= len(advertisement.ids)
         del topic.advertisements[client]
         del client.advertisements[topic.name]
+        _forget_envelope(advertisement)
         self._graph.tidy(topic)
 
     def _stop_hearing(self, subscription: Subscription) -> None:
@@ -269,6 +320,23 @@ class Topics:
         del topic.subscriptions[client]
         del client.subscriptions[topic.name]
         self._graph.tidy(topic)
+
+
+def _learn_envelope(advertisement: Advertisement, name: str, raw: bytes) -> None:
+    """Remember what stands before a topic's messages, if no more than that must be known of the next one."""
+    client, envelope = advertisement.client, envelope_of(raw)
+    if envelope and topic_of(envelope) == name:
+        _forget_envelope(advertisement)
+        advertisement.envelope = envelope
+        client.envelopes[envelope] = advertisement
+        client.publishing = advertisement
+
+
+def _forget_envelope(advertisement: Advertisement) -> None:
+    client = advertisement.client
+    client.envelopes.pop(advertisement.envelope, None)
+    if client.publishing is advertisement:
+        client.publishing = None
 
 
 def _cut_out(operation: Operation, raw: bytes | None) -> bytes | None:

@@ -30,7 +30,7 @@ async def test_a_message_passes_from_client_to_client() -> None:
 @pytest.mark.parametrize("length", [1, 125, 126, 127, 65_535, 65_536, 1 << 20])
 def test_frames_are_those_of_the_standard(length: int) -> None:
     payload = b"{" * length
-    assert frames.header(payload) + payload == Frame(Opcode.TEXT, payload).serialize(mask=False)
+    assert frames.unmasked([payload]) == Frame(Opcode.TEXT, payload).serialize(mask=False)
 
 
 @pytest.mark.parametrize("size", [0, 60, 80, 100, 200, 65_400, 65_500, 65_600, 200_000, (1 << 20) - 60])

@@ -1,0 +1,129 @@
+"""A proven envelope makes the same of whatever stands after it as reading all of it does; no other is taken."""
+
+import orjson
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from bridge.envelope import LONGEST, envelope_of, topic_of
+from bridge.events import MessageReceived, Unusable
+from bridge.protocol import ClientCore
+
+CANONICAL = b'{"op":"publish","topic":"/t","msg":'
+
+
+def test_what_stands_before_a_message_is_its_envelope():
+    assert envelope_of(CANONICAL + b'{"msg":1}}') == CANONICAL
+    assert envelope_of(b'{"op":"status"}') == b""
+    assert envelope_of(b'{"op":"publish","topic":"' + b"t" * LONGEST + b'","msg":{}}') == b""
+
+
+@pytest.mark.parametrize(
+    "envelope",
+    [
+        CANONICAL,
+        b'{"op": "publish", "topic": "/t", "msg": ',
+        b'{"topic":"\\/t","op":"publish","msg":',
+        b'{"op":"publish","msg":{},"topic":"/t","msg":',
+    ],
+)
+def test_an_envelope_tells_its_topic(envelope):
+    assert topic_of(envelope) == "/t"
+
+
+@pytest.mark.parametrize(
+    "envelope",
+    [
+        b"",
+        b"{",
+        b'{"op":"publish","topic":"/t","msg"',
+        b'{"op":"publish","topic":"/t","id":1,"msg":',
+        b'{"op":"publish","topic":"/t","latch":true,"msg":',
+        b'{"op":"publish","topic":7,"msg":',
+        b'{"op":"status","topic":"/t","msg":',
+        b'{"op":"publish","topic":"/t","msg":{"a":',
+        b'{"op":"publish","topic":"/t","msg":{},"x":',
+        b'{"op":"publish","topic":"/t","msg":"',
+        b'{"op":"publish","msg":{},"topic":',
+        b'[{"op":"publish","topic":"/t","msg":',
+        CANONICAL + b"{}}",
+    ],
+)
+def test_what_is_no_envelope_of_a_topic_alone_tells_none(envelope):
+    assert topic_of(envelope) is None
+
+
+@settings(max_examples=500, deadline=None)
+@given(
+    st.lists(
+        st.sampled_from([*b'{}[]":, \\', *b'"op""topic""msg""publish""/t"']).map(lambda byte: bytes([byte]))
+        | st.sampled_from([b'"op":"publish"', b'"topic":"/t"', b'"topic":"/u"', b'"msg":', b"{}", b","]),
+        max_size=12,
+    ).map(b"".join)
+)
+@example(b'"op":"publish","msg":{},"topic":"/t","msg":')
+def test_a_proven_envelope_says_the_same_around_any_message(middle):
+    envelope = b"{" + middle
+    topic = topic_of(envelope)
+    if topic is not None:
+        for message in (b"{}", b'{"a":1}', b'{"op":"x","topic":"y","msg":{}}', b' {"}":"{"} '):
+            whole = orjson.loads(envelope + message + b"}")
+            assert whole == {"op": "publish", "topic": topic, "msg": orjson.loads(message)}
+
+
+# --- the client's core
+
+
+def core_that_knows() -> ClientCore:
+    core = ClientCore(max_size=2000, max_depth=5)
+    core.restore()
+    core.subscribe("/t")
+    for _ in range(2):
+        assert core.receive(CANONICAL + b'{"a":1}}', 0.0) == MessageReceived("/t", {"a": 1}, (1,))
+    assert core._known.topic == "/t"
+    return core
+
+
+def test_what_is_wrong_is_told_behind_a_known_envelope_too():
+    core = core_that_knows()
+    for message in (
+        b"{",
+        b"[1]",
+        b'{"a":[[[[]]]]}',
+        b'"x"',
+        b'{"a":"\xff"}',
+        b'{"a":"' + b"x" * 2000 + b'"}',
+    ):
+        assert isinstance(core.receive(CANONICAL + message + b"}", 0.0), Unusable)
+    for end in (b"", b"}}", b"} x"):
+        assert isinstance(core.receive(CANONICAL + b"{}" + end, 0.0), Unusable)
+    assert core.receive(CANONICAL + b'{"a":[NaN,1e999]}}', 0.0) == MessageReceived(
+        "/t", {"a": [None, None]}, (1,)
+    )
+    assert core.receive(CANONICAL + b'{"a":1},"topic":"/u"}', 0.0) is None
+    assert core.receive(CANONICAL + b'{"a":1},"msg":{"b":2}}', 0.0) == MessageReceived("/t", {"b": 2}, (1,))
+
+
+def test_a_known_envelope_is_of_nobody_who_unsubscribed():
+    core = core_that_knows()
+    core.unsubscribe(1)
+    assert core.receive(CANONICAL + b'{"a":1}}', 0.0) is None
+    number = core.subscribe("/t")
+    again = core.subscribe("/t")
+    for _ in range(3):
+        assert core.receive(CANONICAL + b'{"a":1}}', 0.0) == MessageReceived("/t", {"a": 1}, (number, again))
+
+
+def test_who_is_slower_stays_slower_with_a_known_envelope():
+    core = core_that_knows()
+    slow = core.subscribe("/t", throttle_rate=1000)
+    heard = [core.receive(CANONICAL + b"{}}", now) for now in (10.0, 10.1, 10.2, 11.1)]
+    assert [event.subscriptions for event in heard] == [(1, slow), (1,), (1,), (1, slow)]
+
+
+def test_envelopes_that_never_come_again_are_not_gathered():
+    core = core_that_knows()
+    for number in range(100):
+        odd = b'{%b"op":"publish","topic":"/t","msg":{}}' % (b" " * number)
+        assert core.receive(odd, 0.0) == MessageReceived("/t", {}, (1,))
+    assert len(core._envelopes) <= 8
