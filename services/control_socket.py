@@ -102,7 +102,10 @@ class _Callers:
             with contextlib.suppress(OSError, TimeoutError):
                 async with asyncio.timeout(ORDER_TIME):
                     writer.write(msgspec.json.encode(answer))
-                    await writer.drain()
+                    writer.write_eof()
+                    # a socket that is closed with something unread takes the answer along
+                    while await reader.read(1 << 16):
+                        pass
         finally:
             writer.close()
 

@@ -1,0 +1,134 @@
+"""The shape of a deployment: what may change in a run that goes on does, and what may not is named, before and after."""
+
+import pytest
+
+from toolchain.deployment import (
+    Board,
+    Deployment,
+    Dimension,
+    MachineSection,
+    Output,
+    Queue,
+    Source,
+    Variable,
+    WrittenPrior,
+)
+from toolchain.same_shape import differences
+
+SOURCE = Source(uri="ws://a:9090", topic="/boat/sensors", type="boat_msgs/Sensors")
+D1 = Variable(name="D1", bits=7, values=101)
+B1 = Variable(name="B1", bits=7, values=100)
+ROOM = Variable(name="room", kind="prior_select", bits=2, values=3)
+Y, X = Dimension(label="y", size=4), Dimension(label="x", size=3)
+MACHINE = MachineSection(lines=12, prior_bits=2, prior_mode="written")
+BOARDS = tuple(
+    Board(image=f"boards/board{at}.bm", image_hash=str(at) * 64, line_offset=6 * at, lines=6) for at in (0, 1)
+)
+
+
+def deployment(**fields):
+    made = {
+        "name": "boat",
+        "sources": (SOURCE,),
+        "variables": (D1, B1, ROOM),
+        "searched": (Y, X),
+        "machine": MACHINE,
+        "boards": BOARDS,
+    }
+    return Deployment(**(made | fields))
+
+
+def changed(section, **fields):
+    return type(section)(**(dict(section) | fields))
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"name": "boat, mended", "hash": "0" * 64, "tolerance_s": 0.2},
+        {"boards": tuple(changed(each, image="b.bm", image_hash="f" * 64) for each in BOARDS)},
+        {"machine": changed(MACHINE, target_count=100, max_cycles=4096, stop="own", scale="column")},
+        {"variables": (B1, D1, ROOM)},
+        {
+            "variables": (
+                changed(
+                    D1, offset=1.0, step=0.5, values=90, on_range="clamp", on_missing="missing", path="d.one"
+                ),
+                B1,
+                ROOM,
+            )
+        },
+        {"searched": (changed(Y, offset=5.0, step=2.0), changed(X, states=("a", "b", "c")))},
+        {"prior": WrittenPrior(path="prior")},
+    ],
+)
+def test_what_may_change(fields):
+    assert differences(deployment(), deployment(**fields)) == []
+    assert differences(deployment(**fields), deployment()) == []
+
+
+@pytest.mark.parametrize(
+    ("fields", "said"),
+    [
+        ({"queue": Queue.ALL}, "queue is latest in the run and all in the new one"),
+        ({"sources": (changed(SOURCE, uri="ws://b:9090"),)}, "[[source]] 0 uri is ws://a:9090 in"),
+        ({"sources": (changed(SOURCE, topic="/b"),)}, "[[source]] 0 topic is /boat/sensors in"),
+        ({"sources": (changed(SOURCE, type="b/B"),)}, "[[source]] 0 type is boat_msgs/Sensors in"),
+        ({"sources": (changed(SOURCE, compression="cbor"),)}, "[[source]] 0 compression is none in"),
+        ({"sources": (SOURCE, changed(SOURCE, topic="/b"))}, "[[source]] number is 1 in the run and 2 in"),
+        ({"variables": (D1, ROOM)}, "[[variable]] names is B1, D1, room in the run and D1, room in"),
+        (
+            {"variables": (changed(D1, bits=8), B1, ROOM)},
+            "[[variable]] bits of column 1 is 7 in the run and 8",
+        ),
+        ({"searched": (X, Y)}, "[[searched]] 0 label is y in the run and x in"),
+        ({"outputs": (Output(topic="/other"),)}, "[[output]] 0 topic is /BMresults in"),
+        ({"outputs": (Output(uri="ws://b:1"),)}, "[[output]] 0 uri is empty in the run and ws://b:1 in"),
+        ({"boards": (changed(BOARDS[0], endpoint="unix:/b"), BOARDS[1])}, "[[board]] 0 endpoint is empty in"),
+        ({"boards": (changed(BOARDS[0], lines=12),)}, "[[board]] number is 2 in the run and 1 in"),
+        *(
+            ({"machine": changed(MACHINE, **{name: value})}, f"[machine] {name} is")
+            for name, value in {
+                "interface": "20x2048",
+                "prob_bits": 10,
+                "counter_bits": 10,
+                "rng": "lfsr16",
+                "rng_banks": 8,
+                "rng_reset": "free",
+                "shared": False,
+                "steps_per_clock": 4,
+                "sensor_mode": "cell",
+                "replicas": 2,
+            }.items()
+        ),
+    ],
+)
+def test_what_may_not_change_is_named(fields, said):
+    found = differences(deployment(), Deployment.model_construct(**(dict(deployment()) | fields)))
+    assert str(found[0]).startswith(said), found
+    assert len(found) == 1 or "searched" in said
+
+
+def test_columns_of_other_widths_are_no_other_order():
+    wide = changed(B1, bits=9)
+    before = deployment(variables=(D1, wide, ROOM))
+    found = differences(before, deployment(variables=(wide, D1, ROOM)))
+    assert [each.field for each in found] == [
+        "[[variable]] bits of column 1",
+        "[[variable]] bits of column 2",
+    ]
+
+
+def test_every_field_is_decided():
+    """A field that is added to a section is one of the shape, unless it is said to be free."""
+    for section, table in ((MachineSection, "machine"), (Source, "sources"), (Output, "outputs")):
+        before = deployment()
+        inside = getattr(before, table)
+        one = inside if table == "machine" else inside[0]
+        unnoticed = set()
+        for name in section.model_fields:
+            other = one.model_copy(update={name: "something else"})
+            after = before.model_copy(update={table: other if table == "machine" else (other,)})
+            if not differences(before, after):
+                unnoticed.add(name)
+        assert unnoticed == ({"scale", "target_count", "max_cycles", "stop"} if table == "machine" else set())
