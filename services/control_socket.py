@@ -111,9 +111,11 @@ class _Callers:
 
     async def _answer(self, reader: asyncio.StreamReader) -> Answer:
         try:
-            return Answer(ExitCode.DONE, await self._obey(await _order(reader)))
-        except OSError as error:
-            return Answer(ExitCode.CHILD, f"the connection failed: {error.strerror or error}")
+            order = await _order(reader)
+        except (ControlError, OSError) as error:
+            return Answer(ExitCode.USAGE, str(error))
+        try:
+            return Answer(ExitCode.DONE, await self._obey(order))
         except Exception as error:  # whoever ordered it is told, and the run goes on
             return Answer(exit_code_of(error), str(error) or type(error).__name__)
 

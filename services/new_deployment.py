@@ -6,7 +6,7 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
-from services.errors import NotReloadedError, ShapeError
+from services.errors import NotReloadedError, SettingsError, ShapeError
 from services.supervision import KEPT
 from toolchain.deployment import Deployment, load_deployment
 from toolchain.same_shape import differences
@@ -27,8 +27,13 @@ def read_new(folder: Path, in_force: Deployment, as_used: Callable[[Deployment],
     Raises:
         ToolchainError: It is damaged, of another version, or not there.
         ShapeError: It differs in what has to stay; names the fields.
+        SettingsError: The folder can't be reached.
     """
-    loaded = load_deployment(folder, images=False)
+    try:
+        loaded = load_deployment(folder, images=False)
+    except OSError as error:
+        msg = f"{folder} can't be read: {error.strerror or error}"
+        raise SettingsError(msg) from error
     found = differences(as_used(in_force), as_used(loaded))
     if found:
         rest = f"; {len(found) - _NAMED} more" if len(found) > _NAMED else ""

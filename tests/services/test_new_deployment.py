@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from services.errors import NotReloadedError, ShapeError
+from services.errors import NotReloadedError, SettingsError, ShapeError
 from services.generations import Generations
 from services.new_deployment import forget, keep, read_new
 from services.records import Hello, NotReloaded, Prepare, Prepared, Switch, Switched
@@ -63,6 +63,11 @@ def test_what_flags_override_need_not_be_the_same(boat):
         return deployment.model_copy(update={"sources": sources})
 
     assert read_new(boat, before, as_used).sources[0].uri == "ws://elsewhere:9090"
+
+
+def test_a_folder_that_cannot_be(boat):
+    with pytest.raises(SettingsError, match="can't be read: File name too long"):
+        read_new(boat / ("x" * 300), load_deployment(boat), same)
 
 
 def test_a_copy_outlives_its_folder(boat, tmp_path):
