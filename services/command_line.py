@@ -133,6 +133,10 @@ def stopped_by(number: int) -> StoppedError:
     return StoppedError(*_SIGNALS[signal.Signals(number)])
 
 
+def _pass_over(_number: int, _frame: object) -> None:
+    """Ignore a signal; with SIG_IGN, Python would print a traceback for one that had arrived but was not handled yet."""
+
+
 def raise_on_signals() -> None:
     """For a process with one blocking thread: a signal raises StoppedError where the thread stands.
 
@@ -141,7 +145,7 @@ def raise_on_signals() -> None:
 
     def stop(number: int, _frame: object) -> NoReturn:
         for each in _SIGNALS:
-            signal.signal(each, signal.SIG_IGN)
+            signal.signal(each, _pass_over)
         raise stopped_by(number)
 
     for number in _SIGNALS:

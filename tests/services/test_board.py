@@ -72,3 +72,16 @@ def test_a_masters_boards_say_nothing(start, tmp_path):
     boards.send_signal(signal.SIGTERM)
     _, said = boards.communicate(timeout=30)
     assert said == ""
+
+
+def test_a_second_signal_close_behind_the_first_changes_nothing(start, tmp_path):
+    for _ in range(3):
+        boards = start("--boards", "2", "--directory", str(tmp_path))
+        boards.stderr.readline()
+        boards.send_signal(signal.SIGINT)
+        boards.send_signal(signal.SIGTERM)
+        _, rest = boards.communicate(timeout=30)
+        assert (boards.returncode, rest) in {
+            (130, "interrupted (Ctrl-C)\n"),
+            (143, "asked to end (SIGTERM)\n"),
+        }
