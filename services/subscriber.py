@@ -428,7 +428,10 @@ def subscriber(
         link = listening(endpoint_from(listen, "--listen"), ROLE, loaded.hash)
         return run_async(Subscriber(settings, loaded, link).run())
     if settings.deployment is not None:
-        return run_async(print_addresses(settings, deployment_for(settings), count))
+        loaded = deployment_for(settings)
+        for each in loaded.sources:
+            say(f"listening on {each.topic} at {settings.uri or each.uri}")
+        return run_async(print_addresses(settings, loaded, count))
     if settings.uri is None or topic is None or type_ is None:
         msg = "give --uri, --topic and --type, or --deployment DIR (subscriber --help shows examples)"
         raise SettingsError(msg)
