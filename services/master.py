@@ -979,6 +979,7 @@ class Master:
                     "cycles": record.cycles,
                     "ms": round(milliseconds, 3),
                     "seen": record.seen,
+                    "generation": self._generation,
                 }
             )
             try:
