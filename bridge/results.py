@@ -33,6 +33,8 @@ RESULTS_TOPIC: Final = "/BMresults"
 RESULTS_TYPE: Final = "std_msgs/Float64MultiArray"
 FRAME_TOPIC: Final = "/bm/frame"
 FRAME_TYPE: Final = "diagnostic_msgs/DiagnosticArray"
+REPLICA: Final = "replica"
+"""Label of the first dimension where a posterior is one of several replicas'."""
 
 # NumPy has arrays of no more.
 _MOST_DIMENSIONS: Final = 32
@@ -54,12 +56,14 @@ class StageTimes:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BoardReport:
-    """What one board did with a frame."""
+    """What one board did with a frame; where it holds several machines, what each of these did."""
 
     name: str
     stopped: str
     cycles: int | None = None
     counts_total: int | None = None
+    replica_cycles: tuple[int, ...] = ()
+    replica_stopped: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -89,7 +93,8 @@ class Posterior:
     """A posterior: a probability for each cell of the searched variables' grid, with its frame's data.
 
     Attributes:
-        probabilities: row-major over the labelled dimensions, the first slowest; they sum to 1.
+        probabilities: row-major over the labelled dimensions, the first slowest; they sum to 1. Where the first label
+            is `replica`, there are as many posteriors, one after the other; each sums to 1, or is 0 where it has none.
         labels: the searched variables' names, in the order of the dimensions.
         sizes: how many values each has.
         heard_ns: when it arrived here, Unix time in nanoseconds.
@@ -110,6 +115,27 @@ class Posterior:
         values = np.array(self.probabilities, np.float64).reshape(self.sizes)
         values.flags.writeable = False
         return values
+
+    @property
+    def replicas(self) -> int:
+        """How many posteriors of machines of one kind these are: those of a deployment's replicas, or 1."""
+        return self.sizes[0] if self.labels[0] == REPLICA else 1
+
+    def replica(self, at: int) -> "Posterior":
+        """One replica's posterior by itself, without the dimension of replicas.
+
+        Raises:
+            LabelError: there is no such replica, or it has no posterior: no line of it counted.
+        """
+        if not 0 <= at < self.replicas:
+            raise LabelError(f"replica {at} was asked for: there are 0 to {self.replicas - 1}")
+        if self.labels[0] != REPLICA:
+            return self
+        each = len(self.probabilities) // self.replicas
+        own = self.probabilities[at * each : (at + 1) * each]
+        if not any(own):
+            raise LabelError(f"replica {at} has no posterior in this frame: no line of it counted")
+        return replace(self, probabilities=own, labels=self.labels[1:], sizes=self.sizes[1:])
 
     @property
     def number(self) -> int | None:
@@ -250,6 +276,11 @@ class _DiagnosticArray(_Part):
     status: Annotated[tuple[_Status, ...], Field(min_length=1)]
 
 
+def _listed(value: object) -> object:
+    """What stands between commas."""
+    return tuple(value.split(",")) if isinstance(value, str) else value
+
+
 class _FrameValues(_Part):
     """The keys of the first status; all may be absent."""
 
@@ -270,6 +301,8 @@ class _FrameValues(_Part):
 class _BoardValues(_Part):
     cycles: int | None = None
     counts_total: int | None = None
+    replica_cycles: Annotated[tuple[int, ...], BeforeValidator(_listed)] = ()
+    replica_reasons: Annotated[tuple[str, ...], BeforeValidator(_listed)] = ()
 
 
 class _Dimension(_Part):
@@ -432,6 +465,8 @@ def _read_board(status: _Status) -> BoardReport:
         stopped=status.message,
         cycles=values.cycles,
         counts_total=values.counts_total,
+        replica_cycles=values.replica_cycles,
+        replica_stopped=values.replica_reasons,
     )
 
 

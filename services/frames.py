@@ -14,6 +14,7 @@ from bridge.errors import BridgeError
 from bridge.fields import Field
 from bridge.stamps import header_stamp_ns
 from services.errors import OverflowedQueueError, VariableError
+from services.records import Addresses
 from toolchain.address import to_address
 from toolchain.deployment import Deployment, MachineSection, Variable, WrittenPrior
 from toolchain.errors import ReadingError
@@ -32,12 +33,12 @@ Item = TypeVar("Item")
 
 @dataclass(frozen=True, slots=True)
 class CompleteReading:
-    """One address per variable (None: missing), with the newest stamp or receipt of its messages.
+    """One address per variable (None: missing; a row of them where it has several), with the newest stamp or receipt.
 
-    `prior_codes` is a written prior, two bytes a line; empty where the machine's own stands.
+    `prior_codes` is a written prior, two bytes a line (and replica); empty where the machine's own stands.
     """
 
-    addresses: list[int | None]
+    addresses: Addresses
     stamp_ns: int
     received_ns: int
     received_tick: int
@@ -49,32 +50,50 @@ class _Message:
     stamp_ns: int
     received_ns: int
     received_tick: int
-    addresses: tuple[int | None, ...]
+    addresses: tuple[int | list[int] | None, ...]
     prior_codes: bytes
 
 
 class _SourceReader:
     """Takes the variables of one topic, and the prior where it comes from there, out of its messages."""
 
-    def __init__(self, variables: Sequence[Variable], topic: str, prior: _PriorReader | None) -> None:
+    def __init__(
+        self,
+        deployment: Deployment,
+        variables: Sequence[Variable],
+        topic: str,
+        prior: _PriorReader | None,
+    ) -> None:
+        self._deployment = deployment
+        self._arrays = {variable.name for variable in variables if deployment.reading_shape(variable)}
         self._fields = [(variable, Field(variable.path or variable.name)) for variable in variables]
         self._prior = prior
         self._topic = topic
         self.optional = all(variable.on_missing == "missing" for variable in variables)
         self.needs_prior = prior is not None and not prior.optional
 
-    def read(self, message: dict[str, Any]) -> tuple[int | None, ...]:
-        addresses: list[int | None] = []
+    def read(self, message: dict[str, Any]) -> tuple[int | list[int] | None, ...]:
+        addresses: Addresses = []
         for variable, field in self._fields:
             try:
                 present, value = field.value(message)
                 if not present and variable.on_missing == "error":
                     raise field.missing(message)
-                addresses.append(to_address(variable, value))
+                addresses.append(
+                    self._several(variable, value)
+                    if variable.name in self._arrays
+                    else to_address(variable, value)
+                )
             except (BridgeError, ReadingError) as error:
                 sentence = f"{self._topic}: {error}"
                 raise VariableError(sentence) from error
         return tuple(addresses)
+
+    def _several(self, variable: Variable, value: object) -> list[int] | None:
+        # Here, not above: a subscriber of numbers does without NumPy.
+        from toolchain.address_array import to_addresses
+
+        return to_addresses(self._deployment, variable, value)
 
     def prior(self, message: dict[str, Any]) -> bytes:
         if self._prior is None:
@@ -102,7 +121,12 @@ class _PriorReader:
             if self.optional:
                 return b""
             raise self._field.missing(message)
-        codes = written_prior(value, lines=self._machine.lines, prob_bits=self._machine.prob_bits)
+        codes = written_prior(
+            value,
+            lines=self._machine.lines,
+            prob_bits=self._machine.prob_bits,
+            replicas=self._machine.replicas,
+        )
         return codes.astype("<u2").tobytes()
 
 
@@ -122,6 +146,7 @@ class FrameAssembler:
         ]
         self._readers = [
             _SourceReader(
+                deployment,
                 [deployment.variables[at] for at in columns],
                 deployment.sources[source].topic,
                 _PriorReader(deployment.prior, deployment.machine)
@@ -189,7 +214,7 @@ class FrameAssembler:
                 chosen[source] = near
             elif self._needed[source]:
                 return None
-        addresses: list[int | None] = [None] * self._width
+        addresses: Addresses = [None] * self._width
         prior_codes = b""
         for source, message in chosen.items():
             prior_codes = prior_codes or message.prior_codes

@@ -1000,7 +1000,7 @@ class Master:
 
     def _cell(self, line: int) -> dict[str, float]:
         cell: dict[str, float] = {}
-        for dimension in reversed(self._deployment.searched):
+        for dimension in reversed(self._deployment.result_dimensions):
             line, index = divmod(line, dimension.size)
             cell[dimension.label] = dimension.value(index)
         return dict(reversed(cell.items()))

@@ -6,6 +6,7 @@ posted to every board, the counts are collected, and the result goes back.
 
 from __future__ import annotations
 
+import math
 import selectors
 import socket
 import sys
@@ -15,10 +16,12 @@ from typing import Annotated
 
 import msgspec
 import numpy as np
+import numpy.typing as npt
 import orjson
 import typer
 
 from machines.bm1 import StopReason
+from machines.parameters import SensorMode
 from pcie_shim.driver import PROGRAMMING_S, FrameInput, FrameOutput, MiniCluster
 from pcie_shim.endpoint import Endpoint, listen, remove_listener
 from pcie_shim.errors import (
@@ -49,6 +52,7 @@ from services.generations import Generations
 from services.local_socket import BlockingRecordSocket, check_hello, own_hello
 from services.logs import get_logger, say
 from services.records import (
+    Addresses,
     AnyRecord,
     BoardOutcome,
     Frame,
@@ -278,12 +282,19 @@ class Boards:
 
     def _input(self, frame: Frame) -> FrameInput:
         machine = self._machine
-        sensors, row = tuple(frame.addresses), 0
-        if self._selects and len(sensors) == len(self._deployment.variables):
-            sensors, row = self._deployment.machine_addresses(sensors)
         prior = np.frombuffer(frame.prior_codes, "<u2") if frame.prior_codes else None
+        addresses: tuple[int | None, ...] | npt.NDArray[np.int64]
+        row: int | tuple[int, ...] = 0
+        if machine.is_plain:
+            addresses = tuple(_one(address) for address in frame.addresses)
+            if self._selects and len(addresses) == len(self._deployment.variables):
+                addresses, row = self._deployment.machine_addresses(addresses)
+        else:
+            addresses, row = machine_inputs(self._deployment, frame.addresses)
+            if prior is not None and prior.size == machine.results:
+                prior = prior.reshape(-1, machine.lines) if machine.replicas > 1 else prior
         return FrameInput(
-            addresses=sensors,
+            addresses=addresses,
             prior_address=row,
             prior_codes=prior,
             target_count=machine.target_count,
@@ -349,11 +360,81 @@ def _images_of(deployment: Deployment) -> list[Image]:
     return [read_image(deployment.image_path(at)) for at in range(len(deployment.boards))]
 
 
+def _one(address: int | list[int] | None) -> int | None:
+    if isinstance(address, list):
+        msg = f"The frame has {len(address)} readings of one variable; this machine takes one of each"
+        raise FrameInputError(msg)
+    return address
+
+
+def machine_inputs(
+    deployment: Deployment, addresses: Addresses
+) -> tuple[npt.NDArray[np.int64], int | tuple[int, ...]]:
+    """A frame's inputs where replicas or lines have readings of their own, as the driver takes them.
+
+    Args:
+        deployment: what the shapes come from.
+        addresses: a row for each variable, in their order; None where all of it is missing.
+
+    Returns:
+        The sensors' inputs, -1 in all lines of a missing one, and the row of the prior's table of each replica.
+
+    Raises:
+        FrameInputError: another number of variables, or a row of another length; says which and how long it is to be.
+    """
+    variables = deployment.variables
+    if len(addresses) != len(variables):
+        msg = f"The frame has {len(addresses)} readings; this deployment has {len(variables)} variables"
+        raise FrameInputError(msg)
+    machine = deployment.machine
+    replicas = machine.replicas
+    sensors: list[npt.NDArray[np.int64]] = []
+    row: int | tuple[int, ...] = 0
+    for variable, given in zip(variables, addresses, strict=True):
+        shape = deployment.reading_shape(variable)
+        if given is None:
+            array = np.full(shape, -1, dtype=np.int64)
+        else:
+            array = np.array(given, dtype=np.int64)
+            if array.size != math.prod(shape) or (array.ndim == 0 and shape):
+                msg = (
+                    f"The reading of {variable.name} has {array.size if array.ndim else 'one'} "
+                    f"{'addresses' if array.size != 1 else 'address'}; this deployment takes {math.prod(shape)} of it"
+                )
+                raise FrameInputError(msg)
+            array = array.reshape(shape)
+        if variable.kind == "sensor":
+            sensors.append(array.reshape(replicas, -1))
+        else:
+            top = 2**variable.bits - 1
+            row = (
+                tuple(np.where(array == -1, top, array).tolist())
+                if array.ndim
+                else top
+                if array == -1
+                else int(array)
+            )
+    per_line = machine.sensor_mode is not SensorMode.COLUMN
+    inner = (machine.lines,) if per_line else ()
+    stacked = np.stack(sensors, axis=1) if sensors else np.empty((replicas, 0, *inner), dtype=np.int64)
+    shape = (len(sensors), *inner)
+    return stacked.reshape((replicas, *shape) if replicas > 1 else shape), row
+
+
 def result_record(number: int, output: FrameOutput) -> FrameResult:
     """The boards' outcome as a record."""
     return FrameResult(
         number=number,
-        boards=[BoardOutcome(board.words, board.cycles, int(board.reason)) for board in output.boards],
+        boards=[
+            BoardOutcome(
+                board.words,
+                board.cycles,
+                int(board.reason),
+                list(board.replica_cycles),
+                [int(reason) for reason in board.replica_reasons],
+            )
+            for board in output.boards
+        ],
         register_writes_ns=output.register_writes_ns,
         compute_ns=output.compute_ns,
         reads_ns=output.reads_ns,
@@ -553,7 +634,7 @@ class PcieApp:
 class LineReading(msgspec.Struct):
     """A reading as `subscriber --deployment` prints it."""
 
-    addresses: list[int | None]
+    addresses: Addresses
     stamp_ns: int | None = None
     prior_codes: list[Annotated[int, msgspec.Meta(ge=0, lt=1 << 16)]] = []
 
@@ -601,6 +682,14 @@ def compute_lines(boards: Boards, banks: int) -> int:
                         "reason": board.reason,
                         "why": REASON_WORDS[StopReason(board.reason)],
                     }
+                    | (
+                        {
+                            "replica_cycles": board.replica_cycles,
+                            "replica_reasons": board.replica_reasons,
+                        }
+                        if board.replica_cycles
+                        else {}
+                    )
                     for board, counts in zip(result.boards, counts_of(result), strict=True)
                 ],
             }

@@ -358,6 +358,8 @@ class _LineBoard(msgspec.Struct):
     counts: list[Annotated[int, msgspec.Meta(ge=0, lt=1 << 32)]]
     cycles: Annotated[int, msgspec.Meta(ge=0)]
     reason: StopReason
+    replica_cycles: list[Annotated[int, msgspec.Meta(ge=0)]] = []
+    replica_reasons: list[StopReason] = []
 
 
 class _LineResult(msgspec.Struct):
@@ -369,7 +371,9 @@ class _LineResult(msgspec.Struct):
 _Line = _LineResult | list[Annotated[float, msgspec.Meta(ge=0)]]  # its JSON knows no infinity
 
 
-def result_from_line(line: bytes, number: int, lines: int) -> tuple[FrameResult, int | None] | list[float]:
+def result_from_line(
+    line: bytes, number: int, lines: int, replicas: int = 1
+) -> tuple[FrameResult, int | None] | list[float]:
     """What one line of standard input says: `pcie-app`'s result with its reading's stamp, or an array of probabilities.
 
     Raises:
@@ -387,8 +391,25 @@ def result_from_line(line: bytes, number: int, lines: int) -> tuple[FrameResult,
         raise InputLineError(msg)
     if isinstance(value, list):
         return value
+    each = replicas if replicas > 1 else 0
+    for board in value.boards:
+        if not len(board.replica_cycles) == len(board.replica_reasons) == each:
+            msg = (
+                f"line {number} of standard input has {len(board.replica_cycles)} replicas' cycles on a board; expected a "
+                f"result of {replicas} replica{'s' if replicas > 1 else ''}"
+            )
+            raise InputLineError(msg)
+        if each and len(board.counts) % each:
+            msg = f"line {number} of standard input has {len(board.counts)} counts on a board of {each} replicas"
+            raise InputLineError(msg)
     boards = [
-        BoardOutcome(np.array(board.counts, dtype="<u4").tobytes(), board.cycles, board.reason)
+        BoardOutcome(
+            np.array(board.counts, dtype="<u4").tobytes(),
+            board.cycles,
+            board.reason,
+            board.replica_cycles,
+            [int(reason) for reason in board.replica_reasons],
+        )
         for board in value.boards
     ]
     return FrameResult(value.number, boards, 0, 0, 0, 0), value.stamp_ns
@@ -405,7 +426,8 @@ async def publish_lines(settings: Settings, deployment: Deployment) -> int:
             number += 1
             if not line.strip():
                 continue
-            result = result_from_line(line, number, deployment.machine.lines)
+            machine = deployment.machine
+            result = result_from_line(line, number, machine.results, machine.replicas)
             if isinstance(result, tuple):
                 now, tick = time.time_ns(), time.monotonic_ns()
                 counted, stamp_ns = result

@@ -54,6 +54,11 @@ class Trouble(Record, tag="trouble", frozen=True):
     sentence: str
 
 
+Addresses = list[int | list[int] | None]
+"""What a frame's readings became, in the order of the variables: an address, None for a missing one, or, where replicas or
+lines have readings of their own, a row of them (row by row, -1 for a missing one)."""
+
+
 class Reading(Record, tag="reading", frozen=True):
     """Subscriber to master: one complete set of addresses, in the order of the machine's columns.
 
@@ -66,7 +71,7 @@ class Reading(Record, tag="reading", frozen=True):
     received_ns: int
     received_tick: int
     sent_tick: int
-    addresses: list[int | None]
+    addresses: Addresses
     passed_over: int
     unpaired: int = 0
     prior_codes: bytes = b""
@@ -84,17 +89,22 @@ class Frame(Record, tag="frame", frozen=True):
     """Master to pcie-app: compute this. `number` rises from 1 per master."""
 
     number: int
-    addresses: list[int | None]
+    addresses: Addresses
     bank: int
     prior_codes: bytes = b""
 
 
 class BoardOutcome(Record, tag="board", frozen=True):
-    """What one board returned: counts as little-endian uint32, one per line of its partition."""
+    """What one board returned: counts as little-endian uint32, one per line of its partition, replica after replica.
+
+    Where there are several replicas each has its own cycles and reason; then `cycles` are those of the one that ran longest.
+    """
 
     counts: bytes
     cycles: int
     reason: int
+    replica_cycles: list[int] = []
+    replica_reasons: list[int] = []
 
 
 class FrameResult(Record, tag="result", frozen=True):

@@ -63,12 +63,12 @@ def axes_of(posterior: Posterior, deployment: Deployment | None) -> list[Axis]:
     """
     if deployment is None:
         return [Axis(label, size) for label, size in zip(posterior.labels, posterior.sizes, strict=True)]
-    ours = [(dimension.label, dimension.size) for dimension in deployment.searched]
+    ours = [(dimension.label, dimension.size) for dimension in deployment.result_dimensions]
     theirs = list(zip(posterior.labels, posterior.sizes, strict=True))
     if ours != theirs:
         msg = f"the posterior that came has {_grid(theirs)}, but the deployment of {deployment.directory} has {_grid(ours)}"
         raise ValueError(msg)
-    return [Axis(dimension.label, dimension.size, dimension) for dimension in deployment.searched]
+    return [Axis(dimension.label, dimension.size, dimension) for dimension in deployment.result_dimensions]
 
 
 def printable(text: str) -> str:

@@ -12,7 +12,7 @@ import orjson
 
 from bridge.stamps import header
 from machines.bm1 import StopReason
-from machines.posterior import posterior_of_lines
+from machines.posterior import joint_posterior, posterior_of_lines
 from services.records import FrameResult, Publish
 from toolchain.deployment import Deployment
 
@@ -48,13 +48,18 @@ class Inferred:
     """What the counts of a result come to.
 
     Attributes:
-        posterior: float64[all lines], the joint posterior; None when no line of any board counted.
+        posterior: float64[all lines], the joint posterior; None when no line of any board counted. Of replicas
+            float64[replicas * all lines], one posterior after the other, zeros for a replica that has none; None when
+            none has.
         totals: the sum of each board's counts.
-        best: the most probable line; -1 without a posterior.
+        best: the most probable place in the posterior; -1 without one.
     """
 
     def __init__(self, result: FrameResult) -> None:
         boards = result.boards
+        if boards and boards[0].replica_cycles:
+            self._of_replicas(result)
+            return
         counts = np.frombuffer(b"".join([board.counts for board in boards]), dtype="<u4")
         lines = [len(board.counts) // 4 for board in boards]
         self.totals: list[int] = []
@@ -65,12 +70,33 @@ class Inferred:
             self.posterior = posterior_of_lines(counts, lines, [board.cycles for board in boards])
         self.best = -1 if self.posterior is None else int(self.posterior.argmax())
 
+    def _of_replicas(self, result: FrameResult) -> None:
+        boards, replicas = result.boards, len(result.boards[0].replica_cycles)
+        # each board has its lines of every replica
+        counts = [np.frombuffer(board.counts, dtype="<u4").reshape(replicas, -1) for board in boards]
+        self.totals = [int(of_board.sum(dtype=np.uint64)) for of_board in counts]
+        joints = [
+            joint_posterior(
+                [of_board[replica] for of_board in counts],
+                [board.replica_cycles[replica] for board in boards],
+            )
+            for replica in range(replicas)
+        ]
+        lines = sum(of_board.shape[1] for of_board in counts)
+        self.posterior = None
+        if any(joint is not None for joint in joints):
+            self.posterior = np.concatenate([np.zeros(lines) if joint is None else joint for joint in joints])
+        self.best = -1 if self.posterior is None else int(self.posterior.argmax())
+
 
 def posterior_layout(deployment: Deployment) -> dict[str, Any]:
-    """`layout` of a Float64MultiArray: dimensions labelled with the searched variables, row-major strides."""
+    """`layout` of a Float64MultiArray: dimensions labelled with the searched variables, row-major strides.
+
+    Where there are replicas, they are the first dimension, labelled `replica`.
+    """
     dimensions = []
-    stride = deployment.machine.lines
-    for dimension in deployment.searched:
+    stride = deployment.machine.results
+    for dimension in deployment.result_dimensions:
         dimensions.append({"label": dimension.label, "size": dimension.size, "stride": stride})
         stride //= dimension.size
     return {"dim": dimensions, "data_offset": 0}
@@ -132,6 +158,19 @@ class FrameReport:
             '"board%d"',
             {"cycles": "%d", "counts_total": "%d", "reason": "%s"},
         )
+        self._board_of_replicas = _status(
+            "0",
+            '"rosbayes: board %d"',
+            '"%s"',
+            '"board%d"',
+            {
+                "cycles": "%d",
+                "counts_total": "%d",
+                "reason": "%s",
+                "replica_cycles": "%s",
+                "replica_reasons": "%s",
+            },
+        )
 
     def message(self, publish: Publish, inferred: Inferred, times: Times, sent_ns: int) -> dict[str, Any]:
         """The DiagnosticArray that precedes a result.
@@ -174,7 +213,13 @@ class FrameReport:
         ]
         for index, (board, total) in enumerate(zip(result.boards, totals, strict=True)):
             words = REASON_WORDS[StopReason(board.reason)]
-            statuses.append(self._board % (index, words, index, board.cycles, total, words))
+            said = (index, words, index, board.cycles, total, words)
+            if board.replica_cycles:
+                cycles = ",".join(map(str, board.replica_cycles))
+                reasons = ",".join(REASON_WORDS[StopReason(reason)] for reason in board.replica_reasons)
+                statuses.append(self._board_of_replicas % (*said, cycles, reasons))
+            else:
+                statuses.append(self._board % said)
         return {
             "header": header(publish.stamp_ns, "bm", self._ros_version),
             "status": orjson.Fragment(f"[{','.join(statuses)}]"),

@@ -16,10 +16,17 @@ from pydantic import ValidationError
 
 from machines.bm1 import BM1Machine
 from machines.errors import MachineError
-from machines.parameters import BM1Parameters, PriorMode, RngKind
+from machines.parameters import REPLICAS_MAX, BM1Parameters, PriorMode, RngKind, SensorMode
 from pcie_shim import register_map
 from pcie_shim.errors import PcieShimError
-from pcie_shim.programming_file import Image, Partition, tool_version, write_image
+from pcie_shim.programming_file import (
+    Image,
+    Partition,
+    interface_room,
+    interface_words,
+    tool_version,
+    write_image,
+)
 from toolchain.deployment import (
     FILE_NAME,
     Board,
@@ -27,12 +34,13 @@ from toolchain.deployment import (
     MachineSection,
     Output,
     Source,
+    Variable,
     WrittenPrior,
     deployment_hash,
     write_deployment,
 )
 from toolchain.errors import BuildError
-from toolchain.options import SensorMode
+from toolchain.options import Scale
 from toolchain.outputs.memories import generators
 from toolchain.outputs.output_files import memory_files, quartus_files, write_files
 from toolchain.outputs.rng_table import random_table
@@ -104,11 +112,15 @@ def assemble(model: Model, options: BuildOptions) -> Built:
     check_options(options)
     blocks = partition_lines(model.lines, options.partitions)
     _check_prior(model, options)
-    interface, interface_reason = board_interface(model, blocks, options.interface)
+    interface, interface_reason = board_interface(
+        model, blocks, options.interface, sensor_mode=options.sensor_mode, replicas=options.replicas
+    )
     try:
         parameters = machine_parameters(model, options)
         _check_seeds(replace(parameters, lines=blocks[0].lines))
-        quantised = quantise(model, prob_bits=options.prob_bits, scale=options.scale)
+        quantised = quantise(
+            model, prob_bits=options.prob_bits, scale=options.scaling, sensor_mode=options.sensor_mode
+        )
         images = _images(model, quantised, parameters, blocks, interface, options)
     except (MachineError, PcieShimError) as reason:
         raise BuildError(str(reason)) from reason
@@ -130,7 +142,10 @@ def machine_parameters(model: Model, options: BuildOptions) -> BM1Parameters:
     """
     return BM1Parameters(
         lines=model.lines,
-        sensor_bits=tuple(known.bits for known in model.known),
+        sensor_bits=tuple(
+            options.prob_bits if options.sensor_mode is SensorMode.THRESHOLD else known.bits
+            for known in model.known
+        ),
         prob_bits=options.prob_bits,
         prior_bits=0 if model.prior_select is None else model.prior_select.bits,
         prior_mode=options.prior_mode,
@@ -140,6 +155,8 @@ def machine_parameters(model: Model, options: BuildOptions) -> BM1Parameters:
         steps_per_clock=options.steps_per_clock,
         rng_banks=options.rng_banks,
         rng_reset=options.rng_reset,
+        sensor_mode=options.sensor_mode,
+        replicas=options.replicas,
     )
 
 
@@ -161,13 +178,27 @@ def build_date(model_file: Path) -> str:
 
 
 def board_interface(
-    model: Model, blocks: tuple[Block, ...], given: tuple[int, int] | None
+    model: Model,
+    blocks: tuple[Block, ...],
+    given: tuple[int, int] | None,
+    *,
+    sensor_mode: SensorMode = SensorMode.COLUMN,
+    replicas: int = 1,
 ) -> tuple[tuple[int, int], str]:
     """Return the boards' inputs and results, and a clause that says why where they are not the default.
+
+    Args:
+        model: The model.
+        blocks: Its lines on each board.
+        given: Inputs and results that are asked for; None for as many as are needed, the default at least.
+        sensor_mode: Whether cells have inputs of their own.
+        replicas: Machines on each board.
 
     Raises:
         BuildError: The model is larger than the interface, or the interface than the register map.
     """
+    if sensor_mode is not SensorMode.COLUMN or replicas > 1:
+        return _interface_of_many(model, blocks, given, sensor_mode, replicas)
     sensors, lines = len(model.known), max(block.lines for block in blocks)
     room = (register_map.SENSORS_WORDS, register_map.RESULTS_WORDS)
     if sensors > room[0] or lines > room[1]:
@@ -201,6 +232,49 @@ def board_interface(
     return given, ", as asked for"
 
 
+def _interface_of_many(
+    model: Model,
+    blocks: tuple[Block, ...],
+    given: tuple[int, int] | None,
+    sensor_mode: SensorMode,
+    replicas: int,
+) -> tuple[tuple[int, int], str]:
+    """The interface of boards with replicas, or with inputs for each cell: those all count."""
+    lines = max(block.lines for block in blocks)
+    # the widths are of no account here, and are what any mode takes
+    board = BM1Parameters(
+        lines=lines, sensor_bits=(8,) * len(model.known), sensor_mode=sensor_mode, replicas=replicas
+    )
+    inputs, results = interface_words(board)
+    room = interface_room(board)
+    made_of = f"{len(model.known)} known variables and {lines} lines on a board" + (
+        f", {replicas} times" if replicas > 1 else ""
+    )
+    needed = f"a board needs {inputs} inputs and {results} results ({made_of})"
+    ways = [
+        *(["more --partitions"] if lines > 1 else []),
+        *(["fewer --replicas"] if replicas > 1 else []),
+    ]
+    instead = f": use {' or '.join(ways)}" if ways else ""
+    if inputs > room[0] or results > room[1]:
+        message = f"{needed}, but the register map has room for {room[0]} and {room[1]}{instead}"
+        raise BuildError(message)
+    if given is None:
+        larger = (max(inputs, DEFAULT_INTERFACE[0]), max(results, DEFAULT_INTERFACE[1]))
+        default = f"{DEFAULT_INTERFACE[0]}x{DEFAULT_INTERFACE[1]}"
+        return larger, "" if larger == DEFAULT_INTERFACE else f", larger than the default {default}: {needed}"
+    if given[0] > room[0] or given[1] > room[1]:
+        message = f"the interface {given[0]}x{given[1]} is larger than the register map's {room[0]}x{room[1]}"
+        raise BuildError(message)
+    if inputs > given[0] or results > given[1]:
+        message = (
+            f"the model is larger than the interface {given[0]}x{given[1]}: {needed}; use --interface "
+            f"{max(inputs, given[0])}x{max(results, given[1])} or leave it out"
+        )
+        raise BuildError(message)
+    return given, ", as asked for"
+
+
 def model_hash(model: Model, quantised: Quantised, parameters: BM1Parameters) -> str:
     """Return the SHA-256 (hexadecimal) of the machine that all boards are parts of, and of its names.
 
@@ -212,6 +286,8 @@ def model_hash(model: Model, quantised: Quantised, parameters: BM1Parameters) ->
         "known": [variable.model_dump(mode="json") for variable in model.variables],
         "prob_bits": parameters.prob_bits,
     }
+    if parameters.sensor_mode is not SensorMode.COLUMN or parameters.replicas > 1:
+        words |= {"sensor_mode": parameters.sensor_mode.value, "replicas": parameters.replicas}
     digest = hashlib.sha256(json.dumps(words, sort_keys=True, separators=(",", ":")).encode())
     for codes in (quantised.prior, *quantised.tables):
         digest.update(codes.astype("<u2", copy=False).tobytes())
@@ -268,13 +344,13 @@ def _deployment(
             queue=options.queue,
             tolerance_s=options.tolerance_s,
             sources=_sources(options),
-            variables=model.variables if options.sources is None else options.sources.place(model.variables),
+            variables=_variables(model, options),
             searched=model.searched,
             machine=MachineSection(
                 lines=model.lines,
                 interface=f"{interface[0]}x{interface[1]}",
                 prob_bits=parameters.prob_bits,
-                scale=options.scale.value,
+                scale=options.scaling.value,
                 prior_bits=parameters.prior_bits,
                 prior_mode=parameters.prior_mode,
                 counter_bits=parameters.counter_bits,
@@ -286,6 +362,8 @@ def _deployment(
                 target_count=target,
                 max_cycles=options.max_cycles,
                 stop=options.stop,
+                sensor_mode=parameters.sensor_mode,
+                replicas=parameters.replicas,
             ),
             prior=_written_prior(options),
             boards=tuple(
@@ -303,6 +381,26 @@ def _deployment(
         raise refused_option(reason) from None
 
 
+def _variables(model: Model, options: BuildOptions) -> tuple[Variable, ...]:
+    """The known variables; where cells are given codes, a sensor's values are those, whatever the model's are."""
+    variables = model.variables if options.sources is None else options.sources.place(model.variables)
+    if options.sensor_mode is not SensorMode.THRESHOLD:
+        return tuple(variables)
+    return tuple(
+        Variable(
+            name=variable.name,
+            source=variable.source,
+            path=variable.path,
+            bits=options.prob_bits,
+            values=2**options.prob_bits - 1,
+            on_missing=variable.on_missing,
+        )
+        if variable.kind == "sensor"
+        else variable
+        for variable in variables
+    )
+
+
 def _sources(options: BuildOptions) -> tuple[Source, ...]:
     if options.sources is not None:
         return options.sources.sources
@@ -316,7 +414,7 @@ def _written_prior(options: BuildOptions) -> WrittenPrior | None:
 
 
 def check_options(options: BuildOptions) -> None:
-    """Refuse a URI, topic or type that is none, and a machine that there isn't yet, before anything is computed.
+    """Refuse a URI, topic or type that is none, and options that exclude each other, before anything is computed.
 
     Raises:
         BuildError: Names the option and what it is to be.
@@ -326,16 +424,14 @@ def check_options(options: BuildOptions) -> None:
         Output(topic=options.output)
     except ValidationError as reason:
         raise refused_option(reason) from None
-    if options.sensor_mode is not SensorMode.COLUMN:
+    if options.sensor_mode is not SensorMode.COLUMN and options.scaling is Scale.ADDRESS:
         message = (
-            f"--sensor-mode {options.sensor_mode}: this version's machines have one sensor a column, none of a cell's "
-            "own; use --sensor-mode column"
+            f"--scale address does not go with --sensor-mode {options.sensor_mode}: lines look at different addresses in a "
+            "frame, so the factors of addresses would not cancel; use --scale column or none"
         )
         raise BuildError(message)
-    if options.replicas != 1:
-        message = (
-            f"--replicas {options.replicas}: this version's boards hold one machine each; use --replicas 1"
-        )
+    if not 1 <= options.replicas <= REPLICAS_MAX:
+        message = f"--replicas is {options.replicas}, expected 1 to {REPLICAS_MAX}"
         raise BuildError(message)
 
 
@@ -412,6 +508,7 @@ def build_report(
         f"cycles, stop = {machine.stop}; {machine.rng} with {machine.rng_banks} banks, rng_reset = "
         f"{machine.rng_reset}, {machine.steps_per_clock} steps a clock."
     )
+    machine_sentence += many_sentence(machine)
     paragraphs = [
         f"Model {model.name}: {model.lines} lines ({grid}), {len(model.known)} known variables"
         + (f" in the columns' order {names}." if names else "."),
@@ -431,6 +528,24 @@ def build_report(
     paragraphs += [f"Warning: {warning}" for warning in quantised.warnings]
     paragraphs.append(f"{_topics_sentence(deployment)} Deployment {deployment.hash[:16]}.")
     return "\n\n".join(paragraphs) + "\n"
+
+
+def many_sentence(machine: MachineSection) -> str:
+    """Say what a frame's readings and results are where they are not one number a variable and one posterior."""
+    sentence = {
+        SensorMode.COLUMN: "",
+        SensorMode.CELL: f" Each of the {machine.lines} lines has a reading of its own (sensor_mode = cell).",
+        SensorMode.THRESHOLD: (
+            f" Readings are probabilities, one for each of the {machine.lines} lines (sensor_mode = threshold); there are no "
+            "tables."
+        ),
+    }[machine.sensor_mode]
+    if machine.replicas > 1:
+        sentence += (
+            f" Each board holds {machine.replicas} of these machines around the same generators: a frame brings {machine.replicas} "
+            f"sets of readings and gives {machine.replicas} posteriors."
+        )
+    return sentence
 
 
 def _topics_sentence(deployment: Deployment) -> str:

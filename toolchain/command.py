@@ -8,13 +8,13 @@ from typing import Annotated
 import typer
 
 # NumPy and what needs it are imported where they are used: --help answers at once.
-from machines.parameters import PriorMode, RngKind, RngReset
+from machines.parameters import PriorMode, RngKind, RngReset, SensorMode
 from toolchain.commands import design, flags, regenerate
 from toolchain.commands.refusals import one_sentence
 from toolchain.commands.usage import CommandLine
 from toolchain.deployment import Queue, Stop
 from toolchain.learning.fit_options import FitMethod, FitOptions, FitPrior
-from toolchain.options import BuildOptions, OnMissing, Scale, SensorMode
+from toolchain.options import BuildOptions, OnMissing
 
 app = CommandLine(no_args_is_help=True)
 
@@ -58,7 +58,7 @@ def build(
     partitions: flags.Partitions = 1,
     device: flags.DeviceFlag = None,
     interface: flags.Interface = None,
-    scale: flags.ScaleFlag = Scale.ADDRESS,
+    scale: flags.ScaleFlag = None,
     prob_bits: flags.ProbBits = 8,
     bits: flags.Bits = None,
     prior_mode: flags.PriorModeFlag = PriorMode.TABLE,
@@ -154,7 +154,7 @@ def check(
     partitions: flags.Partitions = 1,
     device: flags.DeviceFlag = None,
     interface: flags.Interface = None,
-    scale: flags.ScaleFlag = Scale.ADDRESS,
+    scale: flags.ScaleFlag = None,
     prob_bits: flags.ProbBits = 8,
     bits: flags.Bits = None,
     prior_mode: flags.PriorModeFlag = PriorMode.TABLE,

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Self, TypeVar
 import tomli_w
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from machines.parameters import COUNTER_BITS_MAX, PriorMode, RngKind, RngReset
+from machines.parameters import COUNTER_BITS_MAX, REPLICAS_MAX, PriorMode, RngKind, RngReset, SensorMode
 from toolchain.errors import DamagedDeploymentError, DeploymentError, DeploymentVersionError
 from toolchain.toml_file import parse_toml, read_text, validate
 
@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 
 FORMAT: Final = 1
 FILE_NAME: Final = "deployment.toml"
+REPLICA: Final = "replica"
+"""Label of the dimension of replicas, the first of what is published."""
 
 _HEADER = """\
 # Written by `toolchain build`. URIs and endpoints may be changed here; the rest belongs to the boards' images
@@ -204,6 +206,10 @@ class MachineSection(_Section):
     target_count: int = Field(default=255, ge=1)
     max_cycles: int = Field(default=2**17, ge=1)
     stop: Choice[Stop] = Stop.SLICES
+    sensor_mode: Choice[SensorMode] = Field(
+        default=SensorMode.COLUMN, exclude_if=lambda mode: mode == SensorMode.COLUMN
+    )
+    replicas: int = Field(default=1, ge=1, le=REPLICAS_MAX, exclude_if=lambda replicas: replicas == 1)
 
     @field_validator("interface")
     @classmethod
@@ -222,6 +228,16 @@ class MachineSection(_Section):
                 message += f", or counters of {enough} bits (--counter-bits {enough})"
             raise ValueError(message)
         return self
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether it is one machine with one reading a column: readings are numbers, and a result is one posterior."""
+        return self.replicas == 1 and self.sensor_mode is SensorMode.COLUMN
+
+    @property
+    def results(self) -> int:
+        """Probabilities of a frame: one a line, for every replica."""
+        return self.replicas * self.lines
 
     @property
     def interface_sensors(self) -> int:
@@ -313,6 +329,9 @@ class DeploymentFile(_Section):
                 f"the searched variables have {cells} cells, but the machine has {self.machine.lines} lines"
             )
             raise ValueError(message)
+        if self.machine.replicas > 1 and REPLICA in [dimension.label for dimension in self.searched]:
+            message = f"a searched variable is called {REPLICA!r}, which is what the dimension of replicas is called"
+            raise ValueError(message)
         offset = 0
         for index, board in enumerate(self.boards):
             if board.line_offset != offset:
@@ -378,6 +397,21 @@ class Deployment(DeploymentFile):
             else:
                 row = 2**variable.bits - 1 if address is None else address
         return tuple(sensors), row
+
+    @property
+    def result_dimensions(self) -> tuple[Dimension, ...]:
+        """The dimensions of what is published: the searched ones, and before them the replicas where there are several."""
+        replicas = self.machine.replicas
+        if replicas == 1:
+            return tuple(self.searched)
+        return (Dimension(label=REPLICA, size=replicas), *self.searched)
+
+    def reading_shape(self, variable: Variable) -> tuple[int, ...]:
+        """Shape of a variable's reading: () a number, (lines,), (replicas,), or (replicas, lines)."""
+        machine = self.machine
+        per_line = machine.sensor_mode is not SensorMode.COLUMN and variable.kind == "sensor"
+        replicas = () if machine.replicas == 1 else (machine.replicas,)
+        return (*replicas, machine.lines) if per_line else replicas
 
     @property
     def path(self) -> Path:

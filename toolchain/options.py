@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import TYPE_CHECKING
 
-from machines.parameters import PriorMode, RngKind, RngReset
+from machines.parameters import PriorMode, RngKind, RngReset, SensorMode
 from toolchain.deployment import Queue, Stop
 
 if TYPE_CHECKING:
@@ -25,17 +25,6 @@ class Scale(StrEnum):
     """A column's whole table."""
     NONE = "none"
     """Nothing: the raw probabilities."""
-
-
-class SensorMode(StrEnum):
-    """What a cell's address is."""
-
-    COLUMN = "column"
-    """The reading of its column's sensor."""
-    CELL = "cell"
-    """A reading of its own."""
-    THRESHOLD = "threshold"
-    """A code of its own, which the host writes."""
 
 
 class OnMissing(StrEnum):
@@ -59,7 +48,8 @@ class BuildOptions:
         partitions: How many boards the lines are split over.
         interface: Inputs and results of the boards' registers; None for the thesis's 20 x 1200, or the model's
             size where that is larger.
-        scale: What is divided by its maximum before quantising.
+        scale: What is divided by its maximum before quantising; None for addresses where a column shares one, else for
+            whole columns.
         prob_bits: Bits of a code (W).
         prior_mode: Whether the prior is the images' table, or written by the host.
         prior_path: Where in the message a written prior is, one number for each line; None where it comes from
@@ -72,8 +62,8 @@ class BuildOptions:
         rng_table: uint32[length], the numbers that `rng = table` plays; None to make them.
         shared: One generator a column, shared by its lines; else one a cell.
         steps_per_clock: Steps of a generator between two cycles; 0 for as many as give fresh bits.
-        sensor_mode: What a cell's address is; only `column` can be built.
-        replicas: Machines on a board; only 1 can be built.
+        sensor_mode: What a cell is given: its column's reading, a reading of its own, or its code (`threshold`).
+        replicas: Machines on a board that share its generators.
         rng_banks: Sets of seeds.
         rng_reset: Whether a frame restarts the generators.
         queue: What happens to frames that come faster than they are computed.
@@ -88,7 +78,7 @@ class BuildOptions:
     output: str = "/BMresults"
     partitions: int = 1
     interface: tuple[int, int] | None = None
-    scale: Scale = Scale.ADDRESS
+    scale: Scale | None = None
     prob_bits: int = 8
     prior_mode: PriorMode = PriorMode.TABLE
     prior_path: str | None = None
@@ -108,3 +98,10 @@ class BuildOptions:
     tolerance_s: float = 0.05
     sources: SourcesFile | None = None
     build_date: str = ""
+
+    @property
+    def scaling(self) -> Scale:
+        """What is divided by its maximum: `scale`, or what goes without saying."""
+        if self.scale is not None:
+            return self.scale
+        return Scale.ADDRESS if self.sensor_mode is SensorMode.COLUMN else Scale.COLUMN

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from machines.encode import decode_code, encode_probability
-from machines.parameters import PROB_BITS_MAX
+from machines.parameters import PROB_BITS_MAX, SensorMode
 from toolchain.errors import ReadingError
 from toolchain.options import Scale
 
@@ -63,7 +63,7 @@ class Quantised:
         prior: uint16[rows, lines]: one row, or one for each address that selects a prior; then the top one is the
             prior without a selection, and unserved ones hold 0.
         tables: uint16[2**bits, lines] per known variable; addresses beyond the served ones hold 0, the top one,
-            a missing reading's, all ones.
+            a missing reading's, all ones. None where cells are given codes.
         losses: The prior's and one per known variable.
         floors: Outlier floors that are too low for the codes.
         warnings: What a user should know, a sentence each.
@@ -76,13 +76,20 @@ class Quantised:
     warnings: tuple[str, ...]
 
 
-def quantise(model: Model, *, prob_bits: int = 8, scale: Scale = Scale.ADDRESS) -> Quantised:
+def quantise(
+    model: Model,
+    *,
+    prob_bits: int = 8,
+    scale: Scale = Scale.ADDRESS,
+    sensor_mode: SensorMode = SensorMode.COLUMN,
+) -> Quantised:
     """Return the model's codes, and what making them has lost.
 
     Args:
         model: The model.
         prob_bits: Bits of a code (W), 1 to 16.
-        scale: What is divided by its maximum first.
+        scale: What is divided by its maximum first; where cells have readings of their own, not addresses.
+        sensor_mode: What cells are given.
 
     Raises:
         machines.errors.ParameterError: `prob_bits` is not 1 to 16.
@@ -93,7 +100,7 @@ def quantise(model: Model, *, prob_bits: int = 8, scale: Scale = Scale.ADDRESS) 
     warnings: list[str] = []
     floors: list[VanishedFloor] = []
     tables = []
-    for known in model.known:
+    for known in model.known if sensor_mode is not SensorMode.THRESHOLD else ():
         ratios = scaled(known.table, scale)
         served = encode_probability(ratios, prob_bits)
         table = np.zeros((1 << known.bits, model.lines), dtype=np.uint16)
@@ -109,8 +116,12 @@ def quantise(model: Model, *, prob_bits: int = 8, scale: Scale = Scale.ADDRESS) 
         if loss.dead_values:
             warnings.append(
                 f"Variable {known.name}: {loss.dead_values} of its {known.values} values are possible but have "
-                "code 0 on every line, so such a reading gives no posterior; use --scale address or more "
-                "--prob-bits."
+                "code 0 on every line, so such a reading "
+                + (
+                    "gives no posterior; use --scale address or more --prob-bits."
+                    if sensor_mode is SensorMode.COLUMN
+                    else "makes its line impossible; use more --prob-bits."
+                )
             )
     return Quantised(
         prior=prior_codes,
@@ -121,13 +132,46 @@ def quantise(model: Model, *, prob_bits: int = 8, scale: Scale = Scale.ADDRESS) 
     )
 
 
-def written_prior(prior: ArrayLike, *, lines: int, prob_bits: int) -> NDArray[np.uint16]:
+def written_codes(likelihoods: NDArray[np.float64], *, prob_bits: int, scale: Scale) -> NDArray[np.uint16]:
+    """Return the codes of likelihoods that a frame brings, one for each line (`sensor_mode = threshold`).
+
+    Args:
+        likelihoods: float64[..., lines] of one sensor: P(its reading | S = line).
+        prob_bits: Bits of a code (W), 1 to 16.
+        scale: `column`: of each row only ratios count, it is divided by its maximum; `none`: they are encoded as they
+            are, up to 1.
+
+    Returns:
+        uint16 codes of the same shape.
+
+    Raises:
+        ReadingError: One is no probability, or all of a row are 0.
+    """
+    least = likelihoods.min()
+    if not (np.isfinite(likelihoods).all() and least >= 0):
+        message = f"{least:g} is no probability" if np.isfinite(least) else "there is one that is not finite"
+        raise ReadingError(message)
+    largest = likelihoods.max(axis=-1, keepdims=True)
+    if scale is Scale.NONE:
+        if float(largest.max()) > 1:
+            message = f"{float(largest.max()):g} is no probability, expected 0 to 1 (scale = none)"
+            raise ReadingError(message)
+        return encode_probability(likelihoods, prob_bits)
+    if not (largest > 0).all():
+        message = "all lines have 0, so that none is possible"
+        raise ReadingError(message)
+    return encode_probability(likelihoods / largest, prob_bits)
+
+
+def written_prior(prior: ArrayLike, *, lines: int, prob_bits: int, replicas: int = 1) -> NDArray[np.uint16]:
     """Return a written prior's codes, uint16[lines]: of the numbers only ratios count.
 
     Args:
-        prior: One number for each line of the machine, such as a posterior of an earlier frame.
+        prior: One number for each line of the machine, such as a posterior of an earlier frame. With replicas, so many
+            serve all of them, and `replicas` times as many are each one's own, one after the other.
         lines: Lines of the machine, over all boards.
         prob_bits: Bits of a code (W), 1 to 16.
+        replicas: Machines on a board. With several, uint16[replicas, lines] is returned.
 
     Raises:
         ReadingError: Another number of numbers, one that is no probability, or all of them 0.
@@ -137,15 +181,19 @@ def written_prior(prior: ArrayLike, *, lines: int, prob_bits: int) -> NDArray[np
     except (TypeError, ValueError):
         message = "the prior to write is not an array of numbers"
         raise ReadingError(message) from None
-    if numbers.shape != (lines,):
+    if replicas > 1 and numbers.size == replicas * lines:
+        numbers = numbers.reshape(replicas, lines)
+    elif numbers.shape != (lines,):
         message = (
             f"the prior to write has shape {numbers.shape}, expected one number for each of {lines} lines"
         )
-        raise ReadingError(message)
-    if not np.all(np.isfinite(numbers)) or np.any(numbers < 0) or not numbers.max() > 0:
+        raise ReadingError(message + (f", or for each of {replicas} replicas" if replicas > 1 else ""))
+    largest = numbers.max(axis=-1, keepdims=True)
+    if not np.all(np.isfinite(numbers)) or np.any(numbers < 0) or not np.all(largest > 0):
         message = "the prior to write is no distribution: it holds a negative, infinite or NaN number, or only zeros"
         raise ReadingError(message)
-    return encode_probability(numbers / numbers.max(), prob_bits)
+    codes = encode_probability(numbers / largest, prob_bits)
+    return codes if replicas == 1 else np.broadcast_to(codes, (replicas, lines)).copy()
 
 
 def _quantised_prior(model: Model, prob_bits: int, scale: Scale) -> tuple[NDArray[np.uint16], ColumnLoss]:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 from pydantic import ValidationError
 
+from machines.parameters import SensorMode
 from pcie_shim.programming_file import Image, Partition, read_image
 from toolchain.build import REPORT_NAME, assemble, board_interface, build_report, refused_option
 from toolchain.deployment import (
@@ -47,6 +48,8 @@ _MACHINE_KEYS: Final = (
     "rng_reset",
     "shared",
     "steps_per_clock",
+    "sensor_mode",
+    "replicas",
 )
 
 
@@ -199,6 +202,8 @@ def _options(deployment: Deployment, image: Image) -> BuildOptions:
         rng_reset=machine.rng_reset,
         shared=machine.shared,
         steps_per_clock=machine.steps_per_clock,
+        sensor_mode=machine.sensor_mode,
+        replicas=machine.replicas,
     )
 
 
@@ -220,6 +225,8 @@ def _with_widths(model: Model, deployment: Deployment) -> Model:
         raise BuildError(message)
     bits = {variable.name: variable.bits for variable in deployment.variables}
     select = model.prior_select
+    if deployment.machine.sensor_mode is SensorMode.THRESHOLD:  # no memory is that wide: there is none
+        bits |= {known.name: known.bits for known in model.known}
     try:
         return replace(
             model,
@@ -240,7 +247,10 @@ def _listed(values: Sequence[object]) -> str:
 def _interface_reason(model: Model, deployment: Deployment) -> str:
     """Return what the report says of the interface: as a build without --interface would, where it has the same."""
     machine = deployment.machine
-    interface, reason = board_interface(model, partition_lines(model.lines, len(deployment.boards)), None)
+    blocks = partition_lines(model.lines, len(deployment.boards))
+    interface, reason = board_interface(
+        model, blocks, None, sensor_mode=machine.sensor_mode, replicas=machine.replicas
+    )
     return reason if interface == (machine.interface_sensors, machine.interface_results) else ", as asked for"
 
 

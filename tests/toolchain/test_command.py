@@ -87,12 +87,14 @@ def test_same_input_same_bytes_though_time_passes(case):
         ),
         (["--rng", "table", "--rng-table", "/no.mif"], "error: /no.mif: No such file or directory\n"),
         (
-            ["--sensor-mode", "cell"],
-            "error: --sensor-mode cell: this version's machines have one sensor a column, none of a cell's own; use",
+            ["--sensor-mode", "cell", "--scale", "address"],
+            "error: --scale address does not go with --sensor-mode cell: lines look at different addresses",
         ),
+        (["--replicas", "257"], "error: --replicas is 257, expected 1 to 256\n"),
+        (["--replicas", "0"], "error: --replicas is 0, expected 1 to 256\n"),
         (
-            ["--replicas", "2"],
-            "error: --replicas 2: this version's boards hold one machine each; use --replicas 1",
+            ["--replicas", "3", "--interface", "20x11"],
+            "error: the model is larger than the interface 20x11: a board needs 3 inputs and 12 results (1 known",
         ),
     ],
 )

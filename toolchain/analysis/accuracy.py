@@ -12,8 +12,10 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from machines.bm1 import Start, addressed_codes
 from machines.encode import decode_code
 from machines.parameters import RngReset
+from toolchain.analysis.emulation import inputs_of_boards
 from toolchain.errors import ModelError
 from toolchain.models.fusion import exact_posterior, fuse
 
@@ -23,7 +25,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from machines.bm1 import BM1Machine
-    from toolchain.analysis.emulation import EmulatedBoards
+    from toolchain.analysis.emulation import EmulatedBoards, Inputs
     from toolchain.analysis.readings import Readings
     from toolchain.models.model import Model
 
@@ -183,7 +185,12 @@ def measure(
         frames += 1
         of_board, prior_row = readings.of_machine(frame, boards.machines[0])
         likelihood = np.concatenate(
-            [_line_probabilities(machine, of_board, prior_row) for machine in boards.machines]
+            [
+                _line_probabilities(machine, own, prior_row)
+                for machine, own in zip(
+                    boards.machines, inputs_of_boards(of_board, boards.machines), strict=True
+                )
+            ]
         )
         ran = [boards.run(of_board, prior_row, _bank(boards, frame, run, banks)) for run in range(banks)]
         posteriors = [posterior for each in ran if (posterior := each.posterior) is not None]
@@ -238,14 +245,11 @@ def _bank(boards: EmulatedBoards, frame: int, run: int, banks: int) -> int:
     return (frame * banks + run) % boards.parameters.rng_banks
 
 
-def _line_probabilities(
-    machine: BM1Machine, addresses: tuple[int, ...], prior_address: int
-) -> NDArray[np.float64]:
+def _line_probabilities(machine: BM1Machine, addresses: Inputs, prior_address: int) -> NDArray[np.float64]:
     """The probability that each line counts in a cycle: float64[lines]."""
-    width = machine.parameters.prob_bits
-    product = decode_code(machine.prior[prior_address], width)
-    for table, address in zip(machine.tables, addresses, strict=True):
-        product = product * decode_code(table[address], width)
+    frame = Start(addresses=addresses, prior_address=prior_address, target_count=1, max_cycles=1)
+    chances = decode_code(addressed_codes(machine, frame), machine.parameters.prob_bits)
+    product: NDArray[np.float64] = np.prod(chances, axis=0)
     return product
 
 

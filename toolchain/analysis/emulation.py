@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
@@ -19,6 +19,10 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import NDArray
+
+
+Inputs: TypeAlias = "tuple[int, ...] | NDArray[np.int64]"
+"""What a frame brings: an address per column, or int64[sensors, all lines] where lines have readings of their own."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,20 +91,20 @@ class EmulatedBoards:
         """Lines of all boards."""
         return sum(machine.parameters.lines for machine in self.machines)
 
-    def run(self, addresses: tuple[int, ...], prior_address: int, bank: int) -> FrameRun:
+    def run(self, addresses: Inputs, prior_address: int, bank: int) -> FrameRun:
         """Run a frame as the host does: slices that end at 256 * 2^k, until a board overflows; or each board by itself."""
         end = first_slice(self.target_count) if self.stop is Stop.SLICES else 0
         if end >= self.max_cycles:
             end = 0
         start = Start(
-            addresses=addresses,
+            addresses=(),
             prior_address=prior_address,
             target_count=self.target_count,
             max_cycles=self.max_cycles,
             bank=bank,
             run_until=end,
         )
-        reasons = [kernel.start(start) for kernel in self._kernels]
+        reasons = self._start(start, addresses)
         while StopReason.SLICE in reasons and StopReason.OVERFLOW not in reasons:
             end = 2 * end if 2 * end < self.max_cycles else 0
             reasons = [
@@ -109,18 +113,24 @@ class EmulatedBoards:
             ]
         return self._shown()
 
-    def run_for(self, addresses: tuple[int, ...], prior_address: int, bank: int, cycles: int) -> FrameRun:
+    def run_for(self, addresses: Inputs, prior_address: int, bank: int, cycles: int) -> FrameRun:
         """Run every board that can count for this many cycles, whatever it counts."""
         start = Start(
-            addresses=addresses,
+            addresses=(),
             prior_address=prior_address,
             target_count=2**COUNTER_BITS_MAX - 1,
             max_cycles=cycles,
             bank=bank,
         )
-        for kernel in self._kernels:
-            kernel.start(start)
+        self._start(start, addresses)
         return self._shown()
+
+    def _start(self, start: Start, addresses: Inputs) -> list[StopReason]:
+        """Start every board with its part of the inputs."""
+        return [
+            kernel.start(replace(start, addresses=own))
+            for kernel, own in zip(self._kernels, inputs_of_boards(addresses, self.machines), strict=True)
+        ]
 
     def _shown(self) -> FrameRun:
         return FrameRun(
@@ -128,6 +138,21 @@ class EmulatedBoards:
             tuple(kernel.cycles for kernel in self._kernels),
             tuple(kernel.reason for kernel in self._kernels),
         )
+
+
+def inputs_of_boards(inputs: Inputs, machines: Sequence[BM1Machine]) -> list[Inputs]:
+    """Return each board's part of a frame's inputs: all of them, or those of its lines."""
+    if isinstance(inputs, tuple):
+        return [inputs] * len(machines)
+    ends = np.cumsum([machine.parameters.lines for machine in machines]).tolist()
+    return [
+        inputs[:, end - machine.parameters.lines : end] for end, machine in zip(ends, machines, strict=True)
+    ]
+
+
+def one_replica(machine: BM1Machine) -> BM1Machine:
+    """Return one of a board's replicas as a machine by itself, which counts the same."""
+    return replace(machine, parameters=replace(machine.parameters, replicas=1))
 
 
 def split(machine: BM1Machine, boards: int) -> tuple[BM1Machine, ...]:
@@ -154,8 +179,7 @@ def joined(machines: Sequence[BM1Machine]) -> BM1Machine:
         replace(first.parameters, lines=sum(machine.parameters.lines for machine in machines)),
         np.hstack([machine.prior for machine in machines]),
         tuple(
-            np.hstack([machine.tables[column] for machine in machines])
-            for column in range(first.parameters.sensors)
+            np.hstack([machine.tables[column] for machine in machines]) for column in range(len(first.tables))
         ),
         first.rng_table,
     )

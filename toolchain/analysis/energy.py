@@ -11,7 +11,9 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from machines.bm1 import Start, addressed_codes
 from machines.encode import decode_code
+from toolchain.analysis.emulation import one_replica
 from toolchain.analysis.resources import logic_of
 
 if TYPE_CHECKING:
@@ -73,16 +75,17 @@ def energy(machines: Sequence[BM1Machine], readings: Readings) -> Energy:
         readings: What its codes' activity is averaged over; the first 50 frames are enough.
     """
     toggles = clocked = 0.0
-    for machine in machines:
+    ends = np.cumsum([machine.parameters.lines for machine in machines]).tolist()
+    for machine, end in zip(machines, ends, strict=True):
         p = machine.parameters
-        logic = logic_of(p, interface_words=p.lines)
+        logic = logic_of(p, interface_words=p.replicas * p.lines)
         parts = {part.name: part for part in logic.parts}
         generators = parts["generators"]
-        cells = p.lines * p.columns
+        cells = p.replicas * p.lines * p.columns
         toggles += (generators.registers + generators.aluts) / 2
         toggles += cells * p.prob_bits / 2
         toggles += parts["cells"].aluts * COMPARATOR_ACTIVITY
-        toggles += _stream_toggles(machine, readings)
+        toggles += p.replicas * _stream_toggles(one_replica(machine), readings, slice(end - p.lines, end))
         clocked += generators.registers + parts["counters"].registers + parts["control"].registers
     return Energy(
         toggles=toggles,
@@ -91,17 +94,16 @@ def energy(machines: Sequence[BM1Machine], readings: Readings) -> Energy:
     )
 
 
-def _stream_toggles(machine: BM1Machine, readings: Readings) -> float:
+def _stream_toggles(machine: BM1Machine, readings: Readings, lines: slice) -> float:
     """Toggles of the cells' bits, the lines' ANDs, their counters and what compares those; a mean over frames."""
     width = machine.parameters.prob_bits
     found = []
     for frame in range(min(len(readings), _FRAMES)):
         addresses, row = readings.of_machine(frame, machine)
-        chances = [decode_code(machine.prior[row], width)]
-        chances += [
-            decode_code(table[at], width) for table, at in zip(machine.tables, addresses, strict=True)
-        ]
+        own = addresses if isinstance(addresses, tuple) else addresses[:, lines]
+        start = Start(addresses=own, prior_address=row, target_count=1, max_cycles=1)
+        chances = decode_code(addressed_codes(machine, start), width)
         line = np.prod(chances, axis=0)
-        bits = sum(float((2 * chance * (1 - chance)).sum()) for chance in chances)
+        bits = float((2 * chances * (1 - chances)).sum())
         found.append(bits + float((2 * line * (1 - line)).sum()) + 3 * float(line.sum()))
     return float(np.mean(found))

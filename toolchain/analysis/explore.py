@@ -204,7 +204,7 @@ def run_task(model: Model, task: Task, readings: Readings, device: Device, banks
     options = task.options
     try:
         parameters = machine_parameters(model, options)
-        quantised = quantise(model, prob_bits=options.prob_bits, scale=options.scale)
+        quantised = quantise(model, prob_bits=options.prob_bits, scale=options.scaling)
         table = random_table(options.prob_bits) if options.rng is RngKind.TABLE else None
         whole = BM1Machine(parameters, quantised.prior, quantised.tables, table)
     except MachineError as reason:
@@ -221,7 +221,7 @@ def run_task(model: Model, task: Task, readings: Readings, device: Device, banks
     machine, quantising = accuracy.machine, accuracy.quantising
     return Point(
         key=task.key,
-        scale=options.scale.value,
+        scale=options.scaling.value,
         rng=options.rng.value,
         steps_per_clock=parameters.steps_per_clock,
         prob_bits=parameters.prob_bits,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -12,6 +12,7 @@ from toolchain.address import to_address
 from toolchain.errors import BuildError, ModelError, ReadingError
 from toolchain.learning.recording import read_recording
 from toolchain.models.model import Known, Model, PriorSelect
+from toolchain.quantise import written_codes
 from toolchain.settings import key_values
 
 if TYPE_CHECKING:
@@ -21,7 +22,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from machines.bm1 import BM1Machine
+    from toolchain.analysis.emulation import Inputs
     from toolchain.deployment import Dimension, Variable
+    from toolchain.options import Scale
 
 MISSING: Final = -1
 
@@ -34,32 +37,49 @@ class Readings:
 
     Attributes:
         source: Where they come from, a clause.
-        addresses: int64[frames, sensors], in the columns' order; `MISSING` for a missing reading.
+        addresses: int64[frames, sensors], in the columns' order; `MISSING` for a missing reading. Where lines have
+            readings of their own int64[frames, sensors, lines].
         prior_addresses: int64[frames], what selects the prior; `MISSING` where nothing does.
+        codes: uint16[frames, sensors, lines], what such addresses' likelihoods are to a machine whose cells are given
+            codes; None for other machines.
+        lines: int64[frames], the true line of each; None where it is not known.
     """
 
     source: str
     addresses: NDArray[np.int64]
     prior_addresses: NDArray[np.int64]
+    codes: NDArray[np.uint16] | None = None
+    lines: NDArray[np.int64] | None = None
 
     def __len__(self) -> int:
         return len(self.addresses)
 
-    def of_model(self, frame: int) -> tuple[tuple[int | None, ...], int | None]:
+    def of_model(self, frame: int) -> tuple[tuple[int | NDArray[np.int64] | None, ...], int | None]:
         """Return a frame as `toolchain.models.fusion.exact_posterior` takes it."""
         row = int(self.prior_addresses[frame])
+        addresses: tuple[int | NDArray[np.int64] | None, ...]
+        if self.addresses.ndim > 2:
+            return tuple(self.addresses[frame]), None if row == MISSING else row
         addresses = tuple(None if at == MISSING else at for at in self.addresses[frame].tolist())
         return addresses, None if row == MISSING else row
 
-    def of_machine(self, frame: int, machine: BM1Machine) -> tuple[tuple[int, ...], int]:
-        """Return a frame as a machine takes it: a missing reading is its column's top address."""
+    def of_machine(self, frame: int, machine: BM1Machine) -> tuple[Inputs, int]:
+        """Return a frame as a machine takes it: a missing reading is its column's top address.
+
+        Where lines have readings of their own, those of all lines are returned, whichever of them the machine has.
+        """
         parameters = machine.parameters
+        row = int(self.prior_addresses[frame])
+        prior_row = parameters.prior_addresses - 1 if row == MISSING else row
+        if self.codes is not None:
+            return self.codes[frame].astype(np.int64), prior_row
+        if self.addresses.ndim > 2:
+            return self.addresses[frame], prior_row
         addresses = tuple(
             parameters.missing_address(column) if at == MISSING else at
             for column, at in enumerate(self.addresses[frame].tolist(), start=1)
         )
-        row = int(self.prior_addresses[frame])
-        return addresses, parameters.prior_addresses - 1 if row == MISSING else row
+        return addresses, prior_row
 
 
 def sample_readings(model: Model, frames: int, *, seed: int, source: str = "") -> Readings:
@@ -93,7 +113,46 @@ def sample_readings(model: Model, frames: int, *, seed: int, source: str = "") -
         cumulative = np.cumsum(known.table[:, lines], axis=0)
         drawn = random.random(frames) * cumulative[-1]
         addresses[:, column] = (cumulative <= drawn).sum(axis=0)
-    return Readings(source or f"{frames} frames drawn from the model (seed {seed})", addresses, rows)
+    said = source or f"{frames} frames drawn from the model (seed {seed})"
+    return Readings(said, addresses, rows, lines=lines)
+
+
+def readings_of_lines(
+    drawn: Readings, model: Model, machine: BM1Machine, *, scale: Scale, seed: int
+) -> Readings:
+    """Return readings that were drawn from a model as a machine's whose lines have readings of their own.
+
+    `cell`: the true line's cell reads what was drawn. What the others read the model does not say; theirs are drawn from
+    the mean of all lines. `threshold`: the likelihoods of what was drawn, as codes.
+
+    Args:
+        drawn: As `sample_readings` draws them.
+        model: The model that they were drawn from.
+        machine: The machine, or one board's.
+        scale: What was divided by its maximum before quantising.
+        seed: The same one draws the same readings of the other lines.
+    """
+    frames = len(drawn)
+    shape = (frames, len(model.known), model.lines)
+    width = machine.parameters.prob_bits
+    if not machine.parameters.has_tables:
+        codes = np.empty(shape, dtype=np.uint16)
+        for column, known in enumerate(model.known):
+            likelihoods = known.table[drawn.addresses[:, column]]
+            codes[:, column] = written_codes(likelihoods, prob_bits=width, scale=scale)
+        return replace(drawn, codes=codes)
+    random = np.random.default_rng((seed, 1))
+    addresses = np.empty(shape, dtype=np.int64)
+    for column, known in enumerate(model.known):
+        mean = np.cumsum(known.table @ _normalised(model.prior_distribution))
+        others = np.searchsorted(mean, random.random((frames, model.lines)) * mean[-1], side="right")
+        addresses[:, column] = np.minimum(others, known.values - 1)
+    if drawn.lines is None:
+        message = "only readings that were drawn know their true line"
+        raise BuildError(message)
+    every = np.arange(frames)
+    addresses[every, :, drawn.lines] = drawn.addresses
+    return replace(drawn, addresses=addresses)
 
 
 def model_of_codes(

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import TYPE_CHECKING, Final
 
-from machines.parameters import BM1Parameters, PriorMode, RngKind, RngReset
+from machines.parameters import BM1Parameters, PriorMode, RngKind, RngReset, SensorMode
+from pcie_shim.programming_file import interface_room, interface_words
 from toolchain.errors import BuildError
 from toolchain.outputs.rng_table import LENGTH
 from toolchain.partition import partition_lines
@@ -199,21 +200,25 @@ def logic_of(parameters: BM1Parameters, *, interface_words: int, word_bits: int 
     if p.rng is RngKind.IDEAL:
         message = "rng = ideal exists emulated only: no FPGA has it; use an LFSR"
         raise BuildError(message)
-    cells = p.lines * p.columns
-    generators = p.columns if p.shared else cells
+    lines = p.replicas * p.lines
+    cells = lines * p.columns
+    generators = p.columns * (1 if p.shared else p.lines)  # replicas share them
     # Where a table is played, a generator is a place in it, which counts up.
     state = p.rng.lfsr_bits or PLACE_BITS
     steps = p.steps_per_clock if p.rng.lfsr_bits else 0
     places = 0 if p.rng.lfsr_bits else generators * state
     seeds = p.rng_banks if p.rng_banks > 1 and p.rng_reset is RngReset.BANK else 0
     bank_bits = max((p.rng_banks - 1).bit_length(), 1)
-    inputs = max(p.prior_bits, 1) + sum(p.sensor_bits)
-    written = p.lines * p.prob_bits if p.prior_mode is PriorMode.WRITTEN else 0
-    counters, results = p.lines * p.counter_bits, interface_words * word_bits
+    per_column = 1 if p.sensor_mode is SensorMode.COLUMN else p.lines
+    inputs = p.replicas * (max(p.prior_bits, 1) + per_column * sum(p.sensor_bits))
+    written = lines * p.prob_bits if p.prior_mode is PriorMode.WRITTEN else 0
+    counters, results = lines * p.counter_bits, interface_words * word_bits
+    # a replica stops by itself: its cycles are kept, and whether it runs
+    stops = (p.replicas - 1) * (CYCLE_BITS + 3)
     return Logic(
         (
             _part("cells", (cells * p.prob_bits, _CODE_BIT), (cells, _CELL), sums=cells * (p.prob_bits + 1)),
-            _part("counters", (counters, _COUNTER_BIT), (p.lines, _LINE), sums=counters, registers=counters),
+            _part("counters", (counters, _COUNTER_BIT), (lines, _LINE), sums=counters, registers=counters),
             _part(
                 "generators",
                 (generators * state, _STATE_BIT),
@@ -227,7 +232,7 @@ def logic_of(parameters: BM1Parameters, *, interface_words: int, word_bits: int 
                 "control",
                 (1, _CONTROL),
                 sums=CYCLE_BITS,
-                registers=3 * CYCLE_BITS + p.counter_bits + bank_bits + 7 + inputs + written,
+                registers=3 * CYCLE_BITS + p.counter_bits + bank_bits + 7 + inputs + written + stops,
             ),
         )
     )
@@ -334,7 +339,7 @@ def estimate(
         message = f"{device.title} has no hard PCIe controller: use --pcie soft"
         raise BuildError(message)
     inputs, results = interface
-    logic = logic_of(parameters, interface_words=max(results, parameters.lines))
+    logic = logic_of(parameters, interface_words=max(results, parameters.replicas * parameters.lines))
     words = Part(name="inputs", aluts=inputs, alms=inputs / 2, registers=inputs * WORD_BITS)
     blocks, logic_tables, mlabs, table_alms = _place(parameters, device, tables)
     soft = tuple(elements / ELEMENTS_PER_ALM for elements in SOFT_PCIE_ELEMENTS)
@@ -342,7 +347,10 @@ def estimate(
         device=device,
         logic=Logic((*logic.parts, words)),
         tables=tables,
-        table_bits=sum(parameters.lines * parameters.prob_bits << bits for bits in _table_bits(parameters)),
+        table_bits=sum(
+            parameters.replicas * parameters.lines * parameters.prob_bits << bits
+            for bits in _table_bits(parameters)
+        ),
         blocks=blocks,
         logic_tables=logic_tables,
         mlabs=mlabs,
@@ -354,7 +362,8 @@ def estimate(
 
 def _table_bits(parameters: BM1Parameters) -> list[int]:
     """The address bits of the columns that have tables: a prior of one row, or a written one, is registers."""
-    return [bits for bits in (parameters.prior_bits, *parameters.sensor_bits) if bits]
+    sensors = parameters.sensor_bits if parameters.has_tables else ()
+    return [bits for bits in (parameters.prior_bits, *sensors) if bits]
 
 
 def _place(parameters: BM1Parameters, device: Device, tables: Tables) -> tuple[int, int, int, float]:
@@ -372,13 +381,14 @@ def _place(parameters: BM1Parameters, device: Device, tables: Tables) -> tuple[i
     for bits in sorted(_table_bits(parameters), reverse=True):
         if tables is Tables.COLUMN:
             # As many of a block's words as possible side by side: the whole column or none of it.
-            wide, each = parameters.lines * width, 1
+            wide, each = parameters.lines * width, parameters.replicas
             own = _blocks(1 << bits, wide)
-            count = 1 if blocks + own <= room else 0
+            count = min(each, max(0, room - blocks) // own)
         else:
-            wide, each = width, parameters.lines
+            # every replica looks at an address of its own, so it has tables of its own
+            wide, each = width, parameters.replicas * parameters.lines
             own = _blocks(1 << bits, wide)
-            count = min(parameters.lines, max(0, room - blocks) // own)
+            count = min(each, max(0, room - blocks) // own)
         blocks += count * own
         left = each - count
         deep = math.ceil((1 << bits) / MLAB_SHAPE[0])
@@ -430,10 +440,21 @@ def boards_needed(
 
     def on(lines: int) -> Estimate:
         part = with_lines(parameters, lines)
-        grown = (max(interface[0], parameters.sensors), max(interface[1], lines))
+        inputs, results = interface_words(part)
+        grown = (max(interface[0], inputs), max(interface[1], results))
         return estimate(part, device, interface=grown, pcie=pcie)
 
+    room = interface_room(parameters)
+    largest_lines = min(largest_lines, room[1] // parameters.replicas)
+    if parameters.sensor_mode is not SensorMode.COLUMN and parameters.sensors:
+        largest_lines = min(largest_lines, room[0] // (parameters.replicas * parameters.sensors))
     most = _most_lines(lambda lines: on(lines).fits, min(parameters.lines, largest_lines))
+    if most == 0 and largest_lines == 0:
+        message = (
+            f"not even one line of {parameters.replicas} replicas fits the register map: it has room for {room[0]} inputs "
+            f"and {room[1]} results; use fewer --replicas"
+        )
+        raise BuildError(message)
     if most == 0:
         message = (
             f"not even one line fits a {device.title}: {on(1).why_not}; use narrower tables or another device"

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from machines.errors import MachineError
-from machines.parameters import BM1Parameters, PriorMode, RngKind, RngReset
+from machines.parameters import BM1Parameters, PriorMode, RngKind, RngReset, SensorMode
 from pcie_shim.errors import PcieShimError
 from toolchain.build import assemble, board_interface, machine_parameters
 from toolchain.checks.finding import Finding, Severity
@@ -138,7 +138,11 @@ def _refusals(model: Model, options: BuildOptions, first: ToolchainError) -> lis
         (
             "the interface",
             lambda: board_interface(
-                model, partition_lines(model.lines, options.partitions), options.interface
+                model,
+                partition_lines(model.lines, options.partitions),
+                options.interface,
+                sensor_mode=options.sensor_mode,
+                replicas=options.replicas,
             ),
         ),
         ("the machine", lambda: machine_parameters(model, options)),
@@ -207,7 +211,7 @@ def _lines(machine: _Machine) -> Iterator[Finding]:
         return
     if machine.parameters.prior_mode is PriorMode.TABLE:
         yield from _dead_prior(machine)
-    for column, variable in enumerate(deployment.sensors):
+    for column, variable in enumerate(deployment.sensors[: len(machine.tables)]):
         lines = np.flatnonzero(~machine.served(column).any(axis=0))
         if lines.size:
             yield Finding(
@@ -257,8 +261,8 @@ def _readings(machine: _Machine) -> Iterator[Finding]:
     """Readings for which every line has a 0 code: a frame with one ends as `impossible`."""
     deployment, model = machine.deployment, machine.model
     alive = _alive(machine)
-    if not alive.any():
-        return
+    if not alive.any() or machine.parameters.sensor_mode is not SensorMode.COLUMN:
+        return  # where each line has a reading of its own, a value says nothing of the other lines
     rows: list[tuple[Variable, NDArray[np.uint16], NDArray[np.float64] | None]] = [
         (variable, table, None if model is None else model.known[column].table @ model.prior_distribution)
         for column, (variable, table) in enumerate(zip(deployment.sensors, machine.tables, strict=True))
@@ -295,7 +299,10 @@ def _readings(machine: _Machine) -> Iterator[Finding]:
 
 def _columns(machine: _Machine) -> Iterator[Finding]:
     """Columns that say nothing, and two that read the same."""
-    for variable, table in zip(machine.deployment.sensors, machine.tables, strict=True):
+    of_columns = machine.parameters.sensor_mode is SensorMode.COLUMN
+    for variable, table in zip(
+        machine.deployment.sensors, machine.tables if of_columns else (), strict=of_columns
+    ):
         served = table[: variable.values]
         if served.shape[1] > 1 and (served == served[:, :1]).all():
             yield Finding(
@@ -574,7 +581,11 @@ def _quantising(quantised: Quantised, options: BuildOptions) -> Iterator[Finding
                 f"often one of {worst.name} ({worst.mass:.1%})"
             ),
             advice="use more --prob-bits"
-            + ("" if options.scale is Scale.ADDRESS else " or --scale address")
+            + (
+                ""
+                if options.scaling is Scale.ADDRESS or options.sensor_mode is not SensorMode.COLUMN
+                else " or --scale address"
+            )
             + ", or a floor for outliers",
         )
 

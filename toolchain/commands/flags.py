@@ -5,9 +5,9 @@ from typing import Annotated, TypeAlias
 
 import typer
 
-from machines.parameters import PriorMode, RngKind, RngReset
+from machines.parameters import PriorMode, RngKind, RngReset, SensorMode
 from toolchain.deployment import Stop
-from toolchain.options import OnMissing, Scale, SensorMode
+from toolchain.options import OnMissing, Scale
 
 ModelPath: TypeAlias = Annotated[
     Path,
@@ -58,7 +58,10 @@ Interface: TypeAlias = Annotated[
     ),
 ]
 ScaleFlag: TypeAlias = Annotated[
-    Scale, typer.Option(help="What is divided by its maximum before quantising.")
+    Scale | None,
+    typer.Option(
+        help="What is divided by its maximum before quantising; default address, column where cells have readings of their own."
+    ),
 ]
 ProbBits: TypeAlias = Annotated[int, typer.Option(help="Bits of a code, 1 to 16.")]
 Bits: TypeAlias = Annotated[
@@ -105,6 +108,11 @@ StepsPerClock: TypeAlias = Annotated[
     ),
 ]
 SensorModeFlag: TypeAlias = Annotated[
-    SensorMode, typer.Option(help="What a cell's address is: only its column's sensor, so far.")
+    SensorMode,
+    typer.Option(
+        help="What a cell is given: its column's reading, a reading of its own (cell), or its probability (threshold)."
+    ),
 ]
-Replicas: TypeAlias = Annotated[int, typer.Option(help="Machines on a board: only 1, so far.")]
+Replicas: TypeAlias = Annotated[
+    int, typer.Option(help="Machines on each board, around the same generators, 1 to 256.")
+]

@@ -10,12 +10,18 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from machines.parameters import SensorMode
 from toolchain.analysis.accuracy import measure
-from toolchain.analysis.emulation import EmulatedBoards, joined
+from toolchain.analysis.emulation import EmulatedBoards, joined, one_replica
 from toolchain.analysis.energy import ASSUMPTIONS, energy
-from toolchain.analysis.readings import model_of_codes, recorded_readings, sample_readings
+from toolchain.analysis.readings import (
+    model_of_codes,
+    readings_of_lines,
+    recorded_readings,
+    sample_readings,
+)
 from toolchain.analysis.resources import Pcie, Tables, device_named, estimate
-from toolchain.build import REPORT_NAME
+from toolchain.build import REPORT_NAME, many_sentence
 from toolchain.commands.build import NetworkQuestion, Unread, read_model
 from toolchain.deployment import load_deployment
 from toolchain.errors import BuildError, DeploymentError
@@ -130,7 +136,7 @@ def inspect(
     readings = _readings(deployment, whole, model, options)
     section = deployment.machine
     boards = EmulatedBoards(
-        machines,
+        [one_replica(machine) for machine in machines],
         target_count=section.target_count,
         max_cycles=section.max_cycles,
         stop=section.stop,
@@ -140,11 +146,12 @@ def inspect(
         estimate(machine.parameters, device, interface=interface, pcie=options.pcie) for machine in machines
     )
     side_by_side = None
-    if whole.parameters.shared and max(each.block_share for each in resources) > 0:
+    wide = whole.parameters.shared and whole.parameters.sensor_mode is SensorMode.COLUMN
+    if wide and max(each.block_share for each in resources) > 0:
         side_by_side = estimate(
             whole.parameters,
             device,
-            interface=(interface[0], max(interface[1], section.lines)),
+            interface=(interface[0], max(interface[1], section.results)),
             pcie=options.pcie,
             tables=Tables.COLUMN,
         )
@@ -192,7 +199,12 @@ def _model(
     model = read_model(options.model, options.question, unread)
     if model.lines == deployment.machine.lines and len(model.known) == whole.parameters.sensors:
         scale = Scale(deployment.machine.scale)
-        quantised = quantise(model, prob_bits=whole.parameters.prob_bits, scale=scale)
+        quantised = quantise(
+            model,
+            prob_bits=whole.parameters.prob_bits,
+            scale=scale,
+            sensor_mode=deployment.machine.sensor_mode,
+        )
         if all(
             np.array_equal(ours, theirs)
             for ours, theirs in zip(
@@ -213,6 +225,13 @@ def _readings(
     frames = options.frames
     if frames is None:
         frames = SLOW_FRAMES if _is_slow(whole) else FRAMES
+    mode = deployment.machine.sensor_mode
+    if options.recording is not None and mode is not SensorMode.COLUMN:
+        message = (
+            f"--readings {options.recording}: a recording's columns are numbers, and this machine's readings are arrays, one "
+            "number for each line: leave it out, and readings are drawn"
+        )
+        raise BuildError(message)
     if options.recording is not None:
         return recorded_readings(
             options.recording,
@@ -226,11 +245,24 @@ def _readings(
             f"--reading {options.columns[0]} says where in a recording a reading is: add --readings FILE"
         )
         raise BuildError(message)
+    if model is None and mode is SensorMode.THRESHOLD:
+        message = (
+            "this machine's cells are given their probabilities, so it holds no tables that readings could be drawn from: "
+            "name the model with --model"
+        )
+        raise BuildError(message)
+    scale = Scale(deployment.machine.scale)
     if model is not None:
-        return sample_readings(model, frames, seed=options.seed)
+        drawn = sample_readings(model, frames, seed=options.seed)
+        if mode is SensorMode.COLUMN:
+            return drawn
+        return readings_of_lines(drawn, model, whole, scale=scale, seed=options.seed)
     drawn_from = model_of_codes(deployment.name, deployment.searched, deployment.variables, whole)
     source = f"{frames} frames drawn from what the codes say of the model (seed {options.seed})"
-    return sample_readings(drawn_from, frames, seed=options.seed, source=source)
+    drawn = sample_readings(drawn_from, frames, seed=options.seed, source=source)
+    if mode is SensorMode.COLUMN:
+        return drawn
+    return readings_of_lines(drawn, drawn_from, whole, scale=scale, seed=options.seed)
 
 
 def _is_slow(machine: BM1Machine) -> bool:
@@ -280,6 +312,7 @@ def _machine_part(found: Inspection) -> str:
             f"{p.rng_banks} bank{'s' if p.rng_banks > 1 else ''}; stops at a count of {machine.target_count} or after "
             f"{machine.max_cycles} cycles, stop = {machine.stop}."
         ),
+        *([many] if (many := many_sentence(machine).strip()) else []),
     ]
     names = [variable.name for variable in deployment.sensors]
     width = max([6, *map(len, names)])
@@ -288,7 +321,9 @@ def _machine_part(found: Inspection) -> str:
     tables = [("prior", p.prior_bits, select.values if select else 1, found.machine.prior)]
     tables += [
         (variable.name, bits, variable.values, table)
-        for variable, bits, table in zip(deployment.sensors, p.sensor_bits, found.machine.tables, strict=True)
+        for variable, bits, table in zip(
+            deployment.sensors, p.sensor_bits, found.machine.tables, strict=p.has_tables
+        )
     ]
     for name, bits, values, table in tables:
         served = table[:values]
@@ -326,6 +361,8 @@ def _time_part(found: Inspection) -> str:
         f"  {found.accuracy.overflow:.0%} of runs end by a full counter; without a posterior: {found.accuracy.without:.1%} of "
         f"runs (in {found.accuracy.impossible:.1%} of frames no line can count)."
     )
+    if found.deployment.machine.replicas > 1:
+        rows.append("  That is one replica's; all run at once, and a frame ends with the last of them.")
     return "\n".join(rows)
 
 

@@ -17,13 +17,14 @@ if TYPE_CHECKING:
 
 
 def exact_posterior(
-    model: Model, addresses: Sequence[int | None], *, prior_address: int | None = None
+    model: Model, addresses: Sequence[int | NDArray[np.int64] | None], *, prior_address: int | None = None
 ) -> NDArray[np.float64]:
     """Return P(S | readings) of the unquantised model.
 
     Args:
         model: The model.
-        addresses: One per known variable, in the columns' order; None for a missing reading.
+        addresses: One per known variable, in the columns' order; None for a missing reading. Where lines have readings of
+            their own (`sensor_mode = cell`), int64[lines] per variable.
         prior_address: Which row of the selected prior; None for the prior without a selection.
 
     Returns:
@@ -39,6 +40,9 @@ def exact_posterior(
     factors = []
     for known, address in zip(model.known, addresses, strict=True):
         if address is None:
+            continue
+        if isinstance(address, np.ndarray):
+            factors.append(known.table[address, np.arange(model.lines)])
             continue
         if not 0 <= address < known.values:
             message = f"variable {known.name}: address {address} is not one of its {known.values}"

@@ -1,7 +1,8 @@
 """Which memories a machine has on each board, and the MIF of each: priors, tiles, random numbers (thesis 3.2).
 
 A column's tiles all see the same reading, so a column is one memory: its address is the reading's, and a word
-holds the code of every line of the board, line 0 in the lowest bits. The same goes for the prior elements.
+holds the code of every line of the board, line 0 in the lowest bits. The same goes for the prior elements. Where each line
+has a reading of its own, a tile is a memory by itself: its bits of those words.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from machines.parameters import PriorMode, RngKind
+from machines.parameters import PriorMode, RngKind, SensorMode
 from machines.rng import LFSR, POLYNOMIALS, generator_numbers, random_numbers
 from toolchain.outputs.mif import mif_lines
 
@@ -133,11 +134,15 @@ def _prior(deployment: Deployment, board: int, image: Image) -> Memory:
 
 def _columns(deployment: Deployment, board: int, image: Image) -> Iterator[Memory]:
     sensors = len(image.machine.tables)
+    parameters = image.machine.parameters
+    if not parameters.has_tables:
+        return
+    whose = "the line's own " if parameters.sensor_mode is SensorMode.CELL else "the "
     for column, (variable, table) in enumerate(
         zip(deployment.sensors, image.machine.tables, strict=True), start=1
     ):
         what = (
-            f"column {column}, tiles, P({variable.name} | S): address = the value of {variable.name}, {variable.values} "
+            f"column {column}, tiles, P({variable.name} | S): address = {whose}value of {variable.name}, {variable.values} "
             "are served; the top one is a missing reading"
         )
         yield _codes(column_name(board, column, sensors), what, image, table)

@@ -22,6 +22,7 @@ _MOST_SEEDS: Final = 4096
 
 _TYPES: Final = """\
   type rng_kind_t is (RNG_LFSR8, RNG_LFSR16, RNG_LFSR24, RNG_LFSR32, RNG_TABLE, RNG_IDEAL);
+  type sensor_mode_t is (SENSOR_COLUMN, SENSOR_CELL, SENSOR_THRESHOLD);
   type natural_array_t is array (natural range <>) of natural;
 
   -- Lines of the model that a board holds, and what identifies its image.
@@ -47,6 +48,13 @@ def parameters_vhd(deployment: Deployment, images: Sequence[Image]) -> str:
             _constant("LINES", "positive", deployment.machine.lines, "of the whole model"),
             _constant("SENSORS", "natural", parameters.sensors),
             _constant("COLUMNS", "positive", parameters.columns),
+            _constant("REPLICAS", "positive", parameters.replicas, "machines around the same generators"),
+            _constant(
+                "SENSOR_MODE",
+                "sensor_mode_t",
+                f"SENSOR_{parameters.sensor_mode.upper()}",
+                "what a column's cells are given",
+            ),
             _sensor_widths(deployment, parameters),
             _section("Resolutions, in bits"),
             _constant("PROB_BITS", "positive", parameters.prob_bits, "of a code in the probability tables"),
@@ -118,12 +126,20 @@ def _array(name: str, kind: str, rows: Iterable[tuple[int, str, str]], range_: s
 
 def _sensor_widths(deployment: Deployment, parameters: BM1Parameters) -> str:
     rows = [
-        (column, str(bits), f"{printable(variable.name)}, {variable.values} values")
+        (
+            column,
+            str(bits),
+            printable(variable.name) + (f", {variable.values} values" if parameters.has_tables else ""),
+        )
         for column, (bits, variable) in enumerate(
             zip(parameters.sensor_bits, deployment.sensors, strict=True), start=1
         )
     ]
-    title = "\n  -- Address bits of every column; its top address is a missing reading.\n"
+    title = (
+        "\n  -- Address bits of every column; its top address is a missing reading.\n"
+        if parameters.has_tables
+        else "\n  -- Bits of the codes that a column's cells are given; all ones is a missing reading.\n"
+    )
     return title + _array("SENSOR_BITS", "natural_array_t", rows, f"1 to {parameters.sensors}")
 
 
@@ -183,6 +199,7 @@ def _partitions(images: Sequence[Image]) -> str:
 
 def _memory_files(images: Sequence[Image]) -> str:
     sensors = images[0].machine.parameters.sensors
+    sensors = sensors if images[0].machine.parameters.has_tables else 0
     columns = f", board<b>_{column_name(0, sensors, sensors).removeprefix('board0_')}" if sensors else ""
     seeds = "rng_seeds.mif" if images[0].machine.parameters.shared else "board<b>_rng_seeds.mif"
     return (

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from machines.bm1 import Start, StopReason
-from machines.parameters import PriorMode, RngKind, RngReset
+from machines.parameters import PriorMode, RngKind, RngReset, SensorMode
 from machines.reference import ReferenceBM1
 from toolchain.build import assemble, build_deployment
 from toolchain.checks.check import check_deployment, check_model, line_name, reading
@@ -19,7 +19,7 @@ from toolchain.command import app
 from toolchain.errors import ModelError
 from toolchain.models.conditional import normal, wrapped_normal
 from toolchain.models.model import Known, Model, PriorSelect, cell_centres, dimension, interval
-from toolchain.options import BuildOptions, Scale, SensorMode
+from toolchain.options import BuildOptions, Scale
 from toolchain.outputs.mif import Mif, mif_text
 
 OPTIONS = BuildOptions(uri="ws://robot:9090", topic="/readings", type="std_msgs/Float64MultiArray")
@@ -385,8 +385,12 @@ def test_several_mistakes_at_once():
     ]
     (finding,) = check_model(model(), replace(OPTIONS, interface=(1, 9)))
     assert "the model is larger than the interface 1x9" in finding.what
-    (finding,) = check_model(model(), replace(OPTIONS, sensor_mode=SensorMode.CELL))
-    assert "--sensor-mode cell" in finding.what
+    (finding,) = check_model(model(), replace(OPTIONS, sensor_mode=SensorMode.CELL, scale=Scale.ADDRESS))
+    assert "--scale address does not go with --sensor-mode cell" in finding.what
+    (finding,) = check_model(
+        model(), replace(OPTIONS, replicas=200, sensor_mode=SensorMode.CELL, interface=(20, 30))
+    )
+    assert "the model is larger than the interface 20x30" in finding.what
 
 
 def test_a_range_that_does_not_fit_its_bits_is_named():
