@@ -95,7 +95,7 @@ def test_what_is_wrong_is_told_behind_a_known_envelope_too():
         b'{"a":"' + b"x" * 2000 + b'"}',
     ):
         assert isinstance(core.receive(CANONICAL + message + b"}", 0.0), Unusable)
-    for end in (b"", b"}}", b"} x"):
+    for end in (b"", b"]", b"}}", b"} x"):
         assert isinstance(core.receive(CANONICAL + b"{}" + end, 0.0), Unusable)
     assert core.receive(CANONICAL + b'{"a":[NaN,1e999]}}', 0.0) == MessageReceived(
         "/t", {"a": [None, None]}, (1,)

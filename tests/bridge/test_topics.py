@@ -224,6 +224,40 @@ async def test_a_wait_in_vain_can_be_given_up_and_begun_again():
         assert (await subscription.next(5)).msg == {"n": 1}
 
 
+async def test_each_wait_ends_at_its_own_time():
+    async with FakeRosbridge() as fake, connect(fake.uri) as ros, asyncio.timeout(30):
+        subscription = ros.subscribe("/a", "p/T")
+        await fake.wait_for_op("subscribe")
+        await fake.publish("/a", {"n": 1})
+        await subscription.next(0.2)  # its alarm rings in the middle of the next wait
+        begun = time.monotonic()
+        with pytest.raises(NoMessageError, match="within 0.5 s"):
+            await subscription.next(0.5)
+        assert time.monotonic() - begun >= 0.5
+        await fake.publish("/a", {"n": 2})
+        await subscription.next(600)  # its alarm is far away
+        with pytest.raises(NoMessageError, match="within 0.1 s"):
+            await subscription.next(0.1)
+        await fake.publish("/a", {"n": 3})
+        await subscription.next(0.1)  # its alarm rings while nobody has a limit
+        waiting = asyncio.create_task(anext(subscription))
+        await asyncio.sleep(0.3)
+        assert not waiting.done()
+        await fake.publish("/a", {"n": 4})
+        assert (await waiting).msg == {"n": 4}
+
+
+async def test_who_may_not_wait_does_not_end_anothers_wait():
+    async with FakeRosbridge() as fake, connect(fake.uri) as ros, asyncio.timeout(30):
+        subscription = ros.subscribe("/a", "p/T")
+        first = asyncio.create_task(subscription.next(0.3))
+        await asyncio.sleep(0)
+        with pytest.raises(ConcurrentReadError):
+            await subscription.next(600)
+        with pytest.raises(NoMessageError, match="within 0.3 s"):
+            await first
+
+
 @pytest.mark.parametrize(
     ("rosapi", "prepare", "said"),
     [

@@ -95,6 +95,19 @@ def test_a_topic_that_is_not_advertised_any_more_is_not_published() -> None:
     assert hub.publisher.envelopes == {}
 
 
+@pytest.mark.parametrize("begun", [b'{"op":"publish","msg":', b'{"msg":', b'{"topic":"/t","msg":'])
+def test_what_says_the_rest_after_its_message_has_no_envelope(begun: bytes) -> None:
+    hub = Hub(knowing=True)
+    rest = {"op": "publish", "topic": "/t"}
+    for key in [key for key in rest if f'"{key}"'.encode() in begun]:
+        del rest[key]
+    hub.say(begun + b'{"n":1},' + json.dumps(rest).encode()[1:])
+    assert [orjson.loads(payload)["msg"] for payload in hub.heard()] == [{"n": 1}]
+    hub.say(begun + b'{"n":2}}')
+    assert hub.heard() == []
+    assert hub.publisher.refused == 1
+
+
 def test_each_topic_has_its_envelope_and_one_alone() -> None:
     hub = Hub(knowing=True)
     said = [
