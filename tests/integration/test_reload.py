@@ -270,7 +270,7 @@ async def test_a_corrected_table_in_the_same_folder(stage, boat, tmp_path):
     await stage.nothing_left("hub")
 
 
-@pytest.mark.parametrize(("victim", "options"), [("board", ()), ("pcie-app", ()), ("board", ("--fused",))])
+@pytest.mark.parametrize(("victim", "options"), [("pcie-app", ()), ("board", ("--fused",))])
 async def test_a_death_while_boards_are_programmed(stage, boat, other_boat, victim, options):
     _, robot, master, runs = await looping(stage, boat, *options, witness=(boat, other_boat))
     robot._publishing.cancel()
