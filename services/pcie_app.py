@@ -395,7 +395,11 @@ def machine_inputs(
         if given is None:
             array = np.full(shape, -1, dtype=np.int64)
         else:
-            array = np.array(given, dtype=np.int64)
+            try:
+                array = np.array(given, dtype=np.int64)
+            except OverflowError:
+                msg = f"The reading of {variable.name} has an address beyond all that a machine has"
+                raise FrameInputError(msg) from None
             if array.size != math.prod(shape) or (array.ndim == 0 and shape):
                 msg = (
                     f"The reading of {variable.name} has {array.size if array.ndim else 'one'} "

@@ -116,7 +116,11 @@ def _length(shape: tuple[int, ...]) -> str:
 
 
 def _holds_text(values: list[Any]) -> bool:
-    return any(isinstance(each, str) or (isinstance(each, list) and _holds_text(each)) for each in values)
+    """Whether there are strings, which NumPy would read as numbers; what lies deeper has no such shape anyway."""
+    return any(
+        isinstance(each, str) or (isinstance(each, list) and any(isinstance(inner, str) for inner in each))
+        for each in values
+    )
 
 
 def _addresses(variable: Variable, numbers: NDArray[np.float64]) -> NDArray[np.int64]:

@@ -147,9 +147,11 @@ def written_codes(likelihoods: NDArray[np.float64], *, prob_bits: int, scale: Sc
     Raises:
         ReadingError: One is no probability, or all of a row are 0.
     """
-    least = likelihoods.min()
-    if not (np.isfinite(likelihoods).all() and least >= 0):
-        message = f"{least:g} is no probability" if np.isfinite(least) else "there is one that is not finite"
+    if not np.isfinite(likelihoods).all():
+        message = "a likelihood is not finite"
+        raise ReadingError(message)
+    if (least := float(likelihoods.min())) < 0:
+        message = f"{least:g} is no probability"
         raise ReadingError(message)
     largest = likelihoods.max(axis=-1, keepdims=True)
     if scale is Scale.NONE:

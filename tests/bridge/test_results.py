@@ -374,3 +374,22 @@ class TestHostile:
             for heard in [*pairing.add_report(report), *pairing.add_posterior(result(1, 5))]:
                 if isinstance(heard, Posterior):
                     assert heard.latency_us is None or heard.latency_us >= 0
+
+
+def test_one_replica_by_itself():
+    both = Posterior(
+        probabilities=(0.25, 0.75, 0.0, 0.0, 1.0, 0.0),
+        labels=("replica", "s"),
+        sizes=(3, 2),
+        heard_ns=5,
+    )
+    assert both.replicas == 3
+    first = both.replica(0)
+    assert (first.probabilities, first.labels, first.sizes) == ((0.25, 0.75), ("s",), (2,))
+    assert first.best() == {"s": 1}
+    assert both.replica(2).best() == {"s": 0}
+    assert first.replica(0) is first
+    with pytest.raises(LabelError, match="replica 1 has no posterior in this frame"):
+        both.replica(1)
+    with pytest.raises(LabelError, match="replica 3 was asked for: there are 0 to 2"):
+        both.replica(3)

@@ -1,5 +1,6 @@
 """What pcie-app and publisher read from standard input, alone: readings, results, probabilities."""
 
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -9,6 +10,7 @@ import pytest
 from services.errors import InputLineError
 from services.pcie_app import reading_from_line
 from services.publisher import result_from_line
+from services.results import Inferred
 
 BIN = Path(sys.executable).parent
 
@@ -120,3 +122,44 @@ def test_flags_that_mean_nothing_are_refused_at_once(deployment, command, said):
     assert done.returncode == 2
     assert done.stderr.startswith(f"error: {said}")
     assert done.stderr.count("\n") == 1
+
+
+OF_REPLICAS = {
+    "counts": [1, 2, 3, 4],
+    "cycles": 9,
+    "reason": 1,
+    "replica_cycles": [9, 5],
+    "replica_reasons": [1, 3],
+}
+
+
+def test_a_result_of_replicas():
+    line = json.dumps({"number": 1, "boards": [OF_REPLICAS]}).encode()
+    counted, _ = result_from_line(line, 1, 4, 2)
+    assert counted.boards[0].replica_cycles == [9, 5]
+    assert Inferred(counted).posterior == pytest.approx([1 / 3, 2 / 3, 3 / 7, 4 / 7])
+
+
+@pytest.mark.parametrize(
+    ("changed", "replicas", "said"),
+    [
+        ({}, 1, "has 2 replicas' cycles on a board; expected a result of 1 replica$"),
+        ({"replica_cycles": [1]}, 2, "has 1 replicas' cycles on a board; expected a result of 2 replicas"),
+        ({"replica_reasons": [1, 9]}, 2, "is no result"),
+        ({"replica_cycles": [1, -1]}, 2, "is no result"),
+        (
+            {"replica_cycles": [1, 1, 1], "replica_reasons": [1, 1, 1]},
+            3,
+            "has 4 counts on a board of 3 replicas",
+        ),
+    ],
+)
+def test_no_result_of_replicas(changed, replicas, said):
+    line = json.dumps({"number": 1, "boards": [OF_REPLICAS | changed]}).encode()
+    with pytest.raises(InputLineError, match=f"line 3 of standard input {said}"):
+        result_from_line(line, 3, 4, replicas)
+
+
+def test_a_reading_may_be_rows():
+    reading = reading_from_line(b'{"addresses": [[1, -1], null, 3]}', 1)
+    assert reading.addresses == [[1, -1], None, 3]

@@ -1,0 +1,136 @@
+"""Replicas and readings for each line, in the services: rows of addresses in, posteriors one after the other out."""
+
+import json
+
+import numpy as np
+import orjson
+import pytest
+
+from bridge.results import read_frame_report, read_posterior
+from machines.bm1 import StopReason
+from machines.parameters import SensorMode
+from pcie_shim.errors import FrameInputError
+from services.errors import VariableError
+from services.frames import FrameAssembler
+from services.pcie_app import machine_inputs
+from services.records import BoardOutcome, FrameResult, Publish
+from services.result_picture import axes_of
+from services.results import FrameReport, Inferred, posterior_layout, times_of
+from toolchain.build import assemble
+from toolchain.models.model import Known, Model, PriorSelect, dimension
+from toolchain.options import BuildOptions
+
+
+def deployment(*, written=False, **changes):
+    """Two lines, one variable of three values, a prior that is selected or written."""
+    model = Model(
+        name="m",
+        searched=(dimension("s", size=2),),
+        known=(Known(name="K", table=np.full((3, 2), 1 / 3), on_missing="missing"),),
+        prior_select=None
+        if written
+        else PriorSelect(name="P", table=np.full((2, 2), 0.5), on_missing="missing"),
+    )
+    options = BuildOptions(uri="ws://r:9090", topic="/t", type="a/B", **changes)
+    return assemble(model, options).deployment
+
+
+CELLS = deployment(replicas=3, sensor_mode=SensorMode.CELL)
+
+
+def test_a_message_becomes_rows():
+    message = {"K": [0, 1, 2, 2, None, None], "P": [1, None, 0]}
+    reading = FrameAssembler(CELLS).take(0, message, 5, 6)
+    assert reading.addresses == [[0, 1, 2, 2, -1, -1], [1, -1, 0]]
+    inputs, rows = machine_inputs(CELLS, reading.addresses)
+    assert inputs.tolist() == [[[0, 1]], [[2, 2]], [[-1, -1]]]
+    assert rows == (1, 3, 0)
+
+
+def test_a_written_prior_is_for_all_replicas_or_each():
+    of = deployment(written=True, replicas=2, prior_mode="written", prior_path="belief")
+    for belief, codes in (([1, 2], [128, 255, 128, 255]), ([1, 2, 3, 0], [128, 255, 255, 0])):
+        reading = FrameAssembler(of).take(0, {"K": [0, 1], "belief": belief}, 5, 6)
+        assert np.frombuffer(reading.prior_codes, "<u2").tolist() == codes
+
+
+def test_a_wrong_length_names_the_variable_and_the_topic():
+    with pytest.raises(
+        VariableError, match=r"/t: variable K has 5 values, expected 6 \(3 replicas of 2 lines\)"
+    ):
+        FrameAssembler(CELLS).take(0, {"K": [0] * 5, "P": [0, 0, 0]}, 5, 6)
+    with pytest.raises(VariableError, match="variable P has 2 values, expected 3"):
+        FrameAssembler(CELLS).take(0, {"K": [0] * 6, "P": [0, 0]}, 5, 6)
+
+
+@pytest.mark.parametrize(
+    ("changes", "addresses", "inputs", "rows"),
+    [
+        ({}, [1, 0], [1], 0),
+        ({}, [None, None], [-1], 3),
+        ({"replicas": 2}, [[1, 2], None], [[1], [2]], (3, 3)),
+        ({"replicas": 2}, [None, [0, 1]], [[-1], [-1]], (0, 1)),
+        ({"sensor_mode": SensorMode.CELL}, [[1, 2], 1], [[1, 2]], 1),
+    ],
+)
+def test_what_the_driver_is_given(changes, addresses, inputs, rows):
+    found, row = machine_inputs(deployment(**changes), addresses)
+    assert (found.tolist(), row) == (inputs, rows)
+
+
+@pytest.mark.parametrize(
+    ("addresses", "sentence"),
+    [
+        ([[0] * 6], "has 1 readings; this deployment has 2 variables"),
+        ([[0] * 5, [0] * 3], "reading of K has 5 addresses; this deployment takes 6 of it"),
+        ([7, [0] * 3], "reading of K has one address; this deployment takes 6 of it"),
+        ([[0] * 6, [0] * 4], "reading of P has 4 addresses; this deployment takes 3 of it"),
+        ([[0] * 5 + [2**70], [0] * 3], "reading of K has an address beyond"),
+    ],
+)
+def test_rows_that_do_not_fit_are_refused(addresses, sentence):
+    with pytest.raises(FrameInputError, match=sentence):
+        machine_inputs(CELLS, addresses)
+
+
+def result(*boards) -> FrameResult:
+    return FrameResult(7, list(boards), 1, 2, 3, 4)
+
+
+def board(counts, cycles, reasons) -> BoardOutcome:
+    words = np.array(counts, "<u4").tobytes()
+    return BoardOutcome(words, max(cycles), int(reasons[0]), cycles, [int(reason) for reason in reasons])
+
+
+OVERFLOW, SLICE, IMPOSSIBLE = StopReason.OVERFLOW, StopReason.SLICE, StopReason.IMPOSSIBLE
+
+
+def test_posteriors_are_normalised_over_boards_and_by_replica():
+    # lines 0 and 1 on one board, line 2 on another; the last replica has no posterior
+    counted = result(
+        board([[10, 30], [4, 4], [0, 0]], [100, 8, 0], [OVERFLOW, OVERFLOW, IMPOSSIBLE]),
+        board([[100], [8], [0]], [1000, 16, 0], [SLICE, SLICE, IMPOSSIBLE]),
+    )
+    inferred = Inferred(counted)
+    assert inferred.posterior == pytest.approx([0.2, 0.6, 0.2, 1 / 3, 1 / 3, 1 / 3, 0, 0, 0])
+    assert (inferred.totals, inferred.best) == ([48, 108], 1)
+    nothing = Inferred(result(board([[0], [0]], [0, 0], [IMPOSSIBLE] * 2)))
+    assert (nothing.posterior, nothing.best, nothing.totals) == (None, -1, [0])
+
+
+def test_what_is_published_is_read_back():
+    counted = result(board([[1, 3], [0, 0], [2, 2]], [100, 0, 40], [OVERFLOW, IMPOSSIBLE, SLICE]))
+    inferred = Inferred(counted)
+    message = {"layout": posterior_layout(CELLS), "data": inferred.posterior.tolist()}
+    assert message["layout"]["dim"] == [
+        {"label": "replica", "size": 3, "stride": 6},
+        {"label": "s", "size": 2, "stride": 2},
+    ]
+    posterior = read_posterior(message, 0)
+    assert posterior.values.tolist() == [[0.25, 0.75], [0, 0], [0.5, 0.5]]
+    assert [axis.label for axis in axes_of(posterior, CELLS)] == ["replica", "s"]
+    publish = Publish(counted, 1, 2, 3, 4, 5)
+    said = FrameReport(CELLS, 2).message(publish, inferred, times_of(publish, 9, 0), 10)
+    (of_board,) = read_frame_report(json.loads(orjson.dumps(said)), 0).boards
+    assert of_board.replica_cycles == (100, 0, 40)
+    assert of_board.replica_stopped == ("overflow", "impossible", "slice")

@@ -1,0 +1,407 @@
+"""Replicas, and readings for each line: arrays become addresses by the one rule, and a build of each kind is what it says."""
+
+import base64
+import json
+import math
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from typer.testing import CliRunner
+
+from machines.encode import decode_code
+from machines.parameters import RngKind, SensorMode
+from machines.posterior import posterior
+from pcie_shim.programming_file import read_image
+from toolchain.address import to_address
+from toolchain.address_array import MISSING, to_addresses
+from toolchain.analysis.emulation import EmulatedBoards, one_replica
+from toolchain.analysis.readings import readings_of_lines, sample_readings
+from toolchain.analysis.resources import DEVICES, boards_needed, estimate, logic_of
+from toolchain.build import BuildError, assemble, build_deployment
+from toolchain.checks.check import check_deployment, check_model
+from toolchain.command import app
+from toolchain.deployment import REPLICA, Deployment, Stop, Variable, load_deployment
+from toolchain.errors import NotANumberError, ReadingError, ReadingMissingError, ValueOutOfRangeError
+from toolchain.models.fusion import exact_posterior
+from toolchain.models.model import Known, Model, PriorSelect, dimension
+from toolchain.options import BuildOptions, Scale
+from toolchain.quantise import quantise, written_prior
+
+OPTIONS = BuildOptions(uri="ws://robot:9090", topic="/costs", type="stereo/Costs")
+CELL = replace(OPTIONS, sensor_mode=SensorMode.CELL)
+THRESHOLD = replace(OPTIONS, sensor_mode=SensorMode.THRESHOLD)
+DOCS = Path(__file__).parents[2] / "docs"
+
+
+def model(lines=6, *, select=False, **known):
+    random = np.random.default_rng(2)
+    tables = [random.dirichlet(np.full(5, 0.8), lines).T for _ in range(2)]
+    return Model(
+        name="disparity",
+        searched=(dimension("disparity", size=lines),),
+        known=(Known(name="left", table=tables[0], **known), Known(name="right", table=tables[1])),
+        prior_select=PriorSelect(name="light", table=random.dirichlet(np.ones(lines), 2)) if select else None,
+    )
+
+
+def deployment_of(options, **changes) -> Deployment:
+    return assemble(model(**changes), options).deployment
+
+
+# Arrays to addresses
+
+
+def variable_of(deployment, **changes) -> Variable:
+    return deployment.variables[0].model_copy(update=changes)
+
+
+@given(
+    st.lists(st.floats(-4, 9) | st.integers(-4, 9), min_size=6, max_size=6),
+    st.sampled_from(["clamp", "missing", "error"]),
+    st.sampled_from([None, 5]),
+)
+def test_every_number_becomes_what_it_becomes_alone(numbers, on_range, period):
+    deployment = deployment_of(replace(OPTIONS, replicas=6))
+    variable = variable_of(
+        deployment, offset=0.5, step=0.75, on_range=on_range, on_missing="missing", period=period
+    )
+    try:
+        alone = [to_address(variable, number) for number in numbers]
+    except ValueOutOfRangeError:
+        with pytest.raises(ValueOutOfRangeError, match=r"value \d of the array"):
+            to_addresses(deployment, variable, numbers)
+        return
+    expected = [MISSING if address is None else address for address in alone]
+    assert to_addresses(deployment, variable, numbers) == (None if set(expected) == {MISSING} else expected)
+
+
+@pytest.mark.parametrize(
+    "given_as",
+    [
+        lambda numbers: numbers,
+        tuple,
+        lambda numbers: [numbers[:6], numbers[6:]],
+        lambda numbers: np.array(numbers, np.uint8),
+        lambda numbers: np.array(numbers, np.float32).reshape(2, 6),
+        bytes,
+        lambda numbers: base64.b64encode(bytes(numbers)).decode(),
+    ],
+)
+def test_an_array_may_come_in_every_form(given_as):
+    deployment = deployment_of(replace(CELL, replicas=2))
+    numbers = [0, 1, 2, 3, 4, 0, 4, 3, 2, 1, 0, 2]
+    assert to_addresses(deployment, deployment.variables[0], given_as(numbers)) == numbers
+
+
+def test_names_of_states_may_stand_for_numbers():
+    deployment = deployment_of(replace(OPTIONS, replicas=2), states=("a", "b", "c", "d", "e"))
+    assert to_addresses(deployment, deployment.variables[0], ["b", "e"]) == [1, 4]
+    with pytest.raises(NotANumberError, match="an array with strings"):
+        to_addresses(deployment, deployment.variables[0], ["b", "f"])
+
+
+def test_a_reading_is_missing_on_all_lines_or_on_none():
+    deployment = deployment_of(replace(CELL, replicas=2))
+    variable = variable_of(deployment, on_missing="missing")
+    none = [None] * 6
+    assert to_addresses(deployment, variable, [*none, *range(5), 0]) == [MISSING] * 6 + [0, 1, 2, 3, 4, 0]
+    assert to_addresses(deployment, variable, [math.nan] * 12) is None
+    assert to_addresses(deployment, variable, None) is None
+    assert to_addresses(deployment, variable, []) is None
+    with pytest.raises(ReadingMissingError, match="missing on some lines of replica 1 and not on others"):
+        to_addresses(deployment, variable, [*none, None, 0, 1, 2, 3, 4])
+    with pytest.raises(ReadingMissingError, match="is absent or null, and this deployment needs it"):
+        to_addresses(deployment, deployment.variables[0], [*none, *range(5), 0])
+    with pytest.raises(ReadingMissingError):
+        to_addresses(deployment, deployment.variables[0], None)
+
+
+def test_of_replicas_one_may_be_missing():
+    deployment = deployment_of(replace(OPTIONS, replicas=3))
+    variable = variable_of(deployment, on_missing="missing")
+    assert to_addresses(deployment, variable, [1, None, 2]) == [1, MISSING, 2]
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "sentence"),
+    [
+        ([1, 2], ReadingError, r"variable left has 2 values, expected 12 (2 replicas of 6 lines)"),
+        ([[1] * 6] * 3, ReadingError, "variable left has 3 x 6 values, expected 12"),
+        (7, NotANumberError, "variable left is of type int, expected an array of 12"),
+        ({"a": 1}, NotANumberError, "variable left is of type dict, expected an array of 12"),
+        ("no base 64", NotANumberError, "variable left is of type str"),
+        ([{}] * 12, NotANumberError, "variable left is no array of 12"),
+        ([["1"] * 6] * 2, NotANumberError, "variable left is an array with strings"),
+        ([[[1]] * 6] * 2, ReadingError, "variable left has 2 x 6 x 1 values"),
+        ([[1, 2], [3]], NotANumberError, "variable left is no array of 12"),
+        (
+            [0] * 11 + [5],
+            ValueOutOfRangeError,
+            "5.0 is out of range, expected 0 to 4 in steps of 1 (value 1, 5 of the",
+        ),
+        ([0] * 11 + [1e308 * 10], ValueOutOfRangeError, "inf is out of range"),
+    ],
+)
+def test_what_is_no_such_array_is_said(value, error, sentence):
+    deployment = deployment_of(replace(CELL, replicas=2))
+    with pytest.raises(error) as caught:
+        to_addresses(deployment, deployment.variables[0], value)
+    assert sentence in str(caught.value)
+
+
+@pytest.mark.parametrize("scale", [Scale.COLUMN, Scale.NONE])
+def test_likelihoods_become_codes(scale):
+    deployment = deployment_of(replace(THRESHOLD, scale=scale))
+    likelihoods = [0.5, 0.25, 0.0, 0.1, 0.05, 0.5]
+    codes = to_addresses(deployment, deployment.variables[0], likelihoods)
+    largest = max(likelihoods) if scale is Scale.COLUMN else 1
+    assert decode_code(codes, 8) == pytest.approx(np.array(likelihoods) / largest, abs=2**-8)
+
+
+@pytest.mark.parametrize(
+    ("scale", "value", "sentence"),
+    [
+        (Scale.COLUMN, [0.0] * 6, "variable left: all lines have 0, so that none is possible"),
+        (Scale.COLUMN, [0.1, -0.1, 0, 0, 0, 0], "variable left: -0.1 is no probability"),
+        (Scale.COLUMN, [0.1, math.inf, 0, 0, 0, 0], "variable left: a likelihood is not finite"),
+        (Scale.NONE, [0.1, 1.5, 0, 0, 0, 0], "variable left: 1.5 is no probability, expected 0 to 1"),
+    ],
+)
+def test_likelihoods_that_are_none_are_said(scale, value, sentence):
+    deployment = deployment_of(replace(THRESHOLD, scale=scale))
+    with pytest.raises(ReadingError) as caught:
+        to_addresses(deployment, deployment.variables[0], value)
+    assert sentence in str(caught.value)
+
+
+def test_written_priors_of_replicas():
+    one = written_prior([1, 2, 4], lines=3, prob_bits=8)
+    assert written_prior([1, 2, 4], lines=3, prob_bits=8, replicas=2).tolist() == [one.tolist()] * 2
+    both = written_prior([1, 2, 4, 3, 3, 0], lines=3, prob_bits=8, replicas=2)
+    assert both.tolist() == [one.tolist(), [255, 255, 0]]
+    with pytest.raises(ReadingError, match="for each of 3 lines, or for each of 2 replicas"):
+        written_prior([1, 2], lines=3, prob_bits=8, replicas=2)
+    with pytest.raises(ReadingError, match="only zeros"):
+        written_prior([1, 2, 4, 0, 0, 0], lines=3, prob_bits=8, replicas=2)
+
+
+# Builds
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        replace(OPTIONS, replicas=3),
+        replace(CELL, partitions=2),
+        replace(CELL, replicas=3, partitions=2),
+        replace(THRESHOLD, replicas=2, prob_bits=6),
+        replace(CELL, rng=RngKind.TABLE, shared=False, rng_banks=2, max_cycles=60000),
+    ],
+)
+def test_a_build_of_each_kind(tmp_path, options):
+    built = build_deployment(model(select=True), tmp_path, options)
+    deployment = load_deployment(tmp_path)
+    assert deployment == built.deployment
+    text = (tmp_path / "deployment.toml").read_text()
+    assert ("replicas = " in text) == (options.replicas > 1)
+    assert ("sensor_mode = " in text) == (options.sensor_mode is not SensorMode.COLUMN)
+    for at, image in enumerate(read_image(deployment.image_path(i)) for i in range(options.partitions)):
+        parameters = image.machine.parameters
+        assert (parameters.replicas, parameters.sensor_mode) == (options.replicas, options.sensor_mode)
+        tables = sorted(tmp_path.glob(f"bm_arch/Memory_MIFs/board{at}_column*.mif"))
+        assert len(tables) == (2 if parameters.has_tables else 0)
+    package = (tmp_path / "bm_arch/bm1_parameters.vhd").read_text()
+    assert re.search(rf"constant REPLICAS +: positive := {options.replicas};", package)
+    assert f"SENSOR_{options.sensor_mode.upper()};" in package
+    findings = check_deployment(tmp_path)
+    assert [finding for finding in findings if finding.severity.name != "NOTE"] == []
+    assert check_model(model(select=True), options) is not None
+
+
+def test_a_machine_of_cells_computes_what_the_model_says(tmp_path):
+    build_deployment(model(), tmp_path, replace(CELL, replicas=2, prob_bits=12, counter_bits=16))
+    (image,) = [read_image(tmp_path / "boards/board0.bm")]
+    random = np.random.default_rng(0)
+    readings = random.integers(0, 5, (2, 2, 6))
+    found = posterior(image.machine, readings, target_count=60000, max_cycles=2**22)
+    for at in range(2):
+        exact = exact_posterior(model(), tuple(readings[at]))
+        assert found[at] == pytest.approx(exact, abs=0.01)
+
+
+def test_columns_are_normalised_as_a_whole():
+    quantised = quantise(model(), scale=CELL.scaling, sensor_mode=SensorMode.CELL)
+    for table, known in zip(quantised.tables, model().known, strict=True):
+        assert decode_code(table[:5], 8) == pytest.approx(known.table / known.table.max(), abs=2**-8)
+    assert quantise(model(), scale=Scale.COLUMN, sensor_mode=SensorMode.THRESHOLD).tables == ()
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        (replace(CELL, scale=Scale.ADDRESS), "--scale address does not go with --sensor-mode cell: "),
+        (
+            replace(THRESHOLD, scale=Scale.ADDRESS),
+            "--scale address does not go with --sensor-mode threshold: ",
+        ),
+        (
+            replace(CELL, replicas=3, interface=(35, 18)),
+            "a board needs 36 inputs and 18 results (2 known variables and 6 lines on a board, 3 times); use --interface 36x18",
+        ),
+        (
+            replace(OPTIONS, replicas=3, interface=(9000, 18)),
+            "9000x18 is larger than the register map's 8192x4096",
+        ),
+    ],
+)
+def test_what_is_impossible_is_one_sentence(options, sentence):
+    with pytest.raises(BuildError) as caught:
+        assemble(model(), options)
+    assert sentence in str(caught.value)
+
+
+def test_more_than_the_register_map_holds_is_refused_with_a_way_out():
+    with pytest.raises(
+        BuildError, match=r"room for 8192 and 4096: use more --partitions or fewer --replicas"
+    ):
+        assemble(model(40), replace(CELL, replicas=200))
+    assemble(model(40), replace(CELL, replicas=200, partitions=2))
+
+
+def test_a_searched_variable_may_not_be_called_as_the_replicas_are():
+    named = Model(
+        name="m", searched=(dimension(REPLICA, size=2),), known=(Known(name="K", table=np.full((2, 2), 0.5)),)
+    )
+    assemble(named, OPTIONS)
+    with pytest.raises(BuildError, match="a searched variable is called 'replica'"):
+        assemble(named, replace(OPTIONS, replicas=2))
+
+
+def test_old_deployments_say_nothing_new():
+    """A deployment of one machine and a reading a column has the text and the hash that it always had."""
+    deployment = deployment_of(OPTIONS)
+    assert deployment.model_dump(mode="json")["machine"].keys().isdisjoint({"replicas", "sensor_mode"})
+
+
+# Regenerating
+
+
+@pytest.mark.parametrize("options", [replace(CELL, replicas=2), THRESHOLD, replace(OPTIONS, replicas=3)])
+def test_regenerated_memories_are_the_same(tmp_path, options):
+    source = """
+import numpy as np
+from toolchain.models.model import Known, Model, dimension
+
+def model():
+    table = np.random.default_rng(2).dirichlet(np.full(5, 0.8), 6).T
+    return Model(name="d", searched=(dimension("d", size=6),), known=(Known(name="left", table=table),))
+"""
+    (tmp_path / "case").mkdir()
+    (tmp_path / "case/model.py").write_text(source)
+    flags = ["--uri", "ws://r:9090", "--topic", "/t", "--type", "a/B"]
+    flags += ["--sensor-mode", options.sensor_mode.value, "--replicas", str(options.replicas)]
+    runner = CliRunner()
+    out = tmp_path / "out"
+    built = runner.invoke(app, ["build", str(tmp_path / "case"), "-o", str(out), *flags])
+    assert built.exit_code == 0, built.output
+    before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+    again = runner.invoke(app, ["regenerate", "memories", str(out), "--model", str(tmp_path / "case")])
+    assert again.exit_code == 0, again.output
+    assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
+
+
+# What is said beforehand
+
+
+@pytest.mark.parametrize(
+    "options", [replace(CELL, replicas=3, partitions=2), replace(THRESHOLD, partitions=2)]
+)
+def test_drawn_readings_give_the_models_posterior(options):
+    of = model()
+    built = assemble(of, replace(options, prob_bits=12, counter_bits=16))
+    machines = [one_replica(image.machine) for image in built.images]
+    drawn = sample_readings(of, 12, seed=4)
+    readings = readings_of_lines(drawn, of, machines[0], scale=Scale.COLUMN, seed=4)
+    boards = EmulatedBoards(machines, target_count=60000, max_cycles=2**22, stop=Stop.SLICES)
+    for frame in range(12):
+        addresses, row = readings.of_model(frame)
+        exact = exact_posterior(of, addresses, prior_address=row)
+        found = boards.run(*readings.of_machine(frame, machines[0]), bank=frame)
+        assert found.posterior == pytest.approx(exact, abs=0.015)
+    if options.sensor_mode is SensorMode.CELL:
+        every = np.arange(12)
+        assert np.array_equal(readings.addresses[every, :, drawn.lines], drawn.addresses)
+
+
+def test_replicas_share_the_generators_and_multiply_the_rest():
+    one = assemble(model(), CELL).images[0].machine.parameters
+    ten = replace(one, replicas=10)
+    alone, together = (
+        {part.name: part for part in logic_of(each, interface_words=60).parts} for each in (one, ten)
+    )
+    assert together["generators"] == alone["generators"]
+    assert together["cells"].alms == pytest.approx(10 * alone["cells"].alms)
+    assert together["counters"].registers == 10 * alone["counters"].registers
+    assert together["control"].registers > alone["control"].registers
+    device = DEVICES["proce-v-d8"]
+    small, large = (estimate(each, device, interface=(120, 1200)) for each in (one, ten))
+    assert large.table_bits == 10 * small.table_bits
+    assert (
+        estimate(
+            replace(one, sensor_mode=SensorMode.THRESHOLD, sensor_bits=(8, 8)), device, interface=(12, 12)
+        ).table_bits
+        == 0
+    )
+    per_column = replace(one, sensor_mode=SensorMode.COLUMN)
+    inputs = [
+        next(part for part in logic_of(each, interface_words=6).parts if part.name == "control").registers
+        for each in (per_column, one)
+    ]
+    assert inputs[1] - inputs[0] == 5 * sum(one.sensor_bits)
+
+
+def test_a_device_gets_as_many_boards_as_the_register_map_needs():
+    device = DEVICES["proce-v-d8"]
+    parameters = assemble(model(40), CELL).images[0].machine.parameters
+    parameters = replace(parameters, replicas=200, prob_bits=2, counter_bits=2)
+    count, why = boards_needed(parameters, device)
+    assert count == 2
+    assert "room for 20 lines a board" in why
+    with pytest.raises(BuildError, match="not even one line of 256 replicas fits the register map"):
+        boards_needed(replace(parameters, replicas=256, sensor_bits=(3,) * 40), device)
+
+
+@pytest.mark.parametrize("mode", ["cell", "threshold"])
+def test_inspect_explains_such_a_deployment(tmp_path, mode):
+    page = (DOCS / "toolchain.md").read_text()
+    (example,) = re.findall(r"```python\n(# disparity/model\.py.*?)```", page, re.DOTALL)
+    (tmp_path / "disparity").mkdir()
+    (tmp_path / "disparity/model.py").write_text(example)
+    runner = CliRunner()
+    flags = ["--uri", "ws://localhost:9090", "--topic", "/costs", "--type", "stereo/Costs"]
+    flags += ["--sensor-mode", mode, "--replicas", "3"]
+    out = tmp_path / "out"
+    built = runner.invoke(app, ["build", str(tmp_path / "disparity"), "-o", str(out), *flags])
+    assert built.exit_code == 0, built.output
+    looked = runner.invoke(app, ["inspect", str(out), "--frames", "5"])
+    if mode == "threshold":
+        assert looked.exit_code == 2
+        assert (
+            "holds no tables that readings could be drawn from: name the model with --model" in looked.stderr
+        )
+    else:
+        assert looked.exit_code == 0, looked.output
+        assert "Each board holds 3 of these machines around the same generators" in looked.stdout
+    named = runner.invoke(
+        app, ["inspect", str(out), "--frames", "5", "--model", str(tmp_path / "disparity"), "--json"]
+    )
+    assert named.exit_code == 0, named.output
+    assert json.loads(named.stdout)["accuracy"]["machine"]["total_variation"]["value"] < 0.1
+    recorded = runner.invoke(app, ["inspect", str(out), "--readings", str(tmp_path / "r.csv")])
+    assert recorded.exit_code == 2
+    assert "this machine's readings are arrays" in recorded.stderr
