@@ -86,21 +86,20 @@ async def works_on_goals(uri: str) -> None:
                 await say(op="action_result", values={"sequence": [0, 1, 1]}, status=4, result=True, **common)
 
 
-boat = publishes("/boat/sensors", "boat_msgs/Sensors", {"D1": 5}, {"D1": 6, "last": True})
-laser = publishes("/scan", "sensor_msgs/LaserScan", {"header": {"frame_id": "laser"}, "ranges": [0.5, 1.5]})
+poses = publishes("/pose", "geometry_msgs/PointStamped", {"point": {"x": 0.8}}, {"point": {"x": 0.9}})
 
 #: By heading: who plays the robot, and what is printed.
 PLAYED: dict[str, tuple[Company | None, str]] = {
-    "Subscribe": (boat, "'D1': 6"),
+    "Subscribe": (poses, "/pose {'x': 0.9}"),
     "Publish": (None, ""),
     "Long arrays": (None, "0.5 float64"),
-    "Serialised messages": (laser, "laser [0.5 1.5]"),
+    "Serialised messages": (None, "laser [0.5 1.5]"),
     "Services": (None, "{'sum': 3}\nservice /add at ws://"),
     "Find a variable in messages": (
         None,
         "D1 (True, 7)\ny (True, 2.5)\npose.position.x (True, 1.5)\nranges[1] (True, 0.5)\ndata[2] (True, 3)\n",
     ),
-    "Several robots": (boat, "two {'D1': 6, 'last': True}"),
+    "Several robots": (poses, "two {'x': 0.9}"),
     "Quality of service (ROS 2)": (None, "{'data': 'here be dragons'}"),
 }
 ELSEWHERE = {"Actions (ROS 2)", "TLS, tokens, proxies"}
