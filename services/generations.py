@@ -6,6 +6,7 @@ A run's deployments are numbered; the master counts them, and says its number wh
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Generic, TypeVar
 
@@ -90,3 +91,26 @@ class Generations(Generic[Made]):
         except KeyError:
             msg = f"generation {number} was not prepared here"
             raise NotPreparedError(msg) from None
+
+
+@dataclass(slots=True)
+class InForce:
+    """The deployment that a run works by, as its master knows it; only a reload changes it.
+
+    Attributes:
+        deployment: The deployment.
+        folder: Where it comes from, as the user named it.
+        generation: How often the run has changed its deployment.
+        former_hash: Of the deployment before it, which a service that starts meanwhile may still have read.
+    """
+
+    deployment: Deployment
+    folder: Path
+    generation: int = 0
+    former_hash: str = ""
+
+    def replace(self, deployment: Deployment, folder: Path) -> None:
+        """Work by another one from now on."""
+        self.former_hash = self.deployment.hash
+        self.deployment, self.folder = deployment, folder
+        self.generation += 1

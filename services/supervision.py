@@ -33,7 +33,7 @@ RUN_DIRECTORY_VARIABLE = "BM_RUN_DIRECTORY"
 STATUS_SUFFIX = ".status.sock"
 CONTROL_SUFFIX = ".control.sock"
 KEPT = "deployment-"
-"""How the folders begin in which a run keeps the deployments of its children (`services.reload`)."""
+"""How the folders begin in which a run keeps the deployments of its children (`services.new_deployment`)."""
 
 RESTARTS = 3
 RESTARTS_WITHIN = 60.0

@@ -1,0 +1,66 @@
+"""What `master` prints of a result on standard output: a JSON object a line, or one sentence."""
+
+from __future__ import annotations
+
+import sys
+
+import orjson
+
+from services.errors import ServiceError
+from services.generations import InForce
+from services.records import Published
+from toolchain.deployment import Deployment
+
+
+def print_json(record: Published, in_force: InForce) -> None:
+    """Print a result as a line of JSON.
+
+    Raises:
+        BrokenPipeError: whoever read it has what it wanted.
+        ServiceError: standard output can't be written.
+    """
+    line = orjson.dumps(
+        {
+            "frame": record.number,
+            "best": cell(in_force.deployment, record.best_line),
+            "probability": record.best_probability,
+            "cycles": record.cycles,
+            "ms": round(record.total_ns / 1e6, 3),
+            "seen": record.seen,
+            "generation": in_force.generation,
+        }
+    )
+    try:
+        sys.stdout.buffer.write(line + b"\n")
+        sys.stdout.buffer.flush()
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        msg = f"standard output can't be written: {error.strerror or error}"
+        raise ServiceError(msg) from error
+
+
+def print_sentence(record: Published, in_force: InForce) -> None:
+    """Print a result for people."""
+    where = ", ".join(
+        f"{label} = {value:g}" for label, value in cell(in_force.deployment, record.best_line).items()
+    )
+    print(
+        f"frame {record.number}: most probable {where} (p = {record.best_probability:.3g}), "
+        f"{record.cycles} cycles, {record.total_ns / 1e6:.2f} ms",
+        flush=True,
+    )
+
+
+def cell(deployment: Deployment, line: int) -> dict[str, float]:
+    """The values that a line of the result stands for, by label.
+
+    Args:
+        deployment: whose result it is.
+        line: its number; the last dimension is the fastest.
+    """
+    values: dict[str, float] = {}
+    for dimension in reversed(deployment.result_dimensions):
+        line, index = divmod(line, dimension.size)
+        values[dimension.label] = dimension.value(index)
+    return dict(reversed(values.items()))
