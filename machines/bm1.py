@@ -14,6 +14,7 @@ from machines.parameters import BM1Parameters, PriorMode, RngKind, SensorMode
 CYCLES_MAX: Final = 2**63 - 1
 """Highest `max_cycles` and `run_until`: both are 64-bit registers that a signed number must hold."""
 
+_COLUMN: Final = SensorMode.COLUMN  # looked up in an enumeration it would cost every frame
 _Scalar = TypeVar("_Scalar", bound=np.generic)
 
 
@@ -237,7 +238,7 @@ def check_start(machine: BM1Machine, start: Start) -> None:
         StartError: Says which part, and what it may be.
     """
     parameters = machine.parameters
-    if parameters.replicas > 1 or parameters.sensor_mode is not SensorMode.COLUMN:
+    if parameters.replicas > 1 or parameters.sensor_mode is not _COLUMN:
         _check_inputs(parameters, start.addresses)
     else:
         if len(start.addresses) != parameters.sensors:
@@ -307,7 +308,7 @@ def check_resume(
 
 def addressed_codes(machine: BM1Machine, start: Start) -> npt.NDArray[np.uint16]:
     """The codes that a valid start's inputs select: uint16[columns, lines], row 0 the prior's; replicas before these."""
-    if machine.parameters.replicas > 1 or machine.parameters.sensor_mode is not SensorMode.COLUMN:
+    if machine.parameters.replicas > 1 or machine.parameters.sensor_mode is not _COLUMN:
         return _codes_of_inputs(machine, start)
     codes = np.empty((machine.parameters.columns, machine.parameters.lines), dtype=np.uint16)
     codes[0] = machine.prior[start.prior_address] if start.prior_codes is None else start.prior_codes

@@ -718,7 +718,11 @@ class MiniCluster:
     def _words(self, frame: FrameInput) -> tuple[bytes, list[bytes], bytes]:
         """Settings, each board's inputs, and the replicas' prior selects, as register words."""
         parameters = self._parameters
-        prior_address, selects = self._prior_selects(frame)
+        prior_address, selects = (
+            (frame.prior_address, b"")
+            if self._is_plain and isinstance(frame.prior_address, int)
+            else self._prior_selects(frame)
+        )
         for name, value, lowest, highest in (
             ("The target count", frame.target_count, 1, parameters.target_count_max),
             ("The most cycles", frame.max_cycles, 1, CYCLES_MAX),

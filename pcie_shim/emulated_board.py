@@ -77,6 +77,7 @@ class EmulatedBoard:
         self._results: npt.NDArray[np.uint32] = np.empty(0, np.uint32)
         self._outcomes: npt.NDArray[np.void] = np.empty(0, _REPLICA)
         self._sensors = struct.Struct("")
+        self._is_plain = True
         self._latched: dict[int, bytes] = {}
         self._error = ErrorCode.NONE
         # of the start or resume that runs, or ran last
@@ -187,7 +188,8 @@ class EmulatedBoard:
         lines = parameters.replicas * parameters.lines
         results = np.frombuffer(self._memory, "<u4", lines, rm.RESULTS)
         self._results = results.reshape(parameters.count_shape)
-        inputs = rm.SENSORS if is_plain(parameters) else rm.INPUTS
+        self._is_plain = is_plain(parameters)
+        inputs = rm.SENSORS if self._is_plain else rm.INPUTS
         self._allow(inputs, image.interface_sensors, _READ_WRITE)
         self._allow(rm.RESULTS, image.interface_results, _READ)
         several = parameters.replicas if parameters.replicas > 1 else 0
@@ -347,17 +349,16 @@ class EmulatedBoard:
         self._put(doorbell, number)
 
     def _inputs(self, parameters: BM1Parameters) -> tuple[int, ...] | npt.NDArray[np.int64]:
-        if is_plain(parameters):
+        if self._is_plain:
             return self._sensors.unpack_from(self._memory, rm.SENSORS)
         shape = parameters.input_shape
         words = np.frombuffer(self._memory, "<u4", math.prod(shape), rm.INPUTS)
         return words.reshape(shape).astype(np.int64)
 
     def _prior_address(self, of_one: int) -> int | tuple[int, ...]:
-        replicas = len(self._outcomes)
-        if not replicas:
+        if self._is_plain or not len(self._outcomes):
             return of_one
-        return tuple(np.frombuffer(self._memory, "<u4", replicas, rm.PRIOR_SELECTS).tolist())
+        return tuple(np.frombuffer(self._memory, "<u4", len(self._outcomes), rm.PRIOR_SELECTS).tolist())
 
     def _halted(self) -> Collection[int]:
         """The replicas that a resume leaves where they are."""
@@ -398,7 +399,7 @@ class EmulatedBoard:
         elif elapsed > CHUNK_S * 1.5e9:
             self._chunk = max(int(self._chunk * CHUNK_S * 1e9 / elapsed), _SHORTEST_CHUNK)
         self._results[:] = kernel.counts
-        if len(self._outcomes):
+        if not self._is_plain and len(self._outcomes):
             self._outcomes["reason"] = kernel.replica_reasons
             self._outcomes["cycles"] = kernel.replica_cycles
         self.running = reason is StopReason.SLICE and cycles != self._run_until
@@ -428,7 +429,7 @@ class EmulatedBoard:
     def interrupt_words(self) -> bytes:
         """What an interrupt carries: the registers from DONE to COMPUTE_NS, one count per line, and replicas' outcomes."""
         words = self._view[rm.DONE : rm.DONE + _OUTCOME.size].tobytes() + self._results.tobytes()
-        return words + self._outcomes.tobytes() if len(self._outcomes) else words
+        return words if self._is_plain else words + self._outcomes.tobytes()
 
     # ---- memory ---------------------------------------------------------------------------------------
 
