@@ -233,13 +233,13 @@ class Subscription(_Handle):
             self._deadline = inf
         if queue:
             return queue.popleft()
-        why = await self._why_silent() or self._session.said_since(begun)
+        why = await self._why_silent(begun)
         raise NoMessageError(
             f"no message of {self.topic} came from {self._session.uri} within {timeout:g} s{why}"
         )
 
-    async def _why_silent(self) -> str:
-        """What can be known about the topic's silence, as the end of a sentence."""
+    async def _why_silent(self, begun: float) -> str:
+        """What can be known about the topic's silence since a time, as the end of a sentence."""
         session = self._session
         if session.state is not State.CONNECTED:
             return f"; the connection is {session.state}: {session.last_error}"
@@ -258,9 +258,11 @@ class Subscription(_Handle):
                 found = await ask_rosapi(session, "publishers", {"topic": self.topic}, EXPLAIN_TIMEOUT)
                 if found.get("publishers") == []:
                     return "; nobody publishes it"
-        except TimeoutError:
-            pass
-        return ""
+        except TimeoutError:  # a server without rosapi says so at once
+            return session.said_since(begun) or (
+                f"; nor did it answer a call of rosapi within {EXPLAIN_TIMEOUT:g} s: is it a rosbridge server?"
+            )
+        return session.said_since(begun)
 
     def end(self) -> None:
         """End the iteration, after what waits in the queue."""
