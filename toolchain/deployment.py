@@ -157,8 +157,9 @@ class Variable(_Section):
     @model_validator(mode="after")
     def _addresses_fit(self) -> Self:
         if self.values > 2**self.bits - 1:
+            bits = "1 bit holds" if self.bits == 1 else f"{self.bits} bits hold"
             message = (
-                f"{self.name} serves {self.values} values, but {self.bits} bits hold {2**self.bits - 1} "
+                f"{self.name} serves {self.values} values, but {bits} {2**self.bits - 1} "
                 "beside the address of a missing reading"
             )
             raise ValueError(message)

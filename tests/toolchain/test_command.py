@@ -79,7 +79,7 @@ def test_same_input_same_bytes_though_time_passes(case):
         (["--bits", "K"], "error: --bits K: expected KEY=VALUE, such as --bits range=8\n"),
         (["--bits", "L=3"], "error: --bits L=3: the model has no such variable; it has K\n"),
         (["--bits", "K=17"], "error: --bits K=17: expected 1 to 16 bits\n"),
-        (["--bits", "K=1"], "error: variable 'K': K serves 2 values, but 1 bits hold 1 beside the address"),
+        (["--bits", "K=1"], "error: variable 'K': K serves 2 values, but 1 bit holds 1 beside the address"),
         (["--steps-per-clock", "257"], "error: steps_per_clock is 257"),
         (
             ["--rng-table", "a.mif"],

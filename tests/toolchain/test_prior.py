@@ -200,7 +200,7 @@ def test_options_that_do_not_fit(tmp_path, options, fields, sentence):
     ("make", "sentence"),
     [
         (lambda: PriorSelect(name="a", table=PRIORS * 2), "P.S . a. of address 0 sums to 2"),
-        (lambda: PriorSelect(name="a", table=PRIORS, bits=1), "serves 3 values, but 1 bits hold 1"),
+        (lambda: PriorSelect(name="a", table=PRIORS, bits=1), "serves 3 values, but 1 bit holds 1"),
         (lambda: PriorSelect(name="a", table=PRIORS[0]), "expected .values, lines."),
         (lambda: model(prior_select=PriorSelect(name="a", table=np.full((2, 3), 1 / 3))), "has 3 lines"),
         (lambda: model(prior_select=PriorSelect(name="heard", table=PRIORS)), "known variable 'heard' twice"),

@@ -495,7 +495,7 @@ def test_the_command_with_json(case):
 @pytest.mark.parametrize(
     ("arguments", "part"),
     [
-        (["--set", "bits=1"], "error: the model: variable 'K': K serves 2 values, but 1 bits hold 1"),
+        (["--set", "bits=1"], "line 5: variable 'K': K serves 2 values, but 1 bit holds 1"),
         (["--interface", "x"], "error: the model: --interface: 'x' is no interface"),
         (["--partitions", "9"], "error: the partitions: 4 lines can't be split over 9 boards"),
     ],
