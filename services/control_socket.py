@@ -1,7 +1,7 @@
-"""Orders to a running master, over a socket of its own in the run's folder: one JSON line in, one JSON object out.
+"""Orders to a running master, over a socket of its own: one JSON line in, one JSON object out.
 
-`master.control.sock` belongs to its user alone (0600). What comes over it is bounded in size, time and number; what is
-no order gets one sentence, and is done with.
+`master.control.sock` belongs to its user alone (0600), in the folder that BM_CONTROL_DIRECTORY names, else in the run's.
+What comes over it is bounded in size, time and number; what is no order gets one sentence, and is done with.
 """
 
 from __future__ import annotations
@@ -171,7 +171,7 @@ async def give_order(path: Path, order: ReloadOrder, *, timeout: float) -> str:
         msg = f"the master at {path} did not answer within {timeout:g} s; `status` says which deployment is in force"
         raise NotReloadedError(msg) from error
     except OSError as error:
-        msg = f"no master takes orders at {path} ({error.strerror or error}); is a master --loop running, with this BM_RUN_DIRECTORY?"
+        msg = f"no master takes orders at {path} ({error.strerror or error}); is a master --loop running, with this BM_CONTROL_DIRECTORY or BM_RUN_DIRECTORY?"
         raise ControlError(msg) from error
     if not data:
         msg = f"the master at {path} ended before it was done"

@@ -102,6 +102,12 @@ class ControlError(ServiceError):
     """What came over a control socket is no order, or the answer is none."""
 
 
+class OutdatedError(ServiceError):
+    """A master asks for what a service's folder holds by now, and the service has what was there before."""
+
+    exit_code = ExitCode.CHILD
+
+
 class StoppedError(ServiceError):
     """A signal asked the process to end; not a failure, but no success either."""
 

@@ -73,7 +73,7 @@ class FusedLink:
         """Tell the master something that ends nothing."""
         self.send(Notice(level, sentence))
 
-    def serve(self, deployment_hash: str) -> None:
+    def serve(self, deployment: Deployment) -> None:
         """There is no other master to greet."""
 
 

@@ -131,7 +131,9 @@ def reload_(
     directory: Annotated[
         Path | None,
         typer.Option(
-            "--directory", help="Run folder of the master (BM_RUN_DIRECTORY), as for `status`.", metavar="DIR"
+            "--directory",
+            help="Folder of the master's control socket: BM_CONTROL_DIRECTORY, or BM_RUN_DIRECTORY, of its own.",
+            metavar="DIR",
         ),
     ] = None,
 ) -> int:
@@ -142,13 +144,13 @@ def reload_(
     or damaged, 5 a board, 6 not now.
     """
     end_with_parent()
-    settings = load_settings(deployment=deployment, run_directory=directory)
+    settings = load_settings(deployment=deployment)
     folder = "" if settings.deployment is None else str(settings.deployment.absolute())
 
     async def order() -> int:
         from services.status import find_run
 
-        run = settings.run_directory or await find_run()
+        run = directory or settings.control_directory or settings.run_directory or await find_run()
         print(await give_order(control_socket(run), ReloadOrder(folder), timeout=RELOAD_TIME))
         return ExitCode.DONE
 

@@ -43,7 +43,7 @@ from services.records import (
     Switch,
     Trouble,
 )
-from services.serving import board_endpoints, deployment_for, endpoint_from
+from services.serving import board_endpoints, deployment_for, endpoint_from, outdated
 from services.settings import load_settings
 from services.standard_input import compute_lines
 from services.status_socket import (
@@ -54,6 +54,7 @@ from services.status_socket import (
     status_thread,
 )
 from services.supervision import end_with_parent, leave_private_directory
+from toolchain.deployment import Deployment
 
 ROLE = "pcie-app"
 
@@ -122,14 +123,15 @@ class PcieApp:
         self._selector = selectors.DefaultSelector()
 
     @property
-    def _hash(self) -> str:
-        return self._boards.generations.deployment.hash
+    def _deployment(self) -> Deployment:
+        return self._boards.generations.deployment
 
     def serve(self) -> int:
         """Serve until a signal raises in this thread.
 
         Raises:
             PcieShimError: the boards can't be opened, or one came back as another.
+            OutdatedError: the folder was changed, and a master asks for what is there now.
         """
         listener = listen(self._endpoint)
         listener.setblocking(False)
@@ -163,7 +165,7 @@ class PcieApp:
         self._master = connection
         self._greeted = False
         self._selector.register(connection, selectors.EVENT_READ)
-        connection.send(own_hello(ROLE, self._hash))
+        connection.send(own_hello(ROLE, self._deployment.hash))
 
     def _drop(self) -> None:
         if self._master is not None:
@@ -196,17 +198,27 @@ class PcieApp:
                 self._drop()
                 return
             for record in records:
-                if not self._greeted:
-                    check_hello(record, "master", self._hash, self._where)
-                    self._greeted = True
+                if self._greeted:
                     self._take(record)
-                    if self._progress.ready is not None:
-                        self._send(self._progress.ready)
                 else:
-                    self._take(record)
+                    self._greet(record)
         except (LocalSocketError, OtherPeerError) as error:
             master.send(Trouble(error.exit_code, str(error)))
             self._drop()
+
+    def _greet(self, record: AnyRecord) -> None:
+        try:
+            check_hello(record, "master", self._deployment.hash, self._where)
+        except OtherPeerError as error:
+            if (why := outdated(self._deployment, record)) is None:
+                raise
+            if self._master is not None:
+                self._master.send(Trouble(error.exit_code, str(error)))
+            raise why from error
+        self._greeted = True
+        self._take(record)
+        if self._progress.ready is not None:
+            self._send(self._progress.ready)
 
     def _take(self, record: AnyRecord) -> None:
         match record:
@@ -261,7 +273,10 @@ def pcie_app(
     board_timeout: options.BoardTimeout = None,
     reprogram: Annotated[
         bool,
-        typer.Option("--reprogram", help="Program boards that hold another image, instead of refusing them."),
+        typer.Option(
+            "--reprogram/--no-reprogram",
+            help="Program boards that hold another image, instead of refusing them.",
+        ),
     ] = False,
     log_level: options.LogLevel = None,
 ) -> int:

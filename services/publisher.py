@@ -289,7 +289,7 @@ class Publisher:
             # no result is under way: the master has waited for them
             answer = self._generations.switch(record)
             self._topics.use(self._generations.deployment, self._generations.number)
-            self._link.serve(self._generations.deployment.hash)
+            self._link.serve(self._generations.deployment)
             self._link.send(answer)
 
     def _tell(self, published: Published) -> None:
@@ -476,7 +476,7 @@ def publisher(
     )
     loaded = deployment_for(settings)
     if listen is not None:
-        link = listening(endpoint_from(listen, "--listen"), ROLE, loaded.hash)
+        link = listening(endpoint_from(listen, "--listen"), ROLE, loaded)
         return run_async(Publisher(settings, loaded, link).run())
     if sys.stdin.isatty():
         msg = "the publisher reads results from standard input, which is a terminal: pipe them in, or use --listen (publisher --help)"

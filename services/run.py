@@ -100,7 +100,8 @@ class Master:
             run_directory = settings.run_directory or peers.directory
             await sockets.enter_async_context(status_served(run_directory, ROLE, self.status))
             if not self._once:
-                await sockets.enter_async_context(control_served(run_directory, self._reloads.order))
+                control = settings.control_directory or run_directory
+                await sockets.enter_async_context(control_served(control, self._reloads.order))
             peers.start()
             if sys.stderr.isatty() and not self._once:
                 self._tasks.append(asyncio.ensure_future(self._show_progress()))

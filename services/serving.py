@@ -6,16 +6,17 @@ import asyncio
 import socket
 from collections.abc import Callable
 from types import TracebackType
-from typing import Protocol, Self
+from typing import Any, Protocol, Self
 
 from pcie_shim.endpoint import Endpoint, listen, parse_endpoint, remove_listener
 from pcie_shim.errors import PcieShimError
-from services.errors import OtherPeerError, SettingsError
+from services.errors import OtherPeerError, OutdatedError, SettingsError
 from services.local_socket import RecordProtocol, check_hello, own_hello
 from services.records import AnyRecord, Hello, Notice, Record, Trouble
 from services.settings import Settings
 from services.supervision import leave_private_directory
 from toolchain.deployment import Deployment, load_deployment
+from toolchain.errors import ToolchainError
 
 GREETING_TIME = 5.0
 """Seconds that who connects has to greet, before the place is free for another."""
@@ -41,7 +42,7 @@ class Link(Protocol):
     def notice(self, level: str, sentence: str) -> None:
         """Tell the master something that ends nothing."""
 
-    def serve(self, deployment_hash: str) -> None:
+    def serve(self, deployment: Deployment) -> None:
         """Greet later masters with another deployment from now on."""
 
     async def __aenter__(self) -> Self:
@@ -60,15 +61,18 @@ MakeLink = Callable[[Callable[[AnyRecord], None]], Link]
 class MasterLink:
     """Listens for a master, greets it, and passes its records on.
 
-    A second master is told that there is one already and is turned away; when a master goes, the next may come.
+    A second master is told that there is one already and is turned away; when a master goes, the next may come. A
+    service that was started before its folder was changed, and is asked for what is there now, ends by an error.
     """
 
     def __init__(
-        self, endpoint: Endpoint, role: str, deployment_hash: str, on_record: Callable[[AnyRecord], None]
+        self, endpoint: Endpoint, role: str, deployment: Deployment, on_record: Callable[[AnyRecord], None]
     ) -> None:
         self._endpoint = endpoint
         self._role = role
-        self._hash = deployment_hash
+        self._deployment = deployment
+        self._service: asyncio.Task[Any] | None = None
+        self._outdated: OutdatedError | None = None
         self._on_record = on_record
         self._master: RecordProtocol | None = None
         self._greeted = False
@@ -79,6 +83,7 @@ class MasterLink:
     async def __aenter__(self) -> Self:
         """Start listening."""
         loop = asyncio.get_running_loop()
+        self._service = asyncio.current_task()
         listener = self._listener = listen(self._endpoint)
 
         def make() -> RecordProtocol:
@@ -93,7 +98,11 @@ class MasterLink:
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Stop listening; take the socket's file away."""
+        """Stop listening; take the socket's file away.
+
+        Raises:
+            OutdatedError: that is why it ends.
+        """
         if self._server is not None:
             self._server.close()
         if self._master is not None:
@@ -102,13 +111,15 @@ class MasterLink:
         if self._listener is not None:
             remove_listener(self._endpoint, self._listener)
         leave_private_directory()
+        if self._outdated is not None and kind is asyncio.CancelledError:
+            raise self._outdated from None
 
     def _open(self, protocol: RecordProtocol) -> None:
         if self._master is not None:
             return  # it is told so when it greets: what is sent before might never be read
         self._master = protocol
         self._greeted = False
-        protocol.send(own_hello(self._role, self._hash))
+        protocol.send(own_hello(self._role, self._deployment.hash))
         asyncio.get_running_loop().call_later(GREETING_TIME, self._check_greeted, protocol)
 
     def _check_greeted(self, protocol: RecordProtocol) -> None:
@@ -122,9 +133,12 @@ class MasterLink:
             return
         if not self._greeted:
             try:
-                check_hello(record, "master", self._hash, f"{self._role} at {self._endpoint}")
+                check_hello(record, "master", self._deployment.hash, f"{self._role} at {self._endpoint}")
             except OtherPeerError as error:
                 protocol.send(Trouble(error.exit_code, str(error)))
+                self._outdated = outdated(self._deployment, record)
+                if self._outdated is not None and self._service is not None:
+                    self._service.cancel()
                 raise
             self._greeted = True
             self._on_record(record)
@@ -161,14 +175,35 @@ class MasterLink:
         """Tell the master something that ends nothing."""
         self.send(Notice(level, sentence))
 
-    def serve(self, deployment_hash: str) -> None:
+    def serve(self, deployment: Deployment) -> None:
         """Greet later masters with another deployment from now on."""
-        self._hash = deployment_hash
+        self._deployment = deployment
 
 
-def listening(endpoint: Endpoint, role: str, deployment_hash: str) -> MakeLink:
+def listening(endpoint: Endpoint, role: str, deployment: Deployment) -> MakeLink:
     """A link over a local socket that the service listens on."""
-    return lambda on_record: MasterLink(endpoint, role, deployment_hash, on_record)
+    return lambda on_record: MasterLink(endpoint, role, deployment, on_record)
+
+
+def outdated(deployment: Deployment, refused: AnyRecord) -> OutdatedError | None:
+    """Why a service that refused a master's greeting has to be started anew; None where that would not help.
+
+    Args:
+        deployment: what the service works by.
+        refused: the greeting.
+    """
+    if not isinstance(refused, Hello) or refused.deployment_hash == deployment.hash:
+        return None
+    try:
+        there = load_deployment(deployment.directory, images=False).hash
+    except (ToolchainError, OSError):
+        return None
+    if there != refused.deployment_hash:
+        return None
+    return OutdatedError(
+        f"{deployment.directory} was changed since this was started, from deployment {deployment.hash[:12]} to {there[:12]}, "
+        "and a master asks for what is there now; start this anew"
+    )
 
 
 def endpoint_from(text: str, flag: str) -> Endpoint:

@@ -53,6 +53,9 @@ class Settings(BaseSettings):
         default=False, description="subscriber, publisher and pcie-app inside the master's process"
     )
     run_directory: Path | None = Field(default=None, description="folder of the processes' status sockets")
+    control_directory: Path | None = Field(
+        default=None, description="folder of the master's control socket; the run directory without it"
+    )
     ready_timeout: Seconds = Field(
         default=10, description="seconds without a frame after which a process is not ready"
     )
@@ -60,7 +63,7 @@ class Settings(BaseSettings):
         default="info", description="what is logged; debug has a line for every frame"
     )
 
-    @field_validator("run_directory", mode="before")
+    @field_validator("run_directory", "control_directory", mode="before")
     @classmethod
     def _no_directory(cls, value: object) -> object:
         return value or None  # an empty variable means none, not the folder that one happens to stand in

@@ -126,7 +126,7 @@ class Subscriber:
         unpaired = self._unpaired
         answer = self._generations.switch(record)
         self._unpaired_before = unpaired - self._assembler.unpaired
-        self._link.serve(self._deployment.hash)
+        self._link.serve(self._deployment)
         return answer
 
     def status(self) -> ProcessStatus:
@@ -346,7 +346,7 @@ def subscriber(
         raise SettingsError(msg)
     if listen is not None:
         loaded = deployment_for(settings)
-        link = listening(endpoint_from(listen, "--listen"), ROLE, loaded.hash)
+        link = listening(endpoint_from(listen, "--listen"), ROLE, loaded)
         return run_async(Subscriber(settings, loaded, link).run())
     if settings.deployment is not None:
         loaded = deployment_for(settings)
