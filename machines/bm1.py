@@ -9,10 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from machines.errors import MachineError, ParameterError, StartError
-from machines.parameters import BM1Parameters, PriorMode, RngKind, SensorMode
-
-CYCLES_MAX: Final = 2**63 - 1
-"""Highest `max_cycles` and `run_until`: both are 64-bit registers that a signed number must hold."""
+from machines.parameters import CYCLES_MAX, BM1Parameters, PriorMode, RngKind, SensorMode
 
 _COLUMN: Final = SensorMode.COLUMN  # looked up in an enumeration it would cost every frame
 _Scalar = TypeVar("_Scalar", bound=np.generic)

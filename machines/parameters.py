@@ -24,6 +24,9 @@ RNG_BANKS_MAX: Final = 65536
 REPLICAS_MAX: Final = 256
 """Most machines on a board: the register map has room for the outcomes of so many."""
 
+CYCLES_MAX: Final = 2**63 - 1
+"""Highest `max_cycles` and `run_until`: both are 64-bit registers that a signed number must hold."""
+
 
 class RngKind(StrEnum):
     """How a column makes its random numbers. `machines.rng` says how each one works."""

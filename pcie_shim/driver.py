@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Final, Literal, NoReturn, Self
 
 import numpy as np
 
-from machines.bm1 import CYCLES_MAX, StopReason, first_slice, joint_reason
-from machines.parameters import PriorMode, SensorMode
+from machines.bm1 import StopReason, first_slice, joint_reason
+from machines.parameters import CYCLES_MAX, PriorMode, SensorMode
 from pcie_shim import register_map as rm
 from pcie_shim.doorbell import following
 from pcie_shim.endpoint import parse_endpoint

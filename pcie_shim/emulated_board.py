@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, Final, NoReturn
 
 import numpy as np
 
-from machines.bm1 import CYCLES_MAX, Start, StopReason, missing_inputs
+from machines.bm1 import Start, StopReason, missing_inputs
 from machines.errors import MachineError, StartError
 from machines.kernel import make_kernel
-from machines.parameters import PriorMode, RngReset
+from machines.parameters import CYCLES_MAX, PriorMode, RngReset
 from pcie_shim import register_map as rm
 from pcie_shim.doorbell import following
 from pcie_shim.errors import ImageError, PcieShimError

@@ -16,11 +16,20 @@ from contextlib import suppress
 from enum import StrEnum
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Self, TypeVar
+from urllib.parse import urlsplit
 
 import tomli_w
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from machines.parameters import COUNTER_BITS_MAX, REPLICAS_MAX, PriorMode, RngKind, RngReset, SensorMode
+from machines.parameters import (
+    COUNTER_BITS_MAX,
+    CYCLES_MAX,
+    REPLICAS_MAX,
+    PriorMode,
+    RngKind,
+    RngReset,
+    SensorMode,
+)
 from toolchain.errors import DamagedDeploymentError, DeploymentError, DeploymentVersionError
 from toolchain.toml_file import parse_toml, read_text, validate
 
@@ -43,7 +52,11 @@ _INTERFACE = re.compile(r"([1-9]\d{0,4})x([1-9]\d{0,5})")
 
 
 def _websocket_uri(uri: str) -> str:
-    if not re.fullmatch(r"wss?://[^\s/?#]+\S*", uri):
+    try:
+        is_whole = bool(urlsplit(uri).hostname) and urlsplit(uri).port != 0
+    except ValueError:  # a port beyond 65535, half an IPv6 address
+        is_whole = False
+    if not is_whole or not re.fullmatch(r"wss?://[^\s/?#]+\S*", uri):
         message = f"{uri!r} is no WebSocket URI; expected one like 'ws://robot:9090'"
         raise ValueError(message)
     return uri
@@ -205,7 +218,7 @@ class MachineSection(_Section):
     shared: bool = True
     steps_per_clock: int = Field(default=8, ge=1)
     target_count: int = Field(default=255, ge=1)
-    max_cycles: int = Field(default=2**17, ge=1)
+    max_cycles: int = Field(default=2**17, ge=1, le=CYCLES_MAX)
     stop: Choice[Stop] = Stop.SLICES
     sensor_mode: Choice[SensorMode] = Field(
         default=SensorMode.COLUMN, exclude_if=lambda mode: mode == SensorMode.COLUMN

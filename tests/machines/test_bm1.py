@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from machines.bm1 import CYCLES_MAX, BM1Machine, Start, StopReason
+from machines.bm1 import BM1Machine, Start, StopReason
 from machines.errors import ParameterError, StartError
-from machines.parameters import BM1Parameters, PriorMode, RngKind
+from machines.parameters import CYCLES_MAX, BM1Parameters, PriorMode, RngKind
 
 
 def build(prior=None, tables=None, rng_table=None, **parameters):

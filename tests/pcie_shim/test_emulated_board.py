@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from machines.bm1 import CYCLES_MAX, BM1Kernel, Start, StopReason
+from machines.bm1 import BM1Kernel, Start, StopReason
 from machines.kernel import make_kernel
-from machines.parameters import PriorMode, RngKind, RngReset
+from machines.parameters import CYCLES_MAX, PriorMode, RngKind, RngReset
 from pcie_shim import emulated_board
 from pcie_shim import register_map as rm
 from pcie_shim.doorbell import following

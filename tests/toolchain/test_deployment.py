@@ -243,6 +243,13 @@ def test_no_format(folder):
         ("bits = 9\n", "", "the key 'bits' is missing in [[variable]] 2"),
         ("values = 360", "values = 512", "[[variable]] 2: B1 serves 512 values, but 9 bits hold 511"),
         ("ws://a:9090", "http://a:9090", "uri in [[source]] 1: 'http://a:9090' is no WebSocket URI"),
+        ("ws://a:9090", "ws://a:90900", "uri in [[source]] 1: 'ws://a:90900' is no WebSocket URI"),
+        ("ws://a:9090", "ws://[::1", "uri in [[source]] 1: 'ws://[::1' is no WebSocket URI"),
+        (
+            "max_cycles = 131072",
+            f"max_cycles = {2**63}",
+            "max_cycles = 9223372036854775808 in [machine]: expected less than or equal to 9223372036854775807",
+        ),
         ("boat_msgs/Sensors", "Sensors", "type in [[source]] 1: 'Sensors' is no message type"),
         ("step = 2.0", "step = 0.0", "step in [[searched]] 1: a step of 0"),
         ("step = 2.0", "step = nan", "step = nan in [[searched]] 1: expected a finite number"),
