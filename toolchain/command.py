@@ -17,8 +17,6 @@ from toolchain.learning.fit_options import FitMethod, FitOptions, FitPrior
 from toolchain.options import BuildOptions, OnMissing
 
 app = CommandLine(no_args_is_help=True)
-
-
 app.add_typer(regenerate.app, name="regenerate")
 app.add_typer(design.app)
 

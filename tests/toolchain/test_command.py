@@ -24,6 +24,7 @@ def model(size: int = 4):
                  known=(Known(name="K", table=np.full((2, size), 0.5)),))
 """
 TARGET = ["--uri", "ws://robot:9090", "--topic", "/readings", "--type", "std_msgs/msg/Float64"]
+BOAT = Path(__file__).parents[2] / "casestudies" / "boat"
 
 
 @pytest.fixture
@@ -312,3 +313,21 @@ def test_help_loads_no_numpy():
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60
     )
     assert done.stdout == "False\n"
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["check"],
+        ["inspect"],
+        ["regenerate", "project"],
+        ["build", "-o", "out", *TARGET],
+        ["fit", "-o", "f.toml", "--truth", "y=a", "--truth", "x=b", str(BOAT)],
+    ],
+)
+def test_a_path_that_the_system_refuses_is_one_sentence(arguments):
+    name = "x" * 300
+    result = CliRunner().invoke(app, [*arguments, name])
+    assert (result.exit_code, type(result.exception)) == (2, SystemExit)
+    assert result.stderr.splitlines()[-1].startswith("error: ")
+    assert "File name too long" in result.stderr

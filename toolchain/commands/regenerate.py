@@ -9,17 +9,14 @@ import typer
 
 from toolchain.commands import flags
 from toolchain.commands.refusals import one_sentence
+from toolchain.commands.usage import CommandLine
 from toolchain.deployment import FILE_NAME, Queue, Stop
 from toolchain.options import OnMissing
 
 if TYPE_CHECKING:
     from toolchain.regenerate import Changes
 
-app = typer.Typer(
-    no_args_is_help=True,
-    context_settings={"help_option_names": ["-h", "--help"]},
-    rich_markup_mode="markdown",
-)
+app = CommandLine(no_args_is_help=True)
 
 Directory: TypeAlias = Annotated[
     Path, typer.Argument(help="Folder of the deployment, which `toolchain build` wrote.", metavar="DIR")

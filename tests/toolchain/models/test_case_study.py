@@ -151,3 +151,9 @@ def test_what_a_model_is_written_with_comes_from_one_place():
     assert set(toolchain.models.__all__) <= set(dir(toolchain.models))
     with pytest.raises(ImportError, match="nothing_such"):
         from toolchain.models import nothing_such  # noqa: F401 - it isn't there
+
+
+def test_a_model_that_is_no_text_has_no_line(tmp_path):
+    (tmp_path / "model.py").write_bytes(b"\x7fELF\0\0")
+    with pytest.raises(ModelError, match=r"model.py: source code (string )?cannot contain null bytes"):
+        load_model(tmp_path, {})
