@@ -62,18 +62,6 @@ def to_addresses(deployment: Deployment, variable: Variable, value: object) -> l
     return flat
 
 
-def shape_words(deployment: Deployment, variable: Variable) -> str:
-    """Return how long a variable's array is to be, as a person says it: `24 (3 replicas of 8 lines)`."""
-    return _words(deployment.reading_shape(variable), variable, deployment.machine.replicas)
-
-
-def _words(shape: tuple[int, ...], variable: Variable, replicas: int) -> str:
-    if len(shape) == 2:
-        return f"{math.prod(shape)} ({shape[0]} replicas of {shape[1]} lines)"
-    per_replica = replicas > 1 or variable.kind != "sensor"
-    return f"{shape[0]}, one for each {'replica' if per_replica else 'line'}"
-
-
 def _numbers(variable: Variable, value: object, shape: tuple[int, ...]) -> NDArray[np.float64] | None:
     """The message's array as float64 of this shape, NaN where it is null; None where it is empty or absent."""
     if value is None:
