@@ -291,6 +291,33 @@ class Stack:
             "/client.py",
         ]
 
+    def bits(self, count: int, *flags: str, folder: Path | None = None) -> list[Result]:
+        """Results that a client container has computed anew, cycles, counts and posterior; by the deployment in a folder.
+
+        Raises:
+            CheckError: they don't come.
+        """
+        options: list[str] = []
+        if folder is not None:
+            options = [
+                "--volume",
+                f"{folder}:/deployment-given:ro",
+                "--env",
+                "BM_DEPLOYMENT=/deployment-given",
+            ]
+        command = self.client_command("rosbayes_ros", *options)[1:]
+        lines = self.docker(*command, "ws://hub:9090", "--bits", str(count), *flags, limit=120).splitlines()
+        results = [Result.of(each) for each in map(json.loads, lines) if "at" in each]
+        expect(len(results) == count, f"{len(results)} of {count} results came")
+        return results
+
+    def deployments(self) -> dict[str, str]:
+        """The hash of what each service works by; empty for one that does not answer."""
+        # `status` ends with another code while one of them is not ready
+        said = self.docker("exec", self.container("master"), "status", "--json", check=False) or "{}"
+        told = {each["name"]: each.get("deployment", "") for each in json.loads(said).get("processes", [])}
+        return {service: told.get(service, "") for service in CORE}
+
     def up(self, services: tuple[str, ...] = SERVICES) -> float:
         """Start it and wait until all of it is healthy; gives the seconds that it took.
 

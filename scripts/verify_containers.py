@@ -31,13 +31,14 @@ from container_stack import (
     VIEWER,
     Client,
     Engine,
-    Result,
     Stack,
     check_results,
     seconds,
 )
 from processes import ROOT
 from verify_rosbridge import CheckError, Tally, expect
+
+from toolchain.deployment import load_deployment
 
 LIMIT: Final = 900
 """Seconds after which the verification gives up, whatever it waits for."""
@@ -48,6 +49,8 @@ STOP_LIMIT: Final = 5
 """Seconds that a service has to end after SIGTERM; then the engine kills it (exit code 137)."""
 TERMINATED: Final = 143
 KILLED: Final = 137
+MOST_RESTARTS: Final = 4
+"""Of one container, until all have followed to what is in their folder."""
 ROBOT_PORT, BOARD_PORT = 9191, 7100
 BUILT, UP = "the image is built", "docker compose up"
 ALWAYS: Final = (BUILT, UP)
@@ -91,12 +94,7 @@ def start(stack: Stack) -> float:
 
 def check_bits(stack: Stack) -> None:
     """A client container computes results anew: counts and posterior to the bit, and near float64."""
-    count = 8
-    command = stack.client_command("rosbayes_ros")[1:]
-    lines = stack.docker(*command, "ws://hub:9090", "--bits", str(count), limit=120).splitlines()
-    told = [json.loads(line) for line in lines]
-    results = [Result.of(each) for each in told if "at" in each]
-    expect(len(results) == count, f"{len(results)} of {count} results came")
+    results = stack.bits(8)
     stack.notes.append(check_results(results))
 
 
@@ -256,21 +254,82 @@ def check_faults(stack: Stack, tally: Tally) -> None:
         )
 
 
-def check_another_deployment(stack: Stack, folder: Path) -> None:
-    """DEPLOYMENT=DIR: `up` makes the running stack one of another model."""
-    stack.up()
-    stack.variables["DEPLOYMENT"] = str(folder)
+def check_other_deployments(stack: Stack, tally: Tally, folder: Path) -> None:
+    """DEPLOYMENT=DIR, and what is built into that folder while the stack runs."""
+    checks: list[tuple[str, Callable[[Stack, Path], None]]] = [
+        ("DEPLOYMENT=another", another_deployment),
+        ("DEPLOYMENT: master reload", reload_deployment),
+        ("DEPLOYMENT: pcie-app and a board killed after a reload", kill_after_reload),
+        ("DEPLOYMENT: changed without a reload, pcie-app killed", kill_instead_of_reload),
+    ]
+    if stack.only and not any(stack.only in name for name, _ in checks):
+        return
     try:
-        began = time.time()
-        took = stack.up()
-        with Client(stack, "ws://hub:9090", "rosbayes_ros", "--cells", "16", "16") as client:
-            client.flowing(began, 20)
-            stack.notes.append(f"healthy after {took:.1f} s; {check_results(client.results)}")
-    except CheckError:
-        stack.save_logs("DEPLOYMENT before down")
-        raise
+        for name, check in checks:
+            run_check(stack, tally, name, lambda check=check: check(stack, folder))  # type: ignore[misc]  # a default binds the loop's check
     finally:
         stack.down()
+
+
+def another_deployment(stack: Stack, folder: Path) -> None:
+    """`up` makes the running stack one of another model."""
+    stack.up()
+    stack.variables["DEPLOYMENT"] = str(folder)
+    began = time.time()
+    took = stack.up()
+    with Client(stack, "ws://hub:9090", "rosbayes_ros", "--cells", "16", "16") as client:
+        client.flowing(began, 20)
+        stack.notes.append(f"healthy after {took:.1f} s; {check_results(client.results)}")
+
+
+def reload_deployment(stack: Stack, folder: Path) -> None:
+    """`master reload` after other tables were built into the folder: results are theirs, and no container is restarted."""
+    before = {service: stack.restarts(service) for service in SERVICES}
+    correct_tables(folder, 1.1)
+    said = stack.docker("exec", stack.container("master"), "master", "reload").strip()
+    expect(said.startswith("generation 1 is in force"), f"it says {said}")
+    of_deployment(stack, folder)
+    after = {service: stack.restarts(service) for service in SERVICES}
+    expect(after == before, f"containers were restarted: {before}, {after}")
+    stack.notes.append(said)
+    hidden = stack.docker("exec", stack.container("hub"), "sh", "-c", "ls /run/rosbayes/*").split()
+    expect("hub.status.sock" in hidden, f"the hub sees {hidden}")
+    expect("master.control.sock" not in hidden, "the hub can reach the master's control socket")
+
+
+def kill_after_reload(stack: Stack, folder: Path) -> None:
+    """Who is started anew has the deployment in force, which is what the folder holds."""
+    killed_at = time.time()
+    for service in ("pcie-app", "board3"):
+        before = stack.restarts(service)
+        stack.signal(service, "KILL")
+        stack.restarted(service, before, killed_at)
+    of_deployment(stack, folder)
+
+
+def kill_instead_of_reload(stack: Stack, folder: Path) -> None:
+    """The folder was changed and nobody reloads: the first that is started anew has all the others follow, once each."""
+    before = {service: stack.restarts(service) for service in SERVICES}
+    correct_tables(folder, 1.2)
+    at = time.time()
+    stack.signal("pcie-app", "KILL")
+    stack.restarted("pcie-app", before["pcie-app"], at)
+    of_deployment(stack, folder)
+    took = time.time() - at
+    more = {service: stack.restarts(service) - before[service] for service in CORE}
+    expect(max(more.values()) <= MOST_RESTARTS, f"containers were restarted again and again: {more}")
+    times = ", ".join(f"{service} {count}" for service, count in more.items())
+    stack.notes.append(f"results of the new one were compared after {took:.1f} s; restarts: {times}")
+
+
+def of_deployment(stack: Stack, folder: Path) -> None:
+    """All services come to work by what the folder holds now, and results are its own, to the bit."""
+    wanted = hash_of(folder)
+    deadline = time.time() + FLOW_LIMIT
+    while set((found := stack.deployments()).values()) != {wanted}:
+        expect(time.time() < deadline, f"the folder holds {wanted[:12]}, and the services work by {found}")
+        time.sleep(0.25)
+    check_results(stack.bits(3, "--cells", "16", "16", folder=folder))
 
 
 @contextlib.contextmanager
@@ -392,32 +451,38 @@ def fetch_wheels(folder: Path) -> None:
     made.write_text(stamp)
 
 
+def hash_of(folder: Path) -> str:
+    """The hash of the deployment that is in a folder."""
+    return load_deployment(folder, images=False).hash
+
+
+SIZE: Final = ("--set", "width=16", "--set", "height=16")
+
+
+def toolchain(*arguments: str) -> None:
+    """Run the command `toolchain`."""
+    command = [str(Path(sys.executable).with_name("toolchain")), *arguments]
+    subprocess.run(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, check=True, timeout=60)
+
+
 def build_another(folder: Path) -> None:
     """A deployment of another model for DEPLOYMENT: the boat on 16 x 16 cells."""
-    toolchain = [
-        str(Path(sys.executable).with_name("toolchain")),
-        "build",
-        str(ROOT / "casestudies" / "boat"),
-    ]
-    source = ["--uri", "ws://hub:9090", "--topic", "/boat/sensors", "--type", "boat_msgs/Sensors"]
-    subprocess.run(
-        [
-            *toolchain,
-            "-o",
-            str(folder),
-            "--partitions",
-            "4",
-            *source,
-            "--set",
-            "width=16",
-            "--set",
-            "height=16",
-        ],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        check=True,
-        timeout=60,
-    )
+    source = ("--uri", "ws://hub:9090", "--topic", "/boat/sensors", "--type", "boat_msgs/Sensors")
+    boat = str(ROOT / "casestudies" / "boat")
+    toolchain("build", boat, "-o", str(folder), "--partitions", "4", *source, *SIZE)
+
+
+def correct_tables(folder: Path, factor: float) -> None:
+    """Other tables into a deployment: bearings that are so many times as uncertain as the model's own."""
+    model = OUT / "model"
+    shutil.copytree(ROOT / "casestudies" / "boat", model, dirs_exist_ok=True)
+    source = (ROOT / "casestudies" / "boat" / "model.py").read_text()
+    changed = source.replace("sigma=BEARING_SIGMA", f"sigma={factor} * BEARING_SIGMA")
+    expect(changed != source, "the boat's model does not say sigma=BEARING_SIGMA any more")
+    (model / "model.py").write_text(changed)
+    before = hash_of(folder)
+    toolchain("regenerate", "memories", str(folder), "--model", str(model), *SIZE)
+    expect(hash_of(folder) != before, "the deployment's hash is the same with other tables")
 
 
 def run_check(stack: Stack, tally: Tally, name: str, check: Callable[[], object]) -> bool:
@@ -462,9 +527,7 @@ def verify(only: str) -> int:
                 run_check(stack, tally, "status shows all services", lambda: check_status(stack))
                 check_faults(stack, tally)
                 run_check(stack, tally, "docker compose stop", lambda: check_stop(stack))
-                run_check(
-                    stack, tally, "DEPLOYMENT=another", lambda: check_another_deployment(stack, another)
-                )
+                check_other_deployments(stack, tally, another)
                 run_check(stack, tally, "ROSBRIDGE_URI and BM_BOARDS", lambda: check_robot(stack))
                 run_check(stack, tally, "a processor of another name", lambda: check_processor(stack))
         finally:
