@@ -41,6 +41,21 @@ def regenerate(part, directory, *options):
     subprocess.run(command, check=True, capture_output=True, timeout=60)
 
 
+@cache
+def counted(_hash, folder, addresses, bank):
+    """The posterior that a deployment's boards count, in this process; kept by its hash, since folders change."""
+    deployment = load_deployment(folder)
+    images = [read_image(deployment.image_path(board)) for board in range(len(deployment.boards))]
+    machine = deployment.machine
+    boards = EmulatedBoards(
+        [image.machine for image in images],
+        target_count=machine.target_count,
+        max_cycles=machine.max_cycles,
+        stop=machine.stop,
+    )
+    return boards.run(addresses, 0, bank).posterior
+
+
 class Witness(Robot):
     """A robot that knows what it sent, and so what must come back."""
 
@@ -48,11 +63,10 @@ class Witness(Robot):
         super().__init__(uri)
         self.sent = {}
         self._deployments = [load_deployment(folder) for folder in folders]
-        self._counted = cache(self._count)
 
     async def publish(self, **values):
         at = len(self.sent)
-        values |= {"D1": 68 + at % 7, "D2": 48 + at % 5}
+        values |= {"D1": 68 + at % 5, "D2": 48 + at % 3}
         stamp = time.time_ns()
         self.sent[stamp] = values
         header = {
@@ -61,18 +75,6 @@ class Witness(Robot):
         }
         message = {"op": "publish", "topic": "/boat/sensors", "msg": {"header": header, **values}}
         await self._socket.send(json.dumps(message))
-
-    def _count(self, at, addresses, bank):
-        deployment = self._deployments[at]
-        images = [read_image(deployment.image_path(board)) for board in range(len(deployment.boards))]
-        machine = deployment.machine
-        boards = EmulatedBoards(
-            [image.machine for image in images],
-            target_count=machine.target_count,
-            max_cycles=machine.max_cycles,
-            stop=machine.stop,
-        )
-        return boards.run(addresses, 0, bank).posterior
 
     def generations(self):
         """How many results there were of each generation; each must be that one's, to the bit."""
@@ -89,7 +91,7 @@ class Witness(Robot):
             deployment = self._deployments[generation]
             addresses = tuple(to_address(each, reading[each.name]) for each in deployment.variables)
             bank = number % deployment.machine.rng_banks
-            expected = self._counted(generation, addresses, bank)
+            expected = counted(deployment.hash, deployment.directory, addresses, bank)
             assert result["data"] == expected.tolist(), f"frame {number}, generation {generation}"
             found[generation] += 1
             numbers.append(number)
@@ -134,9 +136,13 @@ def pids(stage):
     return {name: {each.pid for each in found} for name, found in stage.processes().items()}
 
 
-@pytest.mark.parametrize("options", [(), ("--fused", "--queue", "all")], ids=["processes", "fused"])
-async def test_every_frame_is_of_one_deployment(stage, boat, other_boat, options):
-    folders = boat, other_boat, boat, other_boat
+@pytest.mark.parametrize(
+    ("options", "victim"),
+    [((), "pcie-app"), (("--fused", "--queue", "all"), "board")],
+    ids=["processes", "fused"],
+)
+async def test_every_frame_is_of_one_deployment(stage, boat, other_boat, options, victim):
+    folders = boat, other_boat, boat, other_boat, boat
     _, robot, master, runs = await looping(stage, boat, *options, witness=folders, rate=80)
     before = pids(stage)
     for generation in (1, 2, 3):
@@ -145,8 +151,7 @@ async def test_every_frame_is_of_one_deployment(stage, boat, other_boat, options
         assert f"generation {generation} is in force" in reloading.out
         assert str(folders[generation]) in reloading.out
         await robot.have(len(robot.results) + 10)
-    found = robot.generations()
-    assert sorted(found) == [0, 1, 2, 3]
+    assert sorted(robot.generations()) == [0, 1, 2, 3]
     assert pids(stage) == before
     status = await status_of(runs, "master")
     assert (status["generation"], status["folder"]) == (3, str(other_boat))
@@ -163,12 +168,45 @@ async def test_every_frame_is_of_one_deployment(stage, boat, other_boat, options
         assert frames["received"] == accounted
     else:
         assert frames["received"] <= accounted  # the subscriber's losses were never received here
+    # no frame may wait for the board that stops now
+    await a_death_while_boards_are_programmed(stage, robot, master, runs, boat, victim)
+    assert sorted(robot.generations()) == [0, 1, 2, 3, 4]
     master.send(signal.SIGKILL)
     await stage.nothing_left("hub")
 
 
-async def test_what_is_refused_changes_nothing(stage, boat, tmp_path):
-    _, robot, master, runs = await looping(stage, boat)
+async def a_death_while_boards_are_programmed(stage, robot, master, runs, folder, victim):
+    """The reload fails, the run goes on with what it had, and the next reload is well."""
+    boards = sorted(stage.processes()["board"], key=lambda each: each.pid)[1:]  # the first is their parent
+    images = [board.image_hash for board in load_deployment(folder, images=False).boards]
+    generation = (await status_of(runs, "master"))["generation"]
+    dies = boards[2] if victim == "board" else stage.processes()["pcie-app"][0]
+    boards[2].suspend()
+    reloading = reload_(stage, runs, "-d", str(folder))
+
+    async def half_way():
+        return (await status_of(runs, "board1"))["boards"][0]["image"] == images[1]
+
+    await until(half_way)
+    dies.kill()
+    if victim != "board":
+        boards[2].resume()
+    assert await reloading.end() in {5, 6}, reloading.out
+    assert victim.removesuffix("-app") in reloading.err.lower()
+    assert "goes on" in master.err
+    before = len(robot.results)
+    await robot.keep_publishing(rate=40, **READING)
+    await robot.have(before + 5)
+    assert max(robot.generations()) == generation
+    # the old images are back when the command has answered, or when pcie-app is: no frame fails for that
+    assert "failed on a board" not in (await status_of(runs, "master"))["frames"]["lost"]
+    again = reload_(stage, runs, "-d", str(folder))
+    assert await again.end() == 0, again.err
+    await robot.have(len(robot.results) + 5)
+
+
+async def test_what_is_refused_changes_nothing(stage, boat, other_boat, tmp_path):
+    hub, robot, master, runs = await looping(stage, boat, witness=(boat, other_boat, boat))
     larger = build_boat(tmp_path / "larger", cells=12)
     elsewhere = tmp_path / "elsewhere"
     shutil.copytree(boat, elsewhere)
@@ -209,15 +247,26 @@ async def test_what_is_refused_changes_nothing(stage, boat, tmp_path):
             assert "order" in answer["sentence"]
     await robot.have(len(robot.results) + 5)
     assert set(robot.generations()) == {0}
+    await the_second_of_two_at_once_is_refused(runs, other_boat)
+    await robot.have(len(robot.results) + 5)
+    assert set(robot.generations()) == {0, 1}
+    # rosbridge may be away
+    hub.send(signal.SIGKILL)
+    await hub.end()
+    await master.says("is gone")
+    reloading = reload_(stage, runs, "-d", str(boat))
+    assert await reloading.end() == 0, reloading.err
+    before = len(robot.results)
+    await stage.hub(int(robot.uri.rsplit(":", 1)[1]))
+    await robot.have(before + 5)
+    assert set(robot.generations()) == {0, 1, 2}
     master.send(signal.SIGINT)
     assert await master.end(12) == 130
     await stage.nothing_left("hub")
 
 
-async def test_the_second_of_two_at_once_is_refused(stage, boat, other_boat):
-    _, robot, _, runs = await looping(stage, boat, witness=(boat, other_boat))
-    order = json.dumps({"order": "reload", "folder": str(other_boat)}).encode() + b"\n"
-    answers = []
+async def the_second_of_two_at_once_is_refused(runs, folder):
+    order = json.dumps({"order": "reload", "folder": str(folder)}).encode() + b"\n"
     with socket.socket(socket.AF_UNIX) as one, socket.socket(socket.AF_UNIX) as two:
         for each in (one, two):
             each.settimeout(30)
@@ -228,8 +277,6 @@ async def test_the_second_of_two_at_once_is_refused(stage, boat, other_boat):
     assert sorted(answer["exit_code"] for answer in answers) == [0, 6]
     refused = max(answers, key=lambda answer: answer["exit_code"])
     assert refused["sentence"] == "another reload is under way; try again when it is done"
-    await robot.have(len(robot.results) + 5)
-    assert set(robot.generations()) == {0, 1}
 
 
 async def test_a_corrected_table_in_the_same_folder(stage, boat, tmp_path):
@@ -270,55 +317,6 @@ async def test_a_corrected_table_in_the_same_folder(stage, boat, tmp_path):
     await stage.nothing_left("hub")
 
 
-@pytest.mark.parametrize(("victim", "options"), [("pcie-app", ()), ("board", ("--fused",))])
-async def test_a_death_while_boards_are_programmed(stage, boat, other_boat, victim, options):
-    _, robot, master, runs = await looping(stage, boat, *options, witness=(boat, other_boat))
-    robot._publishing.cancel()
-    await asyncio.sleep(0.5)  # no frame may wait for the board that stops now
-    boards = sorted(stage.processes()["board"], key=lambda each: each.pid)[1:]  # the first is their parent
-    images = [board.image_hash for board in load_deployment(other_boat, images=False).boards]
-    victims = [boards[2] if victim == "board" else stage.processes()["pcie-app"][0]]
-    boards[2].suspend()
-    reloading = reload_(stage, runs, "-d", str(other_boat))
-
-    async def half_way():
-        return (await status_of(runs, "board1"))["boards"][0]["image"] == images[1]
-
-    await until(half_way)
-    victims[0].kill()
-    if victim != "board":
-        boards[2].resume()
-    assert await reloading.end() in {5, 6}, reloading.out
-    assert victim.removesuffix("-app") in reloading.err.lower()
-    assert "goes on" in master.err
-    before = len(robot.results)
-    await robot.keep_publishing(rate=40, **READING)
-    await robot.have(before + 5)
-    assert set(robot.generations()) == {0}
-    # the old images are back when the command has answered, or when pcie-app is: no frame fails for that
-    assert "failed on a board" not in (await status_of(runs, "master"))["frames"]["lost"]
-    again = reload_(stage, runs, "-d", str(other_boat))
-    assert await again.end() == 0, again.err
-    await robot.have(len(robot.results) + 5)
-    assert set(robot.generations()) == {0, 1}
-    master.send(signal.SIGINT)
-    assert await master.end(12) == 130
-    await stage.nothing_left("hub")
-
-
-async def test_rosbridge_may_be_away(stage, boat, other_boat):
-    hub, robot, master, runs = await looping(stage, boat, witness=(boat, other_boat))
-    hub.send(signal.SIGKILL)
-    await hub.end()
-    await master.says("is gone")
-    reloading = reload_(stage, runs, "-d", str(other_boat))
-    assert await reloading.end() == 0, reloading.err
-    before = len(robot.results)
-    await stage.hub(int(robot.uri.rsplit(":", 1)[1]))
-    await robot.have(before + 5)
-    assert set(robot.generations()) == {0, 1}
-
-
 async def test_services_that_the_master_did_not_start(stage, boat, other_boat):
     _, uri = await stage.hub()
     sockets = stage.where / "s"
@@ -350,7 +348,9 @@ async def test_services_that_the_master_did_not_start(stage, boat, other_boat):
 
 
 async def test_there_must_be_a_run(stage, boat, tmp_path):
-    environment = {"BM_RUN_DIRECTORY": str(tmp_path)}
+    orders = tmp_path / "orders"
+    orders.mkdir()
+    environment = {"BM_RUN_DIRECTORY": str(tmp_path), "BM_CONTROL_DIRECTORY": str(orders)}
     reloading = stage.start("master", "reload", environment=environment)
     assert await reloading.end() == 2
     assert "no master takes orders at" in reloading.err
@@ -359,14 +359,15 @@ async def test_there_must_be_a_run(stage, boat, tmp_path):
     boards = ",".join(f"unix:{tmp_path}/board{at}.sock" for at in range(4))
     options = ("--boards", boards, "--peer-timeout", "60")
     master = stage.start("master", "--loop", "-d", str(boat), "--uri", uri, *options, environment=environment)
-    control = tmp_path / "master.control.sock"
+    control = orders / "master.control.sock"
 
     async def listens():
         return control.exists()
 
     await until(listens)
     assert control.stat().st_mode & 0o777 == 0o600
-    reloading = reload_(stage, tmp_path)
+    assert not (tmp_path / control.name).exists()
+    reloading = stage.start("master", "reload", environment=environment)
     assert await reloading.end() == 6
     assert "the run is not ready: it waits for" in reloading.err
     master.send(signal.SIGINT)
