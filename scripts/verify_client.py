@@ -6,7 +6,6 @@ takes what the client says and says what the client reads; the codecs are checke
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import contextlib
 import logging
@@ -16,14 +15,12 @@ import signal
 import sys
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable
-from pathlib import Path
 from socket import socket
 from typing import Any
 
 import numpy as np
-import real_rosbridge
-from processes import ROOT, Process, run_script
-from verify_rosbridge import KINDS, SERVER_LIMIT, CheckError, Kind, Tally, expect
+from processes import ROOT, Process
+from verification import KINDS, SERVER_LIMIT, CheckError, Kind, Tally, expect, on_servers
 
 from bridge import stamps
 from bridge.client import Message, Qos, Ros, State, connect
@@ -435,25 +432,5 @@ async def verify(kinds: list[str]) -> int:
     return 1 if tally.failed else 0
 
 
-def main() -> int:
-    """Read the flags; with the real server, move into a network of its own first."""
-    parser = argparse.ArgumentParser(prog="scripts/verify client", description=__doc__.splitlines()[0])
-    parser.add_argument("--server", choices=["real", "hub", "both"], default="both", help="(both)")
-    server = parser.parse_args().server
-    kinds = ["real", "hub"] if server == "both" else [server]
-    if "real" in kinds and not real_rosbridge.network_is_alone():
-        try:
-            real_rosbridge.install()
-            alone = real_rosbridge.network_command()
-            real_rosbridge.become([*alone, sys.executable, str(Path(__file__).resolve()), "--server", server])
-        except real_rosbridge.RealServerError as error:
-            print(f"error: {error}", file=sys.stderr)
-            return 2
-        except KeyboardInterrupt:
-            print("interrupted (Ctrl-C)", file=sys.stderr)
-            return 130
-    return run_script(lambda: verify(kinds), LIMIT)
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(on_servers(__file__, __doc__, verify, LIMIT))

@@ -6,7 +6,6 @@ client hears on /BMresults and /bm/frame is checked.
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import contextlib
 import fcntl
@@ -24,8 +23,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import real_rosbridge
-from processes import BOAT_TOPIC, ROOT, Process, build, run_script
+from processes import BOAT_TOPIC, ROOT, Process, build
+from verification import KINDS, SERVER_LIMIT, CheckError, Kind, Tally, expect, on_servers
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, InvalidHandshake
 
@@ -42,28 +41,14 @@ COUNT = 10
 """Results of a `--loop` run."""
 EVERY = 0.2
 """Seconds between two readings: far more than a cycle takes, so that a stamp names its reading."""
-SERVER_LIMIT, MASTER_LIMIT, RESULT_LIMIT, LAST_WORDS = 15.0, 40.0, 20.0, 2.0
-"""Seconds until a server serves, a master ends, results flow, and what was published has arrived."""
+MASTER_LIMIT, RESULT_LIMIT, LAST_WORDS = 40.0, 20.0, 2.0
+"""Seconds until a master ends, results flow, and what was published has arrived."""
 FIRST_DATA_TIMEOUT = 2
 FARTHEST = 1.5
 """Cells between a posterior's mean and the true cell, at most."""
 SIZE = 32
 TAIL = 12
 """Lines of a log that are shown when a check fails."""
-
-
-class CheckError(Exception):
-    """Something is not as it must be; says what."""
-
-
-def expect(condition: bool, otherwise: str) -> None:
-    """Go on if it holds.
-
-    Raises:
-        CheckError: it does not.
-    """
-    if not condition:
-        raise CheckError(otherwise)
 
 
 # Readings
@@ -216,27 +201,6 @@ async def readings(uri: str, sent: list[Sent]) -> AsyncIterator[None]:
 
 
 # Servers and masters
-
-
-@dataclass(frozen=True, slots=True)
-class Kind:
-    """A kind of server: how it is started, what it says when it serves, and whether messages of two topics keep their order."""
-
-    name: str
-    command: tuple[str, ...]
-    ready: str
-    keeps_order: bool
-
-
-KINDS = {
-    "real": Kind(
-        "real ROS 2 server",
-        ("python", real_rosbridge.__file__, "serve", "PORT"),
-        ready=real_rosbridge.READY,
-        keeps_order=False,  # each topic has its own way through DDS
-    ),
-    "hub": Kind("hub", ("hub", "--host", "127.0.0.1", "--port", "PORT"), ready=r"ws://\S+", keeps_order=True),
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -530,26 +494,6 @@ def bytes_of(deployments: dict[str, Path]) -> str:
     return digest.hexdigest()
 
 
-@dataclass(slots=True)
-class Tally:
-    """How many checks passed and failed."""
-
-    passed: int = 0
-    failed: int = 0
-
-    def tell(self, name: str, started: float, why: str | None, details: str = "") -> None:
-        """Print one check's line, and what may help under it."""
-        if why is None:
-            self.passed += 1
-            print(f"ok  {name} ({time.monotonic() - started:.1f} s)")
-        else:
-            self.failed += 1
-            print(f"FAIL {name}: {why}")
-        if details:
-            print(details)
-        sys.stdout.flush()
-
-
 async def run_checks(stand: Stand, tally: Tally) -> None:
     """All checks on one server."""
     try:
@@ -614,25 +558,5 @@ async def verify(kinds: list[str]) -> int:
         return 1 if tally.failed else 0
 
 
-def main() -> int:
-    """Read the flags; with the real server, move into a network of its own first."""
-    parser = argparse.ArgumentParser(prog="scripts/verify rosbridge", description=__doc__.splitlines()[0])
-    parser.add_argument("--server", choices=["real", "hub", "both"], default="both", help="(both)")
-    server = parser.parse_args().server
-    kinds = ["real", "hub"] if server == "both" else [server]
-    if "real" in kinds and not real_rosbridge.network_is_alone():
-        try:
-            real_rosbridge.install()
-            alone = real_rosbridge.network_command()
-            real_rosbridge.become([*alone, sys.executable, str(Path(__file__).resolve()), "--server", server])
-        except real_rosbridge.RealServerError as error:
-            print(f"error: {error}", file=sys.stderr)
-            return 2
-        except KeyboardInterrupt:
-            print("interrupted (Ctrl-C)", file=sys.stderr)
-            return 130
-    return run_script(lambda: verify(kinds), LIMIT)
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(on_servers(__file__, __doc__, verify, LIMIT))

@@ -1,0 +1,102 @@
+"""What the verifications have in common: a check's verdict, the tally of checks, and the servers that are chosen."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import real_rosbridge
+from processes import run_script
+
+SERVER_LIMIT = 15.0
+"""Seconds until a server serves."""
+
+
+class CheckError(Exception):
+    """Something is not as it must be; says what."""
+
+
+def expect(condition: bool, otherwise: str) -> None:
+    """Go on if it holds.
+
+    Raises:
+        CheckError: it does not.
+    """
+    if not condition:
+        raise CheckError(otherwise)
+
+
+@dataclass(slots=True)
+class Tally:
+    """How many checks passed and failed."""
+
+    passed: int = 0
+    failed: int = 0
+
+    def tell(self, name: str, started: float, why: str | None, details: str = "") -> None:
+        """Print one check's line, and what may help under it."""
+        if why is None:
+            self.passed += 1
+            print(f"ok  {name} ({time.monotonic() - started:.1f} s)")
+        else:
+            self.failed += 1
+            print(f"FAIL {name}: {why}")
+        if details:
+            print(details)
+        sys.stdout.flush()
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """A kind of server: how it is started, what it says when it serves, and whether messages of two topics keep their order."""
+
+    name: str
+    command: tuple[str, ...]
+    ready: str
+    keeps_order: bool
+
+
+KINDS = {
+    "real": Kind(
+        "real ROS 2 server",
+        ("python", real_rosbridge.__file__, "serve", "PORT"),
+        ready=real_rosbridge.READY,
+        keeps_order=False,  # each topic has its own way through DDS
+    ),
+    "hub": Kind("hub", ("hub", "--host", "127.0.0.1", "--port", "PORT"), ready=r"ws://\S+", keeps_order=True),
+}
+
+
+def on_servers(
+    script: str, description: str, verify: Callable[[list[str]], Awaitable[int]], limit: float
+) -> int:
+    """Read the flags of a verification and run it; with the real server, move into a network of its own first.
+
+    Args:
+        script: The verification's file, `verify_NAME.py`.
+        description: Its docstring; the first line goes into `--help`.
+        verify: All checks on these kinds of servers, `real` or `hub`; returns the exit code.
+        limit: Seconds after which it is given up.
+    """
+    path = Path(script).resolve()
+    name = path.stem.removeprefix("verify_")
+    parser = argparse.ArgumentParser(prog=f"scripts/verify {name}", description=description.splitlines()[0])
+    parser.add_argument("--server", choices=["real", "hub", "both"], default="both", help="(both)")
+    server = parser.parse_args().server
+    kinds = ["real", "hub"] if server == "both" else [server]
+    if "real" in kinds and not real_rosbridge.network_is_alone():
+        try:
+            real_rosbridge.install()
+            alone = real_rosbridge.network_command()
+            real_rosbridge.become([*alone, sys.executable, str(path), "--server", server])
+        except real_rosbridge.RealServerError as error:
+            print(f"error: {error}", file=sys.stderr)
+            return 2
+        except KeyboardInterrupt:
+            print("interrupted (Ctrl-C)", file=sys.stderr)
+            return 130
+    return run_script(lambda: verify(kinds), limit)
