@@ -112,8 +112,8 @@ def _guarded(path: Path, what: str, call: Callable[[], object]) -> object:
     except ToolchainError:
         raise
     except SyntaxError as error:
-        line = f", line {error.lineno}" if error.lineno else ""  # a file that is no text has none
-        message = f"{error.filename or path}{line}: {error.msg}"
+        place = f", line {error.lineno}" if error.lineno else ""  # a file that is no text has none
+        message = f"{error.filename or path}{place}: {error.msg}"
         raise ModelError(message) from None
     except Exception as error:
         line = _line(path, traceback.extract_tb(error.__traceback__))
