@@ -41,7 +41,7 @@ END: Final = 8
 
 PROTOCOL_VERSION: Final = 1
 MAX_PAYLOAD_WORDS: Final = 8192
-"""Longest payload; twice the map's longest block."""
+"""Longest payload: the map's longest block (INPUTS) fits."""
 
 _MAGIC: Final = 0x4D42
 _HEAD: Final = struct.Struct("<HBBIII")
