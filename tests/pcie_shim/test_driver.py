@@ -16,7 +16,8 @@ from hypothesis import strategies as st
 from machines.bm1 import StopReason
 from machines.parameters import PriorMode
 from pcie_shim import register_map as rm
-from pcie_shim.driver import BoardResult, FrameInput, FrameOutput, MiniCluster
+from pcie_shim.driven_board import BoardResult
+from pcie_shim.driver import FrameInput, FrameOutput, MiniCluster
 from pcie_shim.emulated_board import EmulatedBoard
 from pcie_shim.errors import (
     BoardGoneError,

@@ -176,10 +176,10 @@ def test_each_replica_stops_with_its_own_parts() -> None:
 def test_a_frame_that_does_not_fit_is_refused(name: str, change: dict, sentence: str) -> None:
     parts = CASES[name]
     case = Case(parts, MiniCluster.__new__(MiniCluster))
-    from pcie_shim.driver import _Board
+    from pcie_shim.driven_board import DrivenBoard
     from pcie_shim.endpoint import parse_endpoint
 
-    boards = [_Board(at, parse_endpoint("unix:/tmp/x.sock"), part) for at, part in enumerate(parts)]
+    boards = [DrivenBoard(at, parse_endpoint("unix:/tmp/x.sock"), part) for at, part in enumerate(parts)]
     case.cluster.__init__(boards, timeout=1, slack=1)
     with pytest.raises(FrameInputError, match=sentence):
         case.cluster.post(dataclasses.replace(case.frame(1), **change))
@@ -287,7 +287,7 @@ def test_a_board_of_other_capabilities_is_refused(
         other = dataclasses.replace(part, machine=dataclasses.replace(part.machine, parameters=parameters))
         known = part.image_hash
         monkeypatch.setattr(Image, "image_hash", property(lambda _: known))
-        monkeypatch.setattr("pcie_shim.driver.interface_words", lambda _: (inputs, 18))
+        monkeypatch.setattr("pcie_shim.driven_board.interface_words", lambda _: (inputs, 18))
         with pytest.raises(BoardMismatchError, match=sentence):
             MiniCluster.open([board.endpoint], [other])
         assert board.stop() == 0

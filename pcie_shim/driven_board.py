@@ -1,0 +1,339 @@
+"""One board as the driver sees it: its link, what its registers are known to hold, its part of a frame."""
+
+from __future__ import annotations
+
+import select
+import struct
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from machines.bm1 import StopReason, joint_reason
+from pcie_shim import register_map as rm
+from pcie_shim.doorbell import following
+from pcie_shim.errors import (
+    AccessError,
+    BoardError,
+    BoardGoneError,
+    BoardHeldError,
+    BoardLinkError,
+    BoardMismatchError,
+    BoardRefusedError,
+    BoardSilentError,
+    BoardStaleError,
+    BoardUnreachableError,
+    DeviceGoneError,
+    FramingError,
+    GreetingMismatchError,
+    HeldError,
+    ImageError,
+    ImageMismatchError,
+    LinkClosedError,
+    LinkTimeoutError,
+    PcieShimError,
+    SequenceError,
+    ShortReadError,
+    StaleHandleError,
+    UnreachableError,
+)
+from pcie_shim.link import ALL_ONES, Done, SocketLink
+from pcie_shim.loader import program
+from pcie_shim.programming_file import interface_words, is_plain
+from pcie_shim.register_map import BoardState
+
+if TYPE_CHECKING:
+    import numpy.typing as npt
+
+    from pcie_shim.endpoint import Endpoint
+    from pcie_shim.programming_file import Image
+
+_ASSUMED_SPEED: Final = 1e4  # cycles per second of a board that does not say its own
+_START: Final = struct.Struct("<QI")  # RUN_UNTIL, START
+_RESUME: Final = struct.Struct("<QII")  # RUN_UNTIL, START (0: not rung), RESUME
+_BANK_AT: Final = rm.BANK - rm.TARGET_COUNT
+_REASONS: Final = frozenset(StopReason) - {StopReason.NONE}
+_PRIOR_AT: Final = rm.PRIOR_SELECT - rm.TARGET_COUNT
+_REPLICA: Final = np.dtype([("reason", "<u4"), ("zero", "<u4"), ("cycles", "<u8")])  # of OUTCOMES
+_CAPABILITIES: Final = range(rm.CAP_MACHINE, rm.CAP_INTERFACE + 4, 4)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BoardResult:
+    """What one board computed.
+
+    Attributes:
+        words: One count per line of the board, 32 bits each, little-endian, as they came; replica after replica.
+        cycles: Cycles that its machine ran; of replicas the one that ran longest.
+        reason: Why it stopped; IMPOSSIBLE boards ran nothing and have no weight. Of replicas what ``joint_reason``
+            makes of theirs, or SLICE where all of them were stopped by other boards'.
+        compute_ns: Time that its machine took, in nanoseconds, as the board measured it.
+        replica_cycles: Cycles of each replica; empty where the board holds one machine.
+        replica_reasons: Why each replica stopped; empty likewise.
+    """
+
+    words: bytes
+    cycles: int
+    reason: StopReason
+    compute_ns: int
+    replica_cycles: tuple[int, ...] = ()
+    replica_reasons: tuple[StopReason, ...] = ()
+
+    @property
+    def counts(self) -> npt.NDArray[np.uint32]:
+        """uint32[lines of the board], with replicas uint32[replicas, lines of the board]; a copy."""
+        counts = np.frombuffer(self.words, "<u4").astype(np.uint32)
+        return counts.reshape(len(self.replica_cycles), -1) if self.replica_cycles else counts
+
+
+class DrivenBoard:
+    """One board as the driver sees it: its link, and what its registers are known to hold."""
+
+    def __init__(self, index: int, endpoint: Endpoint, image: Image) -> None:
+        self.index = index
+        self.endpoint = endpoint
+        self.image = image
+        parameters = image.machine.parameters
+        self.lines = parameters.lines
+        self.replicas = parameters.replicas
+        self.inputs_at = rm.SENSORS if is_plain(parameters) else rm.INPUTS
+        self.counts_bytes = 4 * self.replicas * self.lines
+        self.result_bytes = self.counts_bytes + (
+            self.replicas * _REPLICA.itemsize if self.replicas > 1 else 0
+        )
+        self.link: SocketLink | None = None
+        self.broken = "it was not opened"
+        self.speed = _ASSUMED_SPEED
+        self._forget()
+
+    def _forget(self) -> None:
+        """Nothing is known of the registers."""
+        self.settings = b""
+        self.selects = b""
+        self.outcomes: npt.NDArray[np.void] = np.zeros(0, _REPLICA)
+        self.prior: npt.NDArray[np.uint16] | None = None
+        self.number = 0
+        self.waiting = False
+        self.done: Done | None = None
+        self.compute_ns = 0
+        self.readable = select.poll()
+
+    # ---- opening --------------------------------------------------------------------------------------
+
+    def open(self, timeout: float, connect_timeout: float, programming_timeout: float) -> None:
+        """Open the board: see ``MiniCluster.open``; a step of programming a blank one may take ``programming_timeout``.
+
+        Raises:
+            PcieShimError: The link's errors, and the image's.
+        """
+        self.close("it is being opened")
+        self._forget()
+        link = self._identified(timeout, connect_timeout)
+        try:
+            if link.greeting.is_blank:
+                program(self.endpoint, self.image, timeout=programming_timeout, token=link.greeting.token)
+                link.close("the board was programmed")
+                link = self._identified(timeout, connect_timeout)
+            self._check_image(link)
+            self._check_capabilities(link)
+            link.write32(rm.CONTROL, rm.CONTROL_RESET_MASK | rm.CONTROL_INTERRUPT_ENABLE_MASK)
+            self.number = link.read32(rm.DONE)
+            self.speed = float(link.read32(rm.CAP_SPEED)) or _ASSUMED_SPEED
+        except BaseException:
+            link.close("opening it failed")
+            raise
+        self.link = link
+        self.readable.register(link.fileno(), select.POLLIN)
+
+    def _identified(self, timeout: float, connect_timeout: float) -> SocketLink:
+        """A link to what is certainly a board with this register map."""
+        link = SocketLink.open(self.endpoint, timeout=timeout, connect_timeout=connect_timeout)
+        try:
+            self._check_identity(link)
+        except BaseException:
+            link.close("opening it failed")
+            raise
+        return link
+
+    def _check_identity(self, link: SocketLink) -> None:
+        identity = link.read32(rm.ID)
+        pattern = time.monotonic_ns() & ALL_ONES
+        link.write32(rm.LIVENESS, pattern)
+        alive = link.read32(rm.LIVENESS) == pattern ^ ALL_ONES
+        if identity != rm.ID_VALUE or not alive:
+            raise GreetingMismatchError(
+                f"What answers at {self.endpoint} is no board: its ID is {identity:#010x} (a board's: "
+                f"{rm.ID_VALUE:#010x}), and its LIVENESS register is {'alive' if alive else 'dead'}"
+            )
+        map_hash = link.read_block(rm.MAP_HASH, rm.MAP_HASH_WORDS).hex()
+        if map_hash != rm.MAP_SHA256:
+            raise GreetingMismatchError(
+                f"The board at {self.endpoint} has register map {map_hash}, this software has "
+                f"{rm.MAP_SHA256}: use a board and a host of the same version"
+            )
+
+    def _check_image(self, link: SocketLink) -> None:
+        found = link.read_block(rm.IMAGE_HASH, rm.IMAGE_HASH_WORDS).hex()
+        if found != self.image.image_hash:
+            raise ImageMismatchError(
+                f"The board at {self.endpoint} holds image {found}, the deployment's is "
+                f"{self.image.image_hash}: program it with the loader, or restart it (a blank board is "
+                "programmed when it is opened)"
+            )
+
+    def _check_capabilities(self, link: SocketLink) -> None:
+        """What the host is going to write and read must be there, whatever the hash of the image says."""
+        parameters = self.image.machine.parameters
+        words = struct.iter_unpack("<I", link.read_block(_CAPABILITIES.start, len(_CAPABILITIES)))
+        said = dict(zip(_CAPABILITIES, (word for (word,) in words), strict=True))
+        mode = (said[rm.CAP_MACHINE] & rm.CAP_MACHINE_SENSOR_MODE_MASK) >> rm.CAP_MACHINE_SENSOR_MODE_SHIFT
+        room = said[rm.CAP_INTERFACE] & 0xFFFF, said[rm.CAP_INTERFACE] >> 16
+        inputs, results = interface_words(parameters)
+        wanted = rm.SensorMode[parameters.sensor_mode.name]
+        for what, theirs, ours in (
+            ("replicas", said[rm.CAP_REPLICAS], parameters.replicas),
+            ("sensor mode", mode, int(wanted)),
+            ("lines", said[rm.CAP_LINES], parameters.lines),
+        ):
+            if theirs != ours:
+                raise ImageMismatchError(
+                    f"The board at {self.endpoint} says {what} {theirs}, the deployment's image has {ours}: "
+                    "program it with the loader, or restart it"
+                )
+        if inputs > room[0] or results > room[1]:
+            raise ImageMismatchError(
+                f"The board at {self.endpoint} has room for {room[0]} inputs and {room[1]} results, the deployment "
+                f"needs {inputs} and {results}: build it for this interface, with more partitions or fewer replicas"
+            )
+
+    def close(self, reason: str) -> None:
+        """End the link; the board stops what it was doing."""
+        if self.link is not None:
+            self.link.close(reason)
+            self.link = None
+        self.broken = reason
+        self.waiting = False
+
+    # ---- a frame --------------------------------------------------------------------------------------
+
+    def start(
+        self,
+        settings: bytes,
+        sensors: bytes,
+        selects: bytes,
+        prior: npt.NDArray[np.uint16] | None,
+        end: int,
+    ) -> None:
+        """Post a new frame: what changed of the settings, the sensors, the doorbell (figure 3.3)."""
+        assert self.link is not None  # noqa: S101 - MiniCluster.run has checked
+        self.waiting = True  # from here on, whatever interrupts the frame must interrupt the board
+        frames = self.link.posted_write(self.inputs_at, sensors) if sensors else b""
+        if selects != self.selects:
+            frames += self.link.posted_write(rm.PRIOR_SELECTS, selects)
+            self.selects = selects
+        if prior is not None and (self.prior is None or not np.array_equal(prior, self.prior)):
+            frames += self.link.posted_write(rm.PRIOR_CODES, prior.astype("<u4").tobytes())
+            self.prior = prior.copy()
+        # Settings, slice and doorbell lie side by side: one burst from the first one that changed.
+        known = self.settings
+        if settings == known:
+            at = len(settings)
+        elif settings[:_BANK_AT] != known[:_BANK_AT]:
+            at = 0
+        elif settings[_BANK_AT:_PRIOR_AT] != known[_BANK_AT:_PRIOR_AT]:
+            at = _BANK_AT
+        else:
+            at = _PRIOR_AT
+        self.settings = settings
+        self.compute_ns = 0
+        self._ring(frames, rm.TARGET_COUNT + at, settings[at:], _START, end)
+
+    def resume(self, end: int, halted: bytes = b"") -> None:
+        """Post the next slice of the frame; ``halted`` are the words of HALT, where they change anything."""
+        assert self.link is not None  # noqa: S101 - MiniCluster.collect has checked
+        frames = self.link.posted_write(rm.HALT, halted) if halted else b""
+        self._ring(frames, rm.RUN_UNTIL, b"", _RESUME, end, 0)
+
+    def _ring(self, frames: bytes, address: int, before: bytes, layout: struct.Struct, *words: int) -> None:
+        assert self.link is not None  # noqa: S101 - MiniCluster.run has checked
+        self.number = following(self.number)
+        self.waiting = True
+        self.done = None
+        burst = before + layout.pack(*words, self.number)
+        self.link.post(frames + self.link.posted_write(address, burst))
+
+    def receive(self) -> bool:
+        """Take what has come, after a poll; True once the board has said done."""
+        assert self.link is not None  # noqa: S101 - a closed link is not polled
+        done = self.link.receive_done()
+        if done is None:
+            return False
+        if not self.waiting or done.number != self.number:
+            raise SequenceError(
+                f"The board at {self.endpoint} said done number {done.number} where {self.number} was due"
+            )
+        if len(done.results) != self.result_bytes:
+            raise ShortReadError(
+                f"The board at {self.endpoint} said done with {len(done.results) // 4} results where "
+                f"{self.result_bytes // 4} were due"
+            )
+        if done.state != BoardState.DONE or done.reason not in _REASONS:
+            raise FramingError(
+                f"The board at {self.endpoint} said done with a status of {done.status:#010x}, which is none"
+            )
+        if self.replicas > 1:
+            outcomes = np.frombuffer(done.results, _REPLICA, self.replicas, self.counts_bytes)
+            if not _REASONS.issuperset(outcomes["reason"].tolist()):
+                raise FramingError(
+                    f"The board at {self.endpoint} said done with a replica's reason that is none"
+                )
+            self.outcomes = outcomes.copy()
+        self.waiting = False
+        self.done = done
+        self.compute_ns += done.compute_ns
+        return True
+
+    @property
+    def reason(self) -> int:
+        """Why the machine stopped last."""
+        return 0 if self.done is None else self.done.reason
+
+    def result(self) -> BoardResult:
+        """The frame's result; the counts are copied out of the link's buffer."""
+        assert self.done is not None  # noqa: S101 - every board has said done
+        if self.replicas > 1:
+            reasons = tuple(StopReason(reason) for reason in self.outcomes["reason"].tolist())
+            joint = joint_reason(reasons, range(self.replicas))
+            return BoardResult(
+                words=bytes(self.done.results[: self.counts_bytes]),
+                cycles=self.done.cycles,
+                reason=joint if joint is not StopReason.NONE else StopReason.SLICE,
+                compute_ns=self.compute_ns,
+                replica_cycles=tuple(self.outcomes["cycles"].tolist()),
+                replica_reasons=reasons,
+            )
+        return BoardResult(
+            words=bytes(self.done.results),
+            cycles=self.done.cycles,
+            reason=StopReason(self.done.reason),
+            compute_ns=self.compute_ns,
+        )
+
+
+_BOARD_ERRORS: Final[tuple[tuple[tuple[type[PcieShimError], ...], type[BoardError]], ...]] = (
+    ((UnreachableError,), BoardUnreachableError),
+    ((HeldError,), BoardHeldError),
+    ((StaleHandleError,), BoardStaleError),
+    ((AccessError,), BoardRefusedError),
+    ((GreetingMismatchError, ImageError), BoardMismatchError),
+    ((LinkTimeoutError,), BoardSilentError),
+    ((LinkClosedError, DeviceGoneError), BoardGoneError),
+    ((PcieShimError,), BoardLinkError),
+)
+
+
+def board_error(board: DrivenBoard, error: PcieShimError) -> BoardError:
+    """The same, said of a board of the mini-cluster."""
+    kind = next(kind for causes, kind in _BOARD_ERRORS if isinstance(error, causes))
+    return kind(f"Board {board.index}: {error}", board=board.index)
