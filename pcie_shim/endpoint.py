@@ -110,10 +110,13 @@ def listen(endpoint: Endpoint) -> socket.socket:
 
 def _is_served(path: str) -> bool:
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+        probe.setblocking(False)
         try:
             probe.connect(path)
         except ConnectionRefusedError:
             return False
+        except BlockingIOError:
+            pass  # its queue is full: a blocking connect would wait until it is served
         return True
 
 

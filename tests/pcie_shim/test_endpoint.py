@@ -1,4 +1,5 @@
 # Endpoints: their text, their programming port, and sockets that are their owner's alone.
+import contextlib
 import socket
 import stat
 from pathlib import Path
@@ -61,6 +62,17 @@ def test_a_dead_processs_socket_is_replaced_and_a_served_one_is_not(folder: Path
         listen(endpoint)
     connect(endpoint, timeout=1).close()
     server.close()
+
+
+def test_a_socket_whose_queue_is_full_is_served_and_not_waited_for(folder: Path) -> None:
+    endpoint = Endpoint(path=str(folder / "a.sock"))
+    with contextlib.ExitStack() as stack:
+        server = stack.enter_context(socket.socket(socket.AF_UNIX))
+        server.bind(endpoint.path)
+        server.listen(0)
+        stack.enter_context(connect(endpoint, timeout=1))
+        with pytest.raises(EndpointError, match="another process listens there"):
+            listen(endpoint)
 
 
 def test_a_taken_port_and_a_missing_folder_are_said(folder: Path) -> None:
