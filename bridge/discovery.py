@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from zeroconf.asyncio import AsyncServiceInfo, AsyncZeroconf
 
 SERVICE_TYPE: Final = "_rosbridge._tcp.local."
-#: Begins a URI that names a robot, and no address.
-SCHEME: Final = "robot:"
 #: Robots that are told of at most; a network with more than this is no robots' network.
 MAX_ROBOTS: Final = 256
 #: Bytes of a name at most (RFC 6763, section 4.1.1).

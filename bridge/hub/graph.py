@@ -186,10 +186,6 @@ class Graph:
         self.actions: dict[str, Action] = {}
         self.latched_bytes = 0
 
-    def topics_of_type(self, type_name: str) -> list[Topic]:
-        """All topics of a type, in either form of its name."""
-        return [topic for topic in self.topics.values() if topic.type and same_type(topic.type, type_name)]
-
     def services_of_type(self, type_name: str) -> list[Service]:
         """All services of a type, in either form of its name."""
         return [service for service in self.services.values() if same_type(service.type, type_name)]
