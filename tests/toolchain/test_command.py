@@ -27,14 +27,6 @@ TARGET = ["--uri", "ws://robot:9090", "--topic", "/readings", "--type", "std_msg
 BOAT = Path(__file__).parents[2] / "casestudies" / "boat"
 
 
-@pytest.fixture
-def case(tmp_path):
-    folder = tmp_path / "case"
-    folder.mkdir()
-    (folder / "model.py").write_text(MODEL)
-    return folder
-
-
 def build(case, *arguments, target=TARGET):
     return CliRunner().invoke(app, ["build", str(case), "-o", str(case.parent / "out"), *target, *arguments])
 

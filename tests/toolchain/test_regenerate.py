@@ -26,14 +26,6 @@ TARGET = ["--uri", "ws://robot:9090", "--topic", "/readings", "--type", "std_msg
 
 
 @pytest.fixture
-def case(tmp_path):
-    folder = tmp_path / "case"
-    folder.mkdir()
-    (folder / "model.py").write_text(MODEL)
-    return folder
-
-
-@pytest.fixture
 def built(case):
     out = case.parent / "out"
     options = ["--partitions", "2", "--scale", "column", "--bits", "D1=6", "--prob-bits", "7"]

@@ -79,14 +79,6 @@ def point(key, variation=0.1, cycles=100.0, alms=1000.0, without=0.0):
     )
 
 
-@pytest.fixture
-def case(tmp_path):
-    folder = tmp_path / "case"
-    folder.mkdir()
-    (folder / "model.py").write_text(MODEL)
-    return folder
-
-
 def run(case, *arguments):
     command = [
         "explore",

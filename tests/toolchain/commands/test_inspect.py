@@ -27,14 +27,6 @@ TARGET = ["--uri", "ws://robot:9090", "--topic", "/readings", "--type", "std_msg
 
 
 @pytest.fixture
-def case(tmp_path):
-    folder = tmp_path / "case"
-    folder.mkdir()
-    (folder / "model.py").write_text(MODEL)
-    return folder
-
-
-@pytest.fixture
 def deployment(case):
     build(case)
     return case.parent / "out"
