@@ -7,24 +7,21 @@ called dead never counts.
 
 from __future__ import annotations
 
-import math
 from collections import Counter
-from dataclasses import dataclass
-from itertools import pairwise
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from machines.errors import MachineError
-from machines.parameters import BM1Parameters, PriorMode, RngKind, RngReset, SensorMode
+from machines.parameters import PriorMode, SensorMode
 from pcie_shim.errors import PcieShimError
 from toolchain.build import assemble, board_interface, machine_parameters
+from toolchain.checks.checked_machine import CheckedMachine
 from toolchain.checks.finding import Finding, Severity
-from toolchain.checks.rng_relations import relations
+from toolchain.checks.generators import generator_findings
 from toolchain.deployment import load_deployment
 from toolchain.errors import ToolchainError
 from toolchain.options import Scale
-from toolchain.outputs.memories import seed_words
 from toolchain.outputs.output_files import Change, compare_files, memory_files, quartus_files
 from toolchain.partition import partition_lines
 from toolchain.regenerate import check_agreement, read_images
@@ -35,7 +32,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from machines.bm1 import BM1Machine
     from pcie_shim.programming_file import Image
     from toolchain.deployment import Deployment, Dimension, Variable
     from toolchain.models.model import Model
@@ -44,45 +40,6 @@ if TYPE_CHECKING:
 
 _MOST_RANGES: Final = 4
 _LOST_OFTEN: Final = 0.02
-_RANDOM_SIGMAS: Final = 5
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Machine:
-    """What is checked: a whole machine, whichever boards hold its lines.
-
-    Attributes:
-        deployment: Its variables, lines and limits.
-        board: The first board's machine: parameters and random numbers, alike on all boards.
-        prior: uint16[rows, lines], over all boards.
-        tables: One uint16[2**bits, lines] per column, over all boards.
-        model: The probabilities, where they are known.
-    """
-
-    deployment: Deployment
-    board: BM1Machine
-    prior: NDArray[np.uint16]
-    tables: tuple[NDArray[np.uint16], ...]
-    model: Model | None
-
-    @property
-    def parameters(self) -> BM1Parameters:
-        """The first board's parameters; only the lines differ from board to board."""
-        return self.board.parameters
-
-    @property
-    def names(self) -> list[str]:
-        """What every column is called, the prior first."""
-        return ["the prior", *(variable.name for variable in self.deployment.sensors)]
-
-    def served(self, column: int) -> NDArray[np.uint16]:
-        """The rows of a column (from 0) that readings address; the missing reading's too, if one may be missing."""
-        return _served(self.deployment.sensors[column], self.tables[column])
-
-    def prior_rows(self) -> NDArray[np.uint16]:
-        """The rows of the prior that can be chosen."""
-        select = self.deployment.prior_select
-        return self.prior if select is None else _served(select, self.prior)
 
 
 def check_model(model: Model, options: BuildOptions) -> list[Finding]:
@@ -159,9 +116,9 @@ def _refusals(model: Model, options: BuildOptions, first: ToolchainError) -> lis
     return list(found.values())
 
 
-def _machine(deployment: Deployment, images: Sequence[Image], model: Model | None) -> _Machine:
+def _machine(deployment: Deployment, images: Sequence[Image], model: Model | None) -> CheckedMachine:
     machines = [image.machine for image in images]
-    return _Machine(
+    return CheckedMachine(
         deployment=deployment,
         board=machines[0],
         prior=np.hstack([machine.prior for machine in machines]),
@@ -172,21 +129,16 @@ def _machine(deployment: Deployment, images: Sequence[Image], model: Model | Non
     )
 
 
-def _check(machine: _Machine) -> Iterator[Finding]:
+def _check(machine: CheckedMachine) -> Iterator[Finding]:
     yield from _lines(machine)
     yield from _readings(machine)
     yield from _columns(machine)
     yield from _ranges(machine.deployment)
     yield from _stopping(machine)
-    yield from _generators(machine)
+    yield from generator_findings(machine)
 
 
-def _served(variable: Variable, rows: NDArray[np.uint16]) -> NDArray[np.uint16]:
-    served = rows[: variable.values]
-    return np.vstack([served, rows[-1:]]) if variable.on_missing == "missing" else served
-
-
-def _alive(machine: _Machine) -> NDArray[np.bool_]:
+def _alive(machine: CheckedMachine) -> NDArray[np.bool_]:
     """Return which lines can count for at least some readings: bool[lines]."""
     alive = np.ones(machine.prior.shape[1], dtype=np.bool_)
     if machine.parameters.prior_mode is PriorMode.TABLE:  # what the host writes is not known here
@@ -196,7 +148,7 @@ def _alive(machine: _Machine) -> NDArray[np.bool_]:
     return alive
 
 
-def _lines(machine: _Machine) -> Iterator[Finding]:
+def _lines(machine: CheckedMachine) -> Iterator[Finding]:
     """Lines that can never count, whatever is read."""
     deployment = machine.deployment
     dead = ~_alive(machine)
@@ -232,7 +184,7 @@ def _lines(machine: _Machine) -> Iterator[Finding]:
             )
 
 
-def _dead_prior(machine: _Machine) -> Iterator[Finding]:
+def _dead_prior(machine: CheckedMachine) -> Iterator[Finding]:
     deployment, model = machine.deployment, machine.model
     dead = ~machine.prior_rows().any(axis=0)
     meant = np.zeros_like(dead)
@@ -257,7 +209,7 @@ def _dead_prior(machine: _Machine) -> Iterator[Finding]:
         )
 
 
-def _readings(machine: _Machine) -> Iterator[Finding]:
+def _readings(machine: CheckedMachine) -> Iterator[Finding]:
     """Readings for which every line has a 0 code: a frame with one ends as `impossible`."""
     deployment, model = machine.deployment, machine.model
     alive = _alive(machine)
@@ -297,7 +249,7 @@ def _readings(machine: _Machine) -> Iterator[Finding]:
             )
 
 
-def _columns(machine: _Machine) -> Iterator[Finding]:
+def _columns(machine: CheckedMachine) -> Iterator[Finding]:
     """Columns that say nothing, and two that read the same."""
     of_columns = machine.parameters.sensor_mode is SensorMode.COLUMN
     for variable, table in zip(
@@ -378,7 +330,7 @@ def _ranges(deployment: Deployment) -> Iterator[Finding]:
             )
 
 
-def _stopping(machine: _Machine) -> Iterator[Finding]:
+def _stopping(machine: CheckedMachine) -> Iterator[Finding]:
     limits = machine.deployment.machine
     if limits.target_count > limits.max_cycles:
         yield Finding(
@@ -390,172 +342,6 @@ def _stopping(machine: _Machine) -> Iterator[Finding]:
                 "them"
             ),
             advice=f"use --max-cycles above {limits.target_count}, or a smaller --target-count",
-        )
-
-
-def _generators(machine: _Machine) -> Iterator[Finding]:
-    parameters = machine.parameters
-    if parameters.rng is RngKind.IDEAL:
-        yield Finding(
-            severity=Severity.NOTE,
-            check="rng",
-            about="rng = ideal",
-            what="such generators exist emulated only: no hardware project is made",
-            advice="for a board use an LFSR",
-        )
-        return
-    if parameters.rng_banks == 1 and parameters.rng_reset is RngReset.BANK:
-        yield Finding(
-            severity=Severity.WARNING,
-            check="rng-banks",
-            about="rng_banks = 1",
-            what="every frame sees the same random numbers, which leaves an error that averaging frames never removes",
-            advice="use --rng-banks 16, or --rng-reset free",
-        )
-    width = parameters.rng.lfsr_bits
-    length = 2**width - 1 if width is not None else len(_table(machine.board))
-    yield from _period(machine, length)
-    if width is None:
-        yield from _table_numbers(machine)
-        return
-    if parameters.steps_per_clock < parameters.prob_bits:
-        yield Finding(
-            severity=Severity.WARNING,
-            check="rng-steps",
-            about=f"steps_per_clock = {parameters.steps_per_clock}",
-            what=(
-                f"numbers of {parameters.prob_bits} bits share {parameters.prob_bits - parameters.steps_per_clock} bits "
-                "with those of the next cycle: means are right, but counts vary up to 2.6 times as much"
-            ),
-            advice="leave --steps-per-clock out, unless it is to be the thesis's machine",
-        )
-    yield from _relations(machine)
-
-
-def _period(machine: _Machine, length: int) -> Iterator[Finding]:
-    parameters, limits = machine.parameters, machine.deployment.machine
-    period = length // math.gcd(length, parameters.steps_per_clock)
-    if limits.max_cycles > period:
-        longer = "a longer --rng-table" if parameters.rng is RngKind.TABLE else "a wider --rng"
-        shortened = (
-            ""
-            if period == length
-            else f" ({length} steps, of which a clock takes {parameters.steps_per_clock})"
-        )
-        yield Finding(
-            severity=Severity.WARNING,
-            check="rng-period",
-            about=f"rng = {parameters.rng}",
-            what=(
-                f"the random numbers repeat after {period} cycles{shortened}, and a frame may run {limits.max_cycles}: "
-                "the later ones say nothing new"
-            ),
-            advice=f"use --max-cycles {period}, or {longer}",
-        )
-
-
-def _relations(machine: _Machine) -> Iterator[Finding]:
-    """Columns whose bits are related by XOR, in some bank; with a generator a cell, in some line."""
-    parameters, names = machine.parameters, machine.names
-    seeds = seed_words(machine.board).reshape(-1, parameters.columns)
-    found = relations(parameters.rng, seeds, parameters.prob_bits)
-    what_groups = "banks" if parameters.shared else "lines in a bank"
-    for count in (2, 3, 4):
-        related = [relation for relation in found.found if len(relation.bits) == count]
-        if not related:
-            continue
-        first = related[0]
-        bank, line = divmod(first.group, 1 if parameters.shared else parameters.lines)
-        where = f"bank {bank}" + ("" if parameters.shared else f", line {line} of board 0")
-        bits = " and ".join(f"bit {bit} of {names[column]}" for column, bit in first.bits)
-        same = count == 2 and first.bits[0][1] == first.bits[1][1]
-        severity = Severity.ERROR if count < 4 else Severity.WARNING
-        if not parameters.shared and not same:
-            severity = Severity.WARNING if count < 4 else Severity.NOTE
-        clean = first.group if parameters.shared else 0
-        yield Finding(
-            severity=severity,
-            check="rng-relation",
-            about=f"rng = {parameters.rng}",
-            what=(
-                f"in {len(related)} of {found.groups} {what_groups} {count} random bits of different columns "
-                f"{'are the same' if count == 2 else 'XOR to 0'} in every cycle ({where}: {bits}), so these columns are not "
-                "independent"
-            ),
-            advice="use a wider --rng or fewer --prob-bits"
-            + (f", or --rng-banks {clean}, which leaves these banks out" if clean > 1 else ""),
-        )
-    if found.groups < len(seeds):
-        yield Finding(
-            severity=Severity.NOTE,
-            check="rng-relation",
-            about=f"rng = {parameters.rng}",
-            what=f"relations were looked for in {found.groups} of {len(seeds)} {what_groups}, for time's sake",
-        )
-
-
-def _table_numbers(machine: _Machine) -> Iterator[Finding]:
-    """What a table of random numbers does to probabilities and to pairs of columns."""
-    parameters, names = machine.parameters, machine.names
-    numbers = _table(machine.board) & np.uint32(parameters.ones_code)
-    codes = 1 << parameters.prob_bits
-    # codes 0 and all-ones don't depend on the numbers
-    below = np.cumsum(np.bincount(numbers, minlength=codes))[: codes - 2] / len(numbers)
-    errors = np.abs(below - np.arange(1, codes - 1) / codes)
-    worst = int(errors.argmax()) if errors.size else 0
-    if errors.size and errors[worst] > 0.5 / codes:
-        yield Finding(
-            severity=Severity.WARNING,
-            check="rng-table",
-            about="rng = table",
-            what=(
-                f"code {worst + 1} counts in {below[worst]:.4g} of the cycles instead of {(worst + 1) / codes:.4g}, for "
-                "the numbers are not equally often in the table"
-            ),
-            advice="use a table with every number equally often, such as the one made without --rng-table",
-        )
-    starts = seed_words(machine.board).reshape(-1, parameters.columns)
-    for group, row in enumerate(starts):
-        order = np.argsort(row, kind="stable")
-        for one, other in pairwise(int(index) for index in order):
-            if row[one] == row[other]:
-                yield Finding(
-                    severity=Severity.ERROR,
-                    check="rng-relation",
-                    about=f"{names[one]} and {names[other]}",
-                    what=f"they play the table from the same place (place {row[one]}, group {group}), so they are the same",
-                    advice="use a longer --rng-table",
-                )
-                return
-    yield from _table_correlation(machine, numbers, starts)
-
-
-def _table_correlation(
-    machine: _Machine, numbers: NDArray[np.uint32], starts: NDArray[np.uint64]
-) -> Iterator[Finding]:
-    """Columns play the ring at fixed distances: at each the numbers should be uncorrelated."""
-    length = len(numbers)
-    centred = numbers - numbers.mean()
-    if not centred.any():
-        return
-    spectrum = np.fft.rfft(centred)
-    correlation = np.fft.irfft(np.abs(spectrum) ** 2, length) / (centred @ centred)
-    limit = _RANDOM_SIGMAS / math.sqrt(length)
-    first = starts[0].astype(np.int64)
-    one, other = np.triu_indices(len(first), 1)
-    found = np.abs(correlation[(first[one] - first[other]) % length])
-    worst = int(found.argmax()) if found.size else 0
-    if found.size and found[worst] > limit:
-        pair = [machine.names[one[worst]], machine.names[other[worst]]]
-        yield Finding(
-            severity=Severity.WARNING,
-            check="rng-relation",
-            about=" and ".join(pair),
-            what=(
-                f"their random numbers correlate by {found[worst]:.2g}; {limit:.2g} and less is what chance does in a "
-                f"table of {length}"
-            ),
-            advice="use a table in a more random order, such as the one made without --rng-table",
         )
 
 
@@ -618,11 +404,7 @@ def _files(directory: Path, deployment: Deployment, images: Sequence[Image]) -> 
             )
 
 
-def _table(board: BM1Machine) -> NDArray[np.uint32]:
-    return np.zeros(0, dtype=np.uint32) if board.rng_table is None else board.rng_table
-
-
-def _wider(machine: _Machine) -> str:
+def _wider(machine: CheckedMachine) -> str:
     scale = "" if machine.deployment.machine.scale == "address" else "--scale address or "
     return f"use {scale}more --prob-bits"
 

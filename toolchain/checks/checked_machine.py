@@ -1,0 +1,59 @@
+"""What is checked: a whole machine, whichever boards hold its lines, and whether it is built or only would be."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from machines.bm1 import BM1Machine
+    from machines.parameters import BM1Parameters
+    from toolchain.deployment import Deployment, Variable
+    from toolchain.models.model import Model
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CheckedMachine:
+    """What is checked: a whole machine, whichever boards hold its lines.
+
+    Attributes:
+        deployment: Its variables, lines and limits.
+        board: The first board's machine: parameters and random numbers, alike on all boards.
+        prior: uint16[rows, lines], over all boards.
+        tables: One uint16[2**bits, lines] per column, over all boards.
+        model: The probabilities, where they are known.
+    """
+
+    deployment: Deployment
+    board: BM1Machine
+    prior: NDArray[np.uint16]
+    tables: tuple[NDArray[np.uint16], ...]
+    model: Model | None
+
+    @property
+    def parameters(self) -> BM1Parameters:
+        """The first board's parameters; only the lines differ from board to board."""
+        return self.board.parameters
+
+    @property
+    def names(self) -> list[str]:
+        """What every column is called, the prior first."""
+        return ["the prior", *(variable.name for variable in self.deployment.sensors)]
+
+    def served(self, column: int) -> NDArray[np.uint16]:
+        """The rows of a column (from 0) that readings address; the missing reading's too, if one may be missing."""
+        return _served(self.deployment.sensors[column], self.tables[column])
+
+    def prior_rows(self) -> NDArray[np.uint16]:
+        """The rows of the prior that can be chosen."""
+        select = self.deployment.prior_select
+        return self.prior if select is None else _served(select, self.prior)
+
+
+def _served(variable: Variable, rows: NDArray[np.uint16]) -> NDArray[np.uint16]:
+    served = rows[: variable.values]
+    return np.vstack([served, rows[-1:]]) if variable.on_missing == "missing" else served

@@ -1,0 +1,195 @@
+"""What is wrong with a machine's random numbers: their period, their steps, and what columns have in common."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from machines.parameters import RngKind, RngReset
+from toolchain.checks.finding import Finding, Severity
+from toolchain.checks.rng_relations import relations
+from toolchain.outputs.memories import seed_words
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from numpy.typing import NDArray
+
+    from machines.bm1 import BM1Machine
+    from toolchain.checks.checked_machine import CheckedMachine
+
+_RANDOM_SIGMAS: Final = 5
+
+
+def generator_findings(machine: CheckedMachine) -> Iterator[Finding]:
+    """Numbers that repeat, are shared, or are related from column to column."""
+    parameters = machine.parameters
+    if parameters.rng is RngKind.IDEAL:
+        yield Finding(
+            severity=Severity.NOTE,
+            check="rng",
+            about="rng = ideal",
+            what="such generators exist emulated only: no hardware project is made",
+            advice="for a board use an LFSR",
+        )
+        return
+    if parameters.rng_banks == 1 and parameters.rng_reset is RngReset.BANK:
+        yield Finding(
+            severity=Severity.WARNING,
+            check="rng-banks",
+            about="rng_banks = 1",
+            what="every frame sees the same random numbers, which leaves an error that averaging frames never removes",
+            advice="use --rng-banks 16, or --rng-reset free",
+        )
+    width = parameters.rng.lfsr_bits
+    length = 2**width - 1 if width is not None else len(_table(machine.board))
+    yield from _period(machine, length)
+    if width is None:
+        yield from _table_numbers(machine)
+        return
+    if parameters.steps_per_clock < parameters.prob_bits:
+        yield Finding(
+            severity=Severity.WARNING,
+            check="rng-steps",
+            about=f"steps_per_clock = {parameters.steps_per_clock}",
+            what=(
+                f"numbers of {parameters.prob_bits} bits share {parameters.prob_bits - parameters.steps_per_clock} bits "
+                "with those of the next cycle: means are right, but counts vary up to 2.6 times as much"
+            ),
+            advice="leave --steps-per-clock out, unless it is to be the thesis's machine",
+        )
+    yield from _relations(machine)
+
+
+def _period(machine: CheckedMachine, length: int) -> Iterator[Finding]:
+    parameters, limits = machine.parameters, machine.deployment.machine
+    period = length // math.gcd(length, parameters.steps_per_clock)
+    if limits.max_cycles > period:
+        longer = "a longer --rng-table" if parameters.rng is RngKind.TABLE else "a wider --rng"
+        shortened = (
+            ""
+            if period == length
+            else f" ({length} steps, of which a clock takes {parameters.steps_per_clock})"
+        )
+        yield Finding(
+            severity=Severity.WARNING,
+            check="rng-period",
+            about=f"rng = {parameters.rng}",
+            what=(
+                f"the random numbers repeat after {period} cycles{shortened}, and a frame may run {limits.max_cycles}: "
+                "the later ones say nothing new"
+            ),
+            advice=f"use --max-cycles {period}, or {longer}",
+        )
+
+
+def _relations(machine: CheckedMachine) -> Iterator[Finding]:
+    """Columns whose bits are related by XOR, in some bank; with a generator a cell, in some line."""
+    parameters, names = machine.parameters, machine.names
+    seeds = seed_words(machine.board).reshape(-1, parameters.columns)
+    found = relations(parameters.rng, seeds, parameters.prob_bits)
+    what_groups = "banks" if parameters.shared else "lines in a bank"
+    for count in (2, 3, 4):
+        related = [relation for relation in found.found if len(relation.bits) == count]
+        if not related:
+            continue
+        first = related[0]
+        bank, line = divmod(first.group, 1 if parameters.shared else parameters.lines)
+        where = f"bank {bank}" + ("" if parameters.shared else f", line {line} of board 0")
+        bits = " and ".join(f"bit {bit} of {names[column]}" for column, bit in first.bits)
+        same = count == 2 and first.bits[0][1] == first.bits[1][1]
+        severity = Severity.ERROR if count < 4 else Severity.WARNING
+        if not parameters.shared and not same:
+            severity = Severity.WARNING if count < 4 else Severity.NOTE
+        clean = first.group if parameters.shared else 0
+        yield Finding(
+            severity=severity,
+            check="rng-relation",
+            about=f"rng = {parameters.rng}",
+            what=(
+                f"in {len(related)} of {found.groups} {what_groups} {count} random bits of different columns "
+                f"{'are the same' if count == 2 else 'XOR to 0'} in every cycle ({where}: {bits}), so these columns are not "
+                "independent"
+            ),
+            advice="use a wider --rng or fewer --prob-bits"
+            + (f", or --rng-banks {clean}, which leaves these banks out" if clean > 1 else ""),
+        )
+    if found.groups < len(seeds):
+        yield Finding(
+            severity=Severity.NOTE,
+            check="rng-relation",
+            about=f"rng = {parameters.rng}",
+            what=f"relations were looked for in {found.groups} of {len(seeds)} {what_groups}, for time's sake",
+        )
+
+
+def _table_numbers(machine: CheckedMachine) -> Iterator[Finding]:
+    """What a table of random numbers does to probabilities and to pairs of columns."""
+    parameters, names = machine.parameters, machine.names
+    numbers = _table(machine.board) & np.uint32(parameters.ones_code)
+    codes = 1 << parameters.prob_bits
+    # codes 0 and all-ones don't depend on the numbers
+    below = np.cumsum(np.bincount(numbers, minlength=codes))[: codes - 2] / len(numbers)
+    errors = np.abs(below - np.arange(1, codes - 1) / codes)
+    worst = int(errors.argmax()) if errors.size else 0
+    if errors.size and errors[worst] > 0.5 / codes:
+        yield Finding(
+            severity=Severity.WARNING,
+            check="rng-table",
+            about="rng = table",
+            what=(
+                f"code {worst + 1} counts in {below[worst]:.4g} of the cycles instead of {(worst + 1) / codes:.4g}, for "
+                "the numbers are not equally often in the table"
+            ),
+            advice="use a table with every number equally often, such as the one made without --rng-table",
+        )
+    starts = seed_words(machine.board).reshape(-1, parameters.columns)
+    for group, row in enumerate(starts):
+        order = np.argsort(row, kind="stable")
+        for one, other in pairwise(int(index) for index in order):
+            if row[one] == row[other]:
+                yield Finding(
+                    severity=Severity.ERROR,
+                    check="rng-relation",
+                    about=f"{names[one]} and {names[other]}",
+                    what=f"they play the table from the same place (place {row[one]}, group {group}), so they are the same",
+                    advice="use a longer --rng-table",
+                )
+                return
+    yield from _table_correlation(machine, numbers, starts)
+
+
+def _table_correlation(
+    machine: CheckedMachine, numbers: NDArray[np.uint32], starts: NDArray[np.uint64]
+) -> Iterator[Finding]:
+    """Columns play the ring at fixed distances: at each the numbers should be uncorrelated."""
+    length = len(numbers)
+    centred = numbers - numbers.mean()
+    if not centred.any():
+        return
+    spectrum = np.fft.rfft(centred)
+    correlation = np.fft.irfft(np.abs(spectrum) ** 2, length) / (centred @ centred)
+    limit = _RANDOM_SIGMAS / math.sqrt(length)
+    first = starts[0].astype(np.int64)
+    one, other = np.triu_indices(len(first), 1)
+    found = np.abs(correlation[(first[one] - first[other]) % length])
+    worst = int(found.argmax()) if found.size else 0
+    if found.size and found[worst] > limit:
+        pair = [machine.names[one[worst]], machine.names[other[worst]]]
+        yield Finding(
+            severity=Severity.WARNING,
+            check="rng-relation",
+            about=" and ".join(pair),
+            what=(
+                f"their random numbers correlate by {found[worst]:.2g}; {limit:.2g} and less is what chance does in a "
+                f"table of {length}"
+            ),
+            advice="use a table in a more random order, such as the one made without --rng-table",
+        )
+
+
+def _table(board: BM1Machine) -> NDArray[np.uint32]:
+    return np.zeros(0, dtype=np.uint32) if board.rng_table is None else board.rng_table
