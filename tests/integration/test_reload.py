@@ -14,6 +14,7 @@ import subprocess
 import time
 from collections import Counter
 from functools import cache
+from pathlib import Path
 
 import pytest
 
@@ -180,12 +181,17 @@ async def a_death_while_boards_are_programmed(stage, robot, master, runs, folder
     boards = sorted(stage.processes()["board"], key=lambda each: each.pid)[1:]  # the first is their parent
     images = [board.image_hash for board in load_deployment(folder, images=False).boards]
     generation = (await status_of(runs, "master"))["generation"]
+    endpoint = (await status_of(runs, "pcie-app"))["boards"][2]["endpoint"]
+    programmed_at = endpoint.removeprefix("unix:").replace(".sock", ".program.sock")
     dies = boards[2] if victim == "board" else stage.processes()["pcie-app"][0]
     boards[2].suspend()
     reloading = reload_(stage, runs, "-d", str(folder))
 
     async def half_way():
-        return (await status_of(runs, "board1"))["boards"][0]["image"] == images[1]
+        # board 1 has its new image, and somebody waits for board 2 to take its own
+        before_it = (await status_of(runs, "board1"))["boards"][0]["image"] == images[1]
+        sockets = Path("/proc/net/unix").read_text().split()
+        return before_it and sockets.count(programmed_at) > 1
 
     await until(half_way)
     dies.kill()
@@ -205,18 +211,25 @@ async def a_death_while_boards_are_programmed(stage, robot, master, runs, folder
     await robot.have(len(robot.results) + 5)
 
 
-async def test_what_is_refused_changes_nothing(stage, boat, other_boat, tmp_path):
-    hub, robot, master, runs = await looping(stage, boat, witness=(boat, other_boat, boat))
-    larger = build_boat(tmp_path / "larger", cells=12)
-    elsewhere = tmp_path / "elsewhere"
+def unfit(boat, where):
+    """Deployments of another size, with other topics, and with a damaged image."""
+    larger = build_boat(where / "larger", cells=12)
+    elsewhere, damaged = where / "elsewhere", where / "damaged"
     shutil.copytree(boat, elsewhere)
     regenerate("deployment", elsewhere, "--topic", "/other/topic", "--output", "/other/results")
-    damaged = tmp_path / "damaged"
     shutil.copytree(boat, damaged)
     image = damaged / "boards/board2.bm"
     data = bytearray(image.read_bytes())
     data[len(data) // 2] ^= 1
     image.write_bytes(data)
+    return larger, elsewhere, damaged
+
+
+async def test_what_is_refused_changes_nothing(stage, boat, other_boat, tmp_path):
+    # nothing to do with each other, and two processors have time for both
+    (hub, robot, master, runs), (larger, elsewhere, damaged) = await asyncio.gather(
+        looping(stage, boat, witness=(boat, other_boat, boat)), asyncio.to_thread(unfit, boat, tmp_path)
+    )
     for folder, *said in (
         (larger, "[machine] lines is 64 in the run and 144 in the new one"),
         (elsewhere, "[[source]] 0 topic is /boat/sensors in the run and /other/topic", "[[output]] 0 topic"),
