@@ -43,18 +43,23 @@ def regenerate(part, directory, *options):
 
 
 @cache
-def counted(_hash, folder, addresses, bank):
-    """The posterior that a deployment's boards count, in this process; kept by its hash, since folders change."""
+def boards_of(_hash, folder, _bank):
+    """A deployment's boards in this process; kept by its hash, since folders change, and by bank, whose random bits take time."""
     deployment = load_deployment(folder)
     images = [read_image(deployment.image_path(board)) for board in range(len(deployment.boards))]
     machine = deployment.machine
-    boards = EmulatedBoards(
+    return EmulatedBoards(
         [image.machine for image in images],
         target_count=machine.target_count,
         max_cycles=machine.max_cycles,
         stop=machine.stop,
     )
-    return boards.run(addresses, 0, bank).posterior
+
+
+@cache
+def counted(hash_, folder, addresses, bank):
+    """The posterior that a deployment's boards count."""
+    return boards_of(hash_, folder, bank).run(addresses, 0, bank).posterior
 
 
 class Witness(Robot):
