@@ -11,7 +11,7 @@ import pytest
 from hypothesis import HealthCheck, event, given, settings
 from hypothesis import strategies as st
 
-from machines import fast
+from machines import fast, fast_code
 from machines.bm1 import BM1Machine, Start, StopReason
 from machines.errors import MachineError
 from machines.fast import FastBM1
@@ -133,7 +133,7 @@ def test_what_is_prepared_changes_nothing(reset):
         start = Start(addresses=(bank, 2, 3), target_count=900, max_cycles=4000, bank=bank)
         assert seen(prepared, prepared.start(start)) == seen(fresh, fresh.start(start))
     if reset is RngReset.BANK:
-        blocks = fast.PREPARED_CYCLES // fast._BLOCK_CYCLES
+        blocks = fast.PREPARED_CYCLES // fast_code.BLOCK_CYCLES
         for bank in range(3):
             first = bank * prepared._kept_blocks
             assert prepared._store.filled[first : first + blocks].all()
@@ -159,20 +159,20 @@ def test_nothing_is_compiled_twice():
         Start(addresses=(1, 2, 3), target_count=70, max_cycles=900, run_until=3),
         kept_bytes=0,
     )
-    for function in (fast._begin, fast._run, fast._jump):
+    for function in (fast_code.begin, fast_code.run, fast_code.jump):
         assert len(function.signatures) == 1
 
 
 def _in_a_child(machine, start, answers):
     kernel = FastBM1(machine)
     kernel.start(start)
-    compiled = sum(fast._run.stats.cache_misses.values())
+    compiled = sum(fast_code.run.stats.cache_misses.values())
     answers.put((compiled, kernel.cycles, kernel.counts.tolist()))
 
 
 def test_a_forked_process_has_the_kernel_loaded():
     fast.warm_up()
-    compiled = sum(fast._run.stats.cache_misses.values())
+    compiled = sum(fast_code.run.stats.cache_misses.values())
     machine, start = machine_of(), Start(addresses=(0, 1, 2), target_count=99, max_cycles=900)
     kernel = FastBM1(machine)
     kernel.start(start)
@@ -190,5 +190,5 @@ def test_where_nothing_can_be_cached_it_is_compiled_all_the_same(monkeypatch):
             raise RuntimeError("cannot cache function: no locator available")
         return lambda function: (function, nogil)
 
-    monkeypatch.setattr(fast, "njit", njit)
-    assert fast._jit(abs) == (abs, True)
+    monkeypatch.setattr(fast_code, "njit", njit)
+    assert fast_code._jit(abs) == (abs, True)

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import HealthCheck, event, given, settings
 from hypothesis import strategies as st
 
-from machines import fast
+from machines import fast, fast_code
 from machines.bm1 import BM1Machine, Start, StopReason, joint_reason
 from machines.errors import MachineError, StartError
 from machines.fast import FastBM1, FastReplicas
@@ -161,9 +161,9 @@ def test_nothing_is_compiled_twice():
         kernel.start(Start(addresses=np.ones(shape, int), target_count=90, max_cycles=2000, run_until=10))
         if kernel.reason is StopReason.SLICE:
             kernel.resume(0)
-    for function in (fast._begin_replicas, fast._resume_replicas, fast._copy_counts):
+    for function in (fast_code.begin_replicas, fast_code.resume_replicas, fast_code.copy_counts):
         assert len(function.signatures) == 1
-    for function in (fast._run_replica, fast._run):  # none where it was loaded as a part of the others
+    for function in (fast_code._run_replica, fast_code.run):  # none where it was loaded as a part of the others
         assert len(function.signatures) <= 1
 
 
