@@ -163,7 +163,10 @@ def test_nothing_is_compiled_twice():
             kernel.resume(0)
     for function in (fast_code.begin_replicas, fast_code.resume_replicas, fast_code.copy_counts):
         assert len(function.signatures) == 1
-    for function in (fast_code._run_replica, fast_code.run):  # none where it was loaded as a part of the others
+    for function in (
+        fast_code._run_replica,
+        fast_code.run,
+    ):  # none where it was loaded as a part of the others
         assert len(function.signatures) <= 1
 
 
