@@ -89,7 +89,8 @@ def build(
     --known smoke,dysp -o build/asia --uri ws://localhost:9090 --topic /patient --type clinic_msgs/Patient`
     """
     with one_sentence():
-        from toolchain.commands.build import NetworkQuestion, Unread, run_build
+        from toolchain.commands.build import run_build
+        from toolchain.commands.named_model import NetworkQuestion, Unread
 
         options = BuildOptions(
             uri=uri or "",
@@ -176,8 +177,8 @@ def check(
     is an error among the findings, else 0.
     """
     with one_sentence():
-        from toolchain.commands.build import NetworkQuestion, Unread
         from toolchain.commands.check import UNTOLD_TARGET, run_check
+        from toolchain.commands.named_model import NetworkQuestion, Unread
 
         options = BuildOptions(
             **UNTOLD_TARGET,

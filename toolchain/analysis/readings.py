@@ -10,10 +10,10 @@ import numpy as np
 from machines.encode import decode_code
 from toolchain.address import to_address
 from toolchain.errors import BuildError, ModelError, ReadingError
+from toolchain.flag_values import key_values
 from toolchain.learning.recording import read_recording
 from toolchain.models.model import Known, Model, PriorSelect
 from toolchain.quantise import written_codes
-from toolchain.settings import key_values
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -10,7 +10,8 @@ import typer
 
 from toolchain.checks.check import check_deployment, check_model, refusal
 from toolchain.checks.finding import Finding, Severity
-from toolchain.commands.build import on_device, read_model, read_options
+from toolchain.commands.build import on_device, read_options
+from toolchain.commands.named_model import read_model
 from toolchain.deployment import FILE_NAME
 from toolchain.errors import BuildError, ToolchainError
 from toolchain.models import case_study
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from toolchain.commands.build import NetworkQuestion, Unread
+    from toolchain.commands.named_model import NetworkQuestion, Unread
     from toolchain.options import BuildOptions
 
 

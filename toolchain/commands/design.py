@@ -75,9 +75,9 @@ def inspect_(
     """
     with one_sentence():
         from toolchain.analysis.resources import Pcie
-        from toolchain.commands.build import NetworkQuestion
         from toolchain.commands.explore import counting
         from toolchain.commands.inspect import InspectOptions, as_json, inspect, report
+        from toolchain.commands.named_model import NetworkQuestion
 
         options = InspectOptions(
             model=model,
@@ -162,8 +162,8 @@ def explore(
     done, and the same command goes on. `toolchain explore --claims out/claims` makes the thesis's claims.
     """
     with one_sentence():
-        from toolchain.commands.build import NetworkQuestion
         from toolchain.commands.explore import ExploreOptions, run_claims_command, run_explore
+        from toolchain.commands.named_model import NetworkQuestion
 
         if claims is not None:
             if model is not None:

@@ -13,7 +13,7 @@ from machines.parameters import RngKind
 from toolchain.analysis.explore import Results, Sweep, explore, pareto, run_task, tasks
 from toolchain.analysis.readings import recorded_readings, sample_readings
 from toolchain.analysis.resources import device_named
-from toolchain.commands.build import NetworkQuestion, Unread, read_model
+from toolchain.commands.named_model import NetworkQuestion, Unread, read_model
 from toolchain.errors import BuildError
 from toolchain.options import Scale
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final
 from toolchain.address import to_address
 from toolchain.analysis.readings import reading_columns
 from toolchain.errors import BuildError, ModelError, ReadingError
+from toolchain.flag_values import key_values
 from toolchain.learning.fit import LEAST_READINGS, Support, fit_model, locate
 from toolchain.learning.fit_options import FitMethod
 from toolchain.learning.fitted import FittedRecording, apply_fit, write_fit
@@ -19,7 +20,6 @@ from toolchain.learning.recording import Recording, read_recording
 from toolchain.models.case_study import load_model
 from toolchain.models.fusion import exact_posterior
 from toolchain.models.model import cell_centres
-from toolchain.settings import key_values
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -22,7 +22,7 @@ from toolchain.analysis.readings import (
 )
 from toolchain.analysis.resources import Pcie, Tables, device_named, estimate
 from toolchain.build import REPORT_NAME, many_sentence
-from toolchain.commands.build import NetworkQuestion, Unread, read_model
+from toolchain.commands.named_model import NetworkQuestion, Unread, read_model
 from toolchain.deployment import load_deployment
 from toolchain.errors import BuildError, DeploymentError
 from toolchain.options import Scale

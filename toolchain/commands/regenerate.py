@@ -52,7 +52,7 @@ def memories(
     """
     with one_sentence():
         from toolchain.build import build_date
-        from toolchain.commands.build import NetworkQuestion, Unread, model_file, read_model
+        from toolchain.commands.named_model import NetworkQuestion, Unread, model_file, read_model
         from toolchain.errors import BuildError
         from toolchain.regenerate import regenerate_memories
 
@@ -127,9 +127,8 @@ def deployment(
     mixed up. No image, memory or board is touched. What is left out stays as it is.
     """
     with one_sentence():
-        from toolchain.commands.build import names_in
+        from toolchain.flag_values import key_values, names_in
         from toolchain.regenerate import DeploymentEdits, regenerate_deployment
-        from toolchain.settings import key_values
 
         edits = DeploymentEdits(
             uri=uri,

@@ -1,4 +1,4 @@
-"""KEY=VALUE, as a user writes it behind a flag."""
+"""What a user writes behind a flag: KEY=VALUE, or names with commas between them."""
 
 from __future__ import annotations
 
@@ -28,3 +28,16 @@ def key_values(settings: Iterable[str], flag: str = "--set", example: str = "wid
             raise BuildError(message)
         found[key] = value
     return found
+
+
+def names_in(flag: str, text: str) -> list[str]:
+    """Return the names in `A,B,C`.
+
+    Raises:
+        BuildError: An empty one.
+    """
+    names = [name.strip() for name in text.split(",")] if text else []
+    if not all(names):
+        message = f"{flag} {text}: expected names with a comma between them, such as {flag} A,B"
+        raise BuildError(message)
+    return names
