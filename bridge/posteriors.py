@@ -379,7 +379,15 @@ def _loop_in_a_thread() -> Iterator[_Do]:
         started.set_result((asyncio.get_running_loop(), stop))
         await stop.wait()
 
-    thread = threading.Thread(target=lambda: asyncio.run(live()), name="posteriors", daemon=True)
+    def run() -> None:
+        try:
+            asyncio.run(live())
+        except BaseException as error:
+            if started.done():
+                raise
+            started.set_exception(error)  # no loop was to be had: who waits for it must not wait on
+
+    thread = threading.Thread(target=run, name="posteriors", daemon=True)
     thread.start()
     loop, stop = started.result()
 

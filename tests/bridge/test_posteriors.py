@@ -5,6 +5,7 @@ fake server  ->  /bm/frame, /BMresults  ->  posteriors(), listen()
 
 import asyncio
 import contextlib
+import errno
 import subprocess
 import sys
 import threading
@@ -308,3 +309,13 @@ async def test_ctrl_c_is_an_end_like_any_other(when):
 def test_numpy_is_not_imported_before_it_is_wanted():
     code = "import sys, bridge.posteriors; sys.exit('numpy' in sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True, timeout=PATIENCE)
+
+
+def test_where_there_is_no_loop_nobody_waits_for_one(monkeypatch):
+    def run(work):
+        work.close()
+        raise OSError(errno.EMFILE, "Too many open files")
+
+    monkeypatch.setattr(asyncio, "run", run)
+    with pytest.raises(OSError, match="Too many open files"):
+        listen("ws://127.0.0.1:1", print)
