@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     from toolchain.options import Scale
 
 MISSING: Final = -1
+MOST_FRAMES: Final = 100_000
+"""All are in memory at once, beside a row of each column's table for each."""
 
 _WEIGHT_STEPS: Final = 500
 
@@ -82,6 +84,17 @@ class Readings:
         return addresses, prior_row
 
 
+def check_frames(frames: int) -> None:
+    """Refuse a number of frames that can't be looked at.
+
+    Raises:
+        BuildError: None, or more than `MOST_FRAMES`.
+    """
+    if not 1 <= frames <= MOST_FRAMES:
+        message = f"--frames is {frames}, expected 1 to {MOST_FRAMES}"
+        raise BuildError(message)
+
+
 def sample_readings(model: Model, frames: int, *, seed: int, source: str = "") -> Readings:
     """Draw readings from a model: a line from the prior, then each reading given that line; none is missing.
 
@@ -94,11 +107,9 @@ def sample_readings(model: Model, frames: int, *, seed: int, source: str = "") -
         source: What they are said to be.
 
     Raises:
-        BuildError: No frames.
+        BuildError: No frames, or too many.
     """
-    if frames < 1:
-        message = f"--frames is {frames}, expected 1 or more"
-        raise BuildError(message)
+    check_frames(frames)
     random = np.random.default_rng(seed)
     rows = np.full(frames, MISSING, dtype=np.int64)
     if model.prior_select is None:
@@ -232,11 +243,9 @@ def recorded_readings(
 
     Raises:
         ModelError: No such recording or column, or no row that the machine takes.
-        BuildError: A name that no variable has, or no frames.
+        BuildError: A name that no variable has, no frames, or too many.
     """
-    if frames < 1:
-        message = f"--frames is {frames}, expected 1 or more"
-        raise BuildError(message)
+    check_frames(frames)
     columns = reading_columns([variable.name for variable in variables], given)
     recording = read_recording(path, list(dict.fromkeys(columns.values())), tolerance_s=tolerance_s)
     rows: list[list[int]] = []

@@ -11,7 +11,7 @@ import typer
 
 from machines.parameters import RngKind
 from toolchain.analysis.explore import Results, Sweep, explore, pareto, run_task, tasks
-from toolchain.analysis.readings import recorded_readings, sample_readings
+from toolchain.analysis.readings import check_frames, recorded_readings, sample_readings
 from toolchain.analysis.resources import device_named
 from toolchain.commands.named_model import NetworkQuestion, Unread, read_model
 from toolchain.errors import BuildError
@@ -205,15 +205,13 @@ def run_claims_command(directory: Path, *, frames: int, seed: int) -> None:
     """Run the thesis's claims as experiments, print their figures and draw them.
 
     Raises:
-        BuildError: No matplotlib, a folder that can't be written, or no frames.
+        BuildError: No matplotlib, a folder that can't be written, no frames, or too many.
     """
     from toolchain.analysis.claims import experiments, run_claims
     from toolchain.analysis.pictures import check_pictures_possible, draw_claims
 
     check_pictures_possible()
-    if frames < 1:
-        message = f"--frames is {frames}, expected 1 or more"
-        raise BuildError(message)
+    check_frames(frames)
     try:
         directory.mkdir(parents=True, exist_ok=True)
     except OSError as reason:

@@ -247,7 +247,7 @@ def test_a_plot(case):
         ),
         (["--device", "d9"], "--device d9: expected one of proce-v-d8"),
         (["--reading", "a=b"], "add --readings FILE"),
-        (["--frames", "0"], "--frames is 0, expected 1 or more"),
+        (["--frames", "0"], "--frames is 0, expected 1 to 100000"),
         (["--claims", "x"], "--claims has a model of its own"),
         (["--partitions", "13"], "12 lines can't be split over 13 boards"),
         (["--banks", "0"], "numbers from 1"),

@@ -121,6 +121,7 @@ def test_a_deployment_with_columns_of_another_width(case):
         (["--readings", "{case}/none.csv"], "none.csv is not there"),
         (["--banks", "0"], "--banks is 0"),
         (["--frames", "-1"], "--frames is -1"),
+        (["--frames", "9" * 30], "expected 1 to 100000"),
     ],
 )
 def test_mistakes(case, deployment, arguments, sentence):
