@@ -57,7 +57,8 @@ class Done(NamedTuple):
         status: The STATUS register.
         cycles: Cycles run in this frame.
         compute_ns: Time the machine took since that start or resume, in nanoseconds.
-        results: One 32-bit count per line, as bytes; valid until the link receives again.
+        results: One 32-bit count per line, of replicas one after the other, and then their OUTCOMES; as bytes, valid
+            until the link receives again.
     """
 
     number: int
@@ -444,6 +445,7 @@ class SocketLink:
 
     def _limit(self, seconds: float) -> None:
         """Let the kernel bound every blocking call: cheaper than Python's own time-outs, a system call each."""
-        value = struct.pack("@ll", int(seconds), int(seconds % 1 * 1e6))
+        # of 0 microseconds the kernel makes no limit at all
+        value = struct.pack("@ll", *divmod(max(1, round(seconds * 1e6)), 10**6))
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, value)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, value)
