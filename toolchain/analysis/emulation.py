@@ -9,7 +9,7 @@ import numpy as np
 
 from machines.bm1 import BM1Machine, Start, StopReason, first_slice
 from machines.kernel import make_kernel
-from machines.parameters import COUNTER_BITS_MAX, BM1Parameters
+from machines.parameters import COUNTER_BITS_MAX, CYCLES_MAX, BM1Parameters
 from machines.posterior import joint_posterior
 from toolchain.deployment import Stop
 from toolchain.errors import BuildError
@@ -71,8 +71,8 @@ class EmulatedBoards:
             bits = machines[0].parameters.counter_bits
             message = f"a target count of {target_count} does not fit counters of {bits} bits: expected 1 to {highest}"
             raise BuildError(message)
-        if max_cycles < 1:
-            message = f"max_cycles is {max_cycles}, expected 1 or more"
+        if not 1 <= max_cycles <= CYCLES_MAX:
+            message = f"max_cycles is {max_cycles}, expected 1 to {CYCLES_MAX}"
             raise BuildError(message)
         self.machines = tuple(machines)
         self.target_count = target_count

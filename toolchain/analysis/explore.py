@@ -7,6 +7,7 @@ import itertools
 import json
 import math
 import os
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Literal
 
@@ -274,8 +275,10 @@ class Results:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.points: dict[str, Point] = {}
+        content = b""
         try:
-            content = path.read_bytes() if path.exists() else b""
+            with suppress(FileNotFoundError), path.open("rb") as file:
+                content = file.read(MAX_FILE_BYTES + 1)
         except OSError as reason:
             message = f"{path} can't be read: {reason.strerror or reason}"
             raise BuildError(message) from None

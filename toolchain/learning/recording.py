@@ -12,7 +12,7 @@ import re
 from bisect import bisect_left
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TextIO
 
 from toolchain.errors import ModelError
 
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 MAX_ROWS: Final = 2_000_000
+_LONGEST_LINE: Final = 1 << 20
 
 _STEP: Final = re.compile(r"(\w+)((?:\[\d{1,9}\])*)")
 
@@ -64,7 +65,7 @@ def _read_csv(path: Path, columns: Sequence[str]) -> Recording:
     rows = 0
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
-            lines = csv.reader(file, strict=True)
+            lines = csv.reader(_lines(path, file), strict=True)
             heading = next(lines, [])
             places = {column: _place(path, heading, column) for column in found}
             for line in lines:
@@ -84,6 +85,15 @@ def _read_csv(path: Path, columns: Sequence[str]) -> Recording:
         message = f"{path} is no CSV file: {reason}"
         raise ModelError(message) from None
     return Recording(path, rows, found)
+
+
+def _lines(path: Path, file: TextIO) -> Iterator[str]:
+    """The lines of a file, which may be one without an end."""
+    while line := file.readline(_LONGEST_LINE + 1):
+        if len(line) > _LONGEST_LINE:
+            message = f"{path} is no CSV file: a line has more than {_LONGEST_LINE} characters"
+            raise ModelError(message)
+        yield line
 
 
 def _check_rows(path: Path, rows: int) -> None:

@@ -306,3 +306,9 @@ def test_ctrl_c_keeps_what_is_done(case):
     assert 1 <= done < 16
     assert len(Results(results).points) == done
     assert len(out.splitlines()) == done + 2
+
+
+def test_a_file_of_results_that_does_not_end_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr("toolchain.analysis.explore.MAX_FILE_BYTES", 1000)
+    with pytest.raises(BuildError, match="more than 1000 bytes"):
+        Results(Path("/dev/zero"))

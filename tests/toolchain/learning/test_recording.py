@@ -134,3 +134,10 @@ def test_a_bag_that_is_none(tmp_path):
     path.write_bytes(path.read_bytes()[:700])
     with pytest.raises(ModelError, match="can't be read as a bag"):
         read_recording(path, ["/range:data"])
+
+
+def test_a_file_that_is_one_endless_line_is_no_csv(tmp_path):
+    path = tmp_path / "endless.csv"
+    path.symlink_to("/dev/zero")
+    with pytest.raises(ModelError, match="a line has more than"):
+        read_recording(path, ["a"])
