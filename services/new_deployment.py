@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import stat
 from collections.abc import Callable
 from pathlib import Path
 
@@ -57,6 +58,7 @@ def keep(deployment: Deployment, directory: Path, generation: int) -> Path:
         The folder with the copy.
 
     Raises:
+        SettingsError: A file of it is not there, can't be read, or is none.
         NotReloadedError: It can't be copied, or was changed meanwhile.
         ToolchainError: The copy is none.
     """
@@ -64,10 +66,8 @@ def keep(deployment: Deployment, directory: Path, generation: int) -> Path:
     shutil.rmtree(kept, ignore_errors=True)
     for source in (deployment.path, *(deployment.image_path(at) for at in range(len(deployment.boards)))):
         copy = kept / source.relative_to(deployment.directory)
+        _check_readable(source)
         try:
-            if source.stat().st_size > _LARGEST_FILE:
-                msg = f"{source} has more than {_LARGEST_FILE >> 20} MiB: it belongs to no deployment"
-                raise NotReloadedError(msg)
             copy.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
             shutil.copyfile(source, copy)
         except OSError as error:
@@ -77,6 +77,24 @@ def keep(deployment: Deployment, directory: Path, generation: int) -> Path:
         msg = f"{deployment.path} was changed while it was read; reload again when that is done"
         raise NotReloadedError(msg)
     return kept
+
+
+def _check_readable(source: Path) -> None:
+    """See that a deployment's file can be copied, before there is a copy to blame.
+
+    Raises:
+        SettingsError: It can't, and says why.
+    """
+    try:
+        found = source.stat()
+        if stat.S_ISREG(found.st_mode):  # to open a pipe would wait for who writes into it
+            source.open("rb").close()
+    except OSError as error:
+        msg = f"{source} can't be read: {error.strerror or error}"
+        raise SettingsError(msg) from error
+    if not stat.S_ISREG(found.st_mode) or found.st_size > _LARGEST_FILE:
+        msg = f"{source} is no file of at most {_LARGEST_FILE >> 20} MiB: it belongs to no deployment; build it again"
+        raise SettingsError(msg)
 
 
 def forget(directory: Path, generation: int) -> None:

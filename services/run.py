@@ -70,6 +70,7 @@ class Master:
         self._reloads = Reloads(settings, self._in_force, self._peers, self, self._log)
         self._readings: WaitingFrames[Waits] = WaitingFrames(settings.queue or deployment.queue)
         self._held = False
+        self._catching_up = 0
         self._computing: tuple[Frame, Reading, int, int] | None = None
         self._at_publisher = 0
         self._number = 0
@@ -252,6 +253,7 @@ class Master:
             self.lose("passed over", self._readings.passed_over)
             self._readings = readings
         self._held = False
+        self._catching_up = len(self._readings)
         self._next()
 
     def lose(self, reason: str, count: int) -> None:
@@ -300,7 +302,10 @@ class Master:
         try:
             self._readings.put(waits)
         except ServiceError as error:
-            self.fail(error)
+            if self._held or self._catching_up:  # a reload was the slow part, not the boards
+                self.lose(LOST_IN_RELOAD, 1)
+            else:
+                self.fail(error)
             return
         self._next()
 
@@ -324,6 +329,7 @@ class Master:
         if waiting is None:
             return
         reading, arrived = waiting
+        self._catching_up = max(0, self._catching_up - 1)
         self._number += 1
         frame = Frame(
             self._number,

@@ -85,9 +85,9 @@ def test_a_copy_of_what_has_changed_is_refused(boat, tmp_path):
     with pytest.raises(NotReloadedError, match="was changed while it was read"):
         keep(loaded, tmp_path, 1)
     loaded = load_deployment(boat)
-    loaded.image_path(1).unlink()
-    with pytest.raises(NotReloadedError, match=r"board1\.bm can't be copied .*No such file"):
-        keep(loaded, tmp_path, 2)
+    (tmp_path / "file").touch()
+    with pytest.raises(NotReloadedError, match=r"deployment\.toml can't be copied .*Not a directory"):
+        keep(loaded, tmp_path / "file", 2)
 
 
 def test_a_service_switches_to_what_it_has_prepared(boat):
@@ -159,3 +159,25 @@ def test_copies_stay_while_the_master_lives(tmp_path, monkeypatch):
     leave(private.path)
     assert not private.path.exists()
     private.remove()
+
+
+@pytest.mark.parametrize(
+    ("made", "said"),
+    [
+        (None, "No such file"),
+        (os.mkfifo, "is no file of at most"),
+        (os.mkdir, "is no file of at most"),
+        (lambda path: os.truncate(os.open(path, os.O_CREAT | os.O_WRONLY), (1 << 28) + 1), "at most 256 MiB"),
+    ],
+    ids=["not there", "pipe", "folder", "huge"],
+)
+def test_an_image_that_is_none_is_the_folders_fault(boat, tmp_path, made, said):
+    loaded = load_deployment(boat)
+    image = loaded.image_path(1)
+    image.unlink()
+    if made is not None:
+        made(image)
+    with pytest.raises(SettingsError, match=said) as refused:
+        keep(loaded, tmp_path, 1)
+    assert str(image) in str(refused.value)
+    assert refused.value.exit_code == 2

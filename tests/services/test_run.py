@@ -1,0 +1,87 @@
+"""A run that keeps all readings, while a reload keeps them from the boards: what is too much then is no board's fault."""
+
+import pytest
+
+from services.errors import OverflowedQueueError
+from services.frames import QUEUE_ALL_DEPTH, WaitingFrames
+from services.peers import Peer
+from services.records import Frame, FrameFailed, Reading
+from services.reload import LOST_IN_RELOAD
+from services.run import Master
+from services.settings import Settings
+from tests.integration.conftest import build_boat
+from toolchain.deployment import load_deployment
+
+READ = Reading(stamp_ns=0, received_ns=0, received_tick=0, sent_tick=0, addresses=(), passed_over=0)
+
+
+class App:
+    """A pcie-app that takes a frame and answers when it is told to."""
+
+    where = "here"
+
+    def __init__(self):
+        self.frames = []
+
+    def send(self, record):
+        self.frames += [record] if isinstance(record, Frame) else []
+        return True
+
+
+@pytest.fixture(scope="module")
+def boat(tmp_path_factory):
+    return load_deployment(build_boat(tmp_path_factory.mktemp("boat") / "deployment"))
+
+
+@pytest.fixture
+async def run(boat):
+    """A run that keeps all, and whose boards wait for frames."""
+    run = Master(Settings(queue="all"), boat, once=False, count=None, json=False)
+    for role in ("subscriber", "publisher", "pcie-app"):
+        peer = run._peers._by_role[role] = Peer(role, None, None)
+        peer.protocol, peer.ready = App(), True
+    return run
+
+
+def read(run, count):
+    for _ in range(count):
+        run.take(run._peers.subscriber, READ)
+
+
+def compute(run, count):
+    for _ in range(count):
+        number = run._peers.app.protocol.frames[-1].number
+        run.take(run._peers.app, FrameFailed(number, 0, 5, "it is not back yet"))
+
+
+async def test_readings_that_come_while_boards_are_held_end_no_run(run):
+    run.hold()
+    read(run, QUEUE_ALL_DEPTH + 7)
+    assert run.status().frames.lost == {LOST_IN_RELOAD: 7}
+    assert not run._end.done()
+
+
+async def test_boards_may_catch_up_after_a_reload(run):
+    run.hold()
+    waited = WaitingFrames("all")
+    for _ in range(QUEUE_ALL_DEPTH):
+        waited.put((READ, 0))
+    run.go_on(waited)
+    read(run, 3)
+    assert run._losses[LOST_IN_RELOAD] == 2  # one is on the boards, so one more could wait
+    for _ in range(QUEUE_ALL_DEPTH - 1):
+        compute(run, 1)
+        read(run, 1)
+    assert not run._end.done()
+    # those that waited for the reload are done, and still as many wait: now it is the boards
+    read(run, 1)
+    with pytest.raises(OverflowedQueueError, match="the slow part"):
+        run._end.result()
+
+
+async def test_too_many_without_a_reload_end_the_run(run):
+    read(run, QUEUE_ALL_DEPTH + 1)
+    assert not run._end.done()
+    read(run, 1)
+    with pytest.raises(OverflowedQueueError, match="the slow part"):
+        run._end.result()
