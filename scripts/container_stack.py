@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Final, Self
 
 from processes import ROOT
-from verify_rosbridge import CheckError, expect
+from verification import CheckError, expect
 
 OUT: Final = ROOT / "out" / "verify-containers"
 ENGINE: Final = ROOT / "scripts" / "container-engine"

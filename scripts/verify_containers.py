@@ -36,7 +36,7 @@ from container_stack import (
     seconds,
 )
 from processes import ROOT
-from verify_rosbridge import CheckError, Tally, expect
+from verification import CheckError, Tally, expect
 
 from toolchain.deployment import load_deployment
 
