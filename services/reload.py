@@ -142,7 +142,10 @@ class Reloads:
                 app.child.give("--reprogram")  # if it is restarted in between, boards hold either image
             boards = len(new.boards) * max(_PROGRAM_TIME, self._settings.peer_timeout)
             await self._ask(app, Switch(number), limit + boards)
-        except BaseException:
+        except asyncio.CancelledError:  # the run ends: nobody is left who could go back
+            self._lose_coming()
+            raise
+        except Exception:
             await self._go_back()
             raise
         lost = self._moving.waiting
@@ -213,10 +216,7 @@ class Reloads:
 
     async def _go_back(self) -> None:
         """Have whoever switched already work by the deployment in force again."""
-        coming, self._coming = self._coming, None
-        if coming is not None:
-            self._moving.lose(LOST_IN_RELOAD, len(coming))
-            self._moving.lose("passed over", coming.passed_over)
+        self._lose_coming()
         in_force = self._in_force
         for peer in self._peers:
             if peer.generation != in_force.generation and peer.protocol is not None and peer.ready:
@@ -226,6 +226,13 @@ class Reloads:
                 except ServiceError as error:
                     self._peers.renew(peer, f"{error}; ending it")
         self._moving.go_on()
+
+    def _lose_coming(self) -> None:
+        """Count the readings that waited for tables which do not come."""
+        coming, self._coming = self._coming, None
+        if coming is not None:
+            self._moving.lose(LOST_IN_RELOAD, len(coming))
+            self._moving.lose("passed over", coming.passed_over)
 
     def _adopt(self, new: Deployment, folder: Path, kept: Path) -> None:
         """The boards have the new tables: hand on the readings that were made for them."""

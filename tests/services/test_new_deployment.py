@@ -8,10 +8,13 @@ import sys
 
 import pytest
 
-from services.errors import NotReloadedError, SettingsError, ShapeError
+from pcie_shim.endpoint import Endpoint
+from services.boards import Boards
+from services.errors import NotReloadedError, SettingsError, ShapeError, StoppedError
 from services.generations import Generations
 from services.new_deployment import forget, keep, read_new
 from services.records import Hello, NotReloaded, Prepare, Prepared, Switch, Switched
+from services.settings import Settings
 from services.supervision import DIRECTORY_VARIABLE, Child, PrivateDirectory
 from tests.integration.conftest import build_boat
 from toolchain.deployment import load_deployment
@@ -88,6 +91,30 @@ def test_a_copy_of_what_has_changed_is_refused(boat, tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(NotReloadedError, match=r"deployment\.toml can't be copied .*Not a directory"):
         keep(loaded, tmp_path / "file", 2)
+
+
+def test_a_signal_that_comes_while_a_service_reads_ends_it(boat):
+    loaded = load_deployment(boat)
+    held = Generations(loaded, lambda _: None)
+
+    def stopped(_):
+        raise StoppedError(143, "terminated")
+
+    held._make = stopped
+    with pytest.raises(StoppedError):
+        held.prepare(Prepare(1, str(boat), loaded.hash))
+
+
+def test_a_signal_that_comes_while_boards_are_programmed_ends_their_process(boat, monkeypatch):
+    loaded = load_deployment(boat)
+    boards = Boards(Settings(), loaded, [Endpoint(path="/nowhere")] * len(loaded.boards))
+
+    def stopped():
+        raise StoppedError(143, "terminated")
+
+    monkeypatch.setattr(boards, "_whole_cluster", stopped)
+    with pytest.raises(StoppedError):
+        boards.switch(Switch(0))
 
 
 def test_a_service_switches_to_what_it_has_prepared(boat):

@@ -1,11 +1,15 @@
 """A run that keeps all readings, while a reload keeps them from the boards: what is too much then is no board's fault."""
 
+import asyncio
+
+import msgspec
 import pytest
 
+from services.control_socket import ReloadOrder
 from services.errors import OverflowedQueueError
 from services.frames import QUEUE_ALL_DEPTH, WaitingFrames
 from services.peers import Peer
-from services.records import Frame, FrameFailed, Reading
+from services.records import Frame, FrameFailed, Prepare, Prepared, Reading, Switched
 from services.reload import LOST_IN_RELOAD
 from services.run import Master
 from services.settings import Settings
@@ -25,6 +29,26 @@ class App:
 
     def send(self, record):
         self.frames += [record] if isinstance(record, Frame) else []
+        return True
+
+
+class Service:
+    """A service that does what a reload asks; or tells of being asked to switch, and does not answer."""
+
+    where = "here"
+
+    def __init__(self, peer, silent):
+        self.asked = []
+        self._peer, self._silent = peer, silent
+
+    def send(self, record):
+        self.asked.append(record)
+        if isinstance(record, Prepare):
+            self._peer.answered(Prepared(record.generation))
+        elif self._silent is None:
+            self._peer.answered(Switched(record.generation))
+        else:
+            self._silent.set()
         return True
 
 
@@ -85,3 +109,22 @@ async def test_too_many_without_a_reload_end_the_run(run):
     read(run, 1)
     with pytest.raises(OverflowedQueueError, match="the slow part"):
         run._end.result()
+
+
+async def test_a_reload_ends_with_its_run(boat, run):
+    """Nobody is asked to go back: they have ended, or end now."""
+    run._began = True
+    asked = asyncio.Event()
+    subscriber, publisher, app = peers = tuple(run._peers)
+    for peer in peers:
+        peer.protocol = Service(peer, asked if peer is app else None)
+    reloading = asyncio.ensure_future(run._reloads.order(ReloadOrder(str(boat.directory))))
+    await asyncio.wait_for(asked.wait(), 20)
+    run.take(subscriber, msgspec.structs.replace(READ, generation=1))
+    told = len(subscriber.protocol.asked)
+    reloading.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await asyncio.wait_for(reloading, 20)
+    assert len(subscriber.protocol.asked) == told
+    assert run.status().frames.lost == {LOST_IN_RELOAD: 1}
+    assert [type(each) for each in publisher.protocol.asked] == [Prepare]
