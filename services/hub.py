@@ -98,6 +98,7 @@ def hub(
             ready(at)
             listens.set_result(at)
 
+        run_directory = load_settings().run_directory  # before anything is begun that would have to be ended
         work = [
             serve_hub(
                 host,
@@ -111,7 +112,7 @@ def hub(
         ]
         if announce is not None:
             work.append(_announce(announce, host, listens, ros, door))
-        async with status_served(load_settings().run_directory, "hub", tell):
+        async with status_served(run_directory, "hub", tell):
             await _all_of(work)
         return 0
 

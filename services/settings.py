@@ -63,7 +63,7 @@ class Settings(BaseSettings):
         default="info", description="what is logged; debug has a line for every frame"
     )
 
-    @field_validator("run_directory", "control_directory", mode="before")
+    @field_validator("deployment", "run_directory", "control_directory", mode="before")
     @classmethod
     def _no_directory(cls, value: object) -> object:
         return value or None  # an empty variable means none, not the folder that one happens to stand in

@@ -1,5 +1,10 @@
 """Settings: flag over variable over default, and a sentence for every mistake."""
 
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import pytest
 
 from services.errors import SettingsError
@@ -49,3 +54,18 @@ def test_a_wrong_variable_says_which(monkeypatch):
 def test_a_path_too_long_for_a_socket_is_refused(tmp_path):
     with pytest.raises(SettingsError, match="too long"):
         endpoint_in(tmp_path / ("x" * 120), "board0")
+
+
+@pytest.mark.parametrize("name", ["deployment", "run_directory", "control_directory"])
+def test_an_empty_variable_names_no_folder(name, monkeypatch):
+    monkeypatch.setenv(f"BM_{name.upper()}", "")
+    assert getattr(load_settings(), name) is None
+
+
+def test_a_hub_with_a_wrong_variable_says_one_sentence():
+    command = [Path(sys.executable).parent / "hub", "--port", "0"]
+    environment = os.environ | {"BM_X": "1"}
+    ended = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60, check=False)
+    assert ended.returncode == 2
+    assert ended.stderr.count("\n") == 1
+    assert ended.stderr.startswith("error: environment variable BM_X is no setting")
