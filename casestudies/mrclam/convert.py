@@ -6,6 +6,7 @@ python -m casestudies.mrclam.convert MRCLAM_Dataset1 -o DATA_DIR
 import csv
 import math
 import re
+import stat
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -100,6 +101,8 @@ def read_columns(path: Path, names: Sequence[str]) -> Iterator[tuple[str, tuple[
         DataFileError: it cannot be read, or a line has something else than these numbers.
     """
     try:
+        if stat.S_ISFIFO(path.stat().st_mode):  # to open it would wait for who writes into it
+            raise DataFileError(f"{path} is a pipe: it is none of the data set")
         if path.stat().st_size > LARGEST_FILE:
             raise DataFileError(f"{path} is larger than {LARGEST_FILE >> 20} MiB: it is none of the data set")
         with path.open(encoding="utf-8") as file:

@@ -1,11 +1,13 @@
 """A tiny data set in the form of the public one, and what becomes of it."""
 
 import math
+import os
 import sys
 
 import pytest
 
-from casestudies.mrclam.convert import app
+from casestudies.errors import DataFileError
+from casestudies.mrclam.convert import app, read_barcodes
 from casestudies.mrclam.landmarks import read_landmarks
 from casestudies.mrclam.recording import read_recording
 
@@ -147,3 +149,9 @@ def test_no_robot_and_no_window(data, tmp_path, capsys, monkeypatch):
     code, _out, err = run(capsys, monkeypatch, data, "-o", tmp_path)
     assert code == 2
     assert "holds no RobotN_Measurement.dat" in err
+
+
+def test_a_pipe_is_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "Barcodes.dat")
+    with pytest.raises(DataFileError, match=r"Barcodes\.dat is a pipe"):
+        read_barcodes(tmp_path)
