@@ -292,10 +292,6 @@ class SocketLink:
             self._refused(frame)
         return self._give_up(SequenceError("an answer came that nobody asked for"))
 
-    def discard_done(self) -> None:
-        """Forget an interrupt that came before an answer: after a reset it says nothing any more."""
-        self._done = None
-
     def request(self, operation: int, flags: int, address: int, count: int, payload: Octets = b"") -> Frame:
         """Send one request and wait for its answer; an interrupt that comes before it is kept.
 

@@ -48,6 +48,7 @@ _HEADER = """\
 
 _TYPE = re.compile(r"[A-Za-z]\w*/(?:msg/)?[A-Za-z]\w*")
 _TOPIC = re.compile(r"/?[A-Za-z]\w*(?:/\w+)*")
+_MESSAGE_PATH = re.compile(r"[A-Za-z_][A-Za-z0-9_]*(?:\.[A-Za-z_][A-Za-z0-9_]*|\[[0-9]{1,9}\])*")
 _INTERFACE = re.compile(r"([1-9]\d{0,4})x([1-9]\d{0,5})")
 
 
@@ -97,9 +98,19 @@ def _sha256(text: str) -> str:
     return text
 
 
+def _message_path(path: str) -> str:
+    if not _MESSAGE_PATH.fullmatch(path):
+        message = f"{path!r} is no place in a message; expected one like 'pose.position.x', 'ranges[3]' or a field's name"
+        raise ValueError(message)
+    return path
+
+
 WebSocketUri = Annotated[str, AfterValidator(_websocket_uri)]
 Topic = Annotated[str, AfterValidator(_topic)]
 MessageType = Annotated[str, AfterValidator(_message_type)]
+MessagePath = Annotated[str, AfterValidator(_message_path)]
+PathOrName = Annotated[str, AfterValidator(lambda path: path and _message_path(path))]
+"""Empty where a variable is searched by its name."""
 Name = Annotated[str, Field(min_length=1, max_length=200)]
 Sha256 = Annotated[str, AfterValidator(_sha256)]
 Step = Annotated[float, AfterValidator(_not_zero)]
@@ -156,7 +167,7 @@ class Variable(_Section):
 
     name: Name
     source: int = Field(default=0, ge=0)
-    path: str = ""
+    path: PathOrName = ""
     kind: Literal["sensor", "prior_select"] = "sensor"
     bits: int = Field(ge=1, le=16)
     offset: float = 0.0
@@ -272,7 +283,7 @@ class WrittenPrior(_Section):
     """
 
     source: int = Field(default=0, ge=0)
-    path: str = Field(min_length=1)
+    path: MessagePath
     on_missing: Literal["error", "model"] = "error"
 
 

@@ -348,5 +348,6 @@ def _with_paths(variables: tuple[Variable, ...], paths: tuple[tuple[str, str], .
             message = f"--path {name}={path}: there is no such variable; there are {names or 'none'}"
             raise BuildError(message)
     return tuple(
-        variable.model_copy(update={"path": said.get(variable.name, variable.path)}) for variable in variables
+        type(variable)(**dict(variable) | {"path": said.get(variable.name, variable.path)})
+        for variable in variables
     )

@@ -3,13 +3,21 @@
 from __future__ import annotations
 
 import difflib
-import re
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Final, Literal
+from typing import TYPE_CHECKING, Final, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field
 
-from toolchain.deployment import MessageType, Name, Sequence, Source, Topic, WebSocketUri, WrittenPrior
+from toolchain.deployment import (
+    MessagePath,
+    MessageType,
+    Name,
+    Sequence,
+    Source,
+    Topic,
+    WebSocketUri,
+    WrittenPrior,
+)
 from toolchain.errors import BuildError
 from toolchain.toml_file import line_of, parse_toml, read_text, validate
 
@@ -19,18 +27,6 @@ if TYPE_CHECKING:
     from toolchain.deployment import Variable
 
 MOST_SOURCES: Final = 256
-
-_PATH = re.compile(r"[A-Za-z_][A-Za-z0-9_]*(?:\.[A-Za-z_][A-Za-z0-9_]*|\[[0-9]{1,9}\])*")
-
-
-def _path(path: str) -> str:
-    if not _PATH.fullmatch(path):
-        message = f"{path!r} is no place in a message; expected one like 'pose.position.x', 'ranges[3]' or a field's name"
-        raise ValueError(message)
-    return path
-
-
-_Path = Annotated[str, AfterValidator(_path)]
 
 
 class SourceTable(BaseModel):
@@ -51,8 +47,8 @@ class SourceTable(BaseModel):
     topic: Topic
     type: MessageType
     compression: Literal["none", "cbor"] = "none"
-    variables: dict[Name, _Path] | None = None
-    prior: _Path | None = None
+    variables: dict[Name, MessagePath] | None = None
+    prior: MessagePath | None = None
 
 
 class SourcesTables(BaseModel):

@@ -137,18 +137,6 @@ def test_a_running_board_answers_and_can_be_reset(start_board: StartBoard) -> No
         assert link.wait_done(1, timeout=5).reason == StopReason.OVERFLOW
 
 
-def test_an_interrupt_from_before_a_reset_can_be_discarded(start_board: StartBoard) -> None:
-    board = start_board()
-    program(board.endpoint, image(MACHINE))
-    with open_link(board) as link:
-        link.write32(rm.CONTROL, ENABLE)
-        link.write_block(rm.TARGET_COUNT, struct.pack("<IQIIQI", 5, 4000, 0, 0, 0, 1))
-        link.write32(rm.CONTROL, rm.CONTROL_RESET_MASK | ENABLE)
-        link.discard_done()
-        link.write32(rm.START, 2)
-        assert link.wait_done(2, timeout=5).number == 2
-
-
 # ---- one host at a time ----
 
 

@@ -19,6 +19,7 @@ from machines.bm1 import BM1Machine
 from machines.parameters import BM1Parameters
 from pcie_shim.programming_file import Image, Partition, write_image
 from toolchain.deployment import (
+    _MESSAGE_PATH,
     Board,
     Deployment,
     Dimension,
@@ -127,7 +128,7 @@ def deployments(draw):
         variables=tuple(
             Variable(
                 name=name,
-                path=draw(st.text(max_size=10)),
+                path=draw(st.just("") | st.from_regex(_MESSAGE_PATH, fullmatch=True)),
                 bits=10,
                 values=draw(st.integers(1, 1023)),
                 period=draw(st.none() | st.integers(1, 1023)),
@@ -241,6 +242,11 @@ def test_no_format(folder):
         ("bits = 9", "bits = true", "bits = True in [[variable]] 2: expected a valid integer"),
         ("bits = 9", "bits = 17", "bits = 17 in [[variable]] 2: expected less than or equal to 16"),
         ("bits = 9\n", "", "the key 'bits' is missing in [[variable]] 2"),
+        (
+            'path = "bearings[0]"',
+            'path = "bearings[0"',
+            "path in [[variable]] 2: 'bearings[0' is no place in a message",
+        ),
         ("values = 360", "values = 512", "[[variable]] 2: B1 serves 512 values, but 9 bits hold 511"),
         ("ws://a:9090", "http://a:9090", "uri in [[source]] 1: 'http://a:9090' is no WebSocket URI"),
         ("ws://a:9090", "ws://a:90900", "uri in [[source]] 1: 'ws://a:90900' is no WebSocket URI"),

@@ -188,7 +188,11 @@ def test_only_the_ratios_of_a_written_prior_count():
             {"prior_select": selected()},
             "selected by time, so it can't be written",
         ),
-        ({"prior_mode": PriorMode.WRITTEN, "prior_path": ""}, {}, "--prior-path is ''"),
+        (
+            {"prior_mode": PriorMode.WRITTEN, "prior_path": ""},
+            {},
+            "--prior-path: '' is no place in a message",
+        ),
     ],
 )
 def test_options_that_do_not_fit(tmp_path, options, fields, sentence):

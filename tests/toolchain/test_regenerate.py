@@ -194,6 +194,7 @@ def test_the_project(built):
         ),
         (["deployment", "--order", "D1,D1"], "--order D1,D1: expected each of D1, D2 once"),
         (["deployment", "--path", "D3=x"], "--path D3=x: there is no such variable; there are D1, D2"),
+        (["deployment", "--path", "D1=a..b"], "'a..b' is no place in a message"),
         (["deployment", "--path", "D3"], "--path D3: expected KEY=VALUE, such as --path range=data[0]"),
         (["deployment", "--uri", "robot"], "--uri: 'robot' is no WebSocket URI"),
         (["deployment", "--output", "a b"], "--output: 'a b' is no topic name"),
