@@ -49,6 +49,8 @@ def run(capsys, *arguments):
 @pytest.fixture(autouse=True)
 def called_painter(monkeypatch):
     monkeypatch.setattr(sys, "argv", ["/usr/bin/painter"])
+    # as an installed command, whatever runs the tests
+    monkeypatch.setattr(sys.modules["__main__"], "__package__", None)
 
 
 @pytest.mark.parametrize(
