@@ -271,7 +271,6 @@ def test_arrays_go_out_without_lists():
         {"a": "\ud800"},
         {"a": 1j},
     ],
-    ids=str,
 )
 def test_what_cannot_be_json(message):
     with pytest.raises(EncodeError, match="cannot be written as JSON"):
