@@ -25,7 +25,7 @@ from pcie_shim.errors import (
 )
 from pcie_shim.loader import program
 from pcie_shim.programming_file import Image, read_image
-from services.errors import ServiceError, StoppedError, exit_code_of
+from services.errors import ServiceError, exit_code_of
 from services.generations import Generations
 from services.records import (
     Addresses,
@@ -128,8 +128,6 @@ class Boards:
             except PcieShimError:
                 self._put_back(cluster)
                 raise
-        except StoppedError:
-            raise
         except (PcieShimError, ServiceError) as error:
             return NotReloaded(record.generation, exit_code_of(error), str(error))
         answer = self.generations.switch(record)

@@ -27,6 +27,9 @@ _SIGNALS = {
     signal.SIGHUP: (ExitCode.HANGUP, "the terminal was closed (SIGHUP)"),
 }
 
+_MOMENT = 0.002
+"""Seconds until a signal's exception that was dropped is raised again."""
+
 
 def make_app(help_text: str) -> CommandLine:
     """A command's typer application."""
@@ -75,16 +78,18 @@ def _outcome(command: Callable[[], int | None]) -> int:
         # whoever read our output has what it wanted (as `| head` does)
         code = ExitCode.DONE
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except StoppedError as stopped:
+        code = stopped.exit_code
+        if PARENT_VARIABLE not in os.environ:
+            # a child ends because its parent says so, which is no news
+            say(str(stopped))
     except Exception as error:
         code = exit_code_of(error)
         if code == ExitCode.BUG and not isinstance(error, ReportedError):
             say(traceback.format_exc().rstrip())
             say("error: this is a bug in rosbayes; please report it with the lines above")
-        elif not isinstance(error, StoppedError):
+        else:
             say(f"error: {error}")
-        elif PARENT_VARIABLE not in os.environ:
-            # a child ends because its parent says so, which is no news
-            say(str(error))
     for number in _SIGNALS:
         signal.signal(number, signal.SIG_IGN)
     return code
@@ -140,7 +145,9 @@ def _pass_over(_number: int, _frame: object) -> None:
 def raise_on_signals() -> None:
     """For a process with one blocking thread: a signal raises StoppedError where the thread stands.
 
-    A second signal while the first is being handled is ignored: cleaning up is bounded anyway.
+    A second signal while the first is being handled is ignored: cleaning up is bounded anyway. Where the thread
+    stands in a function that C code calls back, or in a finaliser, Python drops what is raised; so it is raised again,
+    until it reaches code that can end.
     """
 
     def stop(number: int, _frame: object) -> NoReturn:
@@ -150,3 +157,18 @@ def raise_on_signals() -> None:
 
     for number in _SIGNALS:
         signal.signal(number, stop)
+    sys.unraisablehook = _raise_again
+
+
+def _raise_again(dropped: sys.UnraisableHookArgs) -> None:
+    """Python's hook for an exception that it had to drop: a signal's is raised again a moment later."""
+    stopped = dropped.exc_value
+    if not isinstance(stopped, StoppedError):
+        sys.__unraisablehook__(dropped)
+        return
+
+    def stop(_number: int, _frame: object) -> NoReturn:
+        raise stopped
+
+    signal.signal(signal.SIGALRM, stop)
+    signal.setitimer(signal.ITIMER_REAL, _MOMENT)

@@ -108,8 +108,12 @@ class OutdatedError(ServiceError):
     exit_code = ExitCode.CHILD
 
 
-class StoppedError(ServiceError):
-    """A signal asked the process to end; not a failure, but no success either."""
+class StoppedError(BaseException):
+    """A signal asked the process to end; not a failure, but no success either.
+
+    Like KeyboardInterrupt it is no `Exception`: it rises wherever the process stands, inside a library's code too,
+    and whoever catches "whatever goes wrong here" must not take it for that.
+    """
 
     def __init__(self, exit_code: int, sentence: str) -> None:
         super().__init__(sentence)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Generic, TypeVar
 
-from services.errors import NotPreparedError, StoppedError, exit_code_of
+from services.errors import NotPreparedError, exit_code_of
 from services.records import Hello, NotReloaded, Prepare, Prepared, Switch, Switched
 from toolchain.deployment import Deployment, load_deployment
 
@@ -59,8 +59,6 @@ class Generations(Generic[Made]):
         try:
             loaded = load_deployment(Path(record.folder), images=self._images)
             made = self._make(loaded)
-        except StoppedError:
-            raise
         except Exception as error:  # whatever else it is, the run goes on with what it has
             return NotReloaded(record.generation, exit_code_of(error), str(error))
         if loaded.hash != record.deployment_hash:

@@ -1,0 +1,67 @@
+"""How a process with one blocking thread takes a signal, wherever it stands."""
+
+import subprocess
+import sys
+
+import pytest
+
+from services.errors import ExitCode
+
+_STANDS = {
+    "in a function that C code calls back": """
+import ctypes
+callback = ctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(signal.SIGTERM))
+callback()
+""",
+    "in a finaliser": """
+class Held:
+    def __del__(self):
+        signal.raise_signal(signal.SIGTERM)
+Held()
+""",
+    "where whatever goes wrong is caught": """
+try:
+    signal.raise_signal(signal.SIGTERM)
+except Exception:
+    pass
+""",
+    "in a wait": "import os, threading; threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGTERM)).start()",
+}
+
+
+@pytest.mark.parametrize("stands", _STANDS)
+def test_a_signal_ends_a_process_wherever_it_stands(stands):
+    code = f"""
+import signal, time
+from services.command_line import ends_well, make_app, raise_on_signals
+app = make_app("wait")
+
+@app.command()
+@ends_well
+def wait():
+    raise_on_signals()
+    exec({_STANDS[stands]!r})
+    time.sleep(20)
+
+app()
+"""
+    ended = subprocess.run(
+        [sys.executable, "-c", code], check=False, capture_output=True, text=True, timeout=60
+    )
+    assert (ended.returncode, ended.stderr) == (ExitCode.TERMINATED, "asked to end (SIGTERM)\n")
+
+
+def test_another_exception_that_is_dropped_is_told_as_ever():
+    code = """
+from services.command_line import raise_on_signals
+raise_on_signals()
+class Held:
+    def __del__(self):
+        raise ValueError("lost")
+Held()
+"""
+    ended = subprocess.run(
+        [sys.executable, "-c", code], check=False, capture_output=True, text=True, timeout=60
+    )
+    assert ended.returncode == 0
+    assert "ValueError: lost" in ended.stderr
