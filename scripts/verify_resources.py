@@ -21,9 +21,9 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from machines.bm1 import BM1Machine, Start, StopReason
-from machines.parameters import BM1Parameters, PriorMode, RngKind, RngReset
-from machines.reference import ReferenceBM1
+from machines.bm1 import BM1Machine, Start, StopReason, missing_inputs
+from machines.parameters import BM1Parameters, PriorMode, RngKind, RngReset, SensorMode
+from machines.reference import ReferenceBM1, ReferenceReplicas
 from toolchain.analysis import rtl
 from toolchain.analysis.resources import Alms, logic_of
 
@@ -52,13 +52,15 @@ class Case:
             + f", {p.steps_per_clock} steps, {p.rng_banks} banks"
             + (", free" if p.rng_reset is RngReset.FREE else "")
             + (", written prior" if p.prior_mode is PriorMode.WRITTEN else "")
+            + (f", {p.sensor_mode}" if p.sensor_mode is not SensorMode.COLUMN else "")
+            + (f", {p.replicas} replicas" if p.replicas > 1 else "")
         )
 
 
 def case(lines: int, sensors: int, seed: int, *, calibrated: bool = False, **others: object) -> Case:
     """A machine of these sizes."""
-    bits = (ADDRESS_BITS,) * sensors
-    return Case(BM1Parameters(lines=lines, sensor_bits=bits, **others), seed, calibrated)  # type: ignore[arg-type]  # keyword arguments by name
+    width = others.get("prob_bits", 8) if others.get("sensor_mode") is SensorMode.THRESHOLD else ADDRESS_BITS
+    return Case(BM1Parameters(lines=lines, sensor_bits=(width,) * sensors, **others), seed, calibrated)  # type: ignore[arg-type]  # keyword arguments by name
 
 
 SIMULATED = (
@@ -70,6 +72,14 @@ SIMULATED = (
     case(4, 2, 6, rng=RngKind.LFSR24, rng_reset=RngReset.FREE),
     case(4, 2, 7, shared=False, rng_banks=3),
     case(4, 2, 8, prior_mode=PriorMode.WRITTEN),
+    case(5, 2, 13, sensor_mode=SensorMode.CELL),
+    case(4, 3, 14, sensor_mode=SensorMode.THRESHOLD, prob_bits=6),
+    case(4, 2, 15, replicas=3),
+    case(3, 2, 16, replicas=5, prior_bits=2, rng=RngKind.LFSR16, steps_per_clock=1),
+    case(4, 2, 17, replicas=3, sensor_mode=SensorMode.CELL, rng_banks=1),
+    case(3, 2, 18, replicas=4, sensor_mode=SensorMode.THRESHOLD, rng_reset=RngReset.FREE),
+    case(3, 2, 19, replicas=3, prior_mode=PriorMode.WRITTEN, shared=False, rng_banks=2),
+    case(1, 1, 20, replicas=40, sensor_mode=SensorMode.CELL, counter_bits=4),
 )
 SYNTHESISED = (
     case(4, 2, 1, calibrated=True),
@@ -100,6 +110,8 @@ def machine_of(case: Case) -> BM1Machine:
         return table
 
     tables = [codes(1 << bits) for bits in parameters.sensor_bits]
+    if not parameters.has_tables:
+        tables = []
     for table in tables:
         table[1] = 0  # an address on which no line can count
         table[-1] = parameters.ones_code
@@ -108,98 +120,167 @@ def machine_of(case: Case) -> BM1Machine:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a machine shows at the end of a slice."""
+    """What a machine shows at the end of a slice; a single machine is one replica."""
 
     reason: StopReason
     cycles: int
+    replica_reasons: tuple[StopReason, ...]
+    replica_cycles: tuple[int, ...]
     counts: tuple[int, ...]
     states: tuple[int, ...]
 
 
-def frames_of(case: Case) -> list[tuple[Start, int]]:
-    """Frames that end in every way, each with the cycle that a resume goes on to (0: none, -1: to the end)."""
+@dataclass(frozen=True)
+class Frame:
+    """A start, and what follows where it ends with its slice: the resumes' ends, each with the replicas that they halt."""
+
+    start: Start
+    resumes: tuple[tuple[int, tuple[int, ...]], ...] = ()
+
+
+def frames_of(case: Case) -> list[Frame]:
+    """Frames that end in every way, by themselves or after slices; replicas have inputs of their own."""
     parameters = case.parameters
     random = np.random.default_rng(case.seed + 1000)
-    addresses = [
-        tuple(random.choice([0, *range(2, 1 << bits)]).item() for bits in parameters.sensor_bits)
-        for _ in range(4)
-    ]
-    written = parameters.prior_mode is PriorMode.WRITTEN
-    rows = [
-        random.integers(0, parameters.ones_code + 1, parameters.lines).astype(np.uint16) for _ in range(6)
-    ]
+    replicas, several = parameters.replicas, parameters.replicas > 1
+    # row 1 of every table has no line that can count; as a code 0 says the same
+    never = 1 if parameters.has_tables else 0
+    rows = random.integers(0, parameters.ones_code + 1, (6, *parameters.count_shape)).astype(np.uint16)
 
-    def start(at: int, where: tuple[int, ...], target: int, limit: int, until: int = 0) -> Start:
+    def inputs() -> np.ndarray[tuple[int, ...], np.dtype[np.int64]]:
+        drawn = np.empty(parameters.input_shape, dtype=np.int64)
+        by_column = drawn.reshape(replicas, parameters.sensors, -1)
+        for column, bits in enumerate(parameters.sensor_bits):
+            choice = [each for each in range(1 << bits) if each != never]
+            by_column[:, column] = random.choice(choice, by_column[:, column].shape)
+        return drawn
+
+    def start(
+        at: int,
+        where: np.ndarray[tuple[int, ...], np.dtype[np.int64]],
+        target: int,
+        limit: int,
+        until: int = 0,
+    ) -> Start:
+        prior = at % parameters.prior_addresses
+        others = tuple((at + replica) % parameters.prior_addresses for replica in range(replicas))
         return Start(
-            addresses=where,
-            prior_address=at % parameters.prior_addresses,
-            prior_codes=rows[at] if written and at else None,
+            addresses=tuple(where.tolist()) if where.ndim == 1 else where,
+            prior_address=others if several else prior,
+            prior_codes=rows[at] if parameters.prior_mode is PriorMode.WRITTEN and at else None,
             target_count=min(target, parameters.target_count_max),
             max_cycles=limit,
             bank=at % parameters.rng_banks,
             run_until=until,
         )
 
-    missing = tuple((1 << bits) - 1 for bits in parameters.sensor_bits)
+    def hopeless(which: slice) -> np.ndarray[tuple[int, ...], np.dtype[np.int64]]:
+        where = inputs()
+        where.reshape(replicas, parameters.sensors, -1)[which, 0] = never
+        return where
+
+    missing = np.array(missing_inputs(parameters), dtype=np.int64)
     return [
-        (start(0, addresses[0], 200, 64), 0),
-        (start(1, addresses[1], 5, 400), 0),
-        (start(2, addresses[2], 255, 100, until=31), 57),
-        (start(3, (1, *addresses[3][1:]), 9, 50), 0),
-        (start(4, missing, 30, 300), 0),
-        (start(5, addresses[3], 3, 200, until=64), -1),
+        Frame(start(0, inputs(), 200, 64)),
+        Frame(start(1, inputs(), 5, 400)),
+        Frame(start(2, inputs(), 255, 100, until=31), ((57, ()),)),
+        Frame(start(3, hopeless(slice(None)), 9, 50)),
+        Frame(start(4, missing, 30, 300)),
+        Frame(start(5, inputs(), 3, 200, until=64), ((0, ()),)),
+        *(
+            [
+                # one can't count, one is left behind at the first slice, and another one at the second
+                Frame(
+                    start(1, hopeless(slice(0, 1)), 250, 140, until=8),
+                    ((32, (1,)), (64, (replicas - 1,)), (0, ())),
+                ),
+                Frame(start(2, inputs(), 12, 150, until=16), ((48, ()), (0, (0,)))),
+            ]
+            if several
+            else []
+        ),
     ]
 
 
-def reference(machine: BM1Machine, frames: Sequence[tuple[Start, int]]) -> list[Outcome]:
-    """What the reference machine shows."""
-    kernel = ReferenceBM1(machine)
-    outcomes = []
-    for start, further in frames:
-        kernel.start(start)
-        if further and kernel.reason is StopReason.SLICE:
-            kernel.resume(max(further, 0))
+def reference(machine: BM1Machine, frames: Sequence[Frame]) -> tuple[list[Outcome], list[Frame]]:
+    """What the reference machine shows, and the frames with those of their resumes that it took."""
+    kernel = ReferenceBM1(machine) if machine.parameters.replicas == 1 else ReferenceReplicas(machine)
+    outcomes, played = [], []
+    for frame in frames:
+        kernel.start(frame.start)
+        resumes = []
+        left = set(range(machine.parameters.replicas))
+        for until, wanted in frame.resumes:
+            if kernel.reason is not StopReason.SLICE:
+                break
+            can = {at for at in left if kernel.replica_reasons[at] is StopReason.SLICE}
+            halted = wanted if can - set(wanted) else ()  # somebody has to go on
+            left -= set(halted)
+            kernel.resume(until, halted)
+            resumes.append((until, halted))
+        played.append(Frame(frame.start, tuple(resumes)))
         outcomes.append(
             Outcome(
                 kernel.reason,
                 kernel.cycles,
-                tuple(kernel.counts.tolist()),
+                kernel.replica_reasons,
+                kernel.replica_cycles,
+                tuple(kernel.counts.ravel().tolist()),
                 tuple(kernel.rng_state.ravel().tolist()),
             )
         )
-    return outcomes
+    return outcomes, played
 
 
-def testbench(machine: BM1Machine, frames: Sequence[tuple[Start, int]]) -> str:
+def register_writes(machine: BM1Machine, start: Start) -> dict[int, int]:
+    """What a host writes before a frame: values by the registers' addresses."""
+    parameters, places = machine.parameters, rtl.Places(machine.parameters)
+    selects = np.broadcast_to(np.asarray(start.prior_address), (parameters.replicas,)).tolist()
+    given = np.asarray(start.addresses).ravel().tolist()
+    writes = {
+        rtl.TARGET: start.target_count,
+        rtl.MAX_CYCLES: start.max_cycles,
+        rtl.MAX_CYCLES + 1: 0,
+        rtl.RUN_UNTIL: start.run_until,
+        rtl.RUN_UNTIL + 1: 0,
+        rtl.BANK: start.bank,
+        **{rtl.PRIOR_ADDRESSES + replica: address for replica, address in enumerate(selects)},
+        **{places.inputs + at: address for at, address in enumerate(given)},
+    }
+    if parameters.prior_mode is PriorMode.WRITTEN:
+        prior = machine.prior[0] if start.prior_codes is None else start.prior_codes
+        codes = np.broadcast_to(prior, (parameters.replicas, parameters.lines)).ravel().tolist()
+        writes |= {places.prior_codes + at: code for at, code in enumerate(codes)}
+    return writes
+
+
+def testbench(machine: BM1Machine, frames: Sequence[Frame]) -> str:
     """A bench that writes the registers as a host does, and prints what comes out."""
-    parameters = machine.parameters
+    parameters, places = machine.parameters, rtl.Places(machine.parameters)
     generators = parameters.columns * (1 if parameters.shared else parameters.lines)
+    results, several = parameters.replicas * parameters.lines, parameters.replicas > 1
     steps = []
-    for start, further in frames:
-        writes = {
-            rtl.TARGET: start.target_count,
-            rtl.MAX_CYCLES: start.max_cycles,
-            rtl.MAX_CYCLES + 1: 0,
-            rtl.RUN_UNTIL: start.run_until,
-            rtl.RUN_UNTIL + 1: 0,
-            rtl.BANK: start.bank,
-            rtl.PRIOR_ADDRESS: start.prior_address,
-            **{rtl.SENSORS + at: address for at, address in enumerate(start.addresses)},
-        }
-        if parameters.prior_mode is PriorMode.WRITTEN:
-            prior = machine.prior[0] if start.prior_codes is None else start.prior_codes
-            first = rtl.SENSORS + parameters.sensors
-            writes |= {first + line: code for line, code in enumerate(prior.tolist())}
+    for frame in frames:
+        writes = register_writes(machine, frame.start)
         steps += [f"put({address}, {value});" for address, value in writes.items()]
         steps += [f"put({rtl.CONTROL}, 1);", "finish;"]
-        if further:
-            steps += [
-                f"if (reason == 3) begin put({rtl.RUN_UNTIL}, {max(further, 0)}); put({rtl.CONTROL}, 2); finish; end"
+        for until, halted in frame.resumes:
+            mask = sum(1 << replica for replica in halted)
+            halt = [
+                f"put({places.halt + word}, {mask >> rtl.WORD_BITS * word & 0xFFFFFFFF});"
+                for word in range(places.end - places.halt)
             ]
+            steps += [f"put({rtl.RUN_UNTIL}, {until});", *halt, f"put({rtl.CONTROL}, 2);", "finish;"]
         states = " ".join(f'$write(" %0d", dut.random_{at});' for at in range(generators))
+        words = f"for (i = {places.outcomes}; i < {places.outcomes + rtl.OUTCOME_WORDS * parameters.replicas}; i = i + 1) begin"
         steps += [
             '$write("%0d %0d", reason, cycles);',
-            f"for (i = 0; i < {parameters.lines}; i = i + 1) begin",
+            *(
+                [words, '  read_address = i; @(negedge clk); $write(" %0d", read_data); end']
+                if several
+                else []
+            ),
+            f"for (i = 0; i < {results}; i = i + 1) begin",
             '  read_address = i; @(negedge clk); $write(" %0d", read_data); end',
             states,
             '$display("");',
@@ -226,20 +307,36 @@ endmodule
 """
 
 
-def simulated(case: Case, folder: Path) -> list[Outcome]:
+def simulated(case: Case, frames: Sequence[Frame], folder: Path) -> list[Outcome]:
     """What the text shows in Icarus Verilog."""
-    machine, frames = machine_of(case), frames_of(case)
+    machine = machine_of(case)
     text = folder / "bm1.v"
     text.write_text(rtl.verilog(machine, tables=True) + testbench(machine, frames))
     run(["iverilog", "-g2005", "-Wno-portbind", "-s", "bench", "-o", str(folder / "bm1.vvp"), str(text)])
     printed = run(["vvp", "-n", str(folder / "bm1.vvp")]).splitlines()
-    lines = case.parameters.lines
+    parameters = case.parameters
     outcomes = []
     for line in printed:
         if not line[:1].isdigit():
             sys.exit(f"error: the simulation of {case.name} said {line!r}")
         reason, cycles, *rest = map(int, line.split())
-        outcomes.append(Outcome(StopReason(reason), cycles, tuple(rest[:lines]), tuple(rest[lines:])))
+        reasons, lengths = [StopReason(reason)], [cycles]
+        if parameters.replicas > 1:
+            words = [rest[at : at + rtl.OUTCOME_WORDS] for at in range(0, 4 * parameters.replicas, 4)]
+            reasons = [StopReason(word[0]) for word in words]
+            lengths = [word[2] + (word[3] << 32) for word in words]
+            rest = rest[rtl.OUTCOME_WORDS * parameters.replicas :]
+        results = parameters.replicas * parameters.lines
+        outcomes.append(
+            Outcome(
+                StopReason(reason),
+                cycles,
+                tuple(reasons),
+                tuple(lengths),
+                tuple(rest[:results]),
+                tuple(rest[results:]),
+            )
+        )
     return outcomes
 
 
@@ -319,7 +416,8 @@ def main() -> int:
     with tempfile.TemporaryDirectory(prefix="resources-rosbayes-") as where:
         folder = Path(where)
         for each in SIMULATED:
-            ours, theirs = reference(machine_of(each), frames_of(each)), simulated(each, folder)
+            ours, played = reference(machine_of(each), frames_of(each))
+            theirs = simulated(each, played, folder)
             good = ours == theirs
             passed, failed = passed + good, failed + (not good)
             ends = ", ".join(f"{outcome.reason.name.lower()} {outcome.cycles}" for outcome in ours)
