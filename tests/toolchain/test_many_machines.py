@@ -19,9 +19,12 @@ from machines.posterior import posterior
 from pcie_shim.programming_file import read_image
 from toolchain.address import to_address
 from toolchain.address_array import MISSING, to_addresses
+from toolchain.analysis.boards_needed import boards_needed
+from toolchain.analysis.device import DEVICES
 from toolchain.analysis.emulation import EmulatedBoards, one_replica
+from toolchain.analysis.logic import logic_of
 from toolchain.analysis.readings import readings_of_lines, sample_readings
-from toolchain.analysis.resources import DEVICES, boards_needed, estimate, logic_of
+from toolchain.analysis.resources import estimate
 from toolchain.build import BuildError, assemble, build_deployment
 from toolchain.checks.check import check_deployment, check_model
 from toolchain.command import app
@@ -342,7 +345,7 @@ def test_replicas_share_the_generators_and_multiply_the_rest():
     one = assemble(model(), CELL).images[0].machine.parameters
     ten = replace(one, replicas=10)
     alone, together = (
-        {part.name: part for part in logic_of(each, interface_words=60).parts} for each in (one, ten)
+        {part.name: part for part in logic_of(each, whole_words=False).parts} for each in (one, ten)
     )
     assert together["generators"] == alone["generators"]
     assert together["cells"].alms == pytest.approx(10 * alone["cells"].alms)
@@ -350,16 +353,16 @@ def test_replicas_share_the_generators_and_multiply_the_rest():
     assert together["control"].registers > alone["control"].registers
     device = DEVICES["proce-v-d8"]
     small, large = (estimate(each, device, interface=(120, 1200)) for each in (one, ten))
-    assert large.table_bits == 10 * small.table_bits
+    assert large.memories.table_bits == 10 * small.memories.table_bits
     assert (
         estimate(
             replace(one, sensor_mode=SensorMode.THRESHOLD, sensor_bits=(8, 8)), device, interface=(12, 12)
-        ).table_bits
+        ).memories.table_bits
         == 0
     )
     per_column = replace(one, sensor_mode=SensorMode.COLUMN)
     inputs = [
-        next(part for part in logic_of(each, interface_words=6).parts if part.name == "control").registers
+        next(part for part in logic_of(each, whole_words=False).parts if part.name == "inputs").registers
         for each in (per_column, one)
     ]
     assert inputs[1] - inputs[0] == 5 * sum(one.sensor_bits)

@@ -14,7 +14,7 @@ import numpy as np
 from machines.bm1 import Start, addressed_codes
 from machines.encode import decode_code
 from toolchain.analysis.emulation import one_replica
-from toolchain.analysis.resources import logic_of
+from toolchain.analysis.logic import logic_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -78,7 +78,7 @@ def energy(machines: Sequence[BM1Machine], readings: Readings) -> Energy:
     ends = np.cumsum([machine.parameters.lines for machine in machines]).tolist()
     for machine, end in zip(machines, ends, strict=True):
         p = machine.parameters
-        logic = logic_of(p, interface_words=p.replicas * p.lines)
+        logic = logic_of(p, whole_words=False)
         parts = {part.name: part for part in logic.parts}
         generators = parts["generators"]
         cells = p.replicas * p.lines * p.columns
@@ -86,7 +86,7 @@ def energy(machines: Sequence[BM1Machine], readings: Readings) -> Energy:
         toggles += cells * p.prob_bits / 2
         toggles += parts["cells"].aluts * COMPARATOR_ACTIVITY
         toggles += p.replicas * _stream_toggles(one_replica(machine), readings, slice(end - p.lines, end))
-        clocked += generators.registers + parts["counters"].registers + parts["control"].registers
+        clocked += sum(parts[each].registers for each in ("generators", "counters", "inputs", "control"))
     return Energy(
         toggles=toggles,
         cycle_j=toggles * TOGGLE_J + clocked * CLOCK_J,

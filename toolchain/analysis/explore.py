@@ -19,7 +19,7 @@ from machines.parameters import RngKind
 from toolchain.analysis.accuracy import measure
 from toolchain.analysis.emulation import EmulatedBoards, split
 from toolchain.analysis.resources import Pcie, estimate
-from toolchain.build import machine_parameters
+from toolchain.build import DEFAULT_INTERFACE, machine_parameters
 from toolchain.errors import BuildError
 from toolchain.options import BuildOptions, Scale
 from toolchain.outputs.rng_table import random_table
@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
     from pathlib import Path
 
+    from toolchain.analysis.device import Device
     from toolchain.analysis.readings import Readings
-    from toolchain.analysis.resources import Device
     from toolchain.deployment import Stop
     from toolchain.models.model import Model
 
@@ -217,8 +217,7 @@ def run_task(model: Model, task: Task, readings: Readings, device: Device, banks
     largest = machines[0].parameters
     took = None
     if parameters.rng is not RngKind.IDEAL:
-        interface = (max(20, largest.sensors), max(1200, largest.lines))
-        took = estimate(largest, device, interface=interface, pcie=Pcie.HARD)
+        took = estimate(largest, device, interface=DEFAULT_INTERFACE, pcie=Pcie.HARD)
     machine, quantising = accuracy.machine, accuracy.quantising
     return Point(
         key=task.key,
@@ -241,7 +240,7 @@ def run_task(model: Model, task: Task, readings: Readings, device: Device, banks
         cycles_median=accuracy.cycles.median.value,
         cycles_95=accuracy.cycles.percentile_95.value,
         alms=None if took is None else took.alms,
-        blocks=None if took is None else took.blocks,
+        blocks=None if took is None else took.memories.blocks,
         fits=None if took is None else took.fits,
     )
 

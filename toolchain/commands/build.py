@@ -9,7 +9,8 @@ import typer
 
 from machines.errors import MachineError
 from machines.parameters import RngKind
-from toolchain.analysis.resources import boards_needed, device_named
+from toolchain.analysis.boards_needed import boards_needed
+from toolchain.analysis.device import device_named
 from toolchain.build import (
     DEFAULT_INTERFACE,
     REPORT_NAME,

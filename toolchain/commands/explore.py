@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Final, TypeVar
 import typer
 
 from machines.parameters import RngKind
+from toolchain.analysis.device import device_named
 from toolchain.analysis.explore import Results, Sweep, explore, pareto, run_task, tasks
 from toolchain.analysis.readings import check_frames, recorded_readings, sample_readings
-from toolchain.analysis.resources import device_named
 from toolchain.commands.named_model import NetworkQuestion, Unread, read_model
 from toolchain.errors import BuildError
 from toolchain.options import Scale

@@ -12,6 +12,7 @@ import numpy as np
 
 from machines.parameters import SensorMode
 from toolchain.analysis.accuracy import measure
+from toolchain.analysis.device import device_named
 from toolchain.analysis.emulation import EmulatedBoards, joined, one_replica
 from toolchain.analysis.energy import ASSUMPTIONS, energy
 from toolchain.analysis.readings import (
@@ -20,7 +21,8 @@ from toolchain.analysis.readings import (
     recorded_readings,
     sample_readings,
 )
-from toolchain.analysis.resources import Pcie, Tables, device_named, estimate
+from toolchain.analysis.resources import Pcie, estimate
+from toolchain.analysis.table_memories import Tables
 from toolchain.build import REPORT_NAME, many_sentence
 from toolchain.commands.named_model import NetworkQuestion, Unread, read_model
 from toolchain.deployment import load_deployment
@@ -410,9 +412,10 @@ def _resource_part(found: Inspection) -> str:
         "  part           ALMs  registers",
     ]
     rows += [f"  {part.name:10} {part.alms:8,.0f} {part.registers:10,.0f}" for part in largest.logic.parts]
-    if largest.logic_tables:
+    memories = largest.memories
+    if memories.logic_tables:
         rows.append(
-            f"  tables     {largest.table_alms:8,.0f}             {largest.logic_tables:,} tables in {largest.mlabs:,} memory LABs"
+            f"  tables     {memories.alms:8,.0f}             {memories.logic_tables:,} tables in {memories.mlabs:,} memory LABs"
         )
     low, high = largest.pcie_alms
     controller = (
@@ -423,7 +426,7 @@ def _resource_part(found: Inspection) -> str:
     rows += [
         f"  together   {largest.alms:8,.0f} {largest.logic.registers:10,.0f}   {largest.alm_share:.0%} of {device.alms:,} ALMs",
         (
-            f"  Table memories: {largest.table_bits:,} bits in {largest.blocks:,} of {device.blocks:,} M20K blocks "
+            f"  Table memories: {memories.table_bits:,} bits in {memories.blocks:,} of {device.blocks:,} M20K blocks "
             f"({largest.block_share:.0%}), one a cell. PCIe controller {controller}."
         ),
         "  It fits: up to 80 % of each can be used."
@@ -435,7 +438,7 @@ def _resource_part(found: Inspection) -> str:
         rows.append(
             f"  With a column's tables side by side in wide memories all {found.machine.parameters.lines} lines would "
             + (
-                f"fit one board: {wide.alms:,.0f} ALMs, {wide.blocks:,} blocks."
+                f"fit one board: {wide.alms:,.0f} ALMs, {wide.memories.blocks:,} blocks."
                 if wide.fits
                 else "not fit one board either."
             )
@@ -474,9 +477,9 @@ def as_json(found: Inspection) -> str:
             {
                 "alms": each.alms,
                 "registers": each.logic.registers,
-                "table_bits": each.table_bits,
-                "blocks": each.blocks,
-                "memory_labs": each.mlabs,
+                "table_bits": each.memories.table_bits,
+                "blocks": each.memories.blocks,
+                "memory_labs": each.memories.mlabs,
                 "pcie_alms": list(each.pcie_alms),
                 "fits": each.fits,
             }

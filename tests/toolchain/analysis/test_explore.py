@@ -15,9 +15,9 @@ from typer.testing import CliRunner
 
 from machines.parameters import RngKind
 from tests.toolchain.corridor import corridor
+from toolchain.analysis.device import DEVICES
 from toolchain.analysis.explore import Point, Results, Sweep, explore, pareto, run_task, tasks
 from toolchain.analysis.readings import sample_readings
-from toolchain.analysis.resources import DEVICES
 from toolchain.command import app
 from toolchain.deployment import Stop
 from toolchain.errors import BuildError

@@ -4,17 +4,12 @@ from dataclasses import replace
 
 import pytest
 
-from machines.parameters import BM1Parameters, PriorMode, RngKind
-from toolchain.analysis.resources import (
-    DEVICES,
-    Pcie,
-    Tables,
-    boards_needed,
-    device_named,
-    estimate,
-    logic_of,
-    with_lines,
-)
+from machines.parameters import BM1Parameters, PriorMode, RngKind, RngReset, SensorMode
+from toolchain.analysis.boards_needed import boards_needed, with_lines
+from toolchain.analysis.device import DEVICES, device_named
+from toolchain.analysis.logic import logic_of
+from toolchain.analysis.resources import Pcie, estimate
+from toolchain.analysis.table_memories import Tables
 from toolchain.errors import BuildError
 
 D8 = DEVICES["proce-v-d8"]
@@ -31,8 +26,8 @@ def test_the_boat_does_not_fit_one_board_and_a_quarter_does():
     assert whole.alms > 0.8 * D8.alms
     assert quarter.fits
     assert quarter.alm_share < 0.5
-    assert quarter.blocks == 6 * 256  # a block a cell: 512 words of 8 bits, or fewer
-    assert quarter.logic_tables == 0
+    assert quarter.memories.blocks == 6 * 256  # a block a cell: 512 words of 8 bits, or fewer
+    assert quarter.memories.logic_tables == 0
 
 
 def test_readout_and_interface_registers_count():
@@ -43,13 +38,13 @@ def test_readout_and_interface_registers_count():
 
 def test_tables_in_bits_and_blocks():
     quarter = with_lines(BOAT, 256)
-    assert on_d8(quarter).table_bits == 256 * 3 * 8 * (128 + 512)
+    assert on_d8(quarter).memories.table_bits == 256 * 3 * 8 * (128 + 512)
     # 256 codes of 8 bits side by side, 5 in each block of 512 words of 40 bits
-    assert on_d8(quarter, tables=Tables.COLUMN).blocks == 6 * 52
+    assert on_d8(quarter, tables=Tables.COLUMN).memories.blocks == 6 * 52
     assert on_d8(BOAT, tables=Tables.COLUMN).fits
     deep = BM1Parameters(lines=1, sensor_bits=(12,))
-    assert on_d8(deep).blocks == 2  # 4096 words of 8 bits: two blocks of 4096 x 5
-    assert on_d8(replace(deep, prior_bits=9)).blocks == 3
+    assert on_d8(deep).memories.blocks == 2  # 4096 words of 8 bits: two blocks of 4096 x 5
+    assert on_d8(replace(deep, prior_bits=9)).memories.blocks == 3
 
 
 def test_a_controller_of_logic_takes_8000_to_30000_elements():
@@ -63,9 +58,21 @@ def test_a_controller_of_logic_takes_8000_to_30000_elements():
 
 def test_registers_are_counted_exactly():
     # What yosys finds in these (scripts/verify resources has more).
-    for lines, sensors, registers in ((8, 3, 488), (8, 6, 596), (32, 3, 872)):
-        parameters = BM1Parameters(lines=lines, sensor_bits=(4,) * sensors)
-        assert logic_of(parameters, interface_words=lines, word_bits=8).registers == registers
+    cell, threshold = SensorMode.CELL, SensorMode.THRESHOLD
+    for lines, sensors, registers, others in (
+        (8, 3, 488, {}),
+        (8, 6, 596, {}),
+        (32, 3, 872, {}),
+        (8, 3, 572, {"sensor_mode": cell}),
+        (8, 3, 668, {"sensor_mode": threshold, "sensor_bits": (8, 8, 8)}),
+        (4, 2, 908, {"replicas": 4}),
+        (1, 1, 3216, {"replicas": 32}),
+        (8, 2, 1644, {"replicas": 4, "sensor_mode": threshold, "sensor_bits": (8, 8)}),
+        (4, 2, 1032, {"replicas": 4, "prior_mode": PriorMode.WRITTEN}),
+        (8, 3, 484, {"rng_reset": RngReset.FREE}),
+    ):
+        parameters = BM1Parameters(**{"lines": lines, "sensor_bits": (4,) * sensors} | others)
+        assert logic_of(parameters, whole_words=False).registers == registers
 
 
 @pytest.mark.parametrize(
@@ -79,13 +86,15 @@ def test_registers_are_counted_exactly():
         {"rng": RngKind.TABLE, "steps_per_clock": 1},
         {"prior_mode": PriorMode.WRITTEN},
         {"rng_banks": 256},
+        {"replicas": 2},
+        {"sensor_mode": SensorMode.CELL},
     ],
 )
 def test_more_of_anything_takes_more(more):
     base, larger = on_d8(BOAT, results=2048), on_d8(replace(BOAT, **more), results=2048)
-    assert (larger.alms, larger.blocks, larger.logic.registers) != (
+    assert (larger.alms, larger.memories.blocks, larger.logic.registers) != (
         base.alms,
-        base.blocks,
+        base.memories.blocks,
         base.logic.registers,
     )
     if "rng" not in more:

@@ -1,0 +1,94 @@
+"""How many boards a machine needs: as few as hold its lines, of an FPGA of a kind and of the register map."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from machines.parameters import SensorMode
+from pcie_shim.programming_file import interface_room
+from toolchain.analysis.resources import Pcie, estimate
+from toolchain.errors import BuildError
+from toolchain.partition import partition_lines
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from machines.parameters import BM1Parameters
+    from toolchain.analysis.device import Device
+    from toolchain.analysis.resources import Estimate
+
+
+def boards_needed(
+    parameters: BM1Parameters,
+    device: Device,
+    *,
+    interface: tuple[int, int] = (20, 1200),
+    largest_lines: int = 4096,
+    pcie: Pcie = Pcie.HARD,
+) -> tuple[int, str]:
+    """Return the fewest boards that hold a machine, and a sentence that says why.
+
+    Args:
+        parameters: The whole machine.
+        device: What a board has.
+        interface: Inputs and results of a board's registers, at least; a larger machine gets a larger one.
+        largest_lines: Lines that the register map has room for on a board.
+        pcie: What the PCIe controllers are made of.
+
+    Raises:
+        BuildError: Not even a line a board fits, or generators that no FPGA has.
+    """
+
+    def on(lines: int) -> Estimate:
+        return estimate(with_lines(parameters, lines), device, interface=interface, pcie=pcie)
+
+    room = interface_room(parameters)
+    largest_lines = min(largest_lines, room[1] // parameters.replicas)
+    if parameters.sensor_mode is not SensorMode.COLUMN and parameters.sensors:
+        largest_lines = min(largest_lines, room[0] // (parameters.replicas * parameters.sensors))
+    most = _most_lines(lambda lines: on(lines).fits, min(parameters.lines, largest_lines))
+    if most == 0 and largest_lines == 0:
+        message = (
+            f"not even one line of {parameters.replicas} replicas fits the register map: it has room for {room[0]} inputs "
+            f"and {room[1]} results; use fewer --replicas"
+        )
+        raise BuildError(message)
+    if most == 0:
+        message = (
+            f"not even one line fits a {device.title}: {on(1).why_not}; use narrower tables or another device"
+        )
+        raise BuildError(message)
+    count = math.ceil(parameters.lines / most)
+    largest = partition_lines(parameters.lines, count)[0].lines
+    took = on(largest)
+    share = f"{took.alms:,.0f} ALMs ({took.alm_share:.0%}) and {took.memories.blocks:,} memory blocks ({took.block_share:.0%})"
+    if count == 1:
+        return 1, f"All {parameters.lines} lines fit one {device.title}: {share}."
+    if largest_lines < parameters.lines and on(largest_lines).fits:
+        reason = f"the register map has room for {largest_lines} lines a board"
+    else:
+        reason = f"on one {device.title} {on(parameters.lines).why_not}"
+    boards = f"{count} boards" if count > 2 else "two boards"
+    return count, (
+        f"{parameters.lines} lines need {boards}: {reason}; {largest} lines a board take {share}. An estimate, not a "
+        "compilation."
+    )
+
+
+def _most_lines(fits: Callable[[int], bool], highest: int) -> int:
+    """The most lines that fit, 0 to `highest`: what fits with more fits with fewer."""
+    low, high = 0, highest + 1
+    while high - low > 1:
+        middle = (low + high) // 2
+        if fits(middle):
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+def with_lines(parameters: BM1Parameters, lines: int) -> BM1Parameters:
+    """Return the same machine with another number of lines."""
+    return replace(parameters, lines=lines)

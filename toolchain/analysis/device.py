@@ -1,0 +1,59 @@
+"""FPGAs that a board can have: what there is of each kind of cell, and how much of it a design can use."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+from toolchain.errors import BuildError
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Device:
+    """An FPGA, and the board it is on.
+
+    Attributes:
+        name: As `--device` takes it.
+        title: As a person says it.
+        alms: Adaptive logic modules.
+        registers_per_alm: Registers in each of those.
+        blocks: M20K memory blocks, 20,480 bits each.
+        usable: Share of each that a design can take before it no longer places and routes.
+        hard_pcie: Whether it has PCIe controllers of its own.
+    """
+
+    name: str
+    title: str
+    alms: int
+    registers_per_alm: int
+    blocks: int
+    usable: float = 0.8
+    hard_pcie: bool = True
+
+
+DEVICES: Final = {
+    device.name: device
+    for device in (
+        Device(
+            name="proce-v-d8",
+            title="Gidel Proce V D8 (Stratix V GS D8)",
+            alms=262_400,
+            registers_per_alm=4,
+            blocks=2_567,
+        ),
+    )
+}
+"""The devices that `--device` knows."""
+
+
+def device_named(name: str) -> Device:
+    """Return a device by its name.
+
+    Raises:
+        BuildError: There is none of that name; lists those there are.
+    """
+    try:
+        return DEVICES[name]
+    except KeyError:
+        message = f"--device {name}: expected one of {', '.join(DEVICES)}"
+        raise BuildError(message) from None
