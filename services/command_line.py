@@ -15,7 +15,7 @@ import typer
 import uvloop
 
 from services.errors import ExitCode, ReportedError, StoppedError, exit_code_of
-from services.logs import say
+from services.logs import log_by_lines, say, say_lines
 from services.supervision import PARENT_VARIABLE
 from toolchain.commands.usage import CommandLine
 
@@ -45,6 +45,7 @@ def ends_well(command: Callable[Parameters, int | None]) -> Callable[Parameters,
     @functools.wraps(command)
     def run(*args: Parameters.args, **kwargs: Parameters.kwargs) -> None:
         _open_standard_streams()
+        log_by_lines()
         try:
             code = _outcome(functools.partial(command, *args, **kwargs))
         except StoppedError as stopped:  # a signal came while another end was being told
@@ -86,7 +87,7 @@ def _outcome(command: Callable[[], int | None]) -> int:
     except Exception as error:
         code = exit_code_of(error)
         if code == ExitCode.BUG and not isinstance(error, ReportedError):
-            say(traceback.format_exc().rstrip())
+            say_lines(traceback.format_exc().rstrip())
             say("error: this is a bug in rosbayes; please report it with the lines above")
         else:
             say(f"error: {error}")

@@ -12,6 +12,7 @@ from rich.table import Table
 
 from bridge.discovery import Robot, UnknownRobotError
 from services.command_line import ends_well, make_app, run_async
+from toolchain.commands.one_line import one_line
 
 app = make_app(
     "List the rosbridge servers that announce themselves on this network.\n\n`discover`\n\n"
@@ -64,7 +65,9 @@ def _table(robots: list[Robot]) -> Table:
         table.add_column(column, overflow="fold")
     for robot in robots:
         token = "wanted" if robot.token else ""
-        table.add_row(escape(robot.name), robot.uri, str(robot.ros_version or "?"), token)
+        table.add_row(
+            escape(one_line(robot.name)), escape(one_line(robot.uri)), str(robot.ros_version or "?"), token
+        )
     return table
 
 

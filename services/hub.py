@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import sys
 from collections.abc import Coroutine, Sequence
 from pathlib import Path
 from typing import Annotated, Literal
@@ -16,10 +15,11 @@ from bridge.hub.graph import Graph
 from bridge.hub.server import serve_hub
 from services.command_line import ends_well, make_app, run_async
 from services.errors import SettingsError
-from services.logs import say
+from services.logs import log_libraries, say
 from services.settings import load_settings
 from services.status_socket import HubStatus, ProcessStatus, status_served
 from services.supervision import end_with_parent
+from toolchain.commands.one_line import shown
 
 app = make_app(
     "Serve rosbridge without ROS: topics, services, actions, parameters and rosapi.\n\n`hub --port 9090`\n\n"
@@ -66,18 +66,18 @@ def hub(
             for flags, there in (("--tls-cert and --tls-key", door.tls), ("--token-file", door.tokens))
             if not there
         )
-        msg = f"--host {host} lets everybody on that network publish to your robot; give {missing}, or --insecure if that is meant"
+        msg = f"--host {shown(host)} lets everybody on that network publish to your robot; give {missing}, or --insecure if that is meant"
         raise SettingsError(msg)
 
     # a refusal gets no word to its client (as at the reference server): the log is where it is seen
-    logging.basicConfig(level=logging.WARNING, stream=sys.stderr, format="hub: %(message)s")
+    log_libraries(logging.WARNING, "hub: %(message)s")
 
     listening: list[str] = []
     graphs: list[Graph] = []
 
     def ready(at: int) -> None:
-        shown = f"[{host}]" if ":" in host else host
-        listening.append(f"listening on {'wss' if door.tls else 'ws'}://{shown}:{at}")
+        address = f"[{host}]" if ":" in host else host
+        listening.append(f"listening on {'wss' if door.tls else 'ws'}://{address}:{at}")
         say(f"hub: {listening[0]}")
 
     def tell() -> ProcessStatus:
@@ -153,7 +153,7 @@ def _door(certificate: Path | None, key: Path | None, tokens: Path | None, origi
         raise SettingsError(msg)
     for page in origins:
         if not page.startswith(("http://", "https://")) or page.count("/") != 2:
-            msg = f"--origin {page} is no web page's origin: expected for example https://robot.example:8000"
+            msg = f"--origin {shown(page)} is no web page's origin: expected for example https://robot.example:8000"
             raise SettingsError(msg)
     return Door(
         tls=tls_context(certificate, key) if certificate is not None and key is not None else None,

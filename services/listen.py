@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import contextlib
-import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Final
 
-import orjson
 import typer
 from rich.console import Console, Group
 from rich.live import Live
@@ -22,11 +20,11 @@ from bridge.results import RESULTS_TOPIC, Heard, Posterior
 from services import options
 from services.command_line import ends_well, make_app, run_async
 from services.errors import SettingsError
-from services.logs import say
+from services.logs import put_json, say
 from services.result_file import ResultFile, open_result_file, record
 from services.result_picture import ROWS, Axis, axes_of, in_colour, picture, printable
 from services.serving import deployment_for
-from services.settings import Settings, load_settings
+from services.settings import LONGEST_S, Settings, load_settings
 from toolchain.deployment import Deployment
 
 _QUEUE_SIZE: Final = 1024
@@ -148,8 +146,7 @@ def _print_line(heard: Heard, axes: list[Axis]) -> None:
 
 
 def _print_json(heard: Heard, axes: list[Axis]) -> None:
-    sys.stdout.buffer.write(orjson.dumps(record(heard, axes)) + b"\n")
-    sys.stdout.buffer.flush()
+    put_json(record(heard, axes))
 
 
 @contextlib.contextmanager
@@ -217,7 +214,9 @@ def listen(
     timeout: Annotated[
         float | None,
         typer.Option(
-            min=0.1, help="End after so many seconds without a result; by default they are waited out."
+            min=0.1,
+            max=LONGEST_S,
+            help="End after so many seconds without a result; by default they are waited out.",
         ),
     ] = None,
     first_data_timeout: options.FirstDataTimeout = None,

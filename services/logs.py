@@ -7,8 +7,11 @@ import logging
 import sys
 from typing import Any, TextIO
 
+import orjson
 import structlog
 from structlog.typing import FilteringBoundLogger
+
+from toolchain.commands.one_line import lines_of, one_line
 
 
 class _SurvivingStream:
@@ -31,10 +34,61 @@ class _SurvivingStream:
 
 
 def say(text: str) -> None:
-    """A plain line for the user on standard error, even where that has been closed."""
+    """A plain line for the user on standard error, even where that has been closed; whatever stands in it, it is one."""
+    _write(one_line(text))
+
+
+def say_lines(text: str) -> None:
+    """The same of a text that has several lines, such as a traceback."""
+    _write(lines_of(text))
+
+
+def _write(text: str) -> None:
     stream = _SurvivingStream(sys.stderr)
     stream.write(text + "\n")
     stream.flush()
+
+
+def put_json(value: Any) -> None:
+    """A line of JSON on standard output, for programs; on a terminal, too, none of it is an order.
+
+    Raises:
+        OSError: standard output can't be written.
+    """
+    line = orjson.dumps(value)
+    if not line.isascii():  # orjson has escaped what ASCII has of such characters
+        text = line.decode()
+        line = "".join(each if each.isprintable() else json.dumps(each)[1:-1] for each in text).encode()
+    sys.stdout.buffer.write(line + b"\n")
+    sys.stdout.buffer.flush()
+
+
+class _OneLine(logging.Formatter):
+    """What libraries log may quote a stranger; a traceback that follows has its lines."""
+
+    def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802 - logging's name
+        return one_line(super().formatMessage(record))
+
+    def formatException(self, ei: Any) -> str:  # noqa: N802 - logging's name
+        return lines_of(super().formatException(ei))
+
+
+def log_by_lines() -> None:
+    """Have warnings of libraries come out a line each where nothing else was arranged for them: a server's words are in some."""
+    if logging.lastResort is not None:
+        logging.lastResort.setFormatter(_OneLine())
+
+
+def log_libraries(level: int, form: str) -> None:
+    """Have what libraries log come out on standard error, a line each.
+
+    Args:
+        level: the least that does.
+        form: how a line looks, as `logging` has it.
+    """
+    handler = logging.StreamHandler()
+    handler.setFormatter(_OneLine(form))
+    logging.basicConfig(level=level, handlers=[handler])
 
 
 def get_logger(role: str, level: str = "info") -> FilteringBoundLogger:
@@ -45,7 +99,7 @@ def get_logger(role: str, level: str = "info") -> FilteringBoundLogger:
         level: the least that is written: debug, info or warning. The first call in a process decides.
     """
     # what the libraries log, our own records say in words; only their errors are news
-    logging.basicConfig(level=logging.ERROR, stream=sys.stderr, format="%(name)s: %(message)s")
+    log_libraries(logging.ERROR, "%(name)s: %(message)s")
     if not structlog.is_configured():
         _configure(level)
     logger: FilteringBoundLogger = structlog.get_logger().bind(process=role)
@@ -75,7 +129,7 @@ def _one_line(_: Any, level: str, event: structlog.typing.EventDict) -> str:
     frame = f"frame={event.pop('frame')} " if "frame" in event else ""
     rest = "".join(f" {key}={_value(value)}" for key, value in event.items())
     urgency = "" if level == "info" else f"{level}: "
-    return f"{time} {process}: {urgency}{frame}{sentence}{rest}"
+    return one_line(f"{time} {process}: {urgency}{frame}{sentence}{rest}")
 
 
 def _value(value: Any) -> str:

@@ -18,6 +18,7 @@ from services.run import run_master
 from services.serving import deployment_for
 from services.settings import endpoint_in, load_settings
 from services.supervision import end_with_parent
+from toolchain.commands.one_line import one_line
 
 RELOAD_TIME = 600.0
 """Seconds that `master reload` waits for its answer."""
@@ -151,7 +152,7 @@ def reload_(
         from services.status import find_run
 
         run = directory or settings.control_directory or settings.run_directory or await find_run()
-        print(await give_order(control_socket(run), ReloadOrder(folder), timeout=RELOAD_TIME))
+        print(one_line(await give_order(control_socket(run), ReloadOrder(folder), timeout=RELOAD_TIME)))
         return ExitCode.DONE
 
     return run_async(order())

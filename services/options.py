@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from services.settings import LONGEST_S, SHORTEST_S
+
 Deployment = Annotated[
     Path | None,
     typer.Option("--deployment", "-d", help="Folder that `toolchain build` wrote.", metavar="DIR"),
@@ -52,20 +54,38 @@ Boards = Annotated[
     ),
 ]
 ConnectTimeout = Annotated[
-    float | None, typer.Option("--connect-timeout", help="Seconds to reach the rosbridge server (10).")
+    float | None,
+    typer.Option(
+        "--connect-timeout", min=SHORTEST_S, max=LONGEST_S, help="Seconds to reach the rosbridge server (10)."
+    ),
 ]
 FirstDataTimeout = Annotated[
-    float | None, typer.Option("--first-data-timeout", help="Seconds until the first reading (30).")
+    float | None,
+    typer.Option(
+        "--first-data-timeout", min=SHORTEST_S, max=LONGEST_S, help="Seconds until the first reading (30)."
+    ),
 ]
 PeerTimeout = Annotated[
-    float | None, typer.Option("--peer-timeout", help="Seconds to reach a local process or a board (10).")
+    float | None,
+    typer.Option(
+        "--peer-timeout",
+        min=SHORTEST_S,
+        max=LONGEST_S,
+        help="Seconds to reach a local process or a board (10).",
+    ),
 ]
 BoardTimeout = Annotated[
     float | None,
-    typer.Option("--board-timeout", help="Seconds a board may take beyond max_cycles at its speed (5)."),
+    typer.Option(
+        "--board-timeout",
+        min=SHORTEST_S,
+        max=LONGEST_S,
+        help="Seconds a board may take beyond max_cycles at its speed (5).",
+    ),
 ]
 StopTimeout = Annotated[
-    float | None, typer.Option("--stop-timeout", help="Seconds a process has to end (5).")
+    float | None,
+    typer.Option("--stop-timeout", min=SHORTEST_S, max=LONGEST_S, help="Seconds a process has to end (5)."),
 ]
 LogLevel = Annotated[
     str | None,

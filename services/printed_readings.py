@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import sys
 from typing import Any
-
-import orjson
 
 from bridge.client import Ros, connect
 from bridge.fields import Field
 from services.frames import FrameAssembler
+from services.logs import put_json
 from services.settings import Settings
 from toolchain.deployment import Deployment, Source
 
@@ -40,7 +38,7 @@ async def print_readings(settings: Settings, source: Source, names: list[str], c
                 if not present:
                     raise field.missing(message.msg)
                 values[field.name] = value
-            _print(values or message.msg)
+            put_json(values or message.msg)
             printed += 1
     return 0
 
@@ -72,7 +70,7 @@ async def print_addresses(settings: Settings, deployment: Deployment, count: int
                 if reading is not None and (count is None or printed < count):
                     printed += 1
                     printed_prior = list(memoryview(reading.prior_codes).cast("H"))
-                    _print(
+                    put_json(
                         {"stamp_ns": reading.stamp_ns, "addresses": reading.addresses}
                         | ({"prior_codes": printed_prior} if printed_prior else {})
                     )
@@ -88,8 +86,3 @@ async def print_addresses(settings: Settings, deployment: Deployment, count: int
             for follower in followers:
                 follower.cancel()
     return 0
-
-
-def _print(value: Any) -> None:
-    sys.stdout.buffer.write(orjson.dumps(value) + b"\n")
-    sys.stdout.buffer.flush()

@@ -16,8 +16,12 @@ from pcie_shim.endpoint import Endpoint, parse_endpoint
 from pcie_shim.errors import PcieShimError
 from services.errors import SettingsError
 
-Seconds = Annotated[float, Field(gt=0, le=86_400)]
+SHORTEST_S, LONGEST_S = 0.001, 86_400.0
+"""Seconds that a time-out may be set to."""
+Seconds = Annotated[float, Field(ge=SHORTEST_S, le=LONGEST_S)]
 ENV_PREFIX = "BM_"
+ROBOT = "robot:"
+"""How a URI begins that names a robot instead of an address."""
 
 
 class Settings(BaseSettings):
@@ -78,8 +82,8 @@ class Settings(BaseSettings):
     @field_validator("uri")
     @classmethod
     def _uri(cls, value: str | None) -> str | None:
-        if value is not None and not value.startswith(("ws://", "wss://", "robot:")):
-            msg = "a rosbridge URI starts with ws:// or wss://, for example ws://192.168.1.10:9090 (or robot:NAME, as `discover` lists it)"
+        if value is not None and not value.startswith(("ws://", "wss://", ROBOT)):
+            msg = f"a rosbridge URI starts with ws:// or wss://, for example ws://192.168.1.10:9090 (or {ROBOT}NAME, as `discover` lists it)"
             raise ValueError(msg)
         return value
 
@@ -120,12 +124,20 @@ def load_settings(**flags: Any) -> Settings:
             if name in given
             else f"environment variable {ENV_PREFIX}{name.upper()}"
         )
-        reason = str(first["msg"]).removeprefix("Value error, ").replace("Input should be", "expected", 1)
+        reason = _reason(name, str(first["msg"]))
         msg = f"{where}: {reason} (got {first.get('input')!r})"
         raise SettingsError(msg) from error
-    if "uri" in flags and settings.uri is not None and settings.uri.startswith("robot:"):
-        return settings.model_copy(update={"uri": _found(settings.uri.removeprefix("robot:"))})
+    if "uri" in flags and settings.uri is not None and settings.uri.startswith(ROBOT):
+        return settings.model_copy(update={"uri": _found(settings.uri.removeprefix(ROBOT))})
     return settings
+
+
+def _reason(name: str, said: str) -> str:
+    """What was expected of a setting: of a time-out both its limits, whichever was passed."""
+    known = Settings.model_fields.get(name)
+    if known is not None and known.annotation is float:
+        return f"expected seconds from {SHORTEST_S:g} to {LONGEST_S:g}"
+    return said.removeprefix("Value error, ").replace("Input should be", "expected", 1)
 
 
 def _found(robot: str) -> str:

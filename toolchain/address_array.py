@@ -48,7 +48,7 @@ def to_addresses(deployment: Deployment, variable: Variable, value: object) -> l
     shape = deployment.reading_shape(variable)
     numbers = _numbers(variable, value, shape)
     if numbers is None:
-        to_address(variable, None)  # says that it must not be missing, where it must not
+        to_address(variable, None if value is None else [])  # says what it is, where it must not be missing
         return None
     if machine.sensor_mode is SensorMode.THRESHOLD and variable.kind == "sensor":
         addresses = _codes(variable, numbers, machine.prob_bits, Scale(machine.scale))

@@ -326,7 +326,7 @@ class DeploymentFile(_Section):
     name: Name
     hash: str = ""
     queue: Choice[Queue] = Queue.LATEST
-    tolerance_s: float = Field(default=0.05, ge=0)
+    tolerance_s: float = Field(default=0.05, ge=0, le=86_400)
     sources: Sequence[Source] = Field(validation_alias="source", min_length=1)
     variables: Sequence[Variable] = Field(default=(), validation_alias="variable")
     searched: Sequence[Dimension] = Field(min_length=1)

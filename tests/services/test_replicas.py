@@ -134,3 +134,17 @@ def test_what_is_published_is_read_back():
     (of_board,) = read_frame_report(json.loads(orjson.dumps(said)), 0).boards
     assert of_board.replica_cycles == (100, 0, 40)
     assert of_board.replica_stopped == ("overflow", "impossible", "slice")
+
+
+@pytest.mark.parametrize(
+    ("value", "said"),
+    [(None, "is absent or null"), ([], "is an empty array"), ([[], []], "is an empty array")],
+)
+def test_what_stands_there_instead_of_readings_is_said(value, said):
+    needed = CELLS.model_copy(
+        update={
+            "variables": tuple(each.model_copy(update={"on_missing": "error"}) for each in CELLS.variables)
+        }
+    )
+    with pytest.raises(VariableError, match=f"variable K {said}, and this deployment needs it"):
+        FrameAssembler(needed).take(0, {"K": value, "P": [0, 1, 0]}, 5, 6)

@@ -6,6 +6,7 @@ from contextlib import contextmanager
 
 import typer
 
+from toolchain.commands.one_line import one_line
 from toolchain.errors import ToolchainError
 
 
@@ -15,11 +16,11 @@ def one_sentence() -> Iterator[None]:
     try:
         yield
     except ToolchainError as error:
-        typer.echo(f"error: {error}", err=True)
+        typer.echo(one_line(f"error: {error}"), err=True)
         raise typer.Exit(error.exit_code) from None
     except OSError as error:
         # no file has failed where nobody reads on (`| head`): typer ends that quietly
         if error.filename is None or error.errno == errno.EPIPE:
             raise
-        typer.echo(f"error: {error.filename}: {error.strerror}", err=True)
+        typer.echo(one_line(f"error: {error.filename}: {error.strerror}"), err=True)
         raise typer.Exit(ToolchainError.exit_code) from None

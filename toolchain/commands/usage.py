@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, NoReturn
+from typing import TYPE_CHECKING, Any, Final, NoReturn, cast
 
 import typer
 from typer.core import TyperArgument, TyperOption
 from typer.main import get_command
 
+from toolchain.commands.one_line import one_line, shown
+
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-_SHOWN: Final = 80
-"""Characters of a value that are shown: what is typed may be anything."""
 _TYPES: Final = {int: "NUMBER", float: "NUMBER", str: "TEXT"}
 
 
@@ -34,11 +35,12 @@ class CommandLine(typer.Typer):
         """Run the command with `sys.argv`, or with these arguments, and exit."""
         command = get_command(self)
         name_values(command)
+        check_values(command)
         try:
             code = command.main(arguments, standalone_mode=False)
         except typer.TyperException as error:
             if type(error).__name__ != "NoArgsIsHelpError":  # its help is printed already
-                print(f"error: {usage_sentence(error)}", file=sys.stderr, flush=True)
+                print(f"error: {one_line(usage_sentence(error))}", file=sys.stderr, flush=True)
             sys.exit(2)
         sys.exit(code if isinstance(code, int) else 0)
 
@@ -66,6 +68,67 @@ def name_values(command: Any, parent: typer.Context | None = None) -> None:
         name_values(each, context)
 
 
+class RefusedValueError(typer.BadParameter):
+    """A value that is none for any flag: a blank text, or a number that is not finite."""
+
+    def __init__(self, value: str, context: typer.Context, parameter: TyperOption | TyperArgument) -> None:
+        """Take the value as it was typed, and where."""
+        super().__init__("expected a text that is not blank", context, parameter)
+        self.value = value
+
+
+def check_values(command: Any) -> None:
+    """Have every flag refuse a blank value and a number that is not finite, and every mistake name its own subcommand.
+
+    Args:
+        command: Typer's command or group; its flags are changed.
+    """
+    parse = command.parse_args
+
+    def parse_here(context: typer.Context, arguments: list[str]) -> list[str]:
+        try:
+            rest: list[str] = parse(context, arguments)
+        except typer.TyperException as error:
+            # typer's parser does not say whose flag it was that has no value
+            if getattr(error, "ctx", context) is None:
+                cast("Any", error).ctx = context
+            raise
+        return rest
+
+    command.parse_args = parse_here
+    for parameter in command.params:
+        _check_value(parameter)
+    for each in getattr(command, "commands", {}).values():
+        check_values(each)
+
+
+def _check_value(parameter: TyperOption | TyperArgument) -> None:
+    process = parameter.process_value
+
+    def checked(ctx: Any, value: Any) -> Any:
+        source = ctx.get_parameter_source(parameter.name)
+        typed = value if isinstance(value, list | tuple) else (value,)
+        if source is not None and source.name == "COMMANDLINE":
+            for each in typed:
+                if (
+                    isinstance(each, str)
+                    and not each.strip()
+                    and not _choices(parameter)
+                    and not _is_number(parameter)
+                ):
+                    raise RefusedValueError(each, ctx, parameter)
+        found = process(ctx, value)
+        if isinstance(found, float) and not math.isfinite(found):
+            raise RefusedValueError(str(value), ctx, parameter)
+        return found
+
+    parameter.process_value = checked  # type: ignore[method-assign]  # of this one flag
+
+
+def _is_number(parameter: TyperOption | TyperArgument) -> bool:
+    return parameter.type_descriptor.annotation in {int, float}
+
+
 def _nothing(*_: object, **__: object) -> None:
     """What an argument takes is said by its name."""
 
@@ -74,7 +137,13 @@ def usage_sentence(error: typer.TyperException) -> str:
     """Return what is wrong with a command line: where, what was expected, and where to read on."""
     context = getattr(error, "ctx", None)
     command = Path(sys.argv[0]).name if context is None else context.command_path
-    return f"{_what(error, command).rstrip('. ')}; {command} --help says more"
+    return f"{_without_stop(_what(error, command))}; {command} --help says more"
+
+
+def _without_stop(sentence: str) -> str:
+    """A sentence that goes on: without its full stop, but an ellipsis stays."""
+    sentence = sentence.rstrip()
+    return sentence if sentence.endswith("...") else sentence.removesuffix(".")
 
 
 def _what(error: typer.TyperException, command: str) -> str:
@@ -84,7 +153,7 @@ def _what(error: typer.TyperException, command: str) -> str:
     if kind == "NoSuchOption":
         near = getattr(error, "possibilities", None)
         guess = f" (did you mean {_one_of(near)}?)" if near else ""
-        return f"{command} has no {_printable(option)}{guess}"
+        return f"{command} has no {shown(option)}{guess}"
     if kind == "MissingParameter" and parameter is not None:
         return f"{_place(parameter)} is missing: {_meaning(parameter)}"
     if isinstance(error, typer.BadParameter) and parameter is not None:
@@ -92,10 +161,10 @@ def _what(error: typer.TyperException, command: str) -> str:
     if isinstance(error, typer.BadParameter):
         return f"{error.param_hint or command}: {error.message}"
     if kind == "BadOptionUsage" and "requires" in error.message:
-        return f"{_printable(option)} needs a value"
+        return f"{shown(option)} needs a value"
     if kind == "BadOptionUsage":
-        return f"{_printable(option)} takes no value"
-    return f"{command}: {_printable(error.message[:1].lower() + error.message[1:])}"
+        return f"{shown(option)} takes no value"
+    return f"{command}: {one_line(error.message[:1].lower() + error.message[1:])}"
 
 
 def _place(parameter: TyperOption | TyperArgument) -> str:
@@ -108,17 +177,19 @@ def _meaning(parameter: TyperOption | TyperArgument) -> str:
     choices = _choices(parameter)
     if choices:
         return f"expected {_one_of(choices)}"
-    help_text = (parameter.help or "it must be given").rstrip(".")
+    help_text = _without_stop(parameter.help or "it must be given")
     return help_text[:1].lower() + help_text[1:]
 
 
 def _value(error: typer.BadParameter) -> str:
     """Return the value that was typed, where the check that refused it kept it."""
+    if isinstance(error, RefusedValueError):
+        return f" {shown(error.value)}"
     details = getattr(error.__cause__, "errors", None)
     if details is None:
         return ""
     value = details()[0].get("input")
-    return f" {_printable(value)}" if isinstance(value, str | int | float) else ""
+    return f" {shown(value)}" if isinstance(value, str | int | float) else ""
 
 
 def _expected(error: typer.BadParameter, parameter: TyperOption | TyperArgument) -> str:
@@ -126,8 +197,8 @@ def _expected(error: typer.BadParameter, parameter: TyperOption | TyperArgument)
     if choices:
         return f"expected {_one_of(choices)}"
     kind = parameter.type_descriptor.annotation
-    if kind not in {int, float}:
-        return _printable(error.message.removeprefix("Value error, "))
+    if not _is_number(parameter):
+        return one_line(error.message.removeprefix("Value error, "))
     information = parameter.type_descriptor.parameter_info
     limits = [
         f"{word} {limit:g}"
@@ -143,9 +214,3 @@ def _choices(parameter: TyperOption | TyperArgument) -> list[str]:
 
 def _one_of(choices: Sequence[str]) -> str:
     return choices[0] if len(choices) == 1 else f"{', '.join(choices[:-1])} or {choices[-1]}"
-
-
-def _printable(value: object) -> str:
-    text = str(value)
-    text = text if text.isprintable() and text else repr(text)
-    return text if len(text) <= _SHOWN else text[:_SHOWN] + "..."

@@ -1,0 +1,116 @@
+"""Whatever stands in a sentence, on a terminal it is one line and no order to it."""
+
+import asyncio
+import json
+import subprocess
+import sys
+from asyncio.subprocess import PIPE
+from pathlib import Path
+
+import pytest
+import websockets
+
+from services.logs import put_json, say, say_lines
+from toolchain.commands.one_line import one_line, shown
+
+HOSTILE = "a\nerror: all is well\r\x1b[2J\x9b31m\x07\x08\x7f\u202eend\ud800"
+HARMLESS = "a\\nerror: all is well\\r\\x1b[2J\\x9b31m\\x07\\x08\\x7f\\u202eend\\ud800"
+
+
+def test_what_is_not_printable_is_seen():
+    assert one_line(HOSTILE) == HARMLESS
+    assert one_line("an ordinary line: 3 °C, Ω, 日本") == "an ordinary line: 3 °C, Ω, 日本"
+
+
+@pytest.mark.parametrize(
+    ("value", "seen"),
+    [("", "''"), (" ", "' '"), ("a ", "'a '"), ("a b", "a b"), ("\x1b", r"'\x1b'"), (7, "7")],
+)
+def test_a_value_is_seen(value, seen):
+    assert shown(value) == seen
+
+
+def test_a_long_value_is_cut():
+    assert shown("x" * 1000) == "x" * 80 + "..."
+
+
+def test_what_is_said_is_a_line(capsys):
+    say(HOSTILE)
+    assert capsys.readouterr().err == HARMLESS + "\n"
+    say_lines("one\n\x1btwo")
+    assert capsys.readouterr().err == "one\n\\x1btwo\n"
+
+
+def test_what_is_logged_is_a_line():
+    code = f"""
+import logging
+from services.logs import get_logger, log_libraries
+log_libraries(logging.WARNING, "hub: %(message)s")
+get_logger("master").warning({HOSTILE!r}, reason={HOSTILE!r}, frame=7)
+logging.getLogger("bridge").warning("a topic: %s", {HOSTILE!r})
+try:
+    raise ValueError("one\\n\\x1btwo")
+except ValueError:
+    logging.getLogger("bridge").exception("failed")
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True
+    )
+    ours, theirs, *trace = done.stderr.splitlines()
+    assert f"warning: frame=7 {HARMLESS} reason=" in ours
+    assert theirs == f"hub: a topic: {HARMLESS}"
+    assert trace[-2:] == ["ValueError: one", "\\x1btwo"]
+    assert all(line.isprintable() for line in done.stderr.splitlines())
+
+
+class Hostile:
+    """A rosbridge server that says what a terminal would take for orders, wherever it can."""
+
+    def __init__(self, *operations):
+        self._operations = operations
+        self.uri = ""
+
+    async def __aenter__(self):
+        self._server = await websockets.serve(self._answer, "127.0.0.1", 0)
+        self.uri = f"ws://127.0.0.1:{self._server.sockets[0].getsockname()[1]}"
+        return self
+
+    async def __aexit__(self, *_):
+        self._server.close()
+        await self._server.wait_closed()
+
+    async def _answer(self, connection):
+        async for text in connection:
+            if json.loads(text)["op"] == "subscribe":
+                for each in self._operations:
+                    await connection.send(each if isinstance(each, str) else json.dumps(each))
+
+
+@pytest.mark.parametrize("variables", [("--variables", "K"), ()], ids=["without the variable", "all of it"])
+async def test_a_server_writes_nothing_over_the_terminal(variables):
+    said = HOSTILE.removesuffix("\ud800")
+    status = {"op": "status", "level": "error", "msg": said, "id": said}
+    message = {"op": "publish", "topic": "/t", "msg": {said: 1, "deep": {said: said}}}
+    async with Hostile(status, said, message) as server:
+        command = ("--uri", server.uri, "--topic", "/t", "--type", "a/B", "--count", "1", *variables)
+        process = await asyncio.create_subprocess_exec(
+            Path(sys.executable).with_name("subscriber"), *command, stdout=PIPE, stderr=PIPE
+        )
+        out, err = (each.decode().splitlines() for each in await process.communicate())
+    assert all(line.isprintable() for line in (*out, *err))
+    assert any(HARMLESS.removesuffix("\\ud800") in line for line in err)
+    assert not any(line.startswith("error: all is well") for line in err)
+    if variables:
+        assert (process.returncode, out) == (4, [])
+        assert err[-1].startswith("error: the message has no field 'K'; it has ")
+    else:
+        assert process.returncode == 0
+        assert json.loads(out[0]) == message["msg"]
+
+
+def test_what_is_printed_for_programs_is_what_it_was(capsysbinary):
+    told = {"a\x9b31m": "\u202e\U000e0001\n°"}
+    put_json(told)
+    line = capsysbinary.readouterr().out.decode()
+    assert line.removesuffix("\n").isprintable()
+    assert json.loads(line) == told
