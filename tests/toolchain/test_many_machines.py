@@ -13,12 +13,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
+from machines.bm1 import Start
 from machines.encode import decode_code
+from machines.kernel import make_kernel
 from machines.parameters import RngKind, SensorMode
 from machines.posterior import posterior
 from pcie_shim.programming_file import read_image
 from toolchain.address import to_address
 from toolchain.address_array import MISSING, to_addresses
+from toolchain.analysis.accuracy import measure
 from toolchain.analysis.boards_needed import boards_needed
 from toolchain.analysis.device import DEVICES
 from toolchain.analysis.emulation import EmulatedBoards, one_replica
@@ -379,6 +382,29 @@ def test_a_device_gets_as_many_boards_as_the_register_map_needs():
         boards_needed(replace(parameters, replicas=256, sensor_bits=(3,) * 40), device)
 
 
+@pytest.mark.parametrize("mode", list(SensorMode))
+def test_a_frame_of_replicas_is_measured_as_a_board_runs_it(mode):
+    of = model()
+    built = assemble(of, replace(OPTIONS, sensor_mode=mode, replicas=3))
+    (machine,) = [image.machine for image in built.images]
+    alone = one_replica(machine)
+    readings = sample_readings(of, 12, seed=5)
+    if mode is not SensorMode.COLUMN:
+        readings = readings_of_lines(readings, of, alone, scale=Scale.COLUMN, seed=5)
+    boards = EmulatedBoards([alone], target_count=255, max_cycles=5000, stop=Stop.OWN)
+    measured = measure(boards, readings, of, banks=1, replicas=3)
+    assert (measured.frames, measured.posteriors) == (4, 12)
+    kernel, lengths = make_kernel(machine), []
+    for frame in range(4):
+        ones = [readings.of_machine(3 * frame + replica, alone)[0] for replica in range(3)]
+        kernel.start(Start(addresses=np.array(ones), target_count=255, max_cycles=5000, bank=frame))
+        lengths.append(kernel.cycles)
+    assert measured.cycles.worst == max(lengths)
+    assert measured.cycles.median.value == np.median(lengths)
+    with pytest.raises(BuildError, match="a frame of 20 replicas takes 20 readings, and there are 12"):
+        measure(boards, readings, of, replicas=20)
+
+
 @pytest.mark.parametrize("mode", ["cell", "threshold"])
 def test_inspect_explains_such_a_deployment(tmp_path, mode):
     page = (DOCS / "toolchain.md").read_text()
@@ -400,6 +426,8 @@ def test_inspect_explains_such_a_deployment(tmp_path, mode):
     else:
         assert looked.exit_code == 0, looked.output
         assert "Each board holds 3 of these machines around the same generators" in looked.stdout
+        assert "5 frames, each with readings for 3 replicas" in looked.stdout
+        assert "A frame is 3 posteriors and ends with the last of them" in looked.stdout
     named = runner.invoke(
         app, ["inspect", str(out), "--frames", "5", "--model", str(tmp_path / "disparity"), "--json"]
     )

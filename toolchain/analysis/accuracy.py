@@ -16,7 +16,7 @@ from machines.bm1 import Start, addressed_codes
 from machines.encode import decode_code
 from machines.parameters import RngReset
 from toolchain.analysis.emulation import inputs_of_boards
-from toolchain.errors import ModelError
+from toolchain.errors import BuildError, ModelError
 from toolchain.models.fusion import exact_posterior, fuse
 
 if TYPE_CHECKING:
@@ -100,8 +100,9 @@ class Accuracy:
 
     Attributes:
         frames: Frames.
+        posteriors: Of all frames: one each, or with replicas as many as there are of them.
         banks: Sets of seeds that each was run with.
-        impossible: Share of frames in which no line can count, although the model has a posterior (or always, without one).
+        impossible: Share of posteriors for which no line can count, although the model has one (or always, without a model).
         without: Share of runs without a posterior: these, and those that counted nothing in time.
         overflow: Share of runs that a full counter ended.
         machine: The machine beside the model; None without a model.
@@ -112,6 +113,7 @@ class Accuracy:
     """
 
     frames: int
+    posteriors: int
     banks: int
     impossible: float
     without: float
@@ -124,21 +126,22 @@ class Accuracy:
 
 
 class _Differences:
-    """Collects differences, frame after frame; runs of one frame are averaged."""
+    """Collects differences, frame after frame; runs of one frame, and its replicas, are averaged."""
 
     def __init__(self) -> None:
-        self._frames: list[tuple[float, float, float]] = []
+        self._frames: dict[int, list[tuple[float, float, float]]] = {}
 
-    def add(self, ours: list[NDArray[np.float64]], theirs: NDArray[np.float64]) -> None:
-        """Take the posteriors of one frame."""
+    def add(self, frame: int, ours: list[NDArray[np.float64]], theirs: NDArray[np.float64]) -> None:
+        """Take the posteriors of a frame's runs, or of one replica's."""
         if ours:
-            self._frames.append(tuple(np.mean([_difference(each, theirs) for each in ours], axis=0).tolist()))
+            mean = np.mean([_difference(each, theirs) for each in ours], axis=0)
+            self._frames.setdefault(frame, []).append(tuple(mean.tolist()))
 
     def summary(self) -> Difference | None:
         """Return the averages, or None where there was no frame."""
         if not self._frames:
             return None
-        columns = np.array(self._frames)
+        columns = np.array([np.mean(replicas, axis=0) for replicas in self._frames.values()])
         return Difference(
             total_variation=_bootstrap(columns[:, 0], np.mean),
             kl_bits=_bootstrap(columns[:, 1], np.mean),
@@ -152,38 +155,48 @@ def measure(
     model: Model | None,
     *,
     banks: int = 4,
+    replicas: int = 1,
     advance: Callable[[], None] = lambda: None,
 ) -> Accuracy:
     """Run a machine on readings and compare what comes out with exact inference.
+
+    A replica counts to the bit what a machine by itself counts with the same bank, so one machine is run for all of them.
 
     Args:
         boards: The machine.
         readings: The frames; what the model finds impossible on every line is left out.
         model: The unquantised model, or None where only codes are at hand.
         banks: Sets of seeds to run each frame with; at most as many as the machine has.
-        advance: Called after every frame.
+        replicas: Machines around the same generators: so many of the readings, one after the other, are one frame, which
+            ends with the last of them.
+        advance: Called after every reading.
 
     Raises:
+        BuildError: Fewer readings than replicas.
         ModelError: No frame that the model finds possible.
     """
+    if len(readings) < replicas:
+        message = f"a frame of {replicas} replicas takes {replicas} readings, and there are {len(readings)} ({readings.source})"
+        raise BuildError(message)
     parameters = boards.parameters
     banks = max(1, min(banks, parameters.rng_banks if parameters.rng_reset is RngReset.BANK else banks))
     of_machine, of_codes, of_sampling = _Differences(), _Differences(), _Differences()
-    lengths: list[list[int]] = []
+    lengths: dict[int, list[list[int]]] = {}
     weights: list[NDArray[np.float64]] = []
     places: list[int] = []
-    frames = impossible = without = overflow = 0
-    for frame in range(len(readings)):
+    posteriors_asked = impossible = without = overflow = 0
+    for place in range(len(readings) // replicas * replicas):
+        frame = place // replicas
         exact = None
         if model is not None:
-            addresses, row = readings.of_model(frame)
+            addresses, row = readings.of_model(place)
             try:
                 exact = exact_posterior(model, addresses, prior_address=row)
             except ModelError:
                 advance()
                 continue
-        frames += 1
-        of_board, prior_row = readings.of_machine(frame, boards.machines[0])
+        posteriors_asked += 1
+        of_board, prior_row = readings.of_machine(place, boards.machines[0])
         likelihood = np.concatenate(
             [
                 _line_probabilities(machine, own, prior_row)
@@ -196,34 +209,37 @@ def measure(
         posteriors = [posterior for each in ran if (posterior := each.posterior) is not None]
         without += banks - len(posteriors)
         overflow += sum(any(reason.name == "OVERFLOW" for reason in each.reasons) for each in ran)
-        lengths.append([each.length for each in ran])
+        lengths.setdefault(frame, []).append([each.length for each in ran])
         if not likelihood.any():
             impossible += 1
         else:
             codes = fuse(likelihood, ())
-            of_sampling.add(posteriors, codes)
+            of_sampling.add(frame, posteriors, codes)
             weights.append(likelihood)
-            places.append(frame)
+            places.append(place)
             if exact is not None:
-                of_codes.add([codes], exact)
+                of_codes.add(frame, [codes], exact)
         if exact is not None:
-            of_machine.add(posteriors, exact)
+            of_machine.add(frame, posteriors, exact)
         advance()
-    if not frames:
+    if not posteriors_asked:
         message = f"none of the readings ({readings.source}) is possible in the model"
         raise ModelError(message)
-    lengths_found = np.array(lengths)
+    lengths_found = np.array([np.max(each, axis=0) for each in lengths.values()])
+    # replicas that ran for themselves: of the cycles of these a count's z-score is taken
+    by_themselves = np.array([length for each in lengths.values() for length in each])
     return Accuracy(
-        frames=frames,
+        frames=len(lengths),
+        posteriors=posteriors_asked,
         banks=banks,
-        impossible=impossible / frames,
-        without=without / (frames * banks),
-        overflow=overflow / (frames * banks),
+        impossible=impossible / posteriors_asked,
+        without=without / (posteriors_asked * banks),
+        overflow=overflow / (posteriors_asked * banks),
         machine=of_machine.summary(),
         quantising=of_codes.summary(),
         sampling=of_sampling.summary(),
-        z=_z_scores(boards, readings, places, weights, int(np.median(lengths_found[lengths_found > 0])))
-        if (lengths_found > 0).any()
+        z=_z_scores(boards, readings, places, weights, int(np.median(by_themselves[by_themselves > 0])))
+        if (by_themselves > 0).any()
         else None,
         cycles=Cycles(
             median=_bootstrap(lengths_found, np.median),

@@ -6,28 +6,27 @@ import hashlib
 import itertools
 import json
 import math
-import os
-from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, Literal
-
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from typing import TYPE_CHECKING, Final
 
 from machines.bm1 import BM1Machine
 from machines.errors import MachineError
-from machines.parameters import RngKind
+from machines.parameters import RngKind, SensorMode
 from toolchain.analysis.accuracy import measure
-from toolchain.analysis.emulation import EmulatedBoards, split
+from toolchain.analysis.boards_needed import with_lines
+from toolchain.analysis.emulation import EmulatedBoards, one_replica, split
+from toolchain.analysis.readings import check_frames, readings_of_lines, sample_readings
 from toolchain.analysis.resources import Pcie, estimate
-from toolchain.build import DEFAULT_INTERFACE, machine_parameters
+from toolchain.analysis.sweep_results import Point
+from toolchain.build import DEFAULT_INTERFACE, board_interface, check_options, machine_parameters
 from toolchain.errors import BuildError
 from toolchain.options import BuildOptions, Scale
 from toolchain.outputs.rng_table import random_table
+from toolchain.partition import partition_lines
 from toolchain.quantise import quantise
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
-    from pathlib import Path
 
     from toolchain.analysis.device import Device
     from toolchain.analysis.readings import Readings
@@ -35,10 +34,6 @@ if TYPE_CHECKING:
     from toolchain.models.model import Model
 
 MAX_POINTS: Final = 10_000
-MAX_FILE_BYTES: Final = 1 << 28
-
-_BEGIN: Final = b'{"key":"'
-"""How every line of results begins."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,6 +45,8 @@ class Sweep:
         target_counts: Counts that stop a machine; each with the narrowest counter that holds it.
         rngs: Kinds of generators.
         scales: What is divided by its maximum before quantising.
+        sensor_modes: What cells are given; machines whose cells have inputs of their own are not made with scale `address`.
+        replicas: Machines on a board.
         steps_per_clock: Steps of a generator in a cycle; 0 for as many as give fresh bits.
         partitions: Boards.
         stop: When boards stop.
@@ -62,6 +59,8 @@ class Sweep:
     rngs: tuple[RngKind, ...]
     scales: tuple[Scale, ...]
     steps_per_clock: tuple[int, ...]
+    sensor_modes: tuple[SensorMode, ...] = (SensorMode.COLUMN,)
+    replicas: tuple[int, ...] = (1,)
     partitions: int
     stop: Stop
     max_cycles: int
@@ -73,12 +72,20 @@ class Sweep:
         Raises:
             BuildError: Nothing to combine, or too many machines.
         """
-        lists = (self.scales, self.rngs, self.steps_per_clock, self.prob_bits, self.target_counts)
+        lists = (
+            self.sensor_modes,
+            self.replicas,
+            self.scales,
+            self.rngs,
+            self.steps_per_clock,
+            self.prob_bits,
+            self.target_counts,
+        )
         count = math.prod(map(len, lists))
         if not 0 < count <= MAX_POINTS:
             message = f"these lists combine to {count} machines, expected 1 to {MAX_POINTS}"
             raise BuildError(message)
-        for scale, rng, steps, prob_bits, target in itertools.product(*lists):
+        for mode, replicas, scale, rng, steps, prob_bits, target in itertools.product(*lists):
             if target < 1:
                 message = f"a target count of {target} stops nothing: expected 1 or more"
                 raise BuildError(message)
@@ -95,53 +102,9 @@ class Sweep:
                 stop=self.stop,
                 rng=rng,
                 steps_per_clock=steps,
+                sensor_mode=mode,
+                replicas=replicas,
             )
-
-
-class Point(BaseModel):
-    """One machine of a sweep, measured: a line of the results' file.
-
-    Attributes:
-        key: SHA-256 of all that its figures depend on.
-        total_variation: Beside the model, mean over frames; None where no frame had a posterior.
-        total_variation_low: Its 95 % interval's ends.
-        total_variation_high: Its 95 % interval's ends.
-        quantising: The same of exact inference on the codes.
-        kl_bits: KL(machine || model).
-        map_agreement: Share of frames with the same most probable line.
-        z_rms: Root mean square of z-scores; 1 is ideal.
-        without: Share of runs without a posterior.
-        cycles_median: Cycles of a frame.
-        cycles_95: Their 95th percentile.
-        alms: Of the largest board; None for generators that no FPGA has.
-        blocks: Memory blocks of the largest board.
-        fits: Whether that fits the device.
-    """
-
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
-
-    key: str = Field(pattern="[0-9a-f]{64}")
-    scale: Literal["address", "column", "none"]
-    rng: Literal["lfsr8", "lfsr16", "lfsr24", "lfsr32", "table", "ideal"]
-    steps_per_clock: int
-    prob_bits: int
-    target_count: int
-    counter_bits: int
-    partitions: int
-    frames: int
-    total_variation: float | None
-    total_variation_low: float | None
-    total_variation_high: float | None
-    quantising: float | None
-    kl_bits: float | None
-    map_agreement: float | None
-    z_rms: float | None
-    without: float
-    cycles_median: float
-    cycles_95: float
-    alms: float | None
-    blocks: int | None
-    fits: bool | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,22 +115,100 @@ class Task:
     key: str
 
 
-def tasks(model: Model, sweep: Sweep, readings: Readings, device: Device) -> list[Task]:
+class Frames:
+    """The readings of a sweep, as its machines take them; the same for all machines that take the same.
+
+    Args:
+        model: The model.
+        frames: How many of them; of recorded readings at most.
+        seed: Of what is drawn.
+        recorded: Returns so many recorded readings, or None to draw them from the model.
+    """
+
+    def __init__(
+        self, model: Model, frames: int, *, seed: int, recorded: Callable[[int], Readings] | None = None
+    ) -> None:
+        self._model = model
+        self._frames = frames
+        self._seed = seed
+        self._recorded = recorded
+        self._base: dict[int, Readings] = {}
+        self._fingerprints: dict[tuple[int, bool], str] = {}
+
+    def columns(self, replicas: int) -> Readings:
+        """Return readings of whole columns: as many frames, each with one for every replica.
+
+        Raises:
+            ToolchainError: None can be had.
+        """
+        if replicas not in self._base:
+            check_frames(self._frames)
+            count = self._frames * replicas
+            if self._recorded is not None:
+                self._base[replicas] = self._recorded(count)
+            else:
+                source = f"{self._frames} frames drawn from the model (seed {self._seed})"
+                self._base[replicas] = sample_readings(self._model, count, seed=self._seed, source=source)
+        return self._base[replicas]
+
+    def of(self, machine: BM1Machine, options: BuildOptions) -> Readings:
+        """Return the readings of a machine with these options.
+
+        Raises:
+            ToolchainError: None can be had.
+        """
+        base = self.columns(options.replicas)
+        if options.sensor_mode is SensorMode.COLUMN:
+            return base
+        return readings_of_lines(base, self._model, machine, scale=options.scaling, seed=self._seed)
+
+    def fingerprint(self, options: BuildOptions) -> str:
+        """Return a hash of the model and of all that these machines' readings are made from.
+
+        Raises:
+            ToolchainError: None can be had: recorded readings are those of columns.
+        """
+        if self._recorded is not None and options.sensor_mode is not SensorMode.COLUMN:
+            message = (
+                f"a recording's columns are numbers, and with --sensor-modes {options.sensor_mode} readings are arrays, one "
+                "number for each line: leave --readings out, and readings are drawn"
+            )
+            raise BuildError(message)
+        # other lines' readings are drawn too, with the seed; codes follow from the tables
+        of_cells = options.sensor_mode is SensorMode.CELL
+        if (options.replicas, of_cells) not in self._fingerprints:
+            readings, digest = self.columns(options.replicas), hashlib.sha256()
+            for known in self._model.known:
+                digest.update(known.table.tobytes())
+            digest.update(self._model.prior_distribution.tobytes())
+            if self._model.prior_select is not None:
+                digest.update(self._model.prior_select.table.tobytes())
+            digest.update(readings.addresses.tobytes())
+            digest.update(readings.prior_addresses.tobytes())
+            if of_cells:
+                digest.update(self._seed.to_bytes(16, "little"))
+            self._fingerprints[options.replicas, of_cells] = digest.hexdigest()
+        return self._fingerprints[options.replicas, of_cells]
+
+
+def tasks(model: Model, sweep: Sweep, frames: Frames, device: Device) -> list[Task]:
     """Return every machine of a sweep that can be built; what an LFSR is too narrow for is left out.
 
     Raises:
         BuildError: Nothing is left, or nothing was there.
     """
     found, refused = [], ""
-    inputs = _fingerprint(model, readings)
     for options in sweep.options():
         try:
+            check_options(options)
+            blocks = partition_lines(model.lines, options.partitions)
+            board_interface(model, blocks, None, sensor_mode=options.sensor_mode, replicas=options.replicas)
             parameters = machine_parameters(model, options)
-        except MachineError as reason:
+        except (MachineError, BuildError) as reason:
             refused = refused or str(reason)
             continue
         words = {
-            "inputs": inputs,
+            "inputs": frames.fingerprint(options),
             "parameters": str(parameters),
             "scale": options.scale,
             "target": options.target_count,
@@ -184,19 +225,7 @@ def tasks(model: Model, sweep: Sweep, readings: Readings, device: Device) -> lis
     return found
 
 
-def _fingerprint(model: Model, readings: Readings) -> str:
-    digest = hashlib.sha256()
-    for known in model.known:
-        digest.update(known.table.tobytes())
-    digest.update(model.prior_distribution.tobytes())
-    if model.prior_select is not None:
-        digest.update(model.prior_select.table.tobytes())
-    digest.update(readings.addresses.tobytes())
-    digest.update(readings.prior_addresses.tobytes())
-    return digest.hexdigest()
-
-
-def run_task(model: Model, task: Task, readings: Readings, device: Device, banks: int) -> Point:
+def run_task(model: Model, task: Task, frames: Frames, device: Device, banks: int) -> Point:
     """Measure one machine.
 
     Raises:
@@ -205,23 +234,26 @@ def run_task(model: Model, task: Task, readings: Readings, device: Device, banks
     options = task.options
     try:
         parameters = machine_parameters(model, options)
-        quantised = quantise(model, prob_bits=options.prob_bits, scale=options.scaling)
+        quantised = quantise(
+            model,
+            prob_bits=options.prob_bits,
+            scale=options.scaling,
+            sensor_mode=options.sensor_mode,
+        )
         table = random_table(options.prob_bits) if options.rng is RngKind.TABLE else None
-        whole = BM1Machine(parameters, quantised.prior, quantised.tables, table)
+        whole = one_replica(BM1Machine(parameters, quantised.prior, quantised.tables, table))
     except MachineError as reason:
         raise BuildError(str(reason)) from reason
     machines = split(whole, options.partitions)
     target = options.target_count or parameters.target_count_max
     boards = EmulatedBoards(machines, target_count=target, max_cycles=options.max_cycles, stop=options.stop)
-    accuracy = measure(boards, readings, model, banks=banks)
-    largest = machines[0].parameters
-    took = None
-    if parameters.rng is not RngKind.IDEAL:
-        took = estimate(largest, device, interface=DEFAULT_INTERFACE, pcie=Pcie.HARD)
+    accuracy = measure(boards, frames.of(whole, options), model, banks=banks, replicas=options.replicas)
     machine, quantising = accuracy.machine, accuracy.quantising
-    return Point(
+    point = Point(
         key=task.key,
         scale=options.scaling.value,
+        sensor_mode=options.sensor_mode.value,
+        replicas=options.replicas,
         rng=options.rng.value,
         steps_per_clock=parameters.steps_per_clock,
         prob_bits=parameters.prob_bits,
@@ -239,10 +271,23 @@ def run_task(model: Model, task: Task, readings: Readings, device: Device, banks
         without=accuracy.without,
         cycles_median=accuracy.cycles.median.value,
         cycles_95=accuracy.cycles.percentile_95.value,
-        alms=None if took is None else took.alms,
-        blocks=None if took is None else took.memories.blocks,
-        fits=None if took is None else took.fits,
+        alms=None,
+        blocks=None,
+        fits=None,
     )
+    return with_resources(model, task, point, device)
+
+
+def with_resources(model: Model, task: Task, point: Point, device: Device) -> Point:
+    """Return a point with what its largest board takes, as it is estimated now, whenever the point was measured."""
+    options = task.options
+    if options.rng is RngKind.IDEAL:
+        return point
+    lines = partition_lines(model.lines, options.partitions)[0].lines
+    largest = with_lines(machine_parameters(model, options), lines)
+    took = estimate(largest, device, interface=DEFAULT_INTERFACE, pcie=Pcie.HARD)
+    update = {"alms": took.alms, "blocks": took.memories.blocks, "fits": took.fits}
+    return point.model_copy(update=update)
 
 
 def explore(
@@ -259,84 +304,3 @@ def explore(
             keep(point)
             kept[task.key] = point
         advance(kept[task.key])
-
-
-class Results:
-    """The results' file: one JSON object a line, appended whole, so that an interrupted sweep goes on where it was.
-
-    Args:
-        path: The file; made if it is not there.
-
-    Raises:
-        BuildError: It can't be read or written, or it holds something else.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.points: dict[str, Point] = {}
-        content = b""
-        try:
-            with suppress(FileNotFoundError), path.open("rb") as file:
-                content = file.read(MAX_FILE_BYTES + 1)
-        except OSError as reason:
-            message = f"{path} can't be read: {reason.strerror or reason}"
-            raise BuildError(message) from None
-        if len(content) > MAX_FILE_BYTES:
-            message = f"{path} has more than {MAX_FILE_BYTES} bytes: it is no file of results"
-            raise BuildError(message)
-        lines = content.split(b"\n")
-        # A power cut in the middle of a line leaves a last line without its end: that point is measured again.
-        torn = lines.pop()
-        if torn and not torn.startswith(_BEGIN[: len(torn)]):
-            lines.append(torn)
-        self._torn_at = len(content) - len(torn) if torn else None
-        for number, line in enumerate(lines, start=1):
-            try:
-                point = Point.model_validate_json(line)
-            except ValidationError:
-                message = f"{path}, line {number}, is no result of a sweep: name another file with -o"
-                raise BuildError(message) from None
-            self.points[point.key] = point
-
-    def append(self, point: Point) -> None:
-        """Add a point: one write, and it is on the disk.
-
-        Raises:
-            BuildError: The file can't be written.
-        """
-        line = point.model_dump_json() + "\n"
-        try:
-            if self._torn_at is not None:
-                os.truncate(self.path, self._torn_at)
-                self._torn_at = None
-            descriptor = os.open(self.path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
-            try:
-                written = os.write(descriptor, line.encode())
-                os.fsync(descriptor)
-            finally:
-                os.close(descriptor)
-        except OSError as reason:
-            message = f"{self.path} can't be written: {reason.strerror or reason}"
-            raise BuildError(message) from None
-        if written != len(line):
-            message = f"{self.path} can't be written: the disk is full"
-            raise BuildError(message)
-
-
-def pareto(points: Sequence[Point]) -> list[Point]:
-    """Return the points that no other one is better than: in total variation, cycles, ALMs and runs without a posterior."""
-    judged = [(point, figures) for point in points if (figures := _figures(point)) is not None]
-    return [
-        point
-        for point, own in judged
-        if not any(
-            other != own and all(a <= b for a, b in zip(other, own, strict=True)) for _, other in judged
-        )
-    ]
-
-
-def _figures(point: Point) -> tuple[float, ...] | None:
-    if point.total_variation is None:
-        return None
-    alms = math.inf if point.alms is None else point.alms
-    return (point.total_variation, point.cycles_median, alms, point.without)

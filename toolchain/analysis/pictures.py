@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from toolchain.analysis.claims import Claims
-    from toolchain.analysis.explore import Point
+    from toolchain.analysis.sweep_results import Point
 
 _DPI: Final = 75
 _COLOURS: Final = ("#4477aa", "#ee6677", "#228833", "#ccbb44", "#66ccee", "#aa3377", "#bbbbbb")
@@ -42,20 +42,21 @@ def draw_sweep(path: Path, name: str, points: Sequence[Point], front: Sequence[P
     axes = figure.subplots()
     shown = [point for point in points if point.total_variation is not None]
     largest = max((point.alms or 0.0 for point in shown), default=0.0) or 1.0
-    kinds = sorted({(point.scale, point.rng) for point in shown})
+    several = any(point.replicas > 1 for point in points)
+    kinds = sorted({_kind(point) for point in shown})
     for at, kind in enumerate(kinds):
-        of_kind = [point for point in shown if (point.scale, point.rng) == kind]
+        of_kind = [point for point in shown if _kind(point) == kind]
         axes.scatter(
-            [point.cycles_median for point in of_kind],
+            [point.cycles_a_posterior for point in of_kind],
             [point.total_variation for point in of_kind],
             s=[20 + 120 * (point.alms or 0.0) / largest for point in of_kind],
             color=_COLOURS[at % len(_COLOURS)],
             marker=_MARKERS[at % len(_MARKERS)],
             alpha=0.6,
-            label=f"{kind[1]}, scale {kind[0]}",
+            label=_label(kind),
         )
     axes.scatter(
-        [point.cycles_median for point in front],
+        [point.cycles_a_posterior for point in front],
         [point.total_variation for point in front],
         s=220,
         facecolors="none",
@@ -66,13 +67,24 @@ def draw_sweep(path: Path, name: str, points: Sequence[Point], front: Sequence[P
     axes.set(
         xscale="log",
         yscale="log",
-        xlabel="cycles of a frame (median)",
+        xlabel="cycles of a frame (median)" if not several else "cycles of a frame / its posteriors (median)",
         ylabel="total variation to exact inference (mean)",
         title=f"{name}: accuracy against cycles; the larger, the more ALMs",
     )
     axes.grid(alpha=0.3, which="both")
     axes.legend(fontsize="small", frameon=False)
     _save(figure, path)
+
+
+def _kind(point: Point) -> tuple[str, int, str, str]:
+    """What has a colour of its own."""
+    return point.sensor_mode, point.replicas, point.scale, point.rng
+
+
+def _label(kind: tuple[str, int, str, str]) -> str:
+    mode, replicas, scale, rng = kind
+    others = ("" if mode == "column" else f", {mode}") + ("" if replicas == 1 else f", {replicas} replicas")
+    return f"{rng}, scale {scale}{others}"
 
 
 def draw_claims(path: Path, claims: Claims) -> None:

@@ -52,7 +52,7 @@ def inspect_(
     frames: Annotated[
         int | None,
         typer.Option(
-            help="Frames of readings at most; default 200, or 20 of a machine that is slow to emulate."
+            help="Frames of readings at most; default 200, or 20 of a machine that is slow to emulate; with replicas fewer."
         ),
     ] = None,
     banks: Annotated[
@@ -127,6 +127,16 @@ def explore(
     scales: Annotated[
         str, typer.Option(help="What is divided by its maximum before quantising.", metavar="LIST")
     ] = "address,column",
+    sensor_modes: Annotated[
+        str,
+        typer.Option(
+            help="What a cell is given: its column's reading, its own (cell), or its probability (threshold).",
+            metavar="LIST",
+        ),
+    ] = "column",
+    replicas: Annotated[
+        str, typer.Option(help="Machines on a board, around the same generators.", metavar="LIST")
+    ] = "1",
     steps: Annotated[
         str, typer.Option(help="Steps of a generator in a cycle; 0: fresh bits.", metavar="LIST")
     ] = "0",
@@ -188,6 +198,8 @@ def explore(
             targets=targets,
             rngs=rngs,
             scales=scales,
+            sensor_modes=sensor_modes,
+            replicas=replicas,
             steps=steps,
             partitions=partitions,
             stop=stop,

@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Final, TypeVar
 
 import typer
 
-from machines.parameters import RngKind
+from machines.parameters import RngKind, SensorMode
 from toolchain.analysis.device import device_named
-from toolchain.analysis.explore import Results, Sweep, explore, pareto, run_task, tasks
-from toolchain.analysis.readings import check_frames, recorded_readings, sample_readings
+from toolchain.analysis.explore import Frames, Sweep, explore, run_task, tasks, with_resources
+from toolchain.analysis.readings import check_frames, recorded_readings
+from toolchain.analysis.sweep_results import Results, pareto
 from toolchain.commands.named_model import NetworkQuestion, Unread, read_model
 from toolchain.errors import BuildError
 from toolchain.options import Scale
@@ -23,8 +24,10 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from toolchain.analysis.claims import Course
-    from toolchain.analysis.explore import Point
+    from toolchain.analysis.readings import Readings
+    from toolchain.analysis.sweep_results import Point
     from toolchain.deployment import Stop
+    from toolchain.models.model import Model
 
     Kind = TypeVar("Kind", bound=StrEnum)
 
@@ -46,6 +49,8 @@ class ExploreOptions:
         targets: Target counts.
         rngs: Kinds of generators.
         scales: Kinds of scaling.
+        sensor_modes: What cells are given.
+        replicas: Machines on a board.
         steps: Steps a clock.
         partitions: Boards.
         stop: When boards stop.
@@ -65,6 +70,8 @@ class ExploreOptions:
     targets: str
     rngs: str
     scales: str
+    sensor_modes: str
+    replicas: str
     steps: str
     partitions: int
     stop: Stop
@@ -90,22 +97,17 @@ def run_explore(path: Path, results: Path, plot: Path | None, options: ExploreOp
     device = device_named(options.device)
     sweep = _sweep(options)
     model = read_model(path, options.question, Unread(settings=options.settings, bits=options.bits))
-    if options.recording is None:
-        if options.columns:
-            message = (
-                f"--reading {options.columns[0]} says where in a recording a reading is: add --readings FILE"
-            )
-            raise BuildError(message)
-        readings = sample_readings(model, options.frames, seed=options.seed)
-    else:
-        readings = recorded_readings(
-            options.recording, model.variables, options.columns, frames=options.frames
+    if options.recording is None and options.columns:
+        message = (
+            f"--reading {options.columns[0]} says where in a recording a reading is: add --readings FILE"
         )
+        raise BuildError(message)
+    frames = Frames(model, options.frames, seed=options.seed, recorded=_recorded(model, options))
     kept = Results(results)
-    found = tasks(model, sweep, readings, device)
+    found = tasks(model, sweep, frames, device)
     there = sum(task.key in kept.points for task in found)
     typer.echo(
-        f"{len(found)} machines of {model.name} over {readings.source}"
+        f"{len(found)} machines of {model.name} over {frames.columns(found[0].options.replicas).source}"
         + (f"; {there} of them are in {results}" if there else ""),
         err=True,
     )
@@ -114,13 +116,18 @@ def run_explore(path: Path, results: Path, plot: Path | None, options: ExploreOp
             explore(
                 found,
                 kept.points,
-                lambda task: run_task(model, task, readings, device, sweep.banks),
+                lambda task: run_task(model, task, frames, device, sweep.banks),
                 kept.append,
                 lambda point: advance(_named(point)),
             )
     finally:
-        # Ctrl-C too: what is done is shown, and it is in the file.
-        points = [kept.points[task.key] for task in found if task.key in kept.points]
+        # Ctrl-C too, also between the writing of a point and the knowing of it: what is in the file is shown.
+        kept = Results(results)
+        points = [
+            with_resources(model, task, kept.points[task.key], device)
+            for task in found
+            if task.key in kept.points
+        ]
         if points:
             front = pareto(points)
             typer.echo(table(points, front), nl=False)
@@ -132,6 +139,14 @@ def run_explore(path: Path, results: Path, plot: Path | None, options: ExploreOp
                 typer.echo(f"Wrote {plot}", err=True)
 
 
+def _recorded(model: Model, options: ExploreOptions) -> Callable[[int], Readings] | None:
+    """Reads so many rows of the recording, where there is one."""
+    path = options.recording
+    if path is None:
+        return None
+    return lambda frames: recorded_readings(path, model.variables, options.columns, frames=frames)
+
+
 def _sweep(options: ExploreOptions) -> Sweep:
     if options.partitions < 1 or options.max_cycles < 1 or options.banks < 1:
         message = "--partitions, --max-cycles and --banks are numbers from 1"
@@ -141,6 +156,8 @@ def _sweep(options: ExploreOptions) -> Sweep:
         target_counts=_numbers("--targets", options.targets),
         rngs=_members("--rngs", options.rngs, RngKind),
         scales=_members("--scales", options.scales, Scale),
+        sensor_modes=_members("--sensor-modes", options.sensor_modes, SensorMode),
+        replicas=_numbers("--replicas", options.replicas),
         steps_per_clock=_numbers("--steps", options.steps),
         partitions=options.partitions,
         stop=options.stop,
@@ -166,29 +183,42 @@ def _members(flag: str, text: str, kind: type[Kind]) -> tuple[Kind, ...]:
 
 
 def table(points: Sequence[Point], front: Sequence[Point]) -> str:
-    """Return the sweep as text; the Pareto front's points have a star."""
+    """Return the sweep as text; the Pareto front's points have a star.
+
+    Sensor modes and replicas are columns only where there are others than readings of columns and single machines.
+    """
     keys = {point.key for point in front}
+    several = any(point.replicas > 1 for point in points)
+    modes = any(point.sensor_mode != "column" for point in points)
     rows = [
-        (
-            "  scale    rng     steps  codes  target  total variation (95 %)     by codes    KL bits  same MAP   z rms  without   cycles"
-            "      95 %     ALMs  blocks  fits"
-        )
+        "  "
+        + ("cells      " if modes else "")
+        + ("replicas  " if several else "")
+        + "scale    rng     steps  codes  target  total variation (95 %)     by codes    KL bits  same MAP   z rms  without   cycles"
+        "      95 %" + ("  a posterior" if several else "") + "     ALMs  blocks  fits"
     ]
-    for point in sorted(points, key=lambda each: (each.cycles_median, each.total_variation or 1.0)):
+    for point in sorted(points, key=lambda each: (each.cycles_a_posterior, each.total_variation or 1.0)):
         variation = (
             f"{point.total_variation:7.4f} ({point.total_variation_low:.4f}..{point.total_variation_high:.4f})"
             if point.total_variation is not None
             else "-"
         )
         rows.append(
-            f"{'*' if point.key in keys else ' '} {point.scale:8} {point.rng:7} {point.steps_per_clock:5d}  {point.prob_bits:5d}  "
+            ("* " if point.key in keys else "  ")
+            + (f"{point.sensor_mode:9}  " if modes else "")
+            + (f"{point.replicas:8d}  " if several else "")
+            + f"{point.scale:8} {point.rng:7} {point.steps_per_clock:5d}  {point.prob_bits:5d}  "
             f"{point.target_count:6d}  {variation:>24}  {_cell(point.quantising, '.4f'):>9}  {_cell(point.kl_bits, '.4f'):>9}  "
             f"{_cell(point.map_agreement, '.0%'):>8}  {_cell(point.z_rms, '.2f'):>6}  {point.without:7.1%}  "
-            f"{point.cycles_median:7,.0f}  {point.cycles_95:8,.0f}  {_cell(point.alms, ',.0f'):>7}  {_cell(point.blocks, ','):>6}  "
+            f"{point.cycles_median:7,.0f}  {point.cycles_95:8,.0f}  "
+            + (f"{point.cycles_a_posterior:11,.1f}  " if several else "")
+            + f"{_cell(point.alms, ',.0f'):>7}  {_cell(point.blocks, ','):>6}  "
             f"{'-' if point.fits is None else 'yes' if point.fits else 'no':>4}"
         )
+    cycles = "cycles a posterior" if several else "cycles"
     rows.append(
-        "* nothing else here is better in one of total variation, cycles, ALMs and frames without a posterior, and as good in the others"
+        f"* nothing else here is better in one of total variation, {cycles}, ALMs and frames without a posterior, and as good "
+        "in the others"
     )
     return "\n".join(rows) + "\n"
 
@@ -198,7 +228,9 @@ def _cell(value: float | None, form: str) -> str:
 
 
 def _named(point: Point) -> str:
-    return f"{point.rng}, codes of {point.prob_bits} bits, target {point.target_count}, scale {point.scale}"
+    said = f"{point.rng}, codes of {point.prob_bits} bits, target {point.target_count}, scale {point.scale}"
+    said += "" if point.sensor_mode == "column" else f", {point.sensor_mode}"
+    return said if point.replicas == 1 else f"{said}, {point.replicas} replicas"
 
 
 def run_claims_command(directory: Path, *, frames: int, seed: int) -> None:

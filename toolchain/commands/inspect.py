@@ -16,6 +16,7 @@ from toolchain.analysis.device import device_named
 from toolchain.analysis.emulation import EmulatedBoards, joined, one_replica
 from toolchain.analysis.energy import ASSUMPTIONS, energy
 from toolchain.analysis.readings import (
+    check_frames,
     model_of_codes,
     readings_of_lines,
     recorded_readings,
@@ -51,6 +52,9 @@ FRAMES: Final = 200
 BANKS: Final = 4
 SLOW_FRAMES: Final = 20
 """Of machines that run a cycle at a time: one generator a cell, or no LFSRs."""
+LEAST_FRAMES: Final = 20
+SLOW_LEAST_FRAMES: Final = 3
+"""Of replicas, each of which has readings of its own in every frame."""
 SLOW_BANKS: Final = 1
 
 
@@ -66,7 +70,8 @@ class InspectOptions:
         recording: Recorded readings, or None to draw them.
         columns: `NAME=COLUMN`s of the recording.
         tolerance_s: In a bag, how far from a row another topic's message may be, seconds.
-        frames: How many frames at most; None for 200, or 20 of a machine that only the slow kernel runs.
+        frames: How many frames at most; None for 200, or 20 of a machine that only the slow kernel runs; with replicas
+            for fewer, as each has readings of its own.
         banks: Sets of seeds that each is run with; None for 4, or 1 of such a machine.
         seed: Of the readings that are drawn.
         clock_hz: The clock that times are said at.
@@ -159,7 +164,7 @@ def inspect(
         )
     banks = options.banks or (SLOW_BANKS if _is_slow(whole) else BANKS)
     with counting(len(readings)) as advance:
-        accuracy = measure(boards, readings, model, banks=banks, advance=advance)
+        accuracy = measure(boards, readings, model, banks=banks, replicas=section.replicas, advance=advance)
     return Inspection(
         deployment=deployment,
         machine=whole,
@@ -224,9 +229,13 @@ def _model(
 def _readings(
     deployment: Deployment, whole: BM1Machine, model: Model | None, options: InspectOptions
 ) -> Readings:
+    replicas = deployment.machine.replicas
     frames = options.frames
     if frames is None:
-        frames = SLOW_FRAMES if _is_slow(whole) else FRAMES
+        slow = _is_slow(whole)
+        usual, least = (SLOW_FRAMES, SLOW_LEAST_FRAMES) if slow else (FRAMES, LEAST_FRAMES)
+        frames = max(least, usual // replicas)
+    check_frames(frames)
     mode = deployment.machine.sensor_mode
     if options.recording is not None and mode is not SensorMode.COLUMN:
         message = (
@@ -239,7 +248,7 @@ def _readings(
             options.recording,
             deployment.variables,
             options.columns,
-            frames=frames,
+            frames=frames * replicas,
             tolerance_s=options.tolerance_s,
         )
     if options.columns:
@@ -254,14 +263,16 @@ def _readings(
         )
         raise BuildError(message)
     scale = Scale(deployment.machine.scale)
+    of_each = f", each with readings for {replicas} replicas" if replicas > 1 else ""
     if model is not None:
-        drawn = sample_readings(model, frames, seed=options.seed)
+        source = f"{frames} frames{of_each} drawn from the model (seed {options.seed})"
+        drawn = sample_readings(model, frames * replicas, seed=options.seed, source=source)
         if mode is SensorMode.COLUMN:
             return drawn
         return readings_of_lines(drawn, model, whole, scale=scale, seed=options.seed)
     drawn_from = model_of_codes(deployment.name, deployment.searched, deployment.variables, whole)
-    source = f"{frames} frames drawn from what the codes say of the model (seed {options.seed})"
-    drawn = sample_readings(drawn_from, frames, seed=options.seed, source=source)
+    source = f"{frames} frames{of_each} drawn from what the codes say of the model (seed {options.seed})"
+    drawn = sample_readings(drawn_from, frames * replicas, seed=options.seed, source=source)
     if mode is SensorMode.COLUMN:
         return drawn
     return readings_of_lines(drawn, drawn_from, whole, scale=scale, seed=options.seed)
@@ -359,12 +370,17 @@ def _time_part(found: Inspection) -> str:
         ("worst", float(cycles.worst)),
     ):
         rows.append(f"  {name:6}  {count:10,.0f}  {_unit(count / found.clock_hz, 's'):>10}")
+    counted = "posteriors" if found.deployment.machine.replicas > 1 else "frames"
     rows.append(
         f"  {found.accuracy.overflow:.0%} of runs end by a full counter; without a posterior: {found.accuracy.without:.1%} of "
-        f"runs (in {found.accuracy.impossible:.1%} of frames no line can count)."
+        f"runs (in {found.accuracy.impossible:.1%} of {counted} no line can count)."
     )
     if found.deployment.machine.replicas > 1:
-        rows.append("  That is one replica's; all run at once, and a frame ends with the last of them.")
+        replicas = found.deployment.machine.replicas
+        rows.append(
+            f"  A frame is {replicas} posteriors and ends with the last of them: {cycles.median.value / replicas:,.1f} cycles a posterior "
+            "in the median."
+        )
     return "\n".join(rows)
 
 
@@ -469,6 +485,7 @@ def as_json(found: Inspection) -> str:
         "lines": found.machine.parameters.lines,
         "columns": found.machine.parameters.columns,
         "boards": len(found.deployment.boards),
+        "replicas": found.deployment.machine.replicas,
         "readings": found.readings.source,
         "clock_hz": found.clock_hz,
         "losses": None if found.losses is None else [asdict(loss) for loss in found.losses],

@@ -8,19 +8,21 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from machines.parameters import RngKind
+from machines.parameters import RngKind, SensorMode
 from tests.toolchain.corridor import corridor
 from toolchain.analysis.device import DEVICES
-from toolchain.analysis.explore import Point, Results, Sweep, explore, pareto, run_task, tasks
-from toolchain.analysis.readings import sample_readings
+from toolchain.analysis.explore import Frames, Sweep, explore, run_task, tasks
+from toolchain.analysis.sweep_results import Point, Results, pareto
 from toolchain.command import app
 from toolchain.deployment import Stop
 from toolchain.errors import BuildError
+from toolchain.models.model import Known, Model, dimension
 from toolchain.options import Scale
 
 D8 = DEVICES["proce-v-d8"]
@@ -95,26 +97,56 @@ def run(case, *arguments):
 
 def test_keys_name_what_the_figures_depend_on():
     model = corridor()
-    readings = sample_readings(model, 5, seed=1)
-    keys = [task.key for task in tasks(model, sweep(), readings, D8)]
-    assert len(set(keys)) == 4
-    assert keys == [task.key for task in tasks(model, sweep(), readings, D8)]
+
+    def keys(of=model, seed=1, **others):
+        return [task.key for task in tasks(of, sweep(**others), Frames(of, 5, seed=seed), D8)]
+
+    first = keys()
+    assert len(set(first)) == 4
+    assert first == keys()
+    cell, threshold = (
+        {"sensor_modes": (mode,), "scales": (Scale.COLUMN,)}
+        for mode in (SensorMode.CELL, SensorMode.THRESHOLD)
+    )
+    columns = {"scales": (Scale.COLUMN,)}
     others = [
-        tasks(corridor(sigma=1.1), sweep(), readings, D8),
-        tasks(model, sweep(), sample_readings(model, 5, seed=2), D8),
-        tasks(model, sweep(max_cycles=4097), readings, D8),
-        tasks(model, sweep(partitions=2), readings, D8),
-        tasks(model, sweep(banks=2), readings, D8),
+        keys(corridor(sigma=1.1)),
+        keys(seed=2),
+        keys(max_cycles=4097),
+        keys(partitions=2),
+        keys(banks=2),
+        keys(replicas=(2,)),
+        keys(**columns),
+        keys(**cell),
+        keys(**threshold),
+        keys(**cell, replicas=(2,)),
+        keys(**cell, seed=2),
     ]
-    for other in others:
-        assert not set(keys) & {task.key for task in other}
-    wider = tasks(model, sweep(prob_bits=(4, 8, 12)), readings, D8)
-    assert set(keys) < {task.key for task in wider}
+    assert len({key for each in (first, *others) for key in each}) == 4 * 12
+    assert set(first) < set(keys(prob_bits=(4, 8, 12)))
+    everything = keys(sensor_modes=tuple(SensorMode), replicas=(1, 2), scales=(Scale.ADDRESS, Scale.COLUMN))
+    # address is left out where cells have inputs of their own
+    assert len(everything) == 2 * 4 * (2 + 1 + 1)
+    for each in (first, keys(**columns), keys(**cell), keys(**threshold), keys(replicas=(2,))):
+        assert set(each) < set(everything)
+
+
+def test_keys_are_those_of_older_files():
+    """A file of results that was begun before machines had replicas is gone on with."""
+    model = Model(
+        name="m",
+        searched=(dimension("s", size=2),),
+        known=(Known(name="k", table=np.array([[0.75, 0.25], [0.25, 0.75]])),),
+    )
+    found = tasks(model, sweep(prob_bits=(8,), target_counts=(15,)), Frames(model, 5, seed=1), D8)
+    assert [task.key for task in found] == [
+        "bad1e94345aea384a7ae6766e4c80ed994df62360984350b021d98f9b80fe967"
+    ]
 
 
 def test_a_sweep_goes_on_where_it_stopped(tmp_path):
     model = corridor()
-    readings = sample_readings(model, 5, seed=1)
+    readings = Frames(model, 5, seed=1)
     found = tasks(model, sweep(), readings, D8)
     measured = []
 
@@ -227,10 +259,66 @@ def test_the_command(case):
     assert again.stdout == result.stdout
 
 
+def test_sensor_modes_and_replicas(case):
+    lists = ["--prob-bits", "8", "--targets", "15", "--rngs", "lfsr16", "--scales", "address,column"]
+    first = run(case, *lists)
+    assert first.exit_code == 0, first.stderr
+    assert "replicas" not in first.stdout
+    more = [*lists, "--sensor-modes", "column,cell,threshold", "--replicas", "1,3"]
+    result = run(case, *more)
+    assert result.exit_code == 0, result.stderr
+    # 2 scales of columns, 1 of the others, each with 1 and 3 replicas; the single machines of columns are there
+    assert result.stderr.startswith("8 machines of corridor over 5 frames")
+    assert "; 2 of them are in" in result.stderr
+    rows = result.stdout.splitlines()
+    assert len(rows) == 10
+    assert rows[0].split()[:3] == ["cells", "replicas", "scale"]
+    assert "a posterior" in rows[0]
+    found = {(row[2:].split()[0], row[2:].split()[1]) for row in rows[1:-1]}
+    assert found == {(mode, replicas) for mode in ("column", "cell", "threshold") for replicas in "13"}
+    points = list(Results(case.parent / "r.jsonl").points.values())
+    for point in points:
+        assert point.frames == 5
+        (other,) = [
+            each
+            for each in points
+            if (each.sensor_mode, each.scale, each.replicas)
+            == (point.sensor_mode, point.scale, 4 - point.replicas)
+        ]
+        assert (point.alms < other.alms) == (point.replicas < other.replicas)
+        assert (point.blocks == 0) == (point.sensor_mode == "threshold")
+    assert run(case, *more).stdout == result.stdout
+
+
+def test_no_recording_has_readings_for_each_line(case):
+    recording = case.parent / "r.csv"
+    recording.write_text("range\n1.0\n2.0\n3.0\n")
+    result = run(case, "--readings", str(recording), "--sensor-modes", "cell", "--scales", "column")
+    assert result.exit_code == 2
+    assert "--sensor-modes cell readings are arrays, one number for each line" in result.stderr
+    few = run(case, "--readings", str(recording), "--replicas", "4", "--prob-bits", "8", "--targets", "15")
+    assert few.exit_code == 2
+    assert "a frame of 4 replicas takes 4 readings, and there are 3 (3 of 3 rows of r.csv)" in few.stderr
+
+
+def test_what_a_kept_point_takes_is_estimated_anew(case):
+    """The estimator may have been calibrated since."""
+    lists = ["--prob-bits", "8", "--targets", "15", "--rngs", "lfsr16", "--scales", "address"]
+    result = run(case, *lists)
+    path = case.parent / "r.jsonl"
+    (kept,) = Results(path).points.values()
+    path.unlink()
+    Results(path).append(kept.model_copy(update={"alms": 1.0, "blocks": 7, "fits": False}))
+    again = run(case, *lists)
+    assert "; 1 of them are in" in again.stderr
+    assert again.stdout == result.stdout
+
+
 def test_a_plot(case):
     pytest.importorskip("matplotlib")
     plot = case.parent / "sweep.png"
-    result = run(case, "--prob-bits", "4", "--targets", "15,63", "--rngs", "lfsr16", "--plot", str(plot))
+    lists = ["--prob-bits", "4", "--targets", "15,63", "--rngs", "lfsr16", "--replicas", "1,2"]
+    result = run(case, *lists, "--plot", str(plot))
     assert result.exit_code == 0, result.stderr
     assert plot.read_bytes().startswith(b"\x89PNG")
 
@@ -309,6 +397,6 @@ def test_ctrl_c_keeps_what_is_done(case):
 
 
 def test_a_file_of_results_that_does_not_end_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr("toolchain.analysis.explore.MAX_FILE_BYTES", 1000)
+    monkeypatch.setattr("toolchain.analysis.sweep_results.MAX_FILE_BYTES", 1000)
     with pytest.raises(BuildError, match="more than 1000 bytes"):
         Results(Path("/dev/zero"))

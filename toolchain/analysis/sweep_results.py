@@ -1,0 +1,156 @@
+"""What a sweep has measured: a point a machine, kept in a file line by line, and the Pareto front of several."""
+
+from __future__ import annotations
+
+import math
+import os
+from contextlib import suppress
+from typing import TYPE_CHECKING, Final, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from toolchain.errors import BuildError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+MAX_FILE_BYTES: Final = 1 << 28
+
+_BEGIN: Final = b'{"key":"'
+"""How every line of results begins."""
+
+
+class Point(BaseModel):
+    """One machine of a sweep, measured: a line of the results' file.
+
+    Attributes:
+        key: SHA-256 of all that its figures depend on.
+        total_variation: Beside the model, mean over frames; None where no frame had a posterior.
+        total_variation_low: Its 95 % interval's ends.
+        total_variation_high: Its 95 % interval's ends.
+        quantising: The same of exact inference on the codes.
+        kl_bits: KL(machine || model).
+        map_agreement: Share of frames with the same most probable line.
+        z_rms: Root mean square of z-scores; 1 is ideal.
+        without: Share of runs without a posterior.
+        cycles_median: Cycles of a frame, which is as many posteriors as there are replicas.
+        cycles_95: Their 95th percentile.
+        alms: Of the largest board; None for generators that no FPGA has.
+        blocks: Memory blocks of the largest board.
+        fits: Whether that fits the device.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+    key: str = Field(pattern="[0-9a-f]{64}")
+    scale: Literal["address", "column", "none"]
+    rng: Literal["lfsr8", "lfsr16", "lfsr24", "lfsr32", "table", "ideal"]
+    steps_per_clock: int
+    prob_bits: int
+    target_count: int
+    counter_bits: int
+    partitions: int
+    frames: int
+    total_variation: float | None
+    total_variation_low: float | None
+    total_variation_high: float | None
+    quantising: float | None
+    kl_bits: float | None
+    map_agreement: float | None
+    z_rms: float | None
+    without: float
+    cycles_median: float
+    cycles_95: float
+    alms: float | None
+    blocks: int | None
+    fits: bool | None
+    # files of older sweeps say nothing of these
+    sensor_mode: Literal["column", "cell", "threshold"] = "column"
+    replicas: int = 1
+
+    @property
+    def cycles_a_posterior(self) -> float:
+        """Cycles of a frame, shared by its posteriors."""
+        return self.cycles_median / self.replicas
+
+
+class Results:
+    """The results' file: one JSON object a line, appended whole, so that an interrupted sweep goes on where it was.
+
+    Args:
+        path: The file; made if it is not there.
+
+    Raises:
+        BuildError: It can't be read or written, or it holds something else.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.points: dict[str, Point] = {}
+        content = b""
+        try:
+            with suppress(FileNotFoundError), path.open("rb") as file:
+                content = file.read(MAX_FILE_BYTES + 1)
+        except OSError as reason:
+            message = f"{path} can't be read: {reason.strerror or reason}"
+            raise BuildError(message) from None
+        if len(content) > MAX_FILE_BYTES:
+            message = f"{path} has more than {MAX_FILE_BYTES} bytes: it is no file of results"
+            raise BuildError(message)
+        lines = content.split(b"\n")
+        # A power cut in the middle of a line leaves a last line without its end: that point is measured again.
+        torn = lines.pop()
+        if torn and not torn.startswith(_BEGIN[: len(torn)]):
+            lines.append(torn)
+        self._torn_at = len(content) - len(torn) if torn else None
+        for number, line in enumerate(lines, start=1):
+            try:
+                point = Point.model_validate_json(line)
+            except ValidationError:
+                message = f"{path}, line {number}, is no result of a sweep: name another file with -o"
+                raise BuildError(message) from None
+            self.points[point.key] = point
+
+    def append(self, point: Point) -> None:
+        """Add a point: one write, and it is on the disk.
+
+        Raises:
+            BuildError: The file can't be written.
+        """
+        line = point.model_dump_json() + "\n"
+        try:
+            if self._torn_at is not None:
+                os.truncate(self.path, self._torn_at)
+                self._torn_at = None
+            descriptor = os.open(self.path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
+            try:
+                written = os.write(descriptor, line.encode())
+                os.fsync(descriptor)
+            finally:
+                os.close(descriptor)
+        except OSError as reason:
+            message = f"{self.path} can't be written: {reason.strerror or reason}"
+            raise BuildError(message) from None
+        if written != len(line):
+            message = f"{self.path} can't be written: the disk is full"
+            raise BuildError(message)
+
+
+def pareto(points: Sequence[Point]) -> list[Point]:
+    """Return the points that no other one is better than: in total variation, cycles a posterior, ALMs and runs without one."""
+    judged = [(point, figures) for point in points if (figures := _figures(point)) is not None]
+    return [
+        point
+        for point, own in judged
+        if not any(
+            other != own and all(a <= b for a, b in zip(other, own, strict=True)) for _, other in judged
+        )
+    ]
+
+
+def _figures(point: Point) -> tuple[float, ...] | None:
+    if point.total_variation is None:
+        return None
+    alms = math.inf if point.alms is None else point.alms
+    return (point.total_variation, point.cycles_a_posterior, alms, point.without)
