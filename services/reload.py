@@ -64,6 +64,9 @@ class Moving(Protocol):
     def lose(self, reason: str, count: int) -> None:
         """Count what was lost."""
 
+    def lost_for(self, reason: str) -> int:
+        """How many were lost for a reason so far."""
+
 
 class Reloads:
     """Another deployment for a run, one at a time."""
@@ -123,6 +126,7 @@ class Reloads:
             msg = f"the folder {folder} is not absolute, and the master may stand somewhere else; give the whole path"
             raise SettingsError(msg)
         started = time.monotonic()
+        lost_before = self._moving.lost_for(LOST_IN_RELOAD)
         number = self._in_force.generation + 1
         new = await asyncio.to_thread(read_new, folder, self._in_force.deployment, self._as_used)
         kept = await self._keep_copy(new, number)
@@ -156,10 +160,11 @@ class Reloads:
                     await self._ask(peer, Switch(number), limit)
                 except ServiceError as error:
                     self._peers.renew(peer, f"{error}; ending it")
+        lost_meanwhile = self._moving.lost_for(LOST_IN_RELOAD) - lost_before - lost
         milliseconds = (time.monotonic() - started) * 1000
         return (
             f"generation {number} is in force, deployment {new.hash[:12]} of {folder}; "
-            f"{what_became_of(in_flight, lost)}, {milliseconds:.0f} ms"
+            f"{what_became_of(in_flight, lost, lost_meanwhile)}, {milliseconds:.0f} ms"
         )
 
     async def _ask(
@@ -275,15 +280,19 @@ class Reloads:
             self._peers.give("--deployment", str(kept))
 
 
-def what_became_of(in_flight: int, lost: int) -> str:
-    """Of the frames that were under way when a reload began, in words.
+def what_became_of(in_flight: int, lost: int, lost_meanwhile: int = 0) -> str:
+    """Of the frames that were under way when a reload began, and of the readings that came during it, in words.
 
     Args:
-        in_flight: how many there were.
+        in_flight: how many frames there were.
         lost: how many of them still waited after all the time that they could have.
+        lost_meanwhile: how many readings came while boards were programmed and found no place to wait.
     """
     frames = "1 frame was" if in_flight == 1 else f"{in_flight} frames were"
-    if not lost:
-        return f"{frames} in flight and finished before"
-    done = in_flight - lost
-    return f"{frames} in flight: {done} finished before, {lost} lost after {_DRAIN_TIME:g} s"
+    said = f"{frames} in flight and finished before"
+    if lost:
+        said = f"{frames} in flight: {in_flight - lost} finished before, {lost} lost after {_DRAIN_TIME:g} s"
+    if lost_meanwhile:
+        readings = "1 reading" if lost_meanwhile == 1 else f"{lost_meanwhile} readings"
+        said += f"; {readings} that came meanwhile found no place to wait and {'was' if lost_meanwhile == 1 else 'were'} lost"
+    return said

@@ -260,6 +260,10 @@ class Master:
         """Count what was lost."""
         self._losses[reason] += count
 
+    def lost_for(self, reason: str) -> int:
+        """How many were lost for a reason so far."""
+        return self._losses[reason]
+
     # --- records -------------------------------------------------------------------------------
 
     def _ready(self, peer: Peer, record: Ready) -> None:

@@ -93,8 +93,7 @@ def build_deployment(model: Model, directory: Path, options: BuildOptions, *, re
             written.
     """
     built = assemble(model, options)
-    if remark:
-        built = replace(built, report=f"{built.report}\n{remark}\n")
+    built = replace(built, report=with_remark(built.report, remark))
     written = _write(Path(directory), built.deployment, built.images)
     try:
         (written.directory / REPORT_NAME).write_text(built.report, encoding="utf-8")
@@ -528,6 +527,17 @@ def build_report(
     paragraphs += [f"Warning: {warning}" for warning in quantised.warnings]
     paragraphs.append(f"{_topics_sentence(deployment)} Deployment {deployment.hash[:16]}.")
     return "\n\n".join(paragraphs) + "\n"
+
+
+def with_remark(report: str, remark: str) -> str:
+    """Return a report that ends with how its options were chosen, where there is something to say about that."""
+    return f"{report}\n{remark}\n" if remark else report
+
+
+def remark_of(report: str) -> str:
+    """Return how the options of a build were chosen, as its report says after the deployment's hash; empty where it does not."""
+    end = re.search(r"Deployment [0-9a-f]{16}\.\n\n(.*)\Z", report, re.DOTALL)
+    return end[1].strip() if end else ""
 
 
 def many_sentence(machine: MachineSection) -> str:

@@ -9,7 +9,15 @@ from pydantic import ValidationError
 
 from machines.parameters import SensorMode
 from pcie_shim.programming_file import Image, Partition, read_image
-from toolchain.build import REPORT_NAME, assemble, board_interface, build_report, refused_option
+from toolchain.build import (
+    REPORT_NAME,
+    assemble,
+    board_interface,
+    build_report,
+    refused_option,
+    remark_of,
+    with_remark,
+)
 from toolchain.deployment import (
     FILE_NAME,
     Deployment,
@@ -106,10 +114,12 @@ def regenerate_memories(directory: Path, model: Model | None = None, *, build_da
     model = _with_widths(model, deployment)
     built = assemble(model, replace(_options(deployment, images[0]), build_date=build_date))
     new = _with_targets(built.deployment, deployment)
+    report = build_report(model, new, built.quantised, _interface_reason(model, new))
     parts = [
         image_files(new, built.images),
         memory_files(new, built.images),
-        text_file(REPORT_NAME, build_report(model, new, built.quantised, _interface_reason(model, new))),
+        # the machine's size is the same, and so is why it has so many boards
+        text_file(REPORT_NAME, with_remark(report, _remark(directory))),
         text_file(FILE_NAME, deployment_text(new)),  # last: a folder that is half new has the old hashes
     ]
     return sorted(change for part in parts for change in write_files(directory, part))
@@ -252,6 +262,15 @@ def _interface_reason(model: Model, deployment: Deployment) -> str:
         model, blocks, None, sensor_mode=machine.sensor_mode, replicas=machine.replicas
     )
     return reason if interface == (machine.interface_sensors, machine.interface_results) else ", as asked for"
+
+
+def _remark(directory: Path) -> str:
+    """Return what the report that is there says of how the options were chosen; nothing where there is no such report."""
+    report = directory / REPORT_NAME
+    try:
+        return remark_of(report.read_text(encoding="utf-8")) if report.is_file() else ""
+    except (OSError, UnicodeDecodeError):
+        return ""
 
 
 def _with_targets(new: Deployment, old: Deployment) -> Deployment:

@@ -152,6 +152,18 @@ def test_an_edit_by_hand_is_kept_where_the_images_agree(built):
     assert load_deployment(built).machine.max_cycles == 7
 
 
+@pytest.mark.parametrize("options", [(), ("--device", "proce-v-d8")], ids=["boards as said", "on a device"])
+def test_the_same_model_changes_nothing(case, options):
+    out = case.parent / "on_device"
+    result = CliRunner().invoke(app, ["build", str(case), "-o", str(out), *TARGET, *options])
+    assert result.exit_code == 0, result.stderr
+    assert ("lines fit one" in (out / "report.txt").read_text()) == bool(options)
+    before = contents(out)
+    for _ in range(2):
+        assert set(changes(regenerate("memories", out, "--model", case)).values()) == {"unchanged"}
+    assert contents(out) == before
+
+
 @pytest.mark.parametrize(
     ("old", "new", "sentence"),
     [
