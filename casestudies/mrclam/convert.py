@@ -322,12 +322,15 @@ app = CommandLine()
 @app.command(epilog="Example: `python -m casestudies.mrclam.convert MRCLAM_Dataset1 -o DATA_DIR`")
 def convert(
     folder: Annotated[
-        Path, typer.Argument(help="The folder that the data set was unpacked into: Barcodes.dat, ...")
+        Path,
+        typer.Argument(
+            help="The folder that the data set was unpacked into, with Barcodes.dat and all the others."
+        ),
     ],
     output: Annotated[
         Path,
         typer.Option(
-            "--output-dir", "-o", help="Folder for landmarks.csv and ds1_robot1.csv, ...", metavar="DIR"
+            "--output-dir", "-o", help="Folder for landmarks.csv, and a file for each robot.", metavar="DIR"
         ),
     ],
     robot: Annotated[

@@ -155,3 +155,19 @@ def test_a_pipe_is_not_waited_for(tmp_path):
     os.mkfifo(tmp_path / "Barcodes.dat")
     with pytest.raises(DataFileError, match=r"Barcodes\.dat is a pipe"):
         read_barcodes(tmp_path)
+
+
+def test_what_is_missing_is_said_in_a_whole_sentence(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["convert"])
+    monkeypatch.setattr(sys.modules["__main__"], "__package__", None)
+    for arguments, said in (
+        (
+            [],
+            "FOLDER is missing: the folder that the data set was unpacked into, with Barcodes.dat and all the others; ",
+        ),
+        ([str(tmp_path)], "--output-dir is missing: folder for landmarks.csv, and a file for each robot; "),
+    ):
+        with pytest.raises(SystemExit) as ended:
+            app(arguments)
+        assert ended.value.code == 2
+        assert capsys.readouterr().err == f"error: {said}convert --help says more\n"

@@ -25,7 +25,7 @@ def make_app():
 
     @app.command()
     def paint(
-        wall: Annotated[str, typer.Argument(help="The wall to paint.")],
+        wall: Annotated[str, typer.Argument(help="The wall to paint, its doors, ...")],
         colour: Annotated[Colour, typer.Option("--colour", "-c", help="Its colour.")] = Colour.RED,
         coats: Annotated[int, typer.Option(min=1, max=9)] = 1,
         thickness: Annotated[float, typer.Option(min=0.1)] = 1.0,
@@ -63,9 +63,13 @@ def called_painter(monkeypatch):
         (["paint", "w", "--coats", "1.5"], "--coats 1.5: expected a whole number from 1 to 9;"),
         (["paint", "w", "--thickness", "nan"], "--thickness nan: expected a number from 0.1;"),
         (["paint", "w", "--coats", "\x1b[1m"], r"--coats '\x1b[1m': expected a whole number"),
-        (["paint"], "WALL is missing: the wall to paint;"),
+        (["paint"], "WALL is missing: the wall to paint, its doors, ...;"),
+        (["paint", ""], "WALL '': expected a text that is not blank;"),
+        (["paint", "w", "--thickness", "inf"], "--thickness inf: expected a number from 0.1;"),
+        (["paint", "w", "--thickness", "1e400"], "--thickness 1e400: expected a number from 0.1;"),
+        (["paint", "w", "--coats", " "], "--coats ' ': expected a whole number from 1 to 9;"),
         (["paint", "w", "--colou", "red"], "painter paint has no --colou (did you mean --colour?);"),
-        (["paint", "w", "--coats"], "--coats needs a value;"),
+        (["paint", "w", "--coats"], "--coats needs a value; painter paint --help"),
         (["paint", "w", "--dry=1"], "--dry takes no value;"),
         (["paint", "a", "b"], "painter paint: got unexpected extra argument(s) (b);"),
         (["pant"], "painter: no such command 'pant'. Did you mean 'paint'?; painter --help says more"),
