@@ -339,9 +339,7 @@ def test_drawn_readings_give_the_models_posterior(options):
         exact = exact_posterior(of, addresses, prior_address=row)
         found = boards.run(*readings.of_machine(frame, machines[0]), bank=frame)
         assert found.posterior == pytest.approx(exact, abs=0.015)
-    if options.sensor_mode is SensorMode.CELL:
-        every = np.arange(12)
-        assert np.array_equal(readings.addresses[every, :, drawn.lines], drawn.addresses)
+    assert np.array_equal(readings.addresses[np.arange(12), :, drawn.lines], drawn.addresses)
 
 
 def test_replicas_share_the_generators_and_multiply_the_rest():
@@ -432,7 +430,8 @@ def test_inspect_explains_such_a_deployment(tmp_path, mode):
         app, ["inspect", str(out), "--frames", "5", "--model", str(tmp_path / "disparity"), "--json"]
     )
     assert named.exit_code == 0, named.output
-    assert json.loads(named.stdout)["accuracy"]["machine"]["total_variation"]["value"] < 0.1
+    # lines that all read the same would have nothing to be wrong about
+    assert 0.001 < json.loads(named.stdout)["accuracy"]["machine"]["total_variation"]["value"] < 0.1
     recorded = runner.invoke(app, ["inspect", str(out), "--readings", str(tmp_path / "r.csv")])
     assert recorded.exit_code == 2
     assert "this machine's readings are arrays" in recorded.stderr

@@ -175,8 +175,8 @@ class Frames:
             )
             raise BuildError(message)
         # other lines' readings are drawn too, with the seed; codes follow from the tables
-        of_cells = options.sensor_mode is SensorMode.CELL
-        if (options.replicas, of_cells) not in self._fingerprints:
+        of_lines = options.sensor_mode is not SensorMode.COLUMN
+        if (options.replicas, of_lines) not in self._fingerprints:
             readings, digest = self.columns(options.replicas), hashlib.sha256()
             for known in self._model.known:
                 digest.update(known.table.tobytes())
@@ -185,10 +185,10 @@ class Frames:
                 digest.update(self._model.prior_select.table.tobytes())
             digest.update(readings.addresses.tobytes())
             digest.update(readings.prior_addresses.tobytes())
-            if of_cells:
+            if of_lines:
                 digest.update(self._seed.to_bytes(16, "little"))
-            self._fingerprints[options.replicas, of_cells] = digest.hexdigest()
-        return self._fingerprints[options.replicas, of_cells]
+            self._fingerprints[options.replicas, of_lines] = digest.hexdigest()
+        return self._fingerprints[options.replicas, of_lines]
 
 
 def tasks(model: Model, sweep: Sweep, frames: Frames, device: Device) -> list[Task]:

@@ -43,7 +43,7 @@ class Readings:
             readings of their own int64[frames, sensors, lines].
         prior_addresses: int64[frames], what selects the prior; `MISSING` where nothing does.
         codes: uint16[frames, sensors, lines], what such addresses' likelihoods are to a machine whose cells are given
-            codes; None for other machines.
+            codes (`sensor_mode = threshold`); None for other machines.
         lines: int64[frames], the true line of each; None where it is not known.
     """
 
@@ -133,8 +133,8 @@ def readings_of_lines(
 ) -> Readings:
     """Return readings that were drawn from a model as a machine's whose lines have readings of their own.
 
-    `cell`: the true line's cell reads what was drawn. What the others read the model does not say; theirs are drawn from
-    the mean of all lines. `threshold`: the likelihoods of what was drawn, as codes.
+    The true line's cell reads what was drawn. What the others read the model does not say; theirs are drawn from the mean
+    of all lines. A machine with sensor_mode `threshold` is given their likelihoods, as codes.
 
     Args:
         drawn: As `sample_readings` draws them.
@@ -142,28 +142,29 @@ def readings_of_lines(
         machine: The machine, or one board's.
         scale: What was divided by its maximum before quantising.
         seed: The same one draws the same readings of the other lines.
+
+    Raises:
+        BuildError: The readings were not drawn, so that their true line is not known.
     """
+    if drawn.lines is None:
+        message = "only readings that were drawn know their true line"
+        raise BuildError(message)
     frames = len(drawn)
     shape = (frames, len(model.known), model.lines)
-    width = machine.parameters.prob_bits
-    if not machine.parameters.has_tables:
-        codes = np.empty(shape, dtype=np.uint16)
-        for column, known in enumerate(model.known):
-            likelihoods = known.table[drawn.addresses[:, column]]
-            codes[:, column] = written_codes(likelihoods, prob_bits=width, scale=scale)
-        return replace(drawn, codes=codes)
     random = np.random.default_rng((seed, 1))
     addresses = np.empty(shape, dtype=np.int64)
     for column, known in enumerate(model.known):
         mean = np.cumsum(known.table @ _normalised(model.prior_distribution))
         others = np.searchsorted(mean, random.random((frames, model.lines)) * mean[-1], side="right")
         addresses[:, column] = np.minimum(others, known.values - 1)
-    if drawn.lines is None:
-        message = "only readings that were drawn know their true line"
-        raise BuildError(message)
-    every = np.arange(frames)
-    addresses[every, :, drawn.lines] = drawn.addresses
-    return replace(drawn, addresses=addresses)
+    addresses[np.arange(frames), :, drawn.lines] = drawn.addresses
+    if machine.parameters.has_tables:
+        return replace(drawn, addresses=addresses)
+    codes = np.empty(shape, dtype=np.uint16)
+    for column, known in enumerate(model.known):
+        likelihoods = known.table[addresses[:, column], np.arange(model.lines)]
+        codes[:, column] = written_codes(likelihoods, prob_bits=machine.parameters.prob_bits, scale=scale)
+    return replace(drawn, addresses=addresses, codes=codes)
 
 
 def model_of_codes(
