@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 _DPI: Final = 75
 _COLOURS: Final = ("#4477aa", "#ee6677", "#228833", "#ccbb44", "#66ccee", "#aa3377", "#bbbbbb")
 _MARKERS: Final = "osD^v<>P"
+_KINDS_INSIDE: Final = 5
+"""More of them would lie on the points: they stand beside the picture."""
 
 
 def check_pictures_possible() -> None:
@@ -38,12 +40,13 @@ def draw_sweep(path: Path, name: str, points: Sequence[Point], front: Sequence[P
     Raises:
         BuildError: The file can't be written.
     """
-    figure = _figure((7.2, 4.8))
-    axes = figure.subplots()
     shown = [point for point in points if point.total_variation is not None]
     largest = max((point.alms or 0.0 for point in shown), default=0.0) or 1.0
     several = any(point.replicas > 1 for point in points)
     kinds = sorted({_kind(point) for point in shown})
+    beside = len(kinds) > _KINDS_INSIDE
+    figure = _figure((10.2 if beside else 7.2, 4.8))
+    axes = figure.subplots()
     for at, kind in enumerate(kinds):
         of_kind = [point for point in shown if _kind(point) == kind]
         axes.scatter(
@@ -72,7 +75,10 @@ def draw_sweep(path: Path, name: str, points: Sequence[Point], front: Sequence[P
         title=f"{name}: accuracy against cycles; the larger, the more ALMs",
     )
     axes.grid(alpha=0.3, which="both")
-    axes.legend(fontsize="small", frameon=False)
+    if beside:
+        figure.legend(loc="outside right center", fontsize="small", frameon=False)
+    else:
+        axes.legend(fontsize="small", frameon=False)
     _save(figure, path)
 
 
