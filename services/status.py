@@ -16,6 +16,7 @@ from services.command_line import ends_well, make_app, run_async
 from services.errors import ExitCode, SettingsError
 from services.settings import load_settings
 from services.status_socket import STATUS_LIMIT, SUFFIX, BoardStatus, FrameCounts, ProcessStatus
+from services.supervision import PRIVATE
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -57,7 +58,7 @@ def run_directories() -> list[Path]:
     places = {Path(tempfile.gettempdir())}
     if runtime := os.environ.get("XDG_RUNTIME_DIR"):
         places.add(Path(runtime))
-    found = [path for place in places for path in place.glob("rosbayes-*") if path.is_dir()]
+    found = [path for place in places for path in place.glob(f"{PRIVATE}*") if path.is_dir()]
     return sorted(path for path in found if path.stat().st_uid == os.getuid())
 
 

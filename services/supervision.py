@@ -7,9 +7,11 @@ import contextlib
 import ctypes
 import fcntl
 import os
+import re
 import shutil
 import signal
 import socket
+import stat
 import subprocess
 import sys
 import tempfile
@@ -35,6 +37,12 @@ CONTROL_SUFFIX = ".control.sock"
 KEPT = "deployment-"
 """How the folders begin in which a run keeps the deployments of its children (`services.new_deployment`)."""
 
+PRIVATE = "rosbayes-"
+"""How a run's private directory begins; what follows is tempfile's."""
+_PRIVATE_NAME = re.compile(PRIVATE + "[a-z0-9_]{8}")
+_KEPT_NAME = re.compile(KEPT + "[0-9]+")
+_MOST_ABANDONED = 100
+
 RESTARTS = 3
 RESTARTS_WITHIN = 60.0
 """A process may be restarted three times in 60 s; then its master gives up."""
@@ -43,15 +51,60 @@ _PR_SET_PDEATHSIG = 1
 _TAIL_LINES = 20
 
 
-def make_private_directory() -> Path:
-    """A directory for this run's sockets that only this user can enter (0700)."""
+def _place() -> Path:
+    """Where this user's runs have their private directories."""
     runtime = os.environ.get("XDG_RUNTIME_DIR", "")
     usable = runtime and len(runtime) < 40 and os.access(runtime, os.W_OK | os.X_OK)
+    return Path(runtime if usable else tempfile.gettempdir())
+
+
+def make_private_directory() -> Path:
+    """A directory for this run's sockets that only this user can enter (0700)."""
     try:
-        return Path(tempfile.mkdtemp(prefix="rosbayes-", dir=runtime if usable else None))
+        return Path(tempfile.mkdtemp(prefix=PRIVATE, dir=_place()))
     except OSError as error:
         msg = f"can't make a private directory for the local sockets: {error.strerror or error}; set TMPDIR to a writable folder"
         raise ServiceError(msg) from error
+
+
+def remove_abandoned_directories() -> None:
+    """Take the private directories away that masters left which were killed before anybody else was there to do it.
+
+    One is taken for such only if it is named as one, belongs to this user alone, no master has it locked, and nothing is
+    in it that a run does not put there. Links are not followed.
+    """
+    with contextlib.suppress(OSError):
+        found = [each for each in _place().iterdir() if _PRIVATE_NAME.fullmatch(each.name)]
+        for directory in found[:_MOST_ABANDONED]:
+            with contextlib.suppress(OSError):
+                _remove_if_abandoned(directory)
+
+
+def _remove_if_abandoned(directory: Path) -> None:
+    """Remove one, unless its master lives.
+
+    Raises:
+        OSError: it is no directory, is somebody else's, or is locked.
+    """
+    handle = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+    try:
+        found = os.fstat(handle)
+        if found.st_uid != os.geteuid() or stat.S_IMODE(found.st_mode) != 0o700:
+            return
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)  # a master that is just making it notices (below)
+        with os.scandir(handle) as entries:
+            kinds = {each.name: each.stat(follow_symlinks=False).st_mode for each in entries}
+        kept = {name for name, mode in kinds.items() if stat.S_ISDIR(mode) and _KEPT_NAME.fullmatch(name)}
+        sockets = {name for name, mode in kinds.items() if stat.S_ISSOCK(mode)}
+        if kept | sockets != set(kinds):
+            return
+        for name in sockets:
+            os.unlink(name, dir_fd=handle)
+        for name in kept:
+            shutil.rmtree(name, dir_fd=handle)
+        directory.rmdir()
+    finally:
+        os.close(handle)
 
 
 def ask_for_end_with_parent() -> None:
@@ -84,10 +137,23 @@ class PrivateDirectory:
     """A run's directory while its master lives: locked, so that its children can see when that is over."""
 
     def __init__(self) -> None:
-        self.path = make_private_directory()
-        # the kernel lets go of it when the process ends, however that happens
-        self._lock = os.open(self.path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-        fcntl.flock(self._lock, fcntl.LOCK_EX)
+        """Make it; what runs left that were killed is taken away on the occasion.
+
+        Raises:
+            ServiceError: it can't be made.
+        """
+        remove_abandoned_directories()
+        for _ in range(_MOST_ABANDONED):
+            self.path = make_private_directory()
+            with contextlib.suppress(FileNotFoundError):
+                # the kernel lets go of it when the process ends, however that happens
+                self._lock = os.open(self.path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+                fcntl.flock(self._lock, fcntl.LOCK_EX)
+                if os.fstat(self._lock).st_nlink:
+                    return
+                os.close(self._lock)  # before it was locked, another master took it for an abandoned one
+        msg = f"can't keep a private directory in {self.path.parent}: something removes what is made there"
+        raise ServiceError(msg)
 
     def remove(self) -> None:
         """Take it away with all that is in it."""

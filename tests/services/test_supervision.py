@@ -3,6 +3,7 @@
 import asyncio
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -11,7 +12,7 @@ import psutil
 import pytest
 
 from services.errors import ExitCode, ServiceError
-from services.supervision import RESTARTS, Child, end_all, make_private_directory
+from services.supervision import KEPT, RESTARTS, Child, PrivateDirectory, end_all, make_private_directory
 
 
 def child(code: str) -> Child:
@@ -100,3 +101,71 @@ time.sleep(60)
     while psutil.pid_exists(pid) and psutil.Process(pid).status() != psutil.STATUS_ZOMBIE:
         assert time.monotonic() < deadline, "the child outlived its parent"
         time.sleep(0.02)
+
+
+@pytest.fixture
+def place(tmp_path, monkeypatch):
+    """Where runs have their directories, in this test."""
+    monkeypatch.setenv("XDG_RUNTIME_DIR", "")
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    return tmp_path
+
+
+def left_by_a_killed_master(place, name, *, mode=0o700):
+    """What is there after a SIGKILL: a socket that nobody listens on, and a deployment's copy."""
+    directory = place / name
+    directory.mkdir()
+    with socket.socket(socket.AF_UNIX) as dead:
+        dead.bind(str(directory / "b.sock"))
+    (directory / f"{KEPT}0" / "boards").mkdir(parents=True)
+    (directory / f"{KEPT}0" / "boards" / "board0.bm").write_bytes(b"x")
+    directory.chmod(mode)
+    return directory
+
+
+def test_what_killed_masters_left_goes_with_the_next_start(place):
+    empty = make_private_directory()
+    full = left_by_a_killed_master(place, "rosbayes-abcdefg1")
+    made = PrivateDirectory()
+    assert [each.name for each in place.iterdir()] == [made.path.name]
+    assert not empty.exists()
+    assert not full.exists()
+    made.remove()
+    assert not list(place.iterdir())
+
+
+def test_what_no_killed_master_left_stays(place):
+    alive = PrivateDirectory()
+    others = [
+        left_by_a_killed_master(place, "rosbayes-open0000", mode=0o755),
+        left_by_a_killed_master(place, "rosbayes-of-mine"),
+        left_by_a_killed_master(place, "elsewhere"),
+    ]
+    work = left_by_a_killed_master(place, "rosbayes-mywork00")
+    (work / "thesis.md").write_text("three years")
+    linked = left_by_a_killed_master(place, "rosbayes-linking0")
+    (linked / f"{KEPT}7").symlink_to(others[2])
+    (place / "rosbayes-alink000").symlink_to(others[2])
+    (place / "rosbayes-file0000").write_text("no folder")
+    before = {each: sorted(each.rglob("*")) for each in place.iterdir()}
+    made = PrivateDirectory()
+    made.remove()
+    assert {each: sorted(each.rglob("*")) for each in place.iterdir()} == before
+    alive.remove()
+
+
+def test_a_directory_that_is_taken_for_an_abandoned_one_while_it_is_made_is_made_again(place, monkeypatch):
+    made = []
+
+    def make():
+        made.append(make_private_directory())
+        if len(made) < 3:  # another master starts before this one has its lock
+            made[-1].rmdir()
+        return made[-1]
+
+    monkeypatch.setattr("services.supervision.make_private_directory", make)
+    private = PrivateDirectory()
+    assert private.path == made[-1]
+    assert len(made) == 3
+    assert private.path.is_dir()
+    private.remove()
