@@ -29,6 +29,8 @@ _MEDIUM: Final = 126
 _LONG: Final = 1 << 16
 _MEDIUM_HEADER: Final = Struct("!BBH").pack
 _LONG_HEADER: Final = Struct("!BBQ").pack
+#: The longest header of the frames that `only_message` takes: less is left to the others.
+_LONGEST_QUICK: Final = 8
 #: First bytes of frames that a peer may send: an end or not, no reserved bit, an opcode that there is.
 _SOUND: Final = frozenset(end | opcode for end in (0, 0x80) for opcode in (0, 1, 2, 8, 9, 10))
 #: Keys that are drawn at once.
@@ -84,6 +86,29 @@ def whole_messages(
         at = end
         count -= 1
     return found, at
+
+
+def only_message(data: bytes, *, masked: bool, largest: int) -> bytes | None:
+    """The payload, if what came is one whole message in one frame and nothing else; it says so quickly.
+
+    Args:
+        data: what came.
+        masked: whether the peer is a client.
+        largest: bytes of the message at most.
+    """
+    size = len(data)
+    if size < _LONGEST_QUICK or data[0] not in _WHOLE:
+        return None
+    length, body = data[1] ^ _MASKED if masked else data[1], 2
+    if length == _MEDIUM:
+        length, body = data[2] << 8 | data[3], 4
+    elif length > _MEDIUM:
+        return None
+    if masked:
+        body += 4
+    if body + length != size or length > largest:
+        return None
+    return apply_mask(data[body:], data[body - 4 : body]) if masked else data[body:]
 
 
 def frame_end(data: bytes, at: int, *, masked: bool, largest: int) -> int:

@@ -30,6 +30,9 @@ PUBLISH_QUEUE_SIZE: Final = 100
 #: Seconds that finding out why a topic is silent may take.
 EXPLAIN_TIMEOUT: Final = 0.5
 
+#: Seconds that who waits for one message stays awake, if the one before came within that time.
+_AWAKE: Final = 200e-6
+
 Handler = Callable[[dict[str, Any]], Awaitable[Mapping[str, Any] | None]]
 
 _log = logging.getLogger("bridge")
@@ -110,6 +113,7 @@ class Subscription(_Handle):
         self._queue: deque[Message] = deque(maxlen=queue_size)
         self._waiter: asyncio.Future[None] | None = None
         self._asleep = False  # and not woken yet
+        self._answered_at_once = False
         self._deadline = inf  # of who waits
         self._alarm: asyncio.TimerHandle | None = None
         self._rings = inf
@@ -160,13 +164,24 @@ class Subscription(_Handle):
             await self._news()
         return queue.popleft()
 
-    async def _news(self) -> None:
-        """Wait until something has come, the subscription has ended, or the time is over (see `next`)."""
+    async def _news(self, awake_until: float = 0.0) -> None:
+        """Wait until something has come, the subscription has ended, or the time is over (see `next`).
+
+        Args:
+            awake_until: monotonic seconds up to which the process does not fall asleep over it. Who answers at once
+                is heard sooner so: to fall asleep and be woken takes longer than an answer by way of the hub.
+        """
         self._check_alone()
-        self._waiter = asyncio.get_running_loop().create_future()
-        self._asleep = True
+        waiter = self._waiter = asyncio.get_running_loop().create_future()
         try:
-            await self._waiter
+            while awake_until:
+                await asyncio.sleep(0)  # the loop looks at its sockets, and other tasks have their turn
+                if self._queue or waiter.done():
+                    return
+                if time.monotonic() >= awake_until:
+                    break
+            self._asleep = True
+            await waiter
         finally:
             self._waiter, self._asleep = None, False
 
@@ -182,7 +197,7 @@ class Subscription(_Handle):
         if waiter is not None and not waiter.done():
             waiter.set_result(None)
 
-    def _set_alarm(self) -> None:
+    def _set_alarm(self, now: float) -> None:
         """See that whoever waits is woken at the deadline.
 
         An alarm that was set before and rings earlier serves too: it is set again then. So one is set now and then, not
@@ -193,15 +208,16 @@ class Subscription(_Handle):
                 return
             self._alarm.cancel()
         self._rings = self._deadline
-        delay = max(self._deadline - time.monotonic(), 0)
+        delay = max(self._deadline - now, 0)
         self._alarm = asyncio.get_running_loop().call_later(delay, self._ring)
 
     def _ring(self) -> None:
         self._alarm = None
-        if self._deadline <= time.monotonic():
+        now = time.monotonic()
+        if self._deadline <= now:
             self._wake()
         elif self._deadline != inf:
-            self._set_alarm()
+            self._set_alarm(now)
 
     async def next(self, timeout: float) -> Message:  # noqa: ASYNC109  # the limit is part of the error
         """Wait for one message.
@@ -218,21 +234,24 @@ class Subscription(_Handle):
         queue = self._queue
         if queue:
             return queue.popleft()
-        begun = time.monotonic()
         self._check_alone()
+        now = begun = time.monotonic()
         self._deadline = begun + timeout
-        self._set_alarm()
+        self._set_alarm(begun)
         try:
-            while not queue:
+            while True:
                 if self._closed:
                     raise DisconnectedError(f"the subscription of {self.topic} is closed")
-                if time.monotonic() >= self._deadline:
+                if now >= self._deadline:
                     break
-                await self._news()
+                awake_until = now + _AWAKE
+                await self._news(awake_until if self._answered_at_once else 0.0)
+                now = time.monotonic()
+                if queue:
+                    self._answered_at_once = now < awake_until
+                    return queue.popleft()
         finally:
             self._deadline = inf
-        if queue:
-            return queue.popleft()
         why = await self._why_silent(begun)
         raise NoMessageError(
             f"no message of {self.topic} came from {self._session.uri} within {timeout:g} s{why}"

@@ -354,7 +354,10 @@ class Session:
         Raises:
             DisconnectedError: there is no connection.
         """
-        return self._open_websocket().paused or self._waiting > 0
+        websocket = self._websocket
+        if websocket is None or not websocket.is_open:
+            websocket = self._open_websocket()
+        return websocket.paused or self._waiting > 0
 
     def _open_websocket(self) -> WebSocket:
         websocket = self._websocket

@@ -33,7 +33,15 @@ from websockets.protocol import Event, State
 from websockets.uri import WebSocketURI, parse_uri
 
 from bridge.errors import AccessRefusedError, BridgeError, NotRosbridgeError, UnreachableError, UriError
-from bridge.frames import UNKNOWN, UNSOUND, frame_end, mask_keys, masked_text, whole_messages
+from bridge.frames import (
+    UNKNOWN,
+    UNSOUND,
+    frame_end,
+    mask_keys,
+    masked_text,
+    only_message,
+    whole_messages,
+)
 from bridge.json_codec import excerpt
 from bridge.route import Route, connect_along, shown
 
@@ -224,13 +232,31 @@ class WebSocket(ClientConnection):
 
     def _take_frames(self, data: bytes) -> None:
         """Take frames: hand whole messages over, have the library read each of the others."""
+        at = 0
         if self._rest:
-            self._rest += data
-            if len(self._rest) < self._wanted:
+            rest, missing = self._rest, self._wanted - len(self._rest)
+            at = missing if 0 < missing < len(data) else len(data)
+            rest += data if at == len(data) else data[:at]
+            if len(rest) < self._wanted:
                 return
-            data = bytes(self._rest)
-            self._rest.clear()
-        at, size = 0, len(data)
+            begun = bytes(rest)
+            rest.clear()
+            self._read_frames(begun, 0)
+            if at == len(data):
+                return
+        elif self.opened and self.protocol.current_size is None:
+            message = only_message(data, masked=False, largest=self._largest)
+            if message is not None:  # so it is nearly always, when they do not come in floods
+                self._on_messages([message])
+                return
+        if self._framed:
+            self._read_frames(data, at)
+        else:
+            self._give_library(data[at:])
+
+    def _read_frames(self, data: bytes, at: int) -> None:
+        """Take the frames from ``at`` on; one that is not complete is kept for later."""
+        size = len(data)
         while at < size:
             begun = self.protocol.current_size  # bytes of a message in several frames, None outside of one
             if begun is None and self.opened:

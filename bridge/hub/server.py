@@ -23,7 +23,7 @@ from websockets.http11 import Request
 from websockets.protocol import State
 from websockets.server import ServerProtocol
 
-from bridge.frames import UNKNOWN, UNSOUND, frame_end, unmasked, whole_messages
+from bridge.frames import UNKNOWN, UNSOUND, frame_end, only_message, unmasked, whole_messages
 from bridge.hub.broker import Broker
 from bridge.hub.definitions import RosVersion
 from bridge.hub.door import Door, choose_subprotocol
@@ -250,16 +250,29 @@ class _Connection(asyncio.Protocol):
     def data_received(self, data: bytes) -> None:
         """Do what arrived, to the last answer it causes; but after many frames others have their turn."""
         self._heard = time.monotonic()
+        at, client = 0, self._client
         if self._rest:
             if isinstance(
                 self._rest, bytes
             ):  # a large frame comes in many pieces: they are put together once
                 self._rest = bytearray(self._rest)
-            self._rest += data
+            missing = self._wanted - len(self._rest)
+            at = missing if 0 < missing < len(data) else len(data)
+            self._rest += data if at == len(data) else data[:at]
             if len(self._rest) < self._wanted:
                 return
-            data, self._rest = bytes(self._rest), b""
-        self._work_on(data)
+            begun, self._rest = bytes(self._rest), b""
+            if at == len(data):
+                data, at = begun, 0
+            else:
+                self._take(begun, 0)
+        elif client is not None and self._quick and self._partial is None:
+            message = only_message(data, masked=True, largest=self._hub.limits.message_bytes)
+            if message is not None:  # so it is nearly always, when they do not come in floods
+                self._hub.broker.receive_all(client, [message], self._heard)
+                self._hub.serve()
+                return
+        self._work_on(data, at)
 
     def eof_received(self) -> None:
         """A client that ends its half ends the whole."""
@@ -345,6 +358,7 @@ class _Connection(asyncio.Protocol):
     def _work_on(self, data: bytes, at: int = 0) -> None:
         """Work on a client's bytes for one turn; what is left is for the next, when others had theirs."""
         at = self._take(data, at)
+        self._hub.serve()
         if at < len(data) and not self._transport.is_closing():
             self._transport.pause_reading()
             asyncio.get_running_loop().call_soon(self._go_on, data, at)
@@ -382,7 +396,6 @@ class _Connection(asyncio.Protocol):
                 frames += 1
                 self._hand_over(data[at:end])
                 at = end
-        self._hub.serve()
         return at
 
     def _hand_over(self, data: bytes) -> None:

@@ -59,6 +59,31 @@ def test_a_frame_that_is_not_all_there_is_waited_for(size: int, masked: bool) ->
     assert frames.frame_end(data[:header], 0, masked=masked, largest=1 << 20) == len(data)
 
 
+@pytest.mark.parametrize(
+    ("opcode", "size"),
+    [(opcode, size) for opcode in Opcode for size in SIZES if size < 126 or opcode < Opcode.CLOSE],
+)
+@pytest.mark.parametrize("masked", [True, False])
+def test_one_message_alone_is_found_as_among_others(opcode: Opcode, size: int, masked: bool) -> None:
+    one = Frame(opcode, b"x" * size).serialize(mask=masked)
+    found = frames.whole_messages(one, 0, masked=masked, largest=size)[0]
+    alone = frames.only_message(one, masked=masked, largest=size)
+    assert alone is None or [alone] == found
+    assert (alone is None) is (not found or size > 65_535 or len(one) < 8)
+    assert frames.only_message(one, masked=masked, largest=size - 1) is None
+    assert frames.only_message(one, masked=not masked, largest=size) is None
+    for other in (one[:-1], one + b"\x81", 2 * one):
+        assert frames.only_message(other, masked=masked, largest=1 << 20) is None
+
+
+@given(st.binary(max_size=200), st.booleans(), st.integers(0, 200))
+def test_whatever_comes_means_the_same_alone(rest: bytes, masked: bool, length: int) -> None:
+    for data in (rest, b"\x81" + rest, b"\x81" + bytes((length,)) + rest[: length + 4]):
+        alone = frames.only_message(data, masked=masked, largest=100)
+        if alone is not None:
+            assert frames.whole_messages(data, 0, masked=masked, largest=100) == ([alone], len(data))
+
+
 @pytest.mark.parametrize("masked", [True, False])
 def test_what_is_no_whole_message_is_the_librarys(masked: bool) -> None:
     for opcode in (Opcode.PING, Opcode.PONG, Opcode.CLOSE, Opcode.CONT):
