@@ -17,16 +17,14 @@ from pydantic import ValidationError
 from machines.bm1 import BM1Machine
 from machines.errors import MachineError
 from machines.parameters import REPLICAS_MAX, BM1Parameters, PriorMode, RngKind, SensorMode
-from pcie_shim import register_map
 from pcie_shim.errors import PcieShimError
 from pcie_shim.programming_file import (
     Image,
     Partition,
-    interface_room,
-    interface_words,
     tool_version,
     write_image,
 )
+from toolchain.board_interface import board_interface
 from toolchain.deployment import (
     FILE_NAME,
     Board,
@@ -46,15 +44,11 @@ from toolchain.outputs.output_files import memory_files, quartus_files, write_fi
 from toolchain.outputs.rng_table import random_table
 from toolchain.partition import Block, partition_lines
 from toolchain.quantise import Quantised, quantise
+from toolchain.report import REPORT_NAME, build_report, with_remark
 
 if TYPE_CHECKING:
     from toolchain.models.model import Model
     from toolchain.options import BuildOptions
-
-DEFAULT_INTERFACE: Final = (20, 1200)
-"""Inputs and results of the thesis's PCIe interface (3.2)."""
-
-REPORT_NAME: Final = "report.txt"
 
 _MOST_SEEDS: Final = 1 << 23
 _FLAGS: Final = {"tolerance_s": "--tolerance", "path": "--prior-path"}
@@ -174,104 +168,6 @@ def build_date(model_file: Path) -> str:
     except (ValueError, OverflowError, OSError):
         message = f"SOURCE_DATE_EPOCH is {epoch!r}, expected a number of seconds since 1970"
         raise BuildError(message) from None
-
-
-def board_interface(
-    model: Model,
-    blocks: tuple[Block, ...],
-    given: tuple[int, int] | None,
-    *,
-    sensor_mode: SensorMode = SensorMode.COLUMN,
-    replicas: int = 1,
-) -> tuple[tuple[int, int], str]:
-    """Return the boards' inputs and results, and a clause that says why where they are not the default.
-
-    Args:
-        model: The model.
-        blocks: Its lines on each board.
-        given: Inputs and results that are asked for; None for as many as are needed, the default at least.
-        sensor_mode: Whether cells have inputs of their own.
-        replicas: Machines on each board.
-
-    Raises:
-        BuildError: The model is larger than the interface, or the interface than the register map.
-    """
-    if sensor_mode is not SensorMode.COLUMN or replicas > 1:
-        return _interface_of_many(model, blocks, given, sensor_mode, replicas)
-    sensors, lines = len(model.known), max(block.lines for block in blocks)
-    room = (register_map.SENSORS_WORDS, register_map.RESULTS_WORDS)
-    if sensors > room[0] or lines > room[1]:
-        partitions = -(-model.lines // room[1])
-        message = (
-            f"the model has {sensors} known variables and {lines} lines on a board, but the register map has room "
-            f"for {room[0]} and {room[1]}"
-        )
-        if lines > room[1]:
-            message += f": use --partitions {partitions} or more"
-        raise BuildError(message)
-    if given is None:
-        larger = (max(sensors, DEFAULT_INTERFACE[0]), max(lines, DEFAULT_INTERFACE[1]))
-        if larger == DEFAULT_INTERFACE:
-            return larger, ""
-        return larger, (
-            f", larger than the default {DEFAULT_INTERFACE[0]}x{DEFAULT_INTERFACE[1]}: a board needs {sensors} inputs "
-            f"and {lines} results"
-        )
-    if sensors > given[0] or lines > given[1]:
-        message = (
-            f"the model is larger than the interface {given[0]}x{given[1]}: a board needs {sensors} inputs and "
-            f"{lines} results; use --interface {max(sensors, given[0])}x{max(lines, given[1])} or leave it out"
-        )
-        if lines > given[1]:
-            message += f", or --partitions {-(-model.lines // given[1])}"
-        raise BuildError(message)
-    if given[0] > room[0] or given[1] > room[1]:
-        message = f"the interface {given[0]}x{given[1]} is larger than the register map's {room[0]}x{room[1]}"
-        raise BuildError(message)
-    return given, ", as asked for"
-
-
-def _interface_of_many(
-    model: Model,
-    blocks: tuple[Block, ...],
-    given: tuple[int, int] | None,
-    sensor_mode: SensorMode,
-    replicas: int,
-) -> tuple[tuple[int, int], str]:
-    """The interface of boards with replicas, or with inputs for each cell: those all count."""
-    lines = max(block.lines for block in blocks)
-    # the widths are of no account here, and are what any mode takes
-    board = BM1Parameters(
-        lines=lines, sensor_bits=(8,) * len(model.known), sensor_mode=sensor_mode, replicas=replicas
-    )
-    inputs, results = interface_words(board)
-    room = interface_room(board)
-    made_of = f"{len(model.known)} known variables and {lines} lines on a board" + (
-        f", {replicas} times" if replicas > 1 else ""
-    )
-    needed = f"a board needs {inputs} inputs and {results} results ({made_of})"
-    ways = [
-        *(["more --partitions"] if lines > 1 else []),
-        *(["fewer --replicas"] if replicas > 1 else []),
-    ]
-    instead = f": use {' or '.join(ways)}" if ways else ""
-    if inputs > room[0] or results > room[1]:
-        message = f"{needed}, but the register map has room for {room[0]} and {room[1]}{instead}"
-        raise BuildError(message)
-    if given is None:
-        larger = (max(inputs, DEFAULT_INTERFACE[0]), max(results, DEFAULT_INTERFACE[1]))
-        default = f"{DEFAULT_INTERFACE[0]}x{DEFAULT_INTERFACE[1]}"
-        return larger, "" if larger == DEFAULT_INTERFACE else f", larger than the default {default}: {needed}"
-    if given[0] > room[0] or given[1] > room[1]:
-        message = f"the interface {given[0]}x{given[1]} is larger than the register map's {room[0]}x{room[1]}"
-        raise BuildError(message)
-    if inputs > given[0] or results > given[1]:
-        message = (
-            f"the model is larger than the interface {given[0]}x{given[1]}: {needed}; use --interface "
-            f"{max(inputs, given[0])}x{max(results, given[1])} or leave it out"
-        )
-        raise BuildError(message)
-    return given, ", as asked for"
 
 
 def model_hash(model: Model, quantised: Quantised, parameters: BM1Parameters) -> str:
@@ -492,120 +388,3 @@ def _write(directory: Path, deployment: Deployment, images: tuple[Image, ...]) -
 
 def _not_writable(path: Path, reason: OSError) -> BuildError:
     return BuildError(f"{path} can't be written: {reason.strerror or reason}; choose another folder with -o")
-
-
-def build_report(
-    model: Model, deployment: Deployment, quantised: Quantised, interface_reason: str = ""
-) -> str:
-    """Return what was built and what was lost, in plain sentences; no dates or paths: same input, same bytes."""
-    machine = deployment.machine
-    grid = " x ".join(f"{d.label} {d.size}" for d in model.searched)
-    names = ", ".join(known.name for known in model.known)
-    machine_sentence = (
-        f"Machine: BM1, codes of {machine.prob_bits} bits (scale = {machine.scale}), counters of "
-        f"{machine.counter_bits} bits, stops at a count of {machine.target_count} or after {machine.max_cycles} "
-        f"cycles, stop = {machine.stop}; {machine.rng} with {machine.rng_banks} banks, rng_reset = "
-        f"{machine.rng_reset}, {machine.steps_per_clock} steps a clock."
-    )
-    machine_sentence += many_sentence(machine)
-    paragraphs = [
-        f"Model {model.name}: {model.lines} lines ({grid}), {len(model.known)} known variables"
-        + (f" in the columns' order {names}." if names else "."),
-        *_state_paragraph(model),
-        *_prior_paragraph(model, deployment),
-        machine_sentence,
-        f"Interface: {machine.interface}{interface_reason}.",
-        f"Boards: {len(deployment.boards)}.\n"
-        + "\n".join(
-            f"  {board.image}: lines {board.line_offset} to {board.line_offset + board.lines - 1}, "
-            f"image {board.image_hash[:16]}"
-            for board in deployment.boards
-        ),
-        "Lost by quantising (mass: how often the true line has code 0; KL: of the column's own posterior, bits):\n"
-        + _loss_table(quantised),
-    ]
-    paragraphs += [f"Warning: {warning}" for warning in quantised.warnings]
-    paragraphs.append(f"{_topics_sentence(deployment)} Deployment {deployment.hash[:16]}.")
-    return "\n\n".join(paragraphs) + "\n"
-
-
-def with_remark(report: str, remark: str) -> str:
-    """Return a report that ends with how its options were chosen, where there is something to say about that."""
-    return f"{report}\n{remark}\n" if remark else report
-
-
-def remark_of(report: str) -> str:
-    """Return how the options of a build were chosen, as its report says after the deployment's hash; empty where it does not."""
-    end = re.search(r"Deployment [0-9a-f]{16}\.\n\n(.*)\Z", report, re.DOTALL)
-    return end[1].strip() if end else ""
-
-
-def many_sentence(machine: MachineSection) -> str:
-    """Say what a frame's readings and results are where they are not one number a variable and one posterior."""
-    sentence = {
-        SensorMode.COLUMN: "",
-        SensorMode.CELL: f" Each of the {machine.lines} lines has a reading of its own (sensor_mode = cell).",
-        SensorMode.THRESHOLD: (
-            f" Readings are probabilities, one for each of the {machine.lines} lines (sensor_mode = threshold); there are no "
-            "tables."
-        ),
-    }[machine.sensor_mode]
-    if machine.replicas > 1:
-        sentence += (
-            f" Each board holds {machine.replicas} of these machines around the same generators: a frame brings {machine.replicas} "
-            f"sets of readings and gives {machine.replicas} posteriors."
-        )
-    return sentence
-
-
-def _topics_sentence(deployment: Deployment) -> str:
-    """Say where readings come from (of several topics, which variables) and where posteriors go."""
-    output = deployment.outputs[0]
-    places = [f"{source.uri}, topic {source.topic} ({source.type})" for source in deployment.sources]
-    if len(places) == 1:
-        return f"Readings come from {places[0]}; posteriors go to {output.topic}."
-    for at, place in enumerate(places):
-        names = [variable.name for variable in deployment.variables if variable.source == at]
-        if deployment.prior is not None and deployment.prior.source == at:
-            names.append("the prior")
-        places[at] = f"\n  {place}: {', '.join(names)}"
-    return (
-        f"Readings come from {len(places)} topics, together where their stamps are within "
-        f"{deployment.tolerance_s:g} s:{''.join(places)}\n"
-        f"Posteriors go to {output.topic} on {deployment.output_uri(output)}."
-    )
-
-
-def _state_paragraph(model: Model) -> list[str]:
-    """Say which number, or word, is which state, where values have names."""
-    named = [
-        f"  {name}: " + ", ".join(f"{offset + at * step:g} {state}" for at, state in enumerate(states))
-        for name, offset, step, states in (
-            *((each.label, each.offset, each.step, each.states) for each in model.searched),
-            *((each.name, each.offset, each.step, each.states) for each in model.variables),
-        )
-        if states
-    ]
-    return ["States, as numbers; a reading may be either:\n" + "\n".join(named)] if named else []
-
-
-def _prior_paragraph(model: Model, deployment: Deployment) -> list[str]:
-    if (select := model.prior_select) is not None:
-        return [
-            f"Prior: selected by {select.name}, one of {select.values} rows; a missing reading takes the prior without it."
-        ]
-    if deployment.machine.prior_mode is not PriorMode.WRITTEN:
-        return []
-    if deployment.prior is None:
-        return ["Prior: written by the host; the model's own until it is."]
-    return [f"Prior: written every frame, from {deployment.prior.path} of the message."]
-
-
-def _loss_table(quantised: Quantised) -> str:
-    width = max(len(loss.name) for loss in quantised.losses)
-    rows = [f"  {'column':{max(width, 6)}}  bits  values       mass         KL"]
-    rows += [
-        f"  {loss.name:{max(width, 6)}}  {loss.bits:4d}  {loss.values:6d}  {loss.mass:9.2e}  {loss.kl_bits:9.2e}"
-        for loss in quantised.losses
-    ]
-    return "\n".join(rows)

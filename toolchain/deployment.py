@@ -11,15 +11,13 @@ import hashlib
 import json
 import math
 import re
-from collections import Counter
 from contextlib import suppress
 from enum import StrEnum
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Self, TypeVar
-from urllib.parse import urlsplit
+from typing import TYPE_CHECKING, Any, Final, Literal, Self
 
 import tomli_w
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from machines.parameters import (
     COUNTER_BITS_MAX,
@@ -29,6 +27,22 @@ from machines.parameters import (
     RngKind,
     RngReset,
     SensorMode,
+)
+from toolchain.deployment_fields import (
+    Choice,
+    MessagePath,
+    MessageType,
+    Name,
+    PathOrName,
+    Sequence,
+    Sha256,
+    States,
+    Step,
+    Topic,
+    WebSocketUri,
+    names_differ,
+    states_fit,
+    websocket_uri,
 )
 from toolchain.errors import DamagedDeploymentError, DeploymentError, DeploymentVersionError
 from toolchain.toml_file import parse_toml, read_text, validate
@@ -46,81 +60,7 @@ _HEADER = """\
 # and is guarded by the hash: change the model and build again.
 """
 
-_TYPE = re.compile(r"[A-Za-z]\w*/(?:msg/)?[A-Za-z]\w*")
-_TOPIC = re.compile(r"/?[A-Za-z]\w*(?:/\w+)*")
-_MESSAGE_PATH = re.compile(r"[A-Za-z_][A-Za-z0-9_]*(?:\.[A-Za-z_][A-Za-z0-9_]*|\[[0-9]{1,9}\])*")
 _INTERFACE = re.compile(r"([1-9]\d{0,4})x([1-9]\d{0,5})")
-
-
-def _websocket_uri(uri: str) -> str:
-    try:
-        is_whole = bool(urlsplit(uri).hostname) and urlsplit(uri).port != 0
-    except ValueError:  # a port beyond 65535, half an IPv6 address
-        is_whole = False
-    if not is_whole or not re.fullmatch(r"wss?://[^\s/?#]+\S*", uri):
-        message = f"{uri!r} is no WebSocket URI; expected one like 'ws://robot:9090'"
-        raise ValueError(message)
-    return uri
-
-
-def _topic(topic: str) -> str:
-    if not _TOPIC.fullmatch(topic):
-        message = f"{topic!r} is no topic name; expected one like '/boat/sensors'"
-        raise ValueError(message)
-    if not topic.startswith("/"):
-        message = (
-            f"{topic!r} has no slash at its beginning; write '/{topic}', which means the same on every server"
-        )
-        raise ValueError(message)
-    return topic
-
-
-def _message_type(name: str) -> str:
-    if not _TYPE.fullmatch(name):
-        message = (
-            f"{name!r} is no message type; expected one like 'std_msgs/Float64' or 'std_msgs/msg/Float64'"
-        )
-        raise ValueError(message)
-    return name
-
-
-def _not_zero(step: float) -> float:
-    if step == 0:
-        message = "a step of 0 would give every value the same address"
-        raise ValueError(message)
-    return step
-
-
-def _sha256(text: str) -> str:
-    if not re.fullmatch(r"[0-9a-f]{64}", text):
-        message = f"{text!r} is no SHA-256 hash; expected 64 hexadecimal digits"
-        raise ValueError(message)
-    return text
-
-
-def _message_path(path: str) -> str:
-    if not _MESSAGE_PATH.fullmatch(path):
-        message = f"{path!r} is no place in a message; expected one like 'pose.position.x', 'ranges[3]' or a field's name"
-        raise ValueError(message)
-    return path
-
-
-WebSocketUri = Annotated[str, AfterValidator(_websocket_uri)]
-Topic = Annotated[str, AfterValidator(_topic)]
-MessageType = Annotated[str, AfterValidator(_message_type)]
-MessagePath = Annotated[str, AfterValidator(_message_path)]
-PathOrName = Annotated[str, AfterValidator(lambda path: path and _message_path(path))]
-"""Empty where a variable is searched by its name."""
-Name = Annotated[str, Field(min_length=1, max_length=200)]
-Sha256 = Annotated[str, AfterValidator(_sha256)]
-Step = Annotated[float, AfterValidator(_not_zero)]
-
-Item = TypeVar("Item")
-# TOML has arrays and strings, we keep tuples and enums; what is inside them stays strict.
-Sequence = Annotated[tuple[Item, ...], Field(strict=False)]
-Choice = Annotated[Item, Field(strict=False)]
-# What says nothing is left out of the file and of its hash.
-States = Annotated[tuple[Name, ...], Field(strict=False, exclude_if=lambda states: not states)]
 
 
 class Stop(StrEnum):
@@ -187,7 +127,7 @@ class Variable(_Section):
                 "beside the address of a missing reading"
             )
             raise ValueError(message)
-        _states_fit(self.name, self.states, self.values)
+        states_fit(self.name, self.states, self.values)
         return self
 
 
@@ -202,7 +142,7 @@ class Dimension(_Section):
 
     @model_validator(mode="after")
     def _every_cell_has_a_name(self) -> Self:
-        _states_fit(self.label, self.states, self.size)
+        states_fit(self.label, self.states, self.size)
         return self
 
     def value(self, index: float) -> float:
@@ -316,7 +256,7 @@ class Output(_Section):
     @field_validator("uri")
     @classmethod
     def _uri_or_nothing(cls, uri: str) -> str:
-        return _websocket_uri(uri) if uri else uri
+        return websocket_uri(uri) if uri else uri
 
 
 class DeploymentFile(_Section):
@@ -337,9 +277,9 @@ class DeploymentFile(_Section):
 
     @model_validator(mode="after")
     def _parts_agree(self) -> Self:
-        _names_differ("variable", [variable.name for variable in self.variables])
-        _names_differ("searched", [dimension.label for dimension in self.searched])
-        _names_differ("output", [output.topic for output in self.outputs])
+        names_differ("variable", [variable.name for variable in self.variables])
+        names_differ("searched", [dimension.label for dimension in self.searched])
+        names_differ("output", [output.topic for output in self.outputs])
         for variable in self.variables:
             if variable.source >= len(self.sources):
                 message = (
@@ -586,16 +526,3 @@ def _check_images(deployment: Deployment) -> None:
                 f"{deployment.path} says {board.image_hash[:16]}"
             )
             raise DamagedDeploymentError(message)
-
-
-def _states_fit(name: str, states: tuple[str, ...], size: int) -> None:
-    if states and len(states) != size:
-        message = f"{name} has {size} values, but {len(states)} states are named"
-        raise ValueError(message)
-
-
-def _names_differ(kind: str, names: list[str]) -> None:
-    twice = [name for name, count in Counter(names).items() if count > 1]
-    if twice:
-        message = f"[[{kind}]] has {twice[0]!r} twice; every name must be its own"
-        raise ValueError(message)

@@ -9,15 +9,8 @@ from pydantic import ValidationError
 
 from machines.parameters import SensorMode
 from pcie_shim.programming_file import Image, Partition, read_image
-from toolchain.build import (
-    REPORT_NAME,
-    assemble,
-    board_interface,
-    build_report,
-    refused_option,
-    remark_of,
-    with_remark,
-)
+from toolchain.board_interface import board_interface
+from toolchain.build import assemble, refused_option
 from toolchain.deployment import (
     FILE_NAME,
     Deployment,
@@ -36,6 +29,7 @@ from toolchain.outputs.output_files import (
     write_files,
 )
 from toolchain.partition import partition_lines
+from toolchain.report import REPORT_NAME, build_report, remark_of, with_remark
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

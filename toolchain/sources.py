@@ -8,16 +8,8 @@ from typing import TYPE_CHECKING, Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from toolchain.deployment import (
-    MessagePath,
-    MessageType,
-    Name,
-    Sequence,
-    Source,
-    Topic,
-    WebSocketUri,
-    WrittenPrior,
-)
+from toolchain.deployment import Source, WrittenPrior
+from toolchain.deployment_fields import MessagePath, MessageType, Name, Sequence, Topic, WebSocketUri  # noqa: TC001 - pydantic evaluates annotations
 from toolchain.errors import BuildError
 from toolchain.toml_file import line_of, parse_toml, read_text, validate
 

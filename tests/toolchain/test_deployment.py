@@ -19,7 +19,6 @@ from machines.bm1 import BM1Machine
 from machines.parameters import BM1Parameters
 from pcie_shim.programming_file import Image, Partition, write_image
 from toolchain.deployment import (
-    _MESSAGE_PATH,
     Board,
     Deployment,
     Dimension,
@@ -34,6 +33,7 @@ from toolchain.deployment import (
     load_deployment,
     write_deployment,
 )
+from toolchain.deployment_fields import MESSAGE_PATH
 from toolchain.errors import DamagedDeploymentError, DeploymentError, DeploymentVersionError
 
 
@@ -120,7 +120,7 @@ def deployments(draw):
     return deployment(
         name=draw(NAMES),
         queue=draw(st.sampled_from(list(Queue))),
-        tolerance_s=draw(st.floats(0, 1e9)),
+        tolerance_s=draw(st.floats(0, 86_400)),
         searched=tuple(
             Dimension(label=string.ascii_letters[i], size=size, offset=draw(FLOATS), step=draw(step))
             for i, size in enumerate(sizes)
@@ -128,7 +128,7 @@ def deployments(draw):
         variables=tuple(
             Variable(
                 name=name,
-                path=draw(st.just("") | st.from_regex(_MESSAGE_PATH, fullmatch=True)),
+                path=draw(st.just("") | st.from_regex(MESSAGE_PATH, fullmatch=True)),
                 bits=10,
                 values=draw(st.integers(1, 1023)),
                 period=draw(st.none() | st.integers(1, 1023)),

@@ -11,7 +11,8 @@ from typer.testing import CliRunner
 from bridge.errors import PathError
 from bridge.fields import parse_path
 from toolchain.command import app
-from toolchain.deployment import _MESSAGE_PATH, Variable, deployment_hash, load_deployment, write_deployment
+from toolchain.deployment import Variable, deployment_hash, load_deployment, write_deployment
+from toolchain.deployment_fields import MESSAGE_PATH
 from toolchain.errors import BuildError
 from toolchain.sources import read_sources
 
@@ -209,14 +210,14 @@ def test_flags_that_say_the_same(tmp_path, written, flags, said):
     assert said in result.stderr
 
 
-@given(st.text(st.sampled_from("ab_3[].x-"), max_size=12) | st.from_regex(_MESSAGE_PATH, fullmatch=True))
+@given(st.text(st.sampled_from("ab_3[].x-"), max_size=12) | st.from_regex(MESSAGE_PATH, fullmatch=True))
 def test_a_place_is_what_the_subscriber_takes(path):
     try:
         parse_path(path)
         taken = True
     except PathError:
         taken = False
-    assert bool(_MESSAGE_PATH.fullmatch(path)) == taken
+    assert bool(MESSAGE_PATH.fullmatch(path)) == taken
 
 
 def test_many_sources_are_too_many(written):

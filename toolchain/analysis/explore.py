@@ -18,7 +18,8 @@ from toolchain.analysis.emulation import EmulatedBoards, one_replica, split
 from toolchain.analysis.readings import check_frames, readings_of_lines, sample_readings
 from toolchain.analysis.resources import Pcie, estimate
 from toolchain.analysis.sweep_results import Point
-from toolchain.build import DEFAULT_INTERFACE, board_interface, check_options, machine_parameters
+from toolchain.board_interface import DEFAULT_INTERFACE, board_interface
+from toolchain.build import check_options, machine_parameters
 from toolchain.errors import BuildError
 from toolchain.options import BuildOptions, Scale
 from toolchain.outputs.rng_table import random_table

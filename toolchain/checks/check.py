@@ -15,7 +15,8 @@ import numpy as np
 from machines.errors import MachineError
 from machines.parameters import PriorMode, SensorMode
 from pcie_shim.errors import PcieShimError
-from toolchain.build import assemble, board_interface, machine_parameters
+from toolchain.board_interface import board_interface
+from toolchain.build import assemble, machine_parameters
 from toolchain.checks.checked_machine import CheckedMachine
 from toolchain.checks.finding import Finding, Severity
 from toolchain.checks.generators import generator_findings

@@ -11,18 +11,13 @@ from machines.errors import MachineError
 from machines.parameters import RngKind
 from toolchain.analysis.boards_needed import boards_needed
 from toolchain.analysis.device import device_named
-from toolchain.build import (
-    DEFAULT_INTERFACE,
-    REPORT_NAME,
-    build_date,
-    build_deployment,
-    check_options,
-    machine_parameters,
-)
+from toolchain.board_interface import DEFAULT_INTERFACE
+from toolchain.build import build_date, build_deployment, check_options, machine_parameters
 from toolchain.commands.named_model import model_file, read_model
 from toolchain.deployment import parse_interface
 from toolchain.errors import BuildError
 from toolchain.outputs.rng_table import read_table
+from toolchain.report import REPORT_NAME
 from toolchain.sources import read_sources
 
 if TYPE_CHECKING:

@@ -76,7 +76,8 @@ def inspect_(
     with one_sentence():
         from toolchain.analysis.resources import Pcie
         from toolchain.commands.explore import counting
-        from toolchain.commands.inspect import InspectOptions, as_json, inspect, report
+        from toolchain.commands.inspect import InspectOptions, inspect
+        from toolchain.commands.inspection_report import as_json, report
         from toolchain.commands.named_model import NetworkQuestion
 
         options = InspectOptions(

@@ -8,9 +8,8 @@ the path that joins two known symbols.
 from __future__ import annotations
 
 import math
-from collections import deque
-from dataclasses import dataclass, field, replace
-from itertools import combinations, pairwise
+from dataclasses import dataclass, field
+from itertools import combinations
 from typing import TYPE_CHECKING, Final, TypeAlias
 
 import numpy as np
@@ -19,9 +18,10 @@ from toolchain.errors import ModelError
 from toolchain.models.distribution import MAX_ENTRIES, Distribution, Factor
 from toolchain.models.elimination import Term, eliminate, product, reduced
 from toolchain.models.model import Known, Model, Normal, PriorSelect, dimension
+from toolchain.models.separation import Links, relevant, without_idle
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -166,7 +166,7 @@ class Question:
                 impossible, or needs a table above the limit.
         """
         observed = [symbol.name for symbol in self.observed]
-        active = [_without_idle(factor) for factor in self.joint.factors]
+        active = [without_idle(factor) for factor in self.joint.factors]
         factors, terms = self._factors(active, observed)
         searched = [symbol.name for symbol in self.searched]
         sizes = {symbol.name: symbol.size for symbol in self.joint.symbols}
@@ -178,7 +178,7 @@ class Question:
                 f"most is {MAX_ENTRIES}: search fewer variables"
             )
             raise ModelError(message)
-        links = _Links(terms, factors, {*searched, *self.given})
+        links = Links(terms, factors, {*searched, *self.given})
         if links.joined(observed):
             raise self._refusal(active, observed)
         own: dict[str, list[Term]] = {symbol.name: [] for symbol in self.observed}
@@ -197,7 +197,7 @@ class Question:
     def _factors(self, active: Sequence[Factor], observed: Sequence[str]) -> tuple[list[Factor], list[Term]]:
         """Return what matters for some observed symbols, and the same as terms with what is given put in."""
         asked = {symbol.name for symbol in self.searched} | set(observed) | set(self.given)
-        factors = _relevant(active, asked)
+        factors = relevant(active, asked)
         terms = [
             reduced(Term(tuple(symbol.name for symbol in factor.scope), factor.table), self.given)
             for factor in factors
@@ -213,7 +213,7 @@ class Question:
         found: tuple[list[str], str] | None = None
         for one, other in combinations(observed, 2):
             factors, terms = self._factors(active, [one, other])
-            links = _Links(terms, factors, cut)
+            links = Links(terms, factors, cut)
             path = links.path(one, other)
             if path and (found is None or len(path) < len(found[0])):
                 found = path, links.drawn(path)
@@ -301,106 +301,6 @@ class Question:
             for values in (factor.normal.mean, factor.normal.sigma)
         )
         return Normal(mean=mean, sigma=sigma, floor=factor.normal.floor, outliers=factor.normal.outliers)
-
-
-class _Links:
-    """Which symbols stand in a factor together, what is searched and given being cut out: the question's shape.
-
-    After cutting, symbols of different components are independent given what was cut (the moral graph's criterion).
-    """
-
-    def __init__(self, terms: Sequence[Term], factors: Sequence[Factor], cut: set[str]) -> None:
-        self._neighbours: dict[str, dict[str, Factor]] = {}
-        for term, factor in zip(terms, factors, strict=True):
-            inside = [name for name in term.scope if name not in cut]
-            for name in inside:
-                beside = self._neighbours.setdefault(name, {})
-                for other in inside:
-                    # A distribution that has one as the other's parent says more than a common child does.
-                    if other != name and (other not in beside or _is_arc(factor, name, other)):
-                        beside[other] = factor
-
-    def components(self) -> list[set[str]]:
-        """Return the sets of symbols that are joined, in a fixed order."""
-        left = dict.fromkeys(self._neighbours)
-        found = []
-        while left:
-            component = set(self._paths_from(next(iter(left))))
-            found.append(component)
-            left = {name: None for name in left if name not in component}
-        return found
-
-    def joined(self, observed: Sequence[str]) -> bool:
-        """Return whether two of some symbols are joined."""
-        return any(len(component.intersection(observed)) > 1 for component in self.components())
-
-    def path(self, start: str, end: str) -> list[str]:
-        """Return the shortest path between two symbols; empty where they are not joined."""
-        return self._paths_from(start).get(end, [])
-
-    def _paths_from(self, start: str) -> dict[str, list[str]]:
-        paths = {start: [start]}
-        waiting = deque([start])
-        while waiting:
-            name = waiting.popleft()
-            for other in self._neighbours.get(name, ()):
-                if other not in paths:
-                    paths[other] = [*paths[name], other]
-                    waiting.append(other)
-        return paths
-
-    def drawn(self, path: Sequence[str]) -> str:
-        """Return a path as arrows; a common child stands between its two parents."""
-        text = path[0]
-        for before, after in pairwise(path):
-            factor = self._neighbours[before][after]
-            if not isinstance(factor, Distribution):
-                text += f" -- {after}"
-            elif factor.symbol.name == after:
-                text += f" -> {after}"
-            elif factor.symbol.name == before:
-                text += f" <- {after}"
-            else:
-                text += f" -> {factor.symbol.name} <- {after}"
-        return text
-
-
-def _is_arc(factor: Factor, name: str, other: str) -> bool:
-    return isinstance(factor, Distribution) and factor.symbol.name in {name, other}
-
-
-def _relevant(factors: Iterable[Factor], asked: set[str]) -> list[Factor]:
-    """Leave out what sums to 1: distributions of symbols that nothing left depends on and nobody asks for."""
-    left = list(factors)
-    uses: dict[str, int] = {}
-    for factor in left:
-        for symbol in factor.scope:
-            uses[symbol.name] = uses.get(symbol.name, 0) + 1
-    while True:
-        kept: list[Factor] = []
-        for factor in left:
-            name = factor.symbol.name if isinstance(factor, Distribution) else ""
-            if isinstance(factor, Distribution) and name not in asked and uses[name] == 1:
-                for symbol in factor.scope:
-                    uses[symbol.name] -= 1
-            else:
-                kept.append(factor)
-        if len(kept) == len(left):
-            return kept
-        left = kept
-
-
-def _without_idle(factor: Factor) -> Factor:
-    """Return the factor without the symbols that change nothing in it: an arc in name alone joins nothing."""
-    scope, table = list(factor.scope), factor.table
-    for axis in range(len(scope) - 1, 0, -1):
-        first = np.take(table, [0], axis=axis)
-        if np.array_equal(np.broadcast_to(first, table.shape), table):
-            table = first.squeeze(axis=axis)
-            del scope[axis]
-    if isinstance(factor, Distribution):
-        return replace(factor, given=tuple(scope[1:]), table=table, normal=None)
-    return replace(factor, scope=tuple(scope), table=table)
 
 
 def _given_line(

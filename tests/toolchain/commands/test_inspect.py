@@ -7,7 +7,8 @@ from typer.testing import CliRunner
 
 from toolchain.build import build_deployment
 from toolchain.command import app
-from toolchain.commands.inspect import _unit, machines_of
+from toolchain.commands.inspect import machines_of
+from toolchain.commands.inspection_report import _unit
 from toolchain.deployment import load_deployment
 
 MODEL = """

@@ -1,0 +1,113 @@
+"""What a key of `deployment.toml` may hold: URIs, topics, types, paths in a message, names, hashes."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from typing import Annotated, TypeVar
+from urllib.parse import urlsplit
+
+from pydantic import AfterValidator, Field
+
+_TYPE = re.compile(r"[A-Za-z]\w*/(?:msg/)?[A-Za-z]\w*")
+_TOPIC = re.compile(r"/?[A-Za-z]\w*(?:/\w+)*")
+MESSAGE_PATH = re.compile(r"[A-Za-z_][A-Za-z0-9_]*(?:\.[A-Za-z_][A-Za-z0-9_]*|\[[0-9]{1,9}\])*")
+
+
+def websocket_uri(uri: str) -> str:
+    """Return a WebSocket's URI.
+
+    Raises:
+        ValueError: It is none.
+    """
+    try:
+        is_whole = bool(urlsplit(uri).hostname) and urlsplit(uri).port != 0
+    except ValueError:  # a port beyond 65535, half an IPv6 address
+        is_whole = False
+    if not is_whole or not re.fullmatch(r"wss?://[^\s/?#]+\S*", uri):
+        message = f"{uri!r} is no WebSocket URI; expected one like 'ws://robot:9090'"
+        raise ValueError(message)
+    return uri
+
+
+def _topic(topic: str) -> str:
+    if not _TOPIC.fullmatch(topic):
+        message = f"{topic!r} is no topic name; expected one like '/boat/sensors'"
+        raise ValueError(message)
+    if not topic.startswith("/"):
+        message = (
+            f"{topic!r} has no slash at its beginning; write '/{topic}', which means the same on every server"
+        )
+        raise ValueError(message)
+    return topic
+
+
+def _message_type(name: str) -> str:
+    if not _TYPE.fullmatch(name):
+        message = (
+            f"{name!r} is no message type; expected one like 'std_msgs/Float64' or 'std_msgs/msg/Float64'"
+        )
+        raise ValueError(message)
+    return name
+
+
+def _not_zero(step: float) -> float:
+    if step == 0:
+        message = "a step of 0 would give every value the same address"
+        raise ValueError(message)
+    return step
+
+
+def _sha256(text: str) -> str:
+    if not re.fullmatch(r"[0-9a-f]{64}", text):
+        message = f"{text!r} is no SHA-256 hash; expected 64 hexadecimal digits"
+        raise ValueError(message)
+    return text
+
+
+def _message_path(path: str) -> str:
+    if not MESSAGE_PATH.fullmatch(path):
+        message = f"{path!r} is no place in a message; expected one like 'pose.position.x', 'ranges[3]' or a field's name"
+        raise ValueError(message)
+    return path
+
+
+WebSocketUri = Annotated[str, AfterValidator(websocket_uri)]
+Topic = Annotated[str, AfterValidator(_topic)]
+MessageType = Annotated[str, AfterValidator(_message_type)]
+MessagePath = Annotated[str, AfterValidator(_message_path)]
+PathOrName = Annotated[str, AfterValidator(lambda path: path and _message_path(path))]
+"""Empty where a variable is searched by its name."""
+Name = Annotated[str, Field(min_length=1, max_length=200)]
+Sha256 = Annotated[str, AfterValidator(_sha256)]
+Step = Annotated[float, AfterValidator(_not_zero)]
+
+Item = TypeVar("Item")
+# TOML has arrays and strings, we keep tuples and enums; what is inside them stays strict.
+Sequence = Annotated[tuple[Item, ...], Field(strict=False)]
+Choice = Annotated[Item, Field(strict=False)]
+# What says nothing is left out of the file and of its hash.
+States = Annotated[tuple[Name, ...], Field(strict=False, exclude_if=lambda states: not states)]
+
+
+def states_fit(name: str, states: tuple[str, ...], size: int) -> None:
+    """Refuse names of a variable's values that are not as many as these.
+
+    Raises:
+        ValueError: Says whose, and how many.
+    """
+    if states and len(states) != size:
+        message = f"{name} has {size} values, but {len(states)} states are named"
+        raise ValueError(message)
+
+
+def names_differ(kind: str, names: list[str]) -> None:
+    """Refuse a name that several entries of a kind have.
+
+    Raises:
+        ValueError: Says which.
+    """
+    twice = [name for name, count in Counter(names).items() if count > 1]
+    if twice:
+        message = f"[[{kind}]] has {twice[0]!r} twice; every name must be its own"
+        raise ValueError(message)
