@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 
     from toolchain.models.model import Known, Model
 
+_ROUNDING: Final = 1e-12
+"""A divergence below it, in bits, is that of float64 from itself."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ColumnLoss:
@@ -34,7 +37,7 @@ class ColumnLoss:
         mass: Share of P(S, K) that lies in cells whose code became 0: how often a reading meets such a cell
             on the true line.
         kl_bits: Divergence of the column's own posterior from the exact one, KL(Q(S | k) || P(S | k)) in bits,
-            the expectation over k. (The other way round it would be infinite wherever a tail became 0.)
+            the expectation over k; all lines read the same k. (The other way round it would be infinite wherever a tail became 0.)
         dead_values: Served addresses that are possible, but have code 0 on every line.
     """
 
@@ -237,7 +240,7 @@ def _loss(name: str, bits: int, exact: NDArray[np.float64], quantised: NDArray[n
         bits=bits,
         values=len(exact),
         mass=float(exact[quantised == 0].sum()),
-        kl_bits=max(0.0, float(weight[alive] @ divergence)),
+        kl_bits=kl_bits if (kl_bits := float(weight[alive] @ divergence)) > _ROUNDING else 0.0,
         dead_values=int(np.count_nonzero((weight > 0) & (remaining == 0))),
     )
 

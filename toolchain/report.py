@@ -22,6 +22,7 @@ def build_report(
     machine = deployment.machine
     grid = " x ".join(f"{d.label} {d.size}" for d in model.searched)
     names = ", ".join(known.name for known in model.known)
+    count = f"{len(model.known)} known variable{'s' if len(model.known) != 1 else ''}"
     machine_sentence = (
         f"Machine: BM1, codes of {machine.prob_bits} bits (scale = {machine.scale}), counters of "
         f"{machine.counter_bits} bits, stops at a count of {machine.target_count} or after {machine.max_cycles} "
@@ -30,8 +31,8 @@ def build_report(
     )
     machine_sentence += many_sentence(machine)
     paragraphs = [
-        f"Model {model.name}: {model.lines} lines ({grid}), {len(model.known)} known variables"
-        + (f" in the columns' order {names}." if names else "."),
+        f"Model {model.name}: {model.lines} lines ({grid}), {count}"
+        + (f" in the columns' order {names}." if len(model.known) > 1 else f", {names}." if names else "."),
         *_state_paragraph(model),
         *_prior_paragraph(model, deployment),
         machine_sentence,
@@ -42,8 +43,7 @@ def build_report(
             f"image {board.image_hash[:16]}"
             for board in deployment.boards
         ),
-        "Lost by quantising (mass: how often the true line has code 0; KL: of the column's own posterior, bits):\n"
-        + _loss_table(quantised),
+        loss_heading(machine.sensor_mode) + "\n" + _loss_table(quantised),
     ]
     paragraphs += [f"Warning: {warning}" for warning in quantised.warnings]
     paragraphs.append(f"{_topics_sentence(deployment)} Deployment {deployment.hash[:16]}.")
@@ -59,6 +59,14 @@ def remark_of(report: str) -> str:
     """Return how the options of a build were chosen, as its report says after the deployment's hash; empty where it does not."""
     end = re.search(r"Deployment [0-9a-f]{16}\.\n\n(.*)\Z", report, re.DOTALL)
     return end[1].strip() if end else ""
+
+
+def loss_heading(sensor_mode: SensorMode) -> str:
+    """Say what the figures of a column's loss are."""
+    posterior = "the column's own posterior"
+    if sensor_mode is SensorMode.CELL:
+        posterior += " where all lines read the same"
+    return f"Lost by quantising (mass: how often the true line has code 0; KL: of {posterior}, bits):"
 
 
 def many_sentence(machine: MachineSection) -> str:

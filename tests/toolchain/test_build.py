@@ -214,7 +214,7 @@ def test_the_report_has_loss_and_warnings(tmp_path):
     line = Model(name="line", searched=(interval("x", -0.5, 39.5, cells=40),), known=(known,))
     built = build_deployment(line, tmp_path, OPTIONS)
     assert built.report == (tmp_path / "report.txt").read_text()
-    assert "Model line: 40 lines (x 40), 1 known variables in the columns' order D." in built.report
+    assert "Model line: 40 lines (x 40), 1 known variable, D." in built.report
     assert "Warning: Variable D: its outlier floor of 0.001 vanishes" in built.report
     assert f"{built.quantised.losses[1].mass:.2e}" in built.report
     assert str(tmp_path) not in built.report

@@ -424,7 +424,7 @@ def test_inspect_explains_such_a_deployment(tmp_path, mode):
     else:
         assert looked.exit_code == 0, looked.output
         assert "Each board holds 3 of these machines around the same generators" in looked.stdout
-        assert "5 frames, each with readings for 3 replicas" in looked.stdout
+        assert "5 frames of readings for 3 replicas, drawn from" in looked.stdout
         assert "A frame is 3 posteriors and ends with the last of them" in looked.stdout
     named = runner.invoke(
         app, ["inspect", str(out), "--frames", "5", "--model", str(tmp_path / "disparity"), "--json"]

@@ -261,7 +261,7 @@ def _readings(
         )
         raise BuildError(message)
     scale = Scale(deployment.machine.scale)
-    of_each = f", each with readings for {replicas} replicas" if replicas > 1 else ""
+    of_each = f" of readings for {replicas} replicas," if replicas > 1 else ""
     if model is not None:
         source = f"{frames} frames{of_each} drawn from the model (seed {options.seed})"
         drawn = sample_readings(model, frames * replicas, seed=options.seed, source=source)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from toolchain.analysis.energy import ASSUMPTIONS
 from toolchain.analysis.resources import Pcie
-from toolchain.report import many_sentence
+from toolchain.report import loss_heading, many_sentence
 
 if TYPE_CHECKING:
     from toolchain.analysis.accuracy import Difference, Interval
@@ -76,7 +76,7 @@ def _loss_part(found: Inspection) -> str:
         return found.reported_losses or "Lost by quantising: unknown here; name the model with --model."
     width = max(6, *(len(loss.name) for loss in found.losses))
     rows = [
-        "Lost by quantising (mass: how often the true line has code 0; KL: of the column's own posterior, bits):",
+        loss_heading(found.machine.parameters.sensor_mode),
         f"  {'column':{width}}       mass         KL",
     ]
     rows += [f"  {loss.name:{width}}  {loss.mass:9.2e}  {loss.kl_bits:9.2e}" for loss in found.losses]
