@@ -14,7 +14,7 @@ from rich.live import Live
 from rich.text import Text
 
 from bridge.client import State, connect
-from bridge.errors import BadResultError, NoResultError
+from bridge.errors import BadResultError, LabelError, NoResultError
 from bridge.posteriors import posteriors
 from bridge.results import RESULTS_TOPIC, Heard, Posterior
 from services import options
@@ -30,6 +30,8 @@ from toolchain.deployment import Deployment
 _QUEUE_SIZE: Final = 1024
 """Frames that may wait for a slow terminal or a slow disk."""
 _PICTURES_A_SECOND: Final = 10
+_REPLICAS: Final = 4
+"""Replicas of which a line says something; a file has all."""
 _WORDS: Final = 7
 """Lines of a terminal that are left for what is said beside a picture."""
 
@@ -41,19 +43,40 @@ def line(heard: Heard, axes: list[Axis]) -> str:
     number = "-" if heard.number is None else str(heard.number)
     if not isinstance(heard, Posterior):
         return f"frame {number}: {heard.outcome if heard.outcome.isprintable() else repr(heard.outcome)}"
-    best = heard.best()
-    where = ", ".join(f"{printable(axis.label)} {axis.shown(best[axis.label])}" for axis in axes)
-    parts = [f"frame {number}: {where} with {heard.probability:.3g}"]
-    if means := [axis for axis in axes if not axis.has_states]:
-        mean = heard.mean()
-        parts.append(
-            "mean " + ", ".join(f"{printable(axis.label)} {axis.shown(mean[axis.label])}" for axis in means)
-        )
+    if heard.replicas > 1:  # each has a posterior of its own: nothing is to be said of all
+        parts = [f"frame {number}: {heard.replicas} replicas"]
+        parts += [_of_replica(heard, at, axes[1:]) for at in range(min(heard.replicas, _REPLICAS))]
+        if heard.replicas > _REPLICAS:
+            parts.append(f"and {heard.replicas - _REPLICAS} more")
+    else:
+        parts = [f"frame {number}: {_best(heard, axes)}", *_means(heard, axes)]
     if heard.cycles is not None:
         parts.append(f"{heard.cycles} cycles")
     if heard.latency_us is not None:
         parts.append(f"{heard.latency_us / 1000:.2f} ms")
     return "; ".join(parts)
+
+
+def _best(posterior: Posterior, axes: list[Axis]) -> str:
+    best = posterior.best()
+    where = ", ".join(f"{printable(axis.label)} {axis.shown(best[axis.label])}" for axis in axes)
+    return f"{where} with {posterior.probability:.3g}"
+
+
+def _means(posterior: Posterior, axes: list[Axis]) -> list[str]:
+    """One part of a line, or none where nothing has a mean."""
+    numbers = [axis for axis in axes if not axis.has_states]
+    mean = posterior.mean() if numbers else {}
+    shown = ", ".join(f"{printable(axis.label)} {axis.shown(mean[axis.label])}" for axis in numbers)
+    return [f"mean {shown}"] if shown else []
+
+
+def _of_replica(heard: Posterior, at: int, axes: list[Axis]) -> str:
+    try:
+        one = heard.replica(at)
+    except LabelError:
+        return f"replica {at} no posterior"
+    return f"replica {at} {_best(one, axes)}"
 
 
 class _Told:

@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -63,6 +64,16 @@ class TestLine:
         assert line(posterior, axes_of(posterior, None)) == (
             "frame 7: y 1, x 2 with 0.5; mean y 0.75, x 1.5; 812 cycles; 3.21 ms"
         )
+
+    def test_replicas_have_a_posterior_each(self):
+        posterior = made([[0, 0, 1], [0, 0, 0], [1, 2, 1]], "replica", "x")
+        posterior = replace(posterior, probabilities=(0, 0, 1, 0, 0, 0, 0.25, 0.5, 0.25))
+        assert line(posterior, axes_of(posterior, None)) == (
+            "frame 7: 3 replicas; replica 0 x 2 with 1; replica 1 no posterior; replica 2 x 1 with 0.5; "
+            "812 cycles; 3.21 ms"
+        )
+        many = replace(posterior, probabilities=(1.0,) * 200, sizes=(200, 1))
+        assert "replica 3 x 0 with 1; and 196 more; 812 cycles" in line(many, axes_of(many, None))
 
     def test_values_in_their_units(self):
         posterior = made([[0, 0, 1], [1, 0, 2]], "y", "x")
