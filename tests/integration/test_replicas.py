@@ -110,6 +110,7 @@ def wanted(deployment, message, number):
         target_count=machine.target_count,
         max_cycles=machine.max_cycles,
         bank=number % machine.rng_banks,
+        stop="own" if machine.stop == "own" else "slices",
     )
     images = [read_image(deployment.image_path(at)) for at in range(len(deployment.boards))]
     return expected_of_replicas(images, frame)
@@ -133,12 +134,17 @@ async def answer(robot, message):
 @pytest.mark.parametrize(
     ("options", "flags"),
     [
-        (("--replicas", "3"), ()),
+        (("--replicas", "3", "--stop", "own", "--partitions", "2"), ()),
         (("--sensor-mode", "cell", "--partitions", "2"), ()),
         (("--sensor-mode", "cell", "--replicas", "3", "--partitions", "2"), ("--fused",)),
         (("--sensor-mode", "threshold", "--replicas", "3"), ()),
     ],
-    ids=["three replicas", "cells on two boards", "replicas of cells on two boards", "thresholds"],
+    ids=[
+        "three replicas, each board by itself",
+        "cells on two boards",
+        "replicas of cells on two boards",
+        "thresholds",
+    ],
 )
 async def test_what_is_published_is_what_the_machines_count(stage, tmp_path, options, flags):
     deployment = load_deployment(built(tmp_path / "disparity", *options))
