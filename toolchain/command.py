@@ -116,13 +116,7 @@ def build(
             queue=queue,
             tolerance_s=tolerance,
         )
-        question = NetworkQuestion(
-            searched=searched,
-            known=known,
-            given=tuple(given or ()),
-            prior_select=prior_select,
-            on_missing=on_missing.value,
-        )
+        question = NetworkQuestion.of_flags(searched, known, given, prior_select, on_missing)
         unread = Unread(
             settings=tuple(settings or ()),
             bits=tuple(bits or ()),
@@ -198,13 +192,7 @@ def check(
             sensor_mode=sensor_mode,
             replicas=replicas,
         )
-        question = NetworkQuestion(
-            searched=searched,
-            known=known,
-            given=tuple(given or ()),
-            prior_select=prior_select,
-            on_missing=on_missing.value,
-        )
+        question = NetworkQuestion.of_flags(searched, known, given, prior_select, on_missing)
         unread = Unread(
             settings=tuple(settings or ()),
             bits=tuple(bits or ()),

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any, TypeVar, get_args
 
 from pydantic import BaseModel, ValidationError
 
+from toolchain.bounded_file import read_bounded
+
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
@@ -31,13 +33,7 @@ def read_text(path: Path, error: type[ToolchainError]) -> str:
     Raises:
         error: The file is not there, not readable, too large or not UTF-8.
     """
-    try:
-        with path.open("rb") as file:
-            data = file.read(_MOST_BYTES + 1)
-    except OSError as reason:
-        raise error(f"{path}: {reason.strerror or reason}") from None
-    if len(data) > _MOST_BYTES:
-        raise error(f"{path} is larger than {_MOST_BYTES} bytes: not a configuration file")
+    data = read_bounded(path, _MOST_BYTES, error, "not a configuration file")
     try:
         return data.decode()
     except UnicodeDecodeError as reason:

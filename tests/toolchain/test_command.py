@@ -78,7 +78,10 @@ def test_same_input_same_bytes_though_time_passes(case):
             ["--rng-table", "a.mif"],
             "error: --rng-table is what --rng table plays, but this is --rng lfsr32\n",
         ),
-        (["--rng", "table", "--rng-table", "/no.mif"], "error: /no.mif: No such file or directory\n"),
+        (
+            ["--rng", "table", "--rng-table", "/no.mif"],
+            "error: /no.mif can't be read: No such file or directory\n",
+        ),
         (
             ["--sensor-mode", "cell", "--scale", "address"],
             "error: --scale address does not go with --sensor-mode cell: lines look at different addresses",

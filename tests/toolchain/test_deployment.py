@@ -315,7 +315,7 @@ def test_no_deployment(tmp_path):
         (b"", "format"),
         (b"\xff\xfe", "line 1: not UTF-8"),
         (b"a = 1\n\nb = [", "line 3"),
-        (b"#" * (5 << 20), "larger"),
+        (b"#" * (5 << 20), "has more than 4194304 bytes"),
     ],
 )
 def test_what_is_no_deployment_at_all(folder, content, word):

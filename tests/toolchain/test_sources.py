@@ -192,7 +192,7 @@ def test_no_server(written):
 
 
 def test_no_file(tmp_path):
-    with pytest.raises(BuildError, match=r"sources.toml: No such file"):
+    with pytest.raises(BuildError, match=r"sources.toml can't be read: No such file"):
         read_sources(tmp_path / "sources.toml", None)
 
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 import os
-from contextlib import suppress
 from typing import TYPE_CHECKING, Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from toolchain.bounded_file import read_bounded
 from toolchain.errors import BuildError
 
 if TYPE_CHECKING:
@@ -89,15 +89,8 @@ class Results:
         self.path = path
         self.points: dict[str, Point] = {}
         content = b""
-        try:
-            with suppress(FileNotFoundError), path.open("rb") as file:
-                content = file.read(MAX_FILE_BYTES + 1)
-        except OSError as reason:
-            message = f"{path} can't be read: {reason.strerror or reason}"
-            raise BuildError(message) from None
-        if len(content) > MAX_FILE_BYTES:
-            message = f"{path} has more than {MAX_FILE_BYTES} bytes: it is no file of results"
-            raise BuildError(message)
+        if path.exists():
+            content = read_bounded(path, MAX_FILE_BYTES, BuildError, "it is no file of results")
         lines = content.split(b"\n")
         # A power cut in the middle of a line leaves a last line without its end: that point is measured again.
         torn = lines.pop()

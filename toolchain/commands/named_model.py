@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, Self
 
 from machines.parameters import ADDRESS_BITS_MAX
 from toolchain.errors import BuildError
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from toolchain.models.model import Model
+    from toolchain.options import OnMissing
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -35,6 +36,19 @@ class NetworkQuestion:
     given: tuple[str, ...] = ()
     prior_select: str = ""
     on_missing: Literal["error", "missing"] = "error"
+
+    @classmethod
+    def of_flags(
+        cls, searched: str, known: str, given: list[str] | None, prior_select: str, on_missing: OnMissing
+    ) -> Self:
+        """Return what the five flags of a command say."""
+        return cls(
+            searched=searched,
+            known=known,
+            given=tuple(given or ()),
+            prior_select=prior_select,
+            on_missing=on_missing.value,
+        )
 
     @property
     def flags(self) -> list[str]:

@@ -56,13 +56,7 @@ def memories(
         from toolchain.errors import BuildError
         from toolchain.regenerate import regenerate_memories
 
-        question = NetworkQuestion(
-            searched=searched,
-            known=known,
-            given=tuple(given or ()),
-            prior_select=prior_select,
-            on_missing=on_missing.value,
-        )
+        question = NetworkQuestion.of_flags(searched, known, given, prior_select, on_missing)
         if model is None:
             if settings or question.flags:
                 message = f"{'--set' if settings else question.flags[0]} belongs to a model: add --model"

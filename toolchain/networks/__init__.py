@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
 
+from toolchain.bounded_file import read_bounded
 from toolchain.errors import ModelError, NetworkFileError
 
 if TYPE_CHECKING:
@@ -39,15 +40,7 @@ def read_network(path: Path, *, on_missing: Literal["error", "missing"] = "error
 
     path = Path(path)
     reader = _reader(path)
-    try:
-        with path.open("rb") as file:
-            data = file.read(MAX_BYTES + 1)
-    except OSError as reason:
-        message = f"{path} can't be read: {reason.strerror or reason}"
-        raise NetworkFileError(message) from None
-    if len(data) > MAX_BYTES:
-        message = f"{path} is larger than {MAX_BYTES} bytes, the most that is read"
-        raise NetworkFileError(message)
+    data = read_bounded(path, MAX_BYTES, NetworkFileError, "the most that is read of a network")
     builder = NetworkBuilder(path, on_missing=on_missing)
     reader(data, builder)
     try:

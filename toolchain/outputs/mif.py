@@ -10,6 +10,7 @@ import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, NoReturn
 
+from toolchain.bounded_file import read_bounded
 from toolchain.errors import MifError
 
 if TYPE_CHECKING:
@@ -96,15 +97,7 @@ def read_mif(path: Path) -> Mif:
     Raises:
         MifError: The file can't be read, or is no MIF; says where and what was expected.
     """
-    try:
-        with path.open("rb") as file:
-            data = file.read(MOST_BYTES + 1)
-    except OSError as reason:
-        message = f"{path}: {reason.strerror or reason}"
-        raise MifError(message) from None
-    if len(data) > MOST_BYTES:
-        message = f"{path} is larger than {MOST_BYTES} bytes: no memory of this project"
-        raise MifError(message)
+    data = read_bounded(path, MOST_BYTES, MifError, "no memory of this project")
     return parse_mif(data.decode("latin-1"), str(path))
 
 

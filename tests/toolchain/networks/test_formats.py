@@ -345,7 +345,7 @@ def test_a_file_above_the_limit(tmp_path):
     path = tmp_path / "long.bif"
     with path.open("wb") as file:
         file.truncate(MAX_BYTES + 1)
-    with pytest.raises(NetworkFileError, match="larger than 33554432 bytes"):
+    with pytest.raises(NetworkFileError, match="has more than 33554432 bytes"):
         read_network(path)
 
 
