@@ -79,14 +79,9 @@ class Known:
         Raises:
             ModelError: The table is no conditional distribution, or the addresses don't fit.
         """
-        table = np.array(self.table, dtype=np.float64)
-        if table.ndim != 2 or 0 in table.shape:
-            message = f"P({self.name} | S) has shape {table.shape}, expected (values, lines)"
-            raise ModelError(message)
-        _check_distribution(f"P({self.name} | S)", table)
-        table.flags.writeable = False
-        object.__setattr__(self, "table", table)
-        object.__setattr__(self, "bits", self.bits or len(table).bit_length())
+        what = f"P({self.name} | S)"
+        _keep_table(self, what)
+        _check_distribution(what, self.table)
         self.as_variable()
 
     @property
@@ -138,15 +133,10 @@ class PriorSelect:
         Raises:
             ModelError: A row is no distribution, or the addresses don't fit.
         """
-        table = np.array(self.table, dtype=np.float64)
-        if table.ndim != 2 or 0 in table.shape:
-            message = f"P(S | {self.name}) has shape {table.shape}, expected (values, lines)"
-            raise ModelError(message)
-        for address, row in enumerate(table):
-            _check_distribution(f"P(S | {self.name}) of address {address}", row)
-        table.flags.writeable = False
-        object.__setattr__(self, "table", table)
-        object.__setattr__(self, "bits", self.bits or len(table).bit_length())
+        what = f"P(S | {self.name})"
+        _keep_table(self, what)
+        for address, row in enumerate(self.table):
+            _check_distribution(f"{what} of address {address}", row)
         self.as_variable()
 
     @property
@@ -304,6 +294,17 @@ def _variable(known: Known | PriorSelect, kind: Literal["sensor", "prior_select"
     except ValidationError as reason:
         message = f"variable {known.name!r}: {_first(reason)}"
         raise ModelError(message) from None
+
+
+def _keep_table(variable: Known | PriorSelect, what: str) -> None:
+    """Keep a variable's table as a copy that nobody can write to, and as many address bits as hold it where none are said."""
+    table = np.array(variable.table, dtype=np.float64)
+    if table.ndim != 2 or 0 in table.shape:
+        message = f"{what} has shape {table.shape}, expected (values, lines)"
+        raise ModelError(message)
+    table.flags.writeable = False
+    object.__setattr__(variable, "table", table)
+    object.__setattr__(variable, "bits", variable.bits or len(table).bit_length())
 
 
 def _check_distribution(what: str, table: NDArray[np.float64]) -> None:
