@@ -22,9 +22,9 @@ from services import options
 from services.command_line import ends_well, make_app, raise_on_signals, stopped_by
 from services.errors import BoardFailedError, SettingsError, exit_code_of
 from services.logs import say
-from services.serving import endpoint_from
 from services.settings import endpoint_in, load_settings
-from services.status_socket import BoardStatus, ProcessStatus, status_thread
+from services.sockets.serving import endpoint_from
+from services.sockets.status_socket import BoardStatus, ProcessStatus, status_thread
 from services.supervision import (
     PARENT_VARIABLE,
     RESTARTS,

@@ -27,7 +27,8 @@ from pcie_shim.loader import program
 from pcie_shim.programming_file import Image, read_image
 from services.errors import ServiceError, exit_code_of
 from services.generations import Generations
-from services.records import (
+from services.settings import Settings
+from services.sockets.records import (
     Addresses,
     BoardOutcome,
     Frame,
@@ -37,8 +38,7 @@ from services.records import (
     Switch,
     Switched,
 )
-from services.settings import Settings
-from services.status_socket import BoardStatus
+from services.sockets.status_socket import BoardStatus
 from toolchain.deployment import Deployment
 
 TICK = 0.2

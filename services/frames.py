@@ -14,7 +14,7 @@ from bridge.errors import BridgeError
 from bridge.fields import Field
 from bridge.stamps import header_stamp_ns
 from services.errors import OverflowedQueueError, VariableError
-from services.records import Addresses
+from services.sockets.records import Addresses
 from toolchain.address import to_address
 from toolchain.deployment import Deployment, MachineSection, Variable, WrittenPrior
 from toolchain.errors import ReadingError

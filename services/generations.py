@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Generic, TypeVar
 
 from services.errors import NotPreparedError, exit_code_of
-from services.records import Hello, NotReloaded, Prepare, Prepared, Switch, Switched
+from services.sockets.records import Hello, NotReloaded, Prepare, Prepared, Switch, Switched
 from toolchain.deployment import Deployment, load_deployment
 
 Made = TypeVar("Made")

@@ -17,7 +17,7 @@ from services.command_line import ends_well, make_app, run_async
 from services.errors import SettingsError
 from services.logs import log_libraries, say
 from services.settings import load_settings
-from services.status_socket import HubStatus, ProcessStatus, status_served
+from services.sockets.status_socket import HubStatus, ProcessStatus, status_served
 from services.supervision import end_with_parent
 from toolchain.commands.one_line import shown
 

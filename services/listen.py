@@ -21,10 +21,10 @@ from services import options
 from services.command_line import ends_well, make_app, run_async
 from services.errors import SettingsError
 from services.logs import put_json, say
-from services.result_file import ResultFile, open_result_file, record
-from services.result_picture import ROWS, Axis, axes_of, in_colour, picture, printable
-from services.serving import deployment_for
+from services.printed.result_file import ResultFile, open_result_file, record
+from services.printed.result_picture import ROWS, Axis, axes_of, in_colour, picture, printable
 from services.settings import LONGEST_S, Settings, load_settings
+from services.sockets.serving import deployment_for
 from toolchain.deployment import Deployment
 
 _QUEUE_SIZE: Final = 1024

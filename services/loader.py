@@ -11,8 +11,8 @@ from pcie_shim.loader import program
 from services import options
 from services.command_line import ends_well, make_app
 from services.logs import say
-from services.serving import endpoint_from
 from services.settings import load_settings
+from services.sockets.serving import endpoint_from
 from services.supervision import end_with_parent
 
 app = make_app(

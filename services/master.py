@@ -12,11 +12,11 @@ import typer
 
 from services import options
 from services.command_line import ends_well, make_app, run_async
-from services.control_socket import ReloadOrder, control_socket, give_order
 from services.errors import ExitCode, SettingsError
-from services.run import run_master
-from services.serving import deployment_for
+from services.running.run import run_master
 from services.settings import endpoint_in, load_settings
+from services.sockets.control_socket import ReloadOrder, control_socket, give_order
+from services.sockets.serving import deployment_for
 from services.supervision import end_with_parent
 from toolchain.commands.one_line import one_line
 

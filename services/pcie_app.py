@@ -30,9 +30,10 @@ from services.errors import (
     SettingsError,
     exit_code_of,
 )
-from services.local_socket import BlockingRecordSocket, check_hello, own_hello
 from services.logs import get_logger
-from services.records import (
+from services.settings import load_settings
+from services.sockets.local_socket import BlockingRecordSocket, check_hello, own_hello
+from services.sockets.records import (
     AnyRecord,
     Frame,
     Hello,
@@ -43,16 +44,15 @@ from services.records import (
     Switch,
     Trouble,
 )
-from services.serving import board_endpoints, deployment_for, endpoint_from, outdated
-from services.settings import load_settings
-from services.standard_input import compute_lines
-from services.status_socket import (
+from services.sockets.serving import board_endpoints, deployment_for, endpoint_from, outdated
+from services.sockets.status_socket import (
     FrameCounts,
     ProcessStatus,
     reasons,
     seconds_since,
     status_thread,
 )
+from services.standard_input import compute_lines
 from services.supervision import end_with_parent, leave_private_directory
 from toolchain.deployment import Deployment
 

@@ -26,7 +26,14 @@ from services.command_line import ends_well, make_app, run_async
 from services.errors import InputLineError, SettingsError, exit_code_of
 from services.generations import Generations
 from services.logs import get_logger, say
-from services.records import (
+from services.results import (
+    FrameReport,
+    Inferred,
+    posterior_layout,
+    times_of,
+)
+from services.settings import Settings, load_settings
+from services.sockets.records import (
     AnyRecord,
     Begin,
     BoardOutcome,
@@ -39,15 +46,8 @@ from services.records import (
     Switch,
     Trouble,
 )
-from services.results import (
-    FrameReport,
-    Inferred,
-    posterior_layout,
-    times_of,
-)
-from services.serving import MakeLink, deployment_for, endpoint_from, listening
-from services.settings import Settings, load_settings
-from services.status_socket import (
+from services.sockets.serving import MakeLink, deployment_for, endpoint_from, listening
+from services.sockets.status_socket import (
     FrameCounts,
     ProcessStatus,
     connections,

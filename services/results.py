@@ -13,7 +13,7 @@ import orjson
 from bridge.stamps import header
 from machines.bm1 import StopReason
 from machines.posterior import joint_posterior, posterior_of_lines
-from services.records import FrameResult, Publish
+from services.sockets.records import FrameResult, Publish
 from toolchain.deployment import Deployment
 
 REASON_WORDS = {

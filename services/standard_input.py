@@ -14,8 +14,8 @@ from pcie_shim.errors import FrameInputError
 from services.boards import Boards, result_record
 from services.errors import InputLineError
 from services.logs import say
-from services.records import Addresses, Frame
 from services.results import REASON_WORDS, counts_of
+from services.sockets.records import Addresses, Frame
 
 
 class LineReading(msgspec.Struct):

@@ -15,7 +15,7 @@ import typer
 from services.command_line import ends_well, make_app, run_async
 from services.errors import ExitCode, SettingsError
 from services.settings import load_settings
-from services.status_socket import STATUS_LIMIT, SUFFIX, BoardStatus, FrameCounts, ProcessStatus
+from services.sockets.status_socket import STATUS_LIMIT, SUFFIX, BoardStatus, FrameCounts, ProcessStatus
 from services.supervision import PRIVATE
 
 if TYPE_CHECKING:

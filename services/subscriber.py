@@ -18,10 +18,11 @@ from services.command_line import ends_well, make_app, run_async
 from services.errors import RosbridgeLostError, SettingsError, VariableError, exit_code_of
 from services.frames import CompleteReading, FrameAssembler
 from services.generations import Generations
-from services.local_socket import MAX_RECORD
 from services.logs import get_logger, say
-from services.printed_readings import print_addresses, print_readings
-from services.records import (
+from services.printed.readings import print_addresses, print_readings
+from services.settings import Settings, load_settings
+from services.sockets.local_socket import MAX_RECORD
+from services.sockets.records import (
     AnyRecord,
     Begin,
     Hello,
@@ -35,9 +36,8 @@ from services.records import (
     Trouble,
     Unusable,
 )
-from services.serving import MakeLink, deployment_for, endpoint_from, listening
-from services.settings import Settings, load_settings
-from services.status_socket import (
+from services.sockets.serving import MakeLink, deployment_for, endpoint_from, listening
+from services.sockets.status_socket import (
     FrameCounts,
     ProcessStatus,
     connections,

@@ -35,7 +35,7 @@ RUN_DIRECTORY_VARIABLE = "BM_RUN_DIRECTORY"
 STATUS_SUFFIX = ".status.sock"
 CONTROL_SUFFIX = ".control.sock"
 KEPT = "deployment-"
-"""How the folders begin in which a run keeps the deployments of its children (`services.new_deployment`)."""
+"""How the folders begin in which a run keeps the deployments of its children (`services.running.new_deployment`)."""
 
 PRIVATE = "rosbayes-"
 """How a run's private directory begins; what follows is tempfile's."""

@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from bridge.results import FrameReport, Posterior
-from services import result_file
 from services.errors import SettingsError
 from services.listen import line
-from services.result_file import open_result_file, record
-from services.result_picture import ROWS, Axis, axes_of, in_colour, picture
+from services.printed import result_file
+from services.printed.result_file import open_result_file, record
+from services.printed.result_picture import ROWS, Axis, axes_of, in_colour, picture
 from toolchain.deployment import Board, Deployment, Dimension, MachineSection, Source
 
 HASH = "0" * 64

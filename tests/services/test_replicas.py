@@ -13,9 +13,9 @@ from pcie_shim.errors import FrameInputError
 from services.boards import machine_inputs
 from services.errors import VariableError
 from services.frames import FrameAssembler
-from services.records import BoardOutcome, FrameResult, Publish
-from services.result_picture import axes_of
+from services.printed.result_picture import axes_of
 from services.results import FrameReport, Inferred, posterior_layout, times_of
+from services.sockets.records import BoardOutcome, FrameResult, Publish
 from toolchain.build import assemble
 from toolchain.models.model import Known, Model, PriorSelect, dimension
 from toolchain.options import BuildOptions

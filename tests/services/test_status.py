@@ -13,7 +13,7 @@ from rich.console import Console
 
 from services import ready, status
 from services.errors import SettingsError
-from services.status_socket import (
+from services.sockets.status_socket import (
     BoardStatus,
     ConnectionStatus,
     FrameCounts,

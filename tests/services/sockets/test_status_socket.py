@@ -11,9 +11,9 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from services import status_socket
 from services.errors import SettingsError
-from services.status_socket import (
+from services.sockets import status_socket
+from services.sockets.status_socket import (
     FrameCounts,
     ProcessStatus,
     reasons,

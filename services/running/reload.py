@@ -13,14 +13,14 @@ from typing import Any, Protocol
 
 from structlog.typing import FilteringBoundLogger
 
-from services.control_socket import ReloadOrder
 from services.errors import NotReloadedError, ReportedError, ServiceError, SettingsError
 from services.frames import WaitingFrames
 from services.generations import InForce
-from services.new_deployment import forget, keep, read_new
-from services.peers import ANSWER_TIME, Peer, Peers
-from services.records import NotReloaded, Prepare, Reading, Switch, Switched
+from services.running.new_deployment import forget, keep, read_new
+from services.running.peers import ANSWER_TIME, Peer, Peers
 from services.settings import Settings
+from services.sockets.control_socket import ReloadOrder
+from services.sockets.records import NotReloaded, Prepare, Reading, Switch, Switched
 from toolchain.deployment import Deployment
 
 LOST_IN_RELOAD = "lost in a reload"

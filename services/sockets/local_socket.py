@@ -17,7 +17,7 @@ import msgspec
 
 from pcie_shim.endpoint import Endpoint, no_delay
 from services.errors import LocalSocketError, OtherPeerError
-from services.records import AnyRecord, Hello, Record
+from services.sockets.records import AnyRecord, Hello, Record
 from services.version import VERSION
 
 MAX_RECORD = 4 * 1024 * 1024

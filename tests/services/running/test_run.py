@@ -5,14 +5,14 @@ import asyncio
 import msgspec
 import pytest
 
-from services.control_socket import ReloadOrder
 from services.errors import OverflowedQueueError
 from services.frames import QUEUE_ALL_DEPTH, WaitingFrames
-from services.peers import Peer
-from services.records import Frame, FrameFailed, Prepare, Prepared, Reading, Switched
-from services.reload import LOST_IN_RELOAD
-from services.run import Master
+from services.running.peers import Peer
+from services.running.reload import LOST_IN_RELOAD
+from services.running.run import Master
 from services.settings import Settings
+from services.sockets.control_socket import ReloadOrder
+from services.sockets.records import Frame, FrameFailed, Prepare, Prepared, Reading, Switched
 from tests.integration.conftest import build_boat
 from toolchain.deployment import load_deployment
 

@@ -9,7 +9,6 @@ import time
 from collections import Counter, deque
 from pathlib import Path
 
-from services.control_socket import control_served
 from services.errors import (
     BoardFailedError,
     ExitCode,
@@ -22,9 +21,12 @@ from services.errors import (
 from services.frames import WaitingFrames
 from services.generations import InForce
 from services.logs import get_logger, say
-from services.peers import ANSWER_TIME, ROLE, Awaited, Peer, Peers
-from services.printed_results import print_json, print_sentence
-from services.records import (
+from services.printed.results import print_json, print_sentence
+from services.running.peers import ANSWER_TIME, ROLE, Awaited, Peer, Peers
+from services.running.reload import LOST_IN_RELOAD, Reloads, Waits
+from services.settings import Settings
+from services.sockets.control_socket import control_served
+from services.sockets.records import (
     AnyRecord,
     Begin,
     Frame,
@@ -40,9 +42,7 @@ from services.records import (
     Switched,
     Unusable,
 )
-from services.reload import LOST_IN_RELOAD, Reloads, Waits
-from services.settings import Settings
-from services.status_socket import FrameCounts, ProcessStatus, reasons, seconds_since, status_served
+from services.sockets.status_socket import FrameCounts, ProcessStatus, reasons, seconds_since, status_served
 from services.supervision import RESTARTS, RESTARTS_WITHIN
 from toolchain.deployment import Deployment
 

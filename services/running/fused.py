@@ -20,10 +20,10 @@ from services.pcie_app import ROLE as PCIE_APP
 from services.pcie_app import Progress
 from services.publisher import ROLE as PUBLISHER
 from services.publisher import Publisher
-from services.records import AnyRecord, Frame, Notice, Prepare, Ready, Record, Switch, Trouble
-from services.serving import Link, MakeLink, board_endpoints
 from services.settings import Settings
-from services.status_socket import status_served
+from services.sockets.records import AnyRecord, Frame, Notice, Prepare, Ready, Record, Switch, Trouble
+from services.sockets.serving import Link, MakeLink, board_endpoints
+from services.sockets.status_socket import status_served
 from services.subscriber import ROLE as SUBSCRIBER
 from services.subscriber import Subscriber
 from toolchain.deployment import Deployment

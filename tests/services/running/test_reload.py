@@ -5,13 +5,13 @@ from types import SimpleNamespace
 
 import pytest
 
-from services.control_socket import ReloadOrder
 from services.frames import QUEUE_ALL_DEPTH
 from services.generations import InForce
-from services.peers import Peer
-from services.records import Prepare, Prepared, Reading, Switched
-from services.reload import LOST_IN_RELOAD, Reloads, what_became_of
+from services.running.peers import Peer
+from services.running.reload import LOST_IN_RELOAD, Reloads, what_became_of
 from services.settings import Settings
+from services.sockets.control_socket import ReloadOrder
+from services.sockets.records import Prepare, Prepared, Reading, Switched
 from tests.integration.conftest import build_boat
 from toolchain.deployment import load_deployment
 

@@ -8,7 +8,7 @@ import orjson
 
 from services.errors import ServiceError
 from services.generations import InForce
-from services.records import Published
+from services.sockets.records import Published
 from toolchain.deployment import Deployment
 
 

@@ -15,7 +15,7 @@ import orjson
 
 from bridge.results import Heard, Posterior
 from services.errors import SettingsError
-from services.result_picture import Axis
+from services.printed.result_picture import Axis
 
 MOST_NUMBERS: Final = 1 << 26
 """Probabilities that an archive may hold (512 MiB): it is in memory until it is written."""

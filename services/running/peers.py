@@ -24,12 +24,12 @@ from services.errors import (
     SettingsError,
 )
 from services.generations import InForce
-from services.local_socket import RecordProtocol, check_hello, open_connection, own_hello
 from services.logs import say
-from services.records import AnyRecord, Hello, NotReloaded, Prepared, Switched, Trouble
-from services.serving import board_endpoints, endpoint_from
 from services.settings import Settings, endpoint_in
-from services.status_socket import PeerStatus
+from services.sockets.local_socket import RecordProtocol, check_hello, open_connection, own_hello
+from services.sockets.records import AnyRecord, Hello, NotReloaded, Prepared, Switched, Trouble
+from services.sockets.serving import board_endpoints, endpoint_from
+from services.sockets.status_socket import PeerStatus
 from services.supervision import (
     RESTARTS,
     RESTARTS_WITHIN,
@@ -40,7 +40,7 @@ from services.supervision import (
 )
 
 if TYPE_CHECKING:
-    from services.fused import FusedEnd  # with all that the three services import
+    from services.running.fused import FusedEnd  # with all that the three services import
 
 
 ROLE = "master"
@@ -309,7 +309,7 @@ class Peers:
 
     def _start_inside(self) -> list[asyncio.Task[None]]:
         """`--fused`: run the services here, each as a task."""
-        from services.fused import fused_services
+        from services.running.fused import fused_services
 
         settings = self._settings.model_copy(
             update={

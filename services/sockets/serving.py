@@ -11,9 +11,9 @@ from typing import Any, Protocol, Self
 from pcie_shim.endpoint import Endpoint, listen, parse_endpoint, remove_listener
 from pcie_shim.errors import PcieShimError
 from services.errors import OtherPeerError, OutdatedError, SettingsError
-from services.local_socket import RecordProtocol, check_hello, own_hello
-from services.records import AnyRecord, Hello, Notice, Record, Trouble
 from services.settings import Settings
+from services.sockets.local_socket import RecordProtocol, check_hello, own_hello
+from services.sockets.records import AnyRecord, Hello, Notice, Record, Trouble
 from services.supervision import leave_private_directory
 from toolchain.deployment import Deployment, load_deployment
 from toolchain.errors import ToolchainError

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from services.errors import LocalSocketError, OtherPeerError
-from services.local_socket import (
+from services.sockets.local_socket import (
     MAX_RECORD,
     BlockingRecordSocket,
     RecordSplitter,
@@ -20,7 +20,7 @@ from services.local_socket import (
     encode_record,
     own_hello,
 )
-from services.records import BoardOutcome, Frame, FrameResult, Hello, Notice
+from services.sockets.records import BoardOutcome, Frame, FrameResult, Hello, Notice
 
 small = st.integers(0, 2**40)
 records = st.one_of(

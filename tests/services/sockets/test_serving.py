@@ -7,9 +7,9 @@ import pytest
 
 from pcie_shim.endpoint import parse_endpoint
 from services.errors import OutdatedError
-from services.local_socket import RecordProtocol, open_connection, own_hello
-from services.records import Trouble
-from services.serving import MasterLink, outdated
+from services.sockets.local_socket import RecordProtocol, open_connection, own_hello
+from services.sockets.records import Trouble
+from services.sockets.serving import MasterLink, outdated
 from tests.integration.conftest import build_boat
 from toolchain.deployment import load_deployment
 from toolchain.regenerate import DeploymentEdits, regenerate_deployment

@@ -12,9 +12,9 @@ from pcie_shim.endpoint import Endpoint
 from services.boards import Boards
 from services.errors import NotReloadedError, SettingsError, ShapeError, StoppedError
 from services.generations import Generations
-from services.new_deployment import forget, keep, read_new
-from services.records import Hello, NotReloaded, Prepare, Prepared, Switch, Switched
+from services.running.new_deployment import forget, keep, read_new
 from services.settings import Settings
+from services.sockets.records import Hello, NotReloaded, Prepare, Prepared, Switch, Switched
 from services.supervision import DIRECTORY_VARIABLE, Child, PrivateDirectory
 from tests.integration.conftest import build_boat
 from toolchain.deployment import load_deployment

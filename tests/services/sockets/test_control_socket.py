@@ -8,9 +8,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services import control_socket
-from services.control_socket import ANSWER_LIMIT, CALLERS, ReloadOrder, control_served, give_order, order_of
 from services.errors import ControlError, NotReloadedError, ReportedError, ShapeError
+from services.sockets import control_socket
+from services.sockets.control_socket import (
+    ANSWER_LIMIT,
+    CALLERS,
+    ReloadOrder,
+    control_served,
+    give_order,
+    order_of,
+)
 
 
 @pytest.fixture

@@ -1,0 +1,1 @@
+"""What the processes tell each other, and the local sockets over which they do."""
