@@ -8,7 +8,7 @@ import sys
 import time
 from pathlib import Path
 
-from processes import BOAT_TOPIC, BOAT_TYPE, ROOT, Process, build, run_script
+from scripts.processes import BOAT_TOPIC, BOAT_TYPE, ROOT, Process, build, run_script
 
 LIMIT = 180.0
 """Seconds after which the demo gives up, whatever it waits for."""

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scripts.fuzz_targets import TARGETS
+from scripts.fuzzing.targets import TARGETS
 
 FINDINGS = sorted((Path(__file__).parent / "findings").glob("*"))
 

@@ -44,7 +44,7 @@ def test_says_why_it_is_not_able():
     ("ci", "code", "last"), [("", 0, "0 passed, 0 failed"), ("true", 1, "0 passed, 1 failed")]
 )
 def test_not_verified_is_loud_and_fails_in_ci(ci, code, last):
-    done = run(ROOT / ".venv" / "bin" / "python", ROOT / "scripts" / "verify_containers.py", CI=ci)
+    done = run(ROOT / ".venv" / "bin" / "python", "-P", "-m", "scripts.verifications.containers", CI=ci)
     assert done.returncode == code
     assert "CONTAINERS WERE NOT VERIFIED" in done.stdout
     assert done.stdout.splitlines()[-1] == last

@@ -23,12 +23,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from processes import BOAT_TOPIC, ROOT, Process, build
-from verification import KINDS, SERVER_LIMIT, CheckError, Kind, Tally, expect, on_servers
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, InvalidHandshake
 
 from casestudies.boat import geometry
+from scripts.processes import BOAT_TOPIC, ROOT, Process, build
+from scripts.verifications.checks import KINDS, SERVER_LIMIT, CheckError, Kind, Tally, expect, on_servers
 from services.errors import ServiceError
 
 OUT = ROOT / "out" / "verify"
@@ -559,4 +559,4 @@ async def verify(kinds: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(on_servers(__file__, __doc__, verify, LIMIT))
+    sys.exit(on_servers("rosbridge", __doc__, verify, LIMIT))

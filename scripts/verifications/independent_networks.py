@@ -60,7 +60,7 @@ def read(folder: Path) -> None:
                 }
             )
         arrays["described"] = np.array(json.dumps(described))
-        np.savez(path.with_suffix(".npz"), **arrays)
+        np.savez(path.with_suffix(".npz"), allow_pickle=False, **arrays)
         network.saveBIFXML(str(path.with_suffix(".bifxml")))
         network.saveNET(str(path.with_suffix(".net")))
         path.with_suffix(".uai").write_text(uai(described, arrays))
@@ -121,7 +121,7 @@ def infer(folder: Path) -> None:
                 table = inference.posterior(searched[0]).toarray()
             found.append(table.ravel())
         answers[f"answer{number}"] = np.array(found)
-    np.savez(folder / "answers.npz", **answers)
+    np.savez(folder / "answers.npz", allow_pickle=False, **answers)
 
 
 if __name__ == "__main__":

@@ -22,16 +22,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar, cast
 
-from conformance import install_roslib, install_roslibpy
-from processes import ROOT, Process, run_script
 from rich.console import Console
 from rich.table import Table
 
+from scripts.other_clients.installation import install_roslib, install_roslibpy
+from scripts.processes import ROOT, Process, run_script
 from services.errors import ServiceError
 
 Result = TypeVar("Result")
 
-HERE = Path(__file__).resolve().parent
+SIDES = Path(__file__).with_name("bridge_sides")
 TYPE = "std_msgs/Float64MultiArray"
 PATIENCE = 30.0
 SMALL, LARGE = 6, 1024
@@ -308,14 +308,14 @@ async def round_trips(child: Child, topic: str, values: int, count: int, form: s
 def kinds() -> list[Kind]:
     """All clients; installs those of other projects where they are missing."""
     python = str(install_roslibpy() / "venv" / "bin" / "python")
-    roslibpy = (python, str(HERE / "bench_bridge_roslibpy.py"))
+    roslibpy = (python, str(SIDES / "roslibpy_client.py"))
     return [
-        Kind("ours", (sys.executable, str(HERE / "bench_bridge_ours.py"))),
+        Kind("ours", (sys.executable, str(SIDES / "ours.py"))),
         *(
             Kind(f"roslibpy, {transport}", roslibpy, {"ROSLIBPY_TRANSPORT": transport}, ("none",))
             for transport in ("twisted", "asyncio")
         ),
-        Kind("roslib, Node", ("node", str(HERE / "bench_bridge_roslib.mjs"), str(install_roslib()))),
+        Kind("roslib, Node", ("node", str(SIDES / "roslib_client.mjs"), str(install_roslib()))),
     ]
 
 
@@ -360,7 +360,7 @@ async def bench(arguments: argparse.Namespace) -> int:
         hub, tornado = (Process(name, Path(folder, name)) for name in ("hub", "tornado"))
         try:
             await hub.start("hub", "--port", "0")
-            await tornado.start(clients[1].command[0], str(HERE / "bench_bridge_tornado.py"))
+            await tornado.start(clients[1].command[0], str(SIDES / "tornado_server.py"))
             uris = {
                 "hub": (await hub.line(r"ws://\S+"))[0],
                 "Tornado double": (await tornado.line(r"ws://\S+"))[0],

@@ -20,12 +20,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from processes import BOAT_TOPIC, BOAT_TYPE, Process, build, run_script
 from rich.console import Console
 from rich.table import Table
 
 from bridge.client import Publication, Ros, Subscription, connect
 from bridge.stamps import header, header_stamp_ns
+from scripts.processes import BOAT_TOPIC, BOAT_TYPE, Process, build, run_script
 
 STAGES = (
     "wire_in",
@@ -187,7 +187,7 @@ async def bench(arguments: argparse.Namespace) -> int:
         try:
             await hub.start("hub", "--port", "0")
             uri = (await hub.line(r"ws://\S+"))[0]
-            await echo.start(sys.executable, str(Path(__file__).with_name("echo.py")), uri, str(LINES))
+            await echo.start(sys.executable, "-P", "-m", "scripts.benches.echo", uri, str(LINES))
             for name, master in masters.items():
                 await build("boat", where / f"boat-{name}", uri, topics[name], BOAT_TYPE)
                 flags = ["--fused"] if name == "fused" else []

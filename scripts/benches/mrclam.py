@@ -16,7 +16,6 @@ from statistics import fmean, median
 
 import numpy as np
 from numpy.typing import NDArray
-from processes import ROOT, Process, build, run_script
 from rich.console import Console
 from rich.table import Table
 
@@ -25,6 +24,7 @@ from casestudies.mrclam.landmarks import Landmark, read_landmarks
 from casestudies.mrclam.model import model
 from casestudies.mrclam.player import median_distance, play
 from casestudies.mrclam.recording import RecordedFrame, area_grid, read_recording
+from scripts.processes import ROOT, Process, build, run_script
 from toolchain.address import to_address
 from toolchain.models import Model, exact_posterior
 

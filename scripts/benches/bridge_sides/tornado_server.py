@@ -18,7 +18,7 @@ import socket
 import struct
 import threading
 from collections import defaultdict
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import tornado.ioloop
 import tornado.web
@@ -99,14 +99,14 @@ def deserialised(body: bytes) -> Message:
     message: Any = Float64MultiArray()
     _, message.layout.data_offset, count = struct.unpack_from("<III", body)
     message.data = list(struct.unpack_from(f"<{count}d", body, 12))
-    return message
+    return cast("Message", message)
 
 
 subscribers: dict[str, list[socket.socket]] = defaultdict(list)
 lock = threading.Lock()
 
 
-class Connection(tornado.websocket.WebSocketHandler):
+class Connection(tornado.websocket.WebSocketHandler):  # type: ignore[misc]  # tornado is in an environment of its own
     """One client: a queue, the thread that empties it, and a thread for each of its subscriptions."""
 
     def open(self, *_args: str) -> None:

@@ -6,6 +6,7 @@ import asyncio
 import json
 import sys
 import time
+from collections.abc import Awaitable, Callable
 from typing import Any
 
 import numpy as np
@@ -79,7 +80,11 @@ def tell(answer: object) -> None:
 
 async def main() -> None:
     """Do what each line says until there is none."""
-    do = {"publish": publish, "receive": receive, "round_trip": round_trip}
+    do: dict[str, Callable[..., Awaitable[dict[str, Any]]]] = {
+        "publish": publish,
+        "receive": receive,
+        "round_trip": round_trip,
+    }
     lines = asyncio.StreamReader()
     await asyncio.get_running_loop().connect_read_pipe(lambda: asyncio.StreamReaderProtocol(lines), sys.stdin)
     async with connect(sys.argv[1]) as ros:

@@ -1,5 +1,5 @@
 // roslib on Node as a client under measurement: commands of scripts/bench bridge on standard input, answers on
-// standard output.   node bench_bridge_roslib.mjs ROSLIB_MODULE ws://HOST:PORT
+// standard output.   node roslib_client.mjs ROSLIB_MODULE ws://HOST:PORT
 import { createInterface } from "node:readline";
 import { pathToFileURL } from "node:url";
 

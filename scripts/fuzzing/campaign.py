@@ -1,6 +1,6 @@
 """Fuzzing the bridge with atheris: see scripts/fuzz.
 
-atheris is no dependency of the project: it comes from fuzz.lock into an environment of its own, which sees the
+atheris is no dependency of the project: it comes from atheris.lock into an environment of its own, which sees the
 project's packages besides.
 """
 
@@ -18,8 +18,10 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[1]
-LOCK = Path(__file__).with_name("fuzz.lock")
+from scripts.fuzzing.targets import SEEDS, TARGETS
+
+ROOT = Path(__file__).resolve().parents[2]
+LOCK = Path(__file__).with_name("atheris.lock")
 FINDINGS = ROOT / "tests" / "bridge" / "findings"
 OUT = ROOT / "out" / "fuzz"
 SECONDS = 600.0
@@ -33,7 +35,7 @@ PLAY = """
 import sys
 import atheris
 with atheris.instrument_imports(include=["bridge"]):
-    from scripts.fuzz_targets import TARGETS
+    from scripts.fuzzing.targets import TARGETS
 target = TARGETS[sys.argv.pop(1)]
 atheris.Setup(sys.argv, target)
 atheris.Fuzz()
@@ -93,8 +95,6 @@ def start(target: str, seconds: float, interpreter: Path, scratch: Path) -> Run:
     seeds.mkdir()
     for number, path in enumerate(sorted(FINDINGS.glob(f"{target}-*"))):
         shutil.copy(path, seeds / f"finding-{number}")
-    from fuzz_targets import SEEDS
-
     for number, seed in enumerate(SEEDS.get(target, ())):
         (seeds / f"seed-{number}").write_bytes(seed)
     flags = {
@@ -166,7 +166,8 @@ def fuzz(targets: list[str], seconds: float) -> int:
     OUT.mkdir(parents=True, exist_ok=True)
     at_once = min(len(targets), os.cpu_count() or 1)
     each = seconds * at_once / len(targets)
-    waiting, running, found = list(targets), [], 0
+    waiting, found = list(targets), 0
+    running: list[tuple[Run, float]] = []
     with tempfile.TemporaryDirectory(prefix="fuzz-") as folder:
         try:
             while waiting or running:
@@ -189,8 +190,6 @@ def fuzz(targets: list[str], seconds: float) -> int:
 
 def main() -> int:
     """Read the flags."""
-    from fuzz_targets import TARGETS
-
     parser = argparse.ArgumentParser(
         prog="scripts/fuzz", description="Fuzzes the bridge (see the head of the script)."
     )
@@ -211,5 +210,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.path.insert(0, str(ROOT))
     sys.exit(main())

@@ -15,12 +15,12 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final, Self
 
-from processes import ROOT
-from verification import CheckError, expect
+from scripts.processes import ROOT
+from scripts.verifications.checks import CheckError, expect
 
 OUT: Final = ROOT / "out" / "verify-containers"
 ENGINE: Final = ROOT / "scripts" / "container-engine"
-CLIENT: Final = ROOT / "scripts" / "verify_containers_client.py"
+CLIENT: Final = Path(__file__).with_name("containers_client.py")
 
 UP_LIMIT, FLOW_LIMIT = 90.0, 60.0
 """Seconds until all services are healthy, and until results flow."""
@@ -114,7 +114,7 @@ class Result:
 
 
 class Client:
-    """verify_containers_client.py in a container that goes on until the context ends."""
+    """containers_client.py in a container that goes on until the context ends."""
 
     def __init__(self, stack: Stack, uri: str, network: str, *flags: str) -> None:
         self._stack = stack
@@ -275,7 +275,7 @@ class Stack:
 
     def client_command(self, network: str, *options: str) -> list[str]:
         """How a client's container is started; its URI and flags follow."""
-        volumes = ["--volume", f"{self.project / 'scripts' / CLIENT.name}:/client.py:ro"]
+        volumes = ["--volume", f"{self.project / CLIENT.relative_to(ROOT)}:/client.py:ro"]
         safe = ["--read-only", "--tmpfs", "/tmp", "--cap-drop", "ALL", "--init"]  # noqa: S108 - the container's own
         return [
             "docker",

@@ -58,7 +58,7 @@ OPS = (
     "png",
     "bogus",
 )
-ODD = (
+ODD: tuple[Any, ...] = (
     None,
     True,
     0,

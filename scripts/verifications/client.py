@@ -19,14 +19,14 @@ from socket import socket
 from typing import Any
 
 import numpy as np
-from processes import ROOT, Process
-from verification import KINDS, SERVER_LIMIT, CheckError, Kind, Tally, expect, on_servers
 
 from bridge import stamps
 from bridge.client import Message, Qos, Ros, State, connect
 from bridge.errors import BridgeError, EncodeError, GoalError, NoMessageError, ServiceError
 from bridge.protocol import Compression
 from bridge.serialised import MessageTypes
+from scripts.processes import ROOT, Process
+from scripts.verifications.checks import KINDS, SERVER_LIMIT, CheckError, Kind, Tally, expect, on_servers
 
 LIMIT = 240.0
 """Seconds after which the verification gives up, whatever it waits for."""
@@ -198,11 +198,12 @@ async def check_png(stand: Stand) -> None:
 async def check_fragments(stand: Stand) -> None:
     """Cut by the server, and cut by the client."""
     text = "x\u00e4\U0001f600\n" * 500
-    for options in (
+    fragmentings: tuple[dict[str, Any], ...] = (
         {"fragment_size": 100},
         {"fragments_out": 100},
         {"fragment_size": 50, "fragments_out": 50},
-    ):
+    )
+    for options in fragmentings:
         found = (await stand.passed({"data": text}, "std_msgs/String", **options)).msg["data"]
         expect(found == text, f"another text came with {options}")
     values = np.random.default_rng(5).normal(size=500)
@@ -359,7 +360,8 @@ async def check_nan(stand: Stand) -> None:
 
 async def check_restart(stand: Stand) -> None:
     """A killed server: everything is restored, and the reader is told how long it was blind."""
-    topics = {form: stand.topic() for form in ("none", "cbor", "cbor-raw", "png")}
+    forms: tuple[Compression, ...] = ("none", "cbor", "cbor-raw", "png")
+    topics = {form: stand.topic() for form in forms}
     async with stand.clients() as (subscriber, publisher):
         readers = {
             form: subscriber.subscribe(topic, ARRAY, compression=form) for form, topic in topics.items()
@@ -433,4 +435,4 @@ async def verify(kinds: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(on_servers(__file__, __doc__, verify, LIMIT))
+    sys.exit(on_servers("client", __doc__, verify, LIMIT))

@@ -36,8 +36,8 @@ from toolchain.models.model import Model
 from toolchain.networks import read_network
 from toolchain.quantise import quantise
 
-SCRIPTS = Path(__file__).parent
-LOCK = SCRIPTS / "verify-networks.lock"
+INDEPENDENT = Path(__file__).with_name("independent_networks.py")
+LOCK = Path(__file__).with_name("independent-networks.lock")
 HOME_VARIABLE = "ROSBAYES_NETWORKS_HOME"
 NETWORKS = 24
 FORMATS = (".bif", ".bifxml", ".net", ".uai")
@@ -275,7 +275,7 @@ def verify(only: list[str]) -> Checks:
         for name in set(names) - set(only or names):
             (folder / f"{name}.bif").unlink()
         names = [name for name in names if not only or name in only]
-        run([str(python), str(SCRIPTS / "independent_networks.py"), "read", str(folder)])
+        run([str(python), "-P", str(INDEPENDENT), "read", str(folder)])
         asked: list[Asked] = []
         refused: list[dict[str, Any]] = []
         for name in names:
@@ -288,7 +288,7 @@ def verify(only: list[str]) -> Checks:
             for each in asked
         ]
         (folder / "questions.json").write_text(json.dumps([*listed, *refused]))
-        run([str(python), str(SCRIPTS / "independent_networks.py"), "infer", str(folder)])
+        run([str(python), "-P", str(INDEPENDENT), "infer", str(folder)])
         with np.load(folder / "answers.npz") as answers:
             for number, each in enumerate(asked):
                 theirs = answers[f"answer{number}"]

@@ -7,10 +7,9 @@ import sys
 import time
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
-from pathlib import Path
 
-import real_rosbridge
-from processes import run_script
+from scripts.processes import run_script
+from scripts.verifications import real_rosbridge
 
 SERVER_LIMIT = 15.0
 """Seconds until a server serves."""
@@ -72,18 +71,16 @@ KINDS = {
 
 
 def on_servers(
-    script: str, description: str, verify: Callable[[list[str]], Awaitable[int]], limit: float
+    name: str, description: str, verify: Callable[[list[str]], Awaitable[int]], limit: float
 ) -> int:
     """Read the flags of a verification and run it; with the real server, move into a network of its own first.
 
     Args:
-        script: The verification's file, `verify_NAME.py`.
+        name: The verification's, which is its module's.
         description: Its docstring; the first line goes into `--help`.
         verify: All checks on these kinds of servers, `real` or `hub`; returns the exit code.
         limit: Seconds after which it is given up.
     """
-    path = Path(script).resolve()
-    name = path.stem.removeprefix("verify_")
     parser = argparse.ArgumentParser(prog=f"scripts/verify {name}", description=description.splitlines()[0])
     parser.add_argument("--server", choices=["real", "hub", "both"], default="both", help="(both)")
     server = parser.parse_args().server
@@ -92,7 +89,9 @@ def on_servers(
         try:
             real_rosbridge.install()
             alone = real_rosbridge.network_command()
-            real_rosbridge.become([*alone, sys.executable, str(path), "--server", server])
+            real_rosbridge.become(
+                [*alone, sys.executable, "-P", "-m", f"{__package__}.{name}", "--server", server]
+            )
         except real_rosbridge.RealServerError as error:
             print(f"error: {error}", file=sys.stderr)
             return 2

@@ -21,7 +21,9 @@ from pathlib import Path
 from types import FrameType
 from typing import Final
 
-from container_stack import (
+from scripts.processes import ROOT
+from scripts.verifications.checks import CheckError, Tally, expect
+from scripts.verifications.container_stack import (
     BOARDS,
     CORE,
     ENGINE,
@@ -35,9 +37,6 @@ from container_stack import (
     check_results,
     seconds,
 )
-from processes import ROOT
-from verification import CheckError, Tally, expect
-
 from toolchain.deployment import load_deployment
 
 LIMIT: Final = 900

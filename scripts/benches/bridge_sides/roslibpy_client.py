@@ -10,6 +10,7 @@ import queue
 import sys
 import threading
 import time
+from collections.abc import Callable
 from typing import Any
 
 import roslibpy
@@ -85,7 +86,11 @@ def main() -> None:
     ros = roslibpy.Ros(host, int(port))
     ros.run(PATIENCE)
     tell("connected")
-    do = {"publish": publish, "receive": receive, "round_trip": round_trip}
+    do: dict[str, Callable[..., dict[str, Any]]] = {
+        "publish": publish,
+        "receive": receive,
+        "round_trip": round_trip,
+    }
     for line in sys.stdin:
         command, cpu = json.loads(line), time.process_time()
         answer = do[command.pop("do")](ros, **command)
