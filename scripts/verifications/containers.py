@@ -44,6 +44,8 @@ LIMIT: Final = 900
 FETCH_LIMIT, BUILD_LIMIT = 300.0, 300.0
 FIRST_RESULT: Final = 15.0
 """Seconds from `docker compose up` to the first result, at most."""
+STARTS: Final = 4
+"""Starts of which the best counts: a machine that is busy with something else takes longer, a slow stack always does."""
 STOP_LIMIT: Final = 5
 """Seconds that a service has to end after SIGTERM; then the engine kills it (exit code 137)."""
 TERMINATED: Final = 143
@@ -67,11 +69,13 @@ def check_build(stack: Stack) -> None:
 
 
 def check_up(stack: Stack) -> None:
-    """From `docker compose up` to the first result, and to all services being healthy; the better of two times."""
+    """From `docker compose up` to the first result, and to all services being healthy; the best of several times."""
     first = start(stack)
-    if first > FIRST_RESULT:  # other load on the machine would be to blame
+    for _ in range(STARTS - 1):
+        if first <= FIRST_RESULT:
+            break
         stack.down()
-        first = start(stack)
+        first = min(first, start(stack))
     expect(
         first <= FIRST_RESULT, f"the first result came after {first:.1f} s, {FIRST_RESULT:g} s are allowed"
     )
