@@ -89,7 +89,7 @@ class BoardProcess:
         self.process = _FORK.Process(target=self._run, args=(index, misbehave), daemon=True)
         self.process.start()
         os.close(self._tell)
-        readable, _, _ = select.select([ready], [], [], 20)
+        readable, _, _ = select.select([ready], [], [], 60)
         said = os.read(ready, 1) if readable else b""
         os.close(ready)
         assert said, f"the board at {endpoint} did not start"
@@ -108,12 +108,12 @@ class BoardProcess:
     def stop(self) -> int | None:
         """End it in order; its exit code."""
         self.process.terminate()
-        self.process.join(10)
+        self.process.join(60)
         return self.process.exitcode
 
     def kill(self) -> None:
         self.process.kill()
-        self.process.join(10)
+        self.process.join(60)
 
 
 def expected(parts: Sequence[Image], frame: FrameInput) -> list[tuple[list[int], int, StopReason]]:

@@ -111,7 +111,7 @@ def test_a_frame_in_pieces_is_the_same_frame(cluster: MiniCluster) -> None:
         assert cluster.seconds_left > 0
         descriptor = cluster.awaited
         assert descriptor is not None
-        assert select.select([descriptor], [], [], 10)[0]
+        assert select.select([descriptor], [], [], 60)[0]
         output = cluster.collect(0)
     assert output.slices > 1
     assert outcome(output) == expected(PARTS, whole)
@@ -276,7 +276,7 @@ def test_a_held_board_is_refused(boards: list[BoardProcess]) -> None:
 def test_a_board_that_is_not_there_is_named(start_board: StartBoard, folder: Path) -> None:
     endpoints = [start_board().endpoint, f"unix:{folder}/nobody.sock"]
     with pytest.raises(BoardUnreachableError, match=r"Board 1: No board listens at .*nobody\.sock") as caught:
-        MiniCluster.open(endpoints, images(60, (3, 2)), timeout=0.1)
+        MiniCluster.open(endpoints, images(60, (3, 2)), timeout=3)
     assert caught.value.board == 1
 
 
@@ -312,13 +312,17 @@ def test_images_of_two_models_are_refused() -> None:
 # ---- boards that fail ----
 
 
+SLACK = 3.0
+"""Seconds that a board has beyond its cycles: enough for one that does answer, however busy the machine."""
+
+
 class Failing:
     """A mini-cluster whose second board misbehaves from its second start on."""
 
     def __init__(self, start_board: StartBoard, misbehave: str, **parameters) -> None:
         self.boards = [start_board(index=0), start_board(index=1, misbehave=misbehave), start_board(index=2)]
         self.parts = images(70, (3, 2, 2), **parameters)
-        self.cluster = MiniCluster.open(endpoints_of(self.boards), self.parts, timeout=5, slack=1.0)
+        self.cluster = MiniCluster.open(endpoints_of(self.boards), self.parts, timeout=20, slack=SLACK)
 
     def run(self, given_frame: FrameInput) -> None:
         assert outcome(self.cluster.run(given_frame)) == expected(self.parts, given_frame)
@@ -330,9 +334,9 @@ OWN = {"stop": "own"}
 @pytest.mark.parametrize(
     ("kind", "error", "sentence"),
     [
-        ("drop", BoardSilentError, r"did not say done after 3000 cycles within 1\.?\d* s"),
-        ("stall", BoardSilentError, r"did not say done after 3000 cycles within 1\.?\d* s"),
-        ("never-done", BoardSilentError, r"did not say done after 3000 cycles within 1\.?\d* s"),
+        ("drop", BoardSilentError, r"did not say done after 3000 cycles within 3\.?\d* s"),
+        ("stall", BoardSilentError, r"did not say done after 3000 cycles within 3\.?\d* s"),
+        ("never-done", BoardSilentError, r"did not say done after 3000 cycles within 3\.?\d* s"),
         ("endless", BoardSilentError, "a frame began and did not end"),
         ("short-read", BoardLinkError, "said done with 1 results where 2 were due"),
         ("wrong-sequence", BoardLinkError, "interrupt 3 came where interrupt 2 was due"),
@@ -354,7 +358,7 @@ def test_a_misbehaving_board_fails_the_frame_and_comes_back(
     assert cluster.is_open(0)
     with pytest.raises(BoardGoneError, match=r"Board 1 at unix:.* is not open \(.*\): open it again"):
         cluster.run(frame(**OWN))
-    cluster.reopen(1, timeout=2)
+    cluster.reopen(1, timeout=60)
     for stop in ("own", "slices"):
         failing.run(frame(stop=stop, bank=3))
     cluster.close()
@@ -363,12 +367,12 @@ def test_a_misbehaving_board_fails_the_frame_and_comes_back(
 @pytest.mark.parametrize(
     ("kind", "error", "sentence"),
     [
-        ("drop", BoardSilentError, "did not answer about 0x0000 within 0.5 s: the link is closed"),
-        ("stall", BoardSilentError, "did not answer about 0x0000 within 0.5 s"),
+        ("drop", BoardSilentError, "did not answer about 0x0000 within 2 s: the link is closed"),
+        ("stall", BoardSilentError, "did not answer about 0x0000 within 2 s"),
         (
             "endless",
             BoardSilentError,
-            "0x0000 within 0.5 s: a frame began and did not end: the link is closed",
+            "0x0000 within 2 s: a frame began and did not end: the link is closed",
         ),
         ("short-read", BoardLinkError, "answered a read of 1 words at 0x0000 with 0"),
         ("wrong-sequence", BoardLinkError, "answer 2 came where answer 1 was due"),
@@ -386,12 +390,12 @@ def test_a_board_that_misbehaves_on_opening_is_refused(
 ) -> None:
     board = start_board(misbehave=kind)
     with pytest.raises(error, match=f"Board 0: .*{sentence}"):
-        MiniCluster.open([board.endpoint], images(1, (3,)), timeout=0.5)
+        MiniCluster.open([board.endpoint], images(1, (3,)), timeout=2.0)
 
 
 def test_a_board_that_never_says_done_is_given_the_time_of_its_cycles(start_board: StartBoard) -> None:
     failing = Failing(start_board, "never-done:0:0")
-    with pytest.raises(BoardSilentError, match=r"did not say done after 256 cycles within 1\.?\d* s"):
+    with pytest.raises(BoardSilentError, match=r"did not say done after 256 cycles within 3\.?\d* s"):
         failing.cluster.run(frame(stop="slices"))
 
 
@@ -406,7 +410,7 @@ def test_a_failure_in_a_later_slice(start_board: StartBoard) -> None:
 
 def test_a_killed_board_is_gone_and_its_successor_is_programmed(boards: list[BoardProcess]) -> None:
     parts = images(80, (3, 2))
-    with MiniCluster.open(endpoints_of(boards), parts, timeout=2) as cluster:
+    with MiniCluster.open(endpoints_of(boards), parts, timeout=60) as cluster:
         cluster.run(frame())
         boards[0].kill()
         with pytest.raises(BoardGoneError, match=r"Board 0: .* is gone: "):

@@ -14,13 +14,15 @@ import pytest
 from services.errors import ExitCode, ServiceError
 from services.supervision import KEPT, RESTARTS, Child, PrivateDirectory, end_all, make_private_directory
 
+PATIENCE = 50.0
+
 
 def child(code: str) -> Child:
     return Child("tester", [sys.executable, "-c", code])
 
 
 async def ended(one: Child) -> None:
-    await asyncio.wait_for(one.ended(), 10)
+    await asyncio.wait_for(one.ended(), PATIENCE)
 
 
 async def test_its_error_is_its_sentence_and_code(capsys):
@@ -43,12 +45,16 @@ async def test_a_kill_is_told_with_its_signal():
     assert (str(failure), failure.exit_code) == ("tester was killed by SIGKILL", ExitCode.CHILD)
 
 
-async def test_a_stubborn_child_is_killed_and_named():
+async def test_a_stubborn_child_is_killed_and_named(tmp_path):
     one = child(
-        "import signal, sys, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('up', file=sys.stderr, flush=True); time.sleep(60)"
+        "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN);"
+        f"open({str(tmp_path / 'up')!r}, 'w').close(); time.sleep(60)"
     )
     one.start()
-    await asyncio.sleep(0.3)
+    deadline = time.monotonic() + PATIENCE
+    while not (tmp_path / "up").exists():
+        assert time.monotonic() < deadline
+        await asyncio.sleep(0.02)
     assert await end_all([one], 0.2) == ["tester"]
     assert one.exit_code() == -signal.SIGKILL
 
@@ -56,7 +62,7 @@ async def test_a_stubborn_child_is_killed_and_named():
 async def test_a_willing_child_ends_without_a_kill():
     one = child("import time; time.sleep(60)")
     one.start()
-    assert await end_all([one], 5) == []
+    assert await end_all([one], PATIENCE) == []
 
 
 def test_restarts_are_bounded():
@@ -93,11 +99,12 @@ time.sleep(60)
 """
     parent = subprocess.Popen([sys.executable, "-c", parent_code], stdout=subprocess.PIPE, text=True)
     pid = int(parent.stdout.readline())
-    deadline = time.monotonic() + 10
-    while not (tmp_path / "up").exists() and time.monotonic() < deadline:
+    deadline = time.monotonic() + PATIENCE
+    while not (tmp_path / "up").exists():
+        assert time.monotonic() < deadline
         time.sleep(0.02)
     parent.kill()
-    parent.wait(5)
+    parent.wait(PATIENCE)
     while psutil.pid_exists(pid) and psutil.Process(pid).status() != psutil.STATUS_ZOMBIE:
         assert time.monotonic() < deadline, "the child outlived its parent"
         time.sleep(0.02)

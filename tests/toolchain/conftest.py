@@ -1,11 +1,6 @@
 """A case study's folder, for the tests of the toolchain's commands."""
 
 import pytest
-from hypothesis import settings
-
-# an example that takes long says something of the load, not of the code
-settings.register_profile("no deadline", deadline=None)
-settings.load_profile("no deadline")
 
 
 @pytest.fixture
