@@ -47,6 +47,9 @@ ROLE = "master"
 ANSWER_TIME = 60.0
 """Seconds that a service may take beyond its own limits, before it counts as stuck."""
 
+COMPILING_TIME = 60.0
+"""Seconds that the run's own boards may take longer to listen: where no kernels are kept yet, they compile them first."""
+
 _CONNECT_EVERY = 0.01
 _RECONNECT_PATIENCE = 60.0
 
@@ -241,7 +244,7 @@ class Peers:
                 *(["--boards", ",".join(boards)] if boards else []),
                 *(["--stop", settings.stop] if settings.stop else []),
                 "--peer-timeout",
-                str(settings.peer_timeout),
+                str(settings.peer_timeout + self._compiling_time),
                 "--board-timeout",
                 str(settings.board_timeout),
                 # nobody else can have programmed boards of this run
@@ -262,6 +265,11 @@ class Peers:
                 command = [*own_command(role), "--listen", str(endpoint), *arguments[role]]
                 child = Child(role, command, directory=directory)
             self._by_role[role] = Peer(role, endpoint, child)
+
+    @property
+    def _compiling_time(self) -> float:
+        """Seconds more that boards may take to listen. Whether one of the run's own has died is seen without it."""
+        return 0.0 if self._boards is None else COMPILING_TIME
 
     def start(self) -> None:
         """Start what does not run, connect to all, and bring back what is lost from then on."""
@@ -314,6 +322,7 @@ class Peers:
         settings = self._settings.model_copy(
             update={
                 "boards": self.board_endpoints,
+                "peer_timeout": self._settings.peer_timeout + self._compiling_time,
                 "run_directory": self._settings.run_directory or self.directory,
             }
         )
@@ -383,10 +392,13 @@ class Peers:
     def _awaited(self, peer: Peer) -> Awaited | None:
         settings = self._settings
         if not peer.greeted:
-            return Awaited("greet", peer.since, settings.peer_timeout)
+            opening = (
+                self._compiling_time if peer.role == "pcie-app" else 0
+            )  # it greets when the boards are open
+            return Awaited("greet", peer.since, settings.peer_timeout + opening)
         if not peer.ready:
             boards = len(self._in_force.deployment.boards)
-            limit = settings.connect_timeout + boards * settings.peer_timeout
+            limit = settings.connect_timeout + boards * settings.peer_timeout + self._compiling_time
             return Awaited("get ready", peer.since, limit)
         return self._moving.awaited(peer)
 

@@ -286,6 +286,26 @@ async def test_a_peer_that_says_nothing_is_given_up(stage, boat):
     await stage.nothing_left("hub")
 
 
+SLOW_BOARDS = """
+import sys, time
+if any(word.endswith("/board") for word in sys.orig_argv):
+    time.sleep(12)
+"""
+
+
+@pytest.mark.parametrize("how", [(), ("--fused",)], ids=["processes", "fused"])
+async def test_boards_that_compile_their_kernels_first_are_waited_for(stage, boat, tmp_path, how):
+    """The first start of all takes a slow processor longer than a board may take to be reached."""
+    (tmp_path / "sitecustomize.py").write_text(SLOW_BOARDS)
+    _, uri = await stage.hub()
+    async with Robot(uri) as robot:
+        await robot.keep_publishing()
+        command = ("master", "--once", *how, "-d", str(boat), "--uri", uri)
+        master = stage.start(*command, environment={"PYTHONPATH": str(tmp_path)})
+        assert await master.end(90) == 0, master.err
+    await stage.nothing_left("hub")
+
+
 async def test_results_from_a_file_are_published(stage, boat):
     _, uri = await stage.hub()
     async with Robot(uri) as robot:
