@@ -288,7 +288,7 @@ class Ros:
     @property
     def ros_version(self) -> RosVersion | None:
         """Which ROS the server speaks for: as told, as detected, or as header stamps show; None if unknown."""
-        return self._session.core.ros_version or self._session.core.seen_version
+        return self._session.core.ros_version
 
     async def detect_ros_version(self, timeout: float = DETECT_TIMEOUT) -> RosVersion | None:  # noqa: ASYNC109  # all of it
         """Find out which ROS the server speaks for, if it can be found out.
@@ -310,13 +310,13 @@ class Ros:
             ]
             try:
                 for answer in asyncio.as_completed(questions):
-                    self._session.core.ros_version = await answer
+                    self._session.core.wire.ros_version = await answer
                     if self.ros_version is not None:
                         break
             finally:
                 for question in questions:
                     question.cancel()
-        self._session.core.ros_version = self.ros_version
+        self._session.core.wire.ros_version = self.ros_version
         return self.ros_version
 
     async def _ask_version(self, limit: float) -> RosVersion | None:

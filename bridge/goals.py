@@ -50,7 +50,7 @@ class Goal:
         self._feedback: deque[dict[str, Any]] = deque(maxlen=FEEDBACK_QUEUE_SIZE)
         self._reader: asyncio.Future[None] | None = None
         self._ended: asyncio.Future[GoalEnded] = asyncio.get_running_loop().create_future()
-        self._identity = session.core.send_goal(action, type_name, goal, feedback=feedback)
+        self._identity = session.core.goals.send(action, type_name, goal, feedback=feedback)
         session.goals[self._identity] = self
         session.flush()
 
@@ -82,7 +82,7 @@ class Goal:
 
     async def cancel(self) -> None:
         """Ask for it to be given up; `result` tells whether it was. Nothing happens if it is over."""
-        self._session.core.cancel_goal(self._identity)
+        self._session.core.goals.cancel(self._identity)
         self._session.flush()
 
     async def result(self, timeout: float) -> GoalResult:  # noqa: ASYNC109  # part of the error
@@ -137,4 +137,4 @@ class Goal:
         if not self.done:
             await self.cancel()
         self._session.goals.pop(self._identity, None)
-        self._session.core.forget_goal(self._identity)
+        self._session.core.goals.forget(self._identity)

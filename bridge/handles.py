@@ -19,7 +19,7 @@ from bridge.errors import (
 )
 from bridge.events import ServiceRequested
 from bridge.names import absolute, same_type
-from bridge.protocol import Delivery
+from bridge.protocol.delivery import Delivery
 from bridge.qos import Qos
 from bridge.session import Message, Session, State
 
@@ -117,7 +117,7 @@ class Subscription(_Handle):
         self._deadline = inf  # of who waits
         self._alarm: asyncio.TimerHandle | None = None
         self._rings = inf
-        self._number = session.core.subscribe(
+        self._number = session.core.subscriptions.subscribe(
             topic, type_name, throttle_rate=throttle_rate, queue_length=queue_length, delivery=delivery
         )
         session.receivers[self._number] = self._receive
@@ -294,7 +294,7 @@ class Subscription(_Handle):
     def _take_back(self) -> None:
         del self._session.receivers[self._number]
         self._session.on_blind.discard(self._note_blind)
-        self._session.core.unsubscribe(self._number)
+        self._session.core.subscriptions.unsubscribe(self._number)
 
 
 class Publication(_Handle):
@@ -321,7 +321,10 @@ class Publication(_Handle):
         self.topic = topic
         self._size = queue_size
         self._waiting = 0
-        self._number = session.core.advertise(topic, type_name, latch=latch, queue_size=queue_size, qos=qos)
+        self._publications = session.core.publications
+        self._number = self._publications.advertise(
+            topic, type_name, latch=latch, queue_size=queue_size, qos=qos
+        )
         self._begin()
 
     async def publish(self, msg: Mapping[str, Any], *, timeout: float = 5.0) -> None:  # noqa: ASYNC109  # as above
@@ -387,10 +390,10 @@ class Publication(_Handle):
     def _written(self, msg: Mapping[str, Any]) -> bytes:
         if self._closed:
             raise DisconnectedError(f"{self.topic} is not advertised any more: its publication was closed")
-        return self._session.core.publish(self._number, msg)
+        return self._publications.publish(self._number, msg)
 
     def _take_back(self) -> None:
-        self._session.core.unadvertise(self._number)
+        self._publications.unadvertise(self._number)
 
 
 class Service(_Handle):
@@ -408,7 +411,7 @@ class Service(_Handle):
         self.name = name
         self._handler = handler
         self._limit = handler_timeout
-        session.core.advertise_service(name, type_name)
+        session.core.services.advertise(name, type_name)
         session.servers[absolute(name)] = self._serve
         self._begin()
 
@@ -427,17 +430,17 @@ class Service(_Handle):
         except Exception as error:
             _log.exception("the handler of service %s failed", self.name)
             values = f"{self.name} failed: {type(error).__name__}"
-        core = self._session.core
+        answer = self._session.core.services.answer
         try:
-            core.answer(request.ticket, values, ok=ok)
+            answer(request.ticket, values, ok=ok)
         except BridgeError as error:
             _log.error("the answer of service %s cannot be sent: %s", self.name, error)
-            core.answer(request.ticket, f"the answer cannot be sent: {error}", ok=False)
+            answer(request.ticket, f"the answer cannot be sent: {error}", ok=False)
         self._session.flush()
 
     def _take_back(self) -> None:
         del self._session.servers[absolute(self.name)]
-        self._session.core.unadvertise_service(self.name)
+        self._session.core.services.unadvertise(self.name)
 
 
 async def ask_rosapi(session: Session, name: str, args: Mapping[str, Any], limit: float) -> dict[str, Any]:

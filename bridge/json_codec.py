@@ -43,6 +43,18 @@ def excerpt(data: bytes | str) -> str:
     return shown[: 2 * _SHOWN] + "..." if len(data) > _SHOWN or len(shown) > 2 * _SHOWN else shown
 
 
+def text_of(value: Any) -> str:
+    """What a server says, as text: it is meant to be a string, and some send an object."""
+    if isinstance(value, str):
+        return value
+    if value is None:
+        return ""
+    try:
+        return encode({"": value})[4:-1].decode()
+    except EncodeError:
+        return repr(value)
+
+
 def decode(data: bytes | str, *, max_size: int = MAX_SIZE, max_depth: int = MAX_DEPTH) -> dict[str, Any]:
     """Read one message.
 

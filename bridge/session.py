@@ -159,6 +159,7 @@ class Session:
         """Prepare; `open` connects."""
         self.uri = shown_uri
         self.core = core
+        self._wire = core.wire
         self.state = State.CONNECTING
         self.reconnections = 0
         self.last_error = ""
@@ -379,7 +380,7 @@ class Session:
             DisconnectedError: there is no connection.
         """
         websocket = self._websocket
-        if self.core.fragment_size is not None:
+        if self._wire.fragment_size is not None:
             self._send_pieces(self._open_websocket(), data)
         elif websocket is None or not websocket.send_now(data):
             self._open_websocket()  # which says why there is none
@@ -427,7 +428,7 @@ class Session:
                 self._send_pieces(websocket, message)
 
     def _send_pieces(self, websocket: WebSocket, data: bytes) -> None:
-        for piece in self.core.pieces(data):
+        for piece in self._wire.pieces(data):
             websocket.send_now(piece)
 
     def ask_later(self) -> None:
@@ -437,7 +438,7 @@ class Session:
 
     def _ask_again(self) -> None:
         self._asking = None
-        if self.core.ask_again():
+        if self.core.subscriptions.ask_again():
             self.flush()
             self.ask_later()
 
@@ -454,7 +455,7 @@ class Session:
         if self.must_wait():
             await self.wait_turn(f"a call of {service}", limit)
         begun = time.monotonic()
-        call = self.core.call(service, args)
+        call = self.core.calls.send(service, args)
         future = self._calls[call] = asyncio.get_running_loop().create_future()
         self.flush()
         try:
@@ -466,7 +467,7 @@ class Session:
             ) from None
         finally:
             self._calls.pop(call, None)
-            self.core.forget_call(call)
+            self.core.calls.forget(call)
         if not answer.ok:
             raise ServiceError(answer.values, f"{service} at {self.uri}")
         return answer.values

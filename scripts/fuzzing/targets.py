@@ -31,7 +31,10 @@ from bridge.events import (
 from bridge.fragments import Reassembler, split
 from bridge.hub.broker import Broker
 from bridge.hub.limits import HubLimits
-from bridge.protocol import MAX_CALLS, MAX_GOALS, MAX_REQUESTS, ClientCore, Delivery
+from bridge.protocol import ClientCore, Delivery
+from bridge.protocol.calls import MAX_CALLS
+from bridge.protocol.goals import MAX_GOALS
+from bridge.protocol.services import MAX_REQUESTS
 from bridge.qos import Qos
 from bridge.serialised import MessageTypes
 
@@ -337,17 +340,17 @@ class Play:
         """What must hold at any time."""
         core = self.core
         for data in core.data_to_send():
-            assert core.connected
+            assert core.wire.connected
             assert len(data) <= MAX_SIZE
             operation = json.loads(data, parse_constant=_no_constant)
             assert type(operation) is dict
             assert type(operation["op"]) is str
-            pieces = list(core.pieces(data))
+            pieces = list(core.wire.pieces(data))
             assert pieces == [data] or all(json.loads(piece)["op"] == "fragment" for piece in pieces)
-        assert len(core._requests) <= MAX_REQUESTS  # noqa: SLF001  # no one else can see what it keeps
-        assert len(core._calls) <= MAX_CALLS  # noqa: SLF001  # as above
-        assert len(core._goals) <= MAX_GOALS  # noqa: SLF001  # as above
-        assert core._fragments.waiting_bytes <= 4 * (MAX_SIZE + 128)  # noqa: SLF001  # as above
+        assert core.services.waiting <= MAX_REQUESTS
+        assert len(core.calls) <= MAX_CALLS
+        assert len(core.goals) <= MAX_GOALS
+        assert core._fragments.waiting_bytes <= 4 * (MAX_SIZE + 128)  # noqa: SLF001  # no one else can see it
 
     def hear_raw(self) -> None:
         """The server says anything."""
@@ -418,7 +421,7 @@ class Play:
 
     def subscribe(self) -> None:
         """The user subscribes, perhaps as someone did otherwise before."""
-        number = self.core.subscribe(
+        number = self.core.subscriptions.subscribe(
             self.source.pick(TOPICS),
             self.source.pick(("p/T", "p/msg/T", None, "p/U")),
             throttle_rate=self.source.pick((0, 0, 700, -1)),
@@ -431,12 +434,12 @@ class Play:
         if self.subscriptions:
             number = sorted(self.subscriptions)[self.source.byte() % len(self.subscriptions)]
             self.subscriptions.remove(number)
-            self.core.unsubscribe(number)
+            self.core.subscriptions.unsubscribe(number)
 
     def advertise(self) -> None:
         """The user advertises a topic."""
         self.advertisements.append(
-            self.core.advertise(
+            self.core.publications.advertise(
                 self.source.pick(TOPICS),
                 self.source.pick(("p/T", "p/msg/T", "q")),
                 latch=self.source.byte() % 2 == 0,
@@ -448,48 +451,50 @@ class Play:
         if self.advertisements:
             number = self.advertisements[self.source.byte() % len(self.advertisements)]
             value = self.source.pick((*ODD, math.nan, np.arange(3.0), np.array([math.inf]), b"x", {1: 2}))
-            data = self.core.publish(number, {"value": value})
+            data = self.core.publications.publish(number, {"value": value})
             assert type(json.loads(data, parse_constant=_no_constant)["msg"]) is dict
 
     def unadvertise(self) -> None:
         """The user stops publishing."""
         if self.advertisements:
-            self.core.unadvertise(self.advertisements.pop(self.source.byte() % len(self.advertisements)))
+            self.core.publications.unadvertise(
+                self.advertisements.pop(self.source.byte() % len(self.advertisements))
+            )
 
     def call(self) -> None:
         """The user calls a service, and perhaps waits no longer."""
-        self.calls.append(self.core.call(self.source.pick(("/s", "t")), {"x": self.source.pick(ODD)}))
+        self.calls.append(self.core.calls.send(self.source.pick(("/s", "t")), {"x": self.source.pick(ODD)}))
         if self.source.byte() % 4 == 0:
-            self.core.forget_call(self.calls[-1])
+            self.core.calls.forget(self.calls[-1])
 
     def send_goal(self) -> None:
         """The user sends a goal, and perhaps cancels or forgets it."""
-        goal = self.core.send_goal("/fly", "p/Fly", {"x": self.source.pick(ODD)}, feedback=True)
+        goal = self.core.goals.send("/fly", "p/Fly", {"x": self.source.pick(ODD)}, feedback=True)
         self.goals.append(goal)
         what = self.source.byte() % 4
         if what == 0:
-            self.core.cancel_goal(goal)
+            self.core.goals.cancel(goal)
         elif what == 1:
-            self.core.forget_goal(goal)
+            self.core.goals.forget(goal)
 
     def serve(self) -> None:
         """The user serves a service, or serves it no longer."""
         service = self.source.pick(("/s", "/t"))
-        if service in self.core._services:  # noqa: SLF001  # no one else knows
-            self.core.unadvertise_service(service)
+        if service in self.core.services:
+            self.core.services.unadvertise(service)
         else:
-            self.core.advertise_service(service, "p/T")
+            self.core.services.advertise(service, "p/T")
 
     def answer(self) -> None:
         """The user answers a request, perhaps one that nobody waits for any more."""
         if self.tickets:
             ticket = self.tickets.pop(self.source.byte() % len(self.tickets))
-            self.core.answer(ticket, {"x": self.source.pick(ODD)}, ok=self.source.byte() % 2 == 0)
+            self.core.services.answer(ticket, {"x": self.source.pick(ODD)}, ok=self.source.byte() % 2 == 0)
 
     def look(self) -> None:
         """Time goes by."""
         self.now += 20 * (self.source.byte() % 2)
-        self.core.ask_again()
+        self.core.subscriptions.ask_again()
 
 
 def fuzz_core(data: bytes) -> None:
@@ -510,14 +515,14 @@ def fuzz_again(data: bytes) -> None:
     delivery = source.pick((Delivery(), Delivery(arrays="numpy")))
     for core in cores:
         core.restore()
-        core.subscribe("/a", delivery=delivery)
-        core.subscribe("b")
+        core.subscriptions.subscribe("/a", delivery=delivery)
+        core.subscriptions.subscribe("b")
     while source:
         heard = _published(source)
-        cores[1]._forget_envelopes()  # noqa: SLF001  # so that it looks closely
+        cores[1].subscriptions.forget_envelopes()  # so that it looks closely
         events = [repr(core.receive(heard, 0.0)) for core in cores]
         assert events[0] == events[1], events
-        assert len(cores[0]._envelopes) <= 16  # noqa: SLF001  # no one else can see what it keeps
+        assert len(cores[0].subscriptions.envelopes) <= 16
 
 
 def fuzz_hub(data: bytes) -> None:

@@ -16,7 +16,8 @@ from bridge import cbor_codec, png
 from bridge.errors import OptionError, TypeConflictError
 from bridge.events import GoalEnded, GoalFeedback, GoalStatus, MessageReceived, Unusable
 from bridge.fragments import split
-from bridge.protocol import MAX_GOALS, ClientCore, Delivery
+from bridge.protocol import ClientCore, Delivery
+from bridge.protocol.goals import MAX_GOALS
 from bridge.qos import Qos
 
 CBOR = Delivery(compression="cbor")
@@ -51,15 +52,15 @@ def in_json(msg: Any, topic: str = "/a") -> bytes:
 
 def test_nothing_more_is_asked_than_wanted():
     core = connected()
-    core.subscribe("/a", "p/T")
+    core.subscriptions.subscribe("/a", "p/T")
     assert set(sent(core)[0]) == {"op", "id", "topic", "type", "throttle_rate", "queue_length"}
 
 
 def test_everything_that_can_be_asked_is_asked_again_after_a_loss():
     core = connected()
     delivery = Delivery(compression="cbor", fragment_size=1000, qos=Qos(depth=3))
-    core.subscribe("/a", "p/T", delivery=delivery)
-    core.advertise("/b", "p/T", qos=Qos(durability="transient_local"))
+    core.subscriptions.subscribe("/a", "p/T", delivery=delivery)
+    core.publications.advertise("/b", "p/T", qos=Qos(durability="transient_local"))
     before = sent(core)
     core.lost()
     core.restore()
@@ -96,17 +97,17 @@ def test_what_cannot_be_asked(wrong):
 
 def test_subscriptions_of_a_topic_agree_on_the_form():
     core = connected()
-    core.subscribe("/a", "p/T", delivery=CBOR)
-    core.subscribe("a", delivery=CBOR)
+    core.subscriptions.subscribe("/a", "p/T", delivery=CBOR)
+    core.subscriptions.subscribe("a", delivery=CBOR)
     with pytest.raises(TypeConflictError, match="share one on the wire"):
-        core.subscribe("/a", "p/T")
+        core.subscriptions.subscribe("/a", "p/T")
     with pytest.raises(TypeConflictError):
-        core.subscribe("/a", "p/T", delivery=ARRAYS)
-    advertisement = core.advertise("/b", "p/T", qos=Qos(depth=1))
+        core.subscriptions.subscribe("/a", "p/T", delivery=ARRAYS)
+    advertisement = core.publications.advertise("/b", "p/T", qos=Qos(depth=1))
     with pytest.raises(TypeConflictError, match="qos"):
-        core.advertise("/b", "p/T")
-    core.unadvertise(advertisement)
-    core.advertise("/b", "p/T")
+        core.publications.advertise("/b", "p/T")
+    core.publications.unadvertise(advertisement)
+    core.publications.advertise("/b", "p/T")
 
 
 # What comes
@@ -116,7 +117,7 @@ def test_cbor_as_lists_and_as_arrays():
     msg = {"data": np.array([1.5, 2.5]), "image": b"\x01\x02"}
     for delivery in (CBOR, ARRAYS):
         core = connected()
-        number = core.subscribe("/a", "p/T", delivery=delivery)
+        number = core.subscriptions.subscribe("/a", "p/T", delivery=delivery)
         event = core.receive(in_cbor(msg), 0.0)
         assert isinstance(event, MessageReceived)
         assert event.subscriptions == (number,)
@@ -129,7 +130,7 @@ def test_cbor_as_lists_and_as_arrays():
 
 def test_a_server_that_sends_json_all_the_same():
     core = connected()
-    core.subscribe("/a", "p/T", delivery=ARRAYS)
+    core.subscriptions.subscribe("/a", "p/T", delivery=ARRAYS)
     event = core.receive(in_json({"data": [1.5, None]}), 0.0)
     assert isinstance(event, MessageReceived)
     np.testing.assert_array_equal(event.msg["data"], [1.5, np.nan])
@@ -137,10 +138,10 @@ def test_a_server_that_sends_json_all_the_same():
 
 def test_topics_of_one_client_that_want_it_differently():
     core = connected()
-    core.subscribe("/arrays", "p/T", delivery=ARRAYS)
-    core.subscribe("/lists", "p/T", delivery=CBOR)
-    core.subscribe("/raw", "p/T", delivery=RAW)
-    core.subscribe("/json", "p/T")
+    core.subscriptions.subscribe("/arrays", "p/T", delivery=ARRAYS)
+    core.subscriptions.subscribe("/lists", "p/T", delivery=CBOR)
+    core.subscriptions.subscribe("/raw", "p/T", delivery=RAW)
+    core.subscriptions.subscribe("/json", "p/T")
     msg = {"data": np.array([1.5]), "bytes": b"\x01"}
 
     def came(data: bytes) -> Any:
@@ -156,12 +157,12 @@ def test_topics_of_one_client_that_want_it_differently():
 
 def test_cbor_that_nobody_asked_for_is_not_read():
     core = connected()
-    number = core.subscribe("/a", "p/T")
+    number = core.subscriptions.subscribe("/a", "p/T")
     assert isinstance(core.receive(in_cbor({}), 0.0), Unusable)
-    core.unsubscribe(number)
-    number = core.subscribe("/a", "p/T", delivery=CBOR)
+    core.subscriptions.unsubscribe(number)
+    number = core.subscriptions.subscribe("/a", "p/T", delivery=CBOR)
     assert isinstance(core.receive(in_cbor({}), 0.0), MessageReceived)
-    core.unsubscribe(number)
+    core.subscriptions.unsubscribe(number)
     assert isinstance(core.receive(in_cbor({}), 0.0), Unusable)
 
 
@@ -179,13 +180,13 @@ def test_cbor_that_nobody_asked_for_is_not_read():
 )
 def test_cbor_that_is_of_no_use(data):
     core = connected()
-    core.subscribe("/a", "p/T", delivery=CBOR)
+    core.subscriptions.subscribe("/a", "p/T", delivery=CBOR)
     assert isinstance(core.receive(data, 0.0), Unusable)
 
 
 def test_a_message_in_fragments():
     core = connected()
-    core.subscribe("/a", "p/T", delivery=Delivery(fragment_size=10))
+    core.subscriptions.subscribe("/a", "p/T", delivery=Delivery(fragment_size=10))
     pieces = list(split(in_json({"text": "x" * 50}), 10, 0))
     assert len(pieces) > 5
     for piece in reversed(pieces[1:]):
@@ -202,7 +203,7 @@ def test_a_message_in_fragments():
 
 def test_a_message_in_a_picture_and_in_both():
     core = connected()
-    core.subscribe("/a", "p/T", delivery=Delivery(compression="png"))
+    core.subscriptions.subscribe("/a", "p/T", delivery=Delivery(compression="png"))
     picture = json.dumps({"op": "png", "data": png.encode(in_json({"n": 1}))}).encode()
     for pieces in ([picture], list(split(picture, 40, "p"))):
         *rest, last = [core.receive(piece, 0.0) for piece in pieces]
@@ -233,21 +234,24 @@ def wrapped(inner: bytes) -> bytes:
 )
 def test_wrapping_without_a_message(data):
     core = connected()
-    core.subscribe("/a", "p/T")
+    core.subscriptions.subscribe("/a", "p/T")
     assert isinstance(core.receive(data, 0.0), Unusable)
 
 
 def test_large_messages_leave_in_fragments():
     core = connected(fragment_size=40)
-    number = core.advertise("/a", "p/T")
-    small, large = core.publish(number, {"n": 1}), core.publish(number, {"text": "x" * 100})
-    assert [len(list(core.pieces(data))) > 1 for data in (small[:40], large)] == [False, True]
+    number = core.publications.advertise("/a", "p/T")
+    small, large = (
+        core.publications.publish(number, {"n": 1}),
+        core.publications.publish(number, {"text": "x" * 100}),
+    )
+    assert [len(list(core.wire.pieces(data))) > 1 for data in (small[:40], large)] == [False, True]
     other = connected()
-    other.subscribe("/a", "p/T")
-    *rest, last = [other.receive(piece, 0.0) for piece in core.pieces(large)]
+    other.subscriptions.subscribe("/a", "p/T")
+    *rest, last = [other.receive(piece, 0.0) for piece in core.wire.pieces(large)]
     assert rest == [None] * len(rest)
     assert isinstance(last, MessageReceived)
-    ids = {json.loads(piece)["id"] for _ in range(2) for piece in core.pieces(large)}
+    ids = {json.loads(piece)["id"] for _ in range(2) for piece in core.wire.pieces(large)}
     assert len(ids) == 2, "each message has an id of its own"
 
 
@@ -255,7 +259,7 @@ def test_large_messages_leave_in_fragments():
 
 
 def goal_of(core: ClientCore, **options: Any) -> str:
-    return core.send_goal("/fly", "boat_msgs/Fly", {"to": [1, 2]}, feedback=True, **options)
+    return core.goals.send("/fly", "boat_msgs/Fly", {"to": [1, 2]}, feedback=True, **options)
 
 
 def told(core: ClientCore, **operation: Any) -> Any:
@@ -278,13 +282,13 @@ def test_a_goal_its_feedback_and_its_end():
     assert told(core, op="action_feedback", id=goal, action="/fly", values={"n": 1}) == GoalFeedback(
         goal, {"n": 1}
     )
-    core.cancel_goal(goal)
+    core.goals.cancel(goal)
     assert sent(core) == [{"op": "cancel_action_goal", "id": goal, "action": "/fly"}]
     ended = told(core, op="action_result", id=goal, action="/fly", values={"at": 2}, status=5, result=True)
     assert ended == GoalEnded(goal, ok=True, status=GoalStatus.CANCELED, values={"at": 2})
     assert told(core, op="action_feedback", id=goal, values={}) is None
     assert told(core, op="action_result", id=goal, values={}) is None
-    core.cancel_goal(goal)
+    core.goals.cancel(goal)
     assert sent(core) == []
 
 
@@ -315,7 +319,7 @@ def test_goals_are_bounded_and_forgotten_with_the_connection():
     goals = [goal_of(core) for _ in range(MAX_GOALS)]
     with pytest.raises(Exception, match="goals are under way already"):
         goal_of(core)
-    core.forget_goal(goals[0])
+    core.goals.forget(goals[0])
     goal_of(core)
     core.lost()
     core.restore()

@@ -77,10 +77,10 @@ def test_a_proven_envelope_says_the_same_around_any_message(middle):
 def core_that_knows() -> ClientCore:
     core = ClientCore(max_size=2000, max_depth=5)
     core.restore()
-    core.subscribe("/t")
+    core.subscriptions.subscribe("/t")
     for _ in range(2):
         assert core.receive(CANONICAL + b'{"a":1}}', 0.0) == MessageReceived("/t", {"a": 1}, (1,))
-    assert core._known.topic == "/t"
+    assert core.subscriptions._known.topic == "/t"
     return core
 
 
@@ -106,17 +106,17 @@ def test_what_is_wrong_is_told_behind_a_known_envelope_too():
 
 def test_a_known_envelope_is_of_nobody_who_unsubscribed():
     core = core_that_knows()
-    core.unsubscribe(1)
+    core.subscriptions.unsubscribe(1)
     assert core.receive(CANONICAL + b'{"a":1}}', 0.0) is None
-    number = core.subscribe("/t")
-    again = core.subscribe("/t")
+    number = core.subscriptions.subscribe("/t")
+    again = core.subscriptions.subscribe("/t")
     for _ in range(3):
         assert core.receive(CANONICAL + b'{"a":1}}', 0.0) == MessageReceived("/t", {"a": 1}, (number, again))
 
 
 def test_who_is_slower_stays_slower_with_a_known_envelope():
     core = core_that_knows()
-    slow = core.subscribe("/t", throttle_rate=1000)
+    slow = core.subscriptions.subscribe("/t", throttle_rate=1000)
     heard = [core.receive(CANONICAL + b"{}}", now) for now in (10.0, 10.1, 10.2, 11.1)]
     assert [event.subscriptions for event in heard] == [(1, slow), (1,), (1,), (1, slow)]
 
@@ -126,4 +126,4 @@ def test_envelopes_that_never_come_again_are_not_gathered():
     for number in range(100):
         odd = b'{%b"op":"publish","topic":"/t","msg":{}}' % (b" " * number)
         assert core.receive(odd, 0.0) == MessageReceived("/t", {}, (1,))
-    assert len(core._envelopes) <= 8
+    assert len(core.subscriptions.envelopes) <= 8

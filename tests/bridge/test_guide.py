@@ -15,9 +15,12 @@ from typing import Any
 import pytest
 from websockets.asyncio.client import connect as plain_connect
 
-from bridge import fragments, goals, handles, json_codec, protocol, session, websocket
+from bridge import fragments, goals, handles, json_codec, session, websocket
 from bridge.client import connect
 from bridge.hub.door import Door
+from bridge.protocol.calls import MAX_CALLS
+from bridge.protocol.goals import MAX_GOALS
+from bridge.protocol.services import MAX_REQUESTS
 from tests.bridge.hub.sockets import running_hub
 
 GUIDE = Path(__file__).parents[2] / "docs" / "bridge.md"
@@ -180,10 +183,10 @@ def test_no_example_is_left_out():
         ("messages in fragments that are incomplete", str(fragments.MAX_SETS)),
         ("fragments of one message", str(fragments.MAX_FRAGMENTS)),
         ("waiting for a message's next fragment", f"{fragments.MAX_AGE:g} s"),
-        ("calls that wait for answers", str(protocol.MAX_CALLS)),
-        ("goals under way", str(protocol.MAX_GOALS)),
+        ("calls that wait for answers", str(MAX_CALLS)),
+        ("goals under way", str(MAX_GOALS)),
         ("feedback that waits in a goal", str(goals.FEEDBACK_QUEUE_SIZE)),
-        ("requests to services of this client", str(protocol.MAX_REQUESTS)),
+        ("requests to services of this client", str(MAX_REQUESTS)),
         ("the closing handshake", f"{websocket.CLOSE_TIMEOUT:g} s"),
         ("status messages kept", str(session.KEPT_STATUSES)),
     ],

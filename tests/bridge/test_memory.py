@@ -75,11 +75,11 @@ async def test_calls_and_goals_that_come_and_go():
         def play(rounds: int) -> None:
             core = ros._session.core
             for number in range(rounds):
-                call = core.call("/echo", {"n": number})
+                call = core.calls.send("/echo", {"n": number})
                 take([b'{"op":"service_response","id":"%b","values":{},"result":true}' % call.encode()])
-                goal = core.send_goal("/fly", "p/Fly", {}, feedback=True)
+                goal = core.goals.send("/fly", "p/Fly", {}, feedback=True)
                 take([b'{"op":"action_result","id":"%b","values":{},"status":4}' % goal.encode()])
-                core.unsubscribe(core.subscribe("/b", "p/T"))
+                core.subscriptions.unsubscribe(core.subscriptions.subscribe("/b", "p/T"))
                 core.data_to_send()
 
         assert growth(play, 1500) < SLACK

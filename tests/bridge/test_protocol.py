@@ -24,7 +24,9 @@ from bridge.errors import (
 )
 from bridge.events import CallAnswered, MessageReceived, ServiceRequested, StatusReceived, Unusable
 from bridge.json_codec import MAX_DEPTH
-from bridge.protocol import MAX_CALLS, MAX_REQUESTS, ClientCore
+from bridge.protocol import ClientCore
+from bridge.protocol.calls import MAX_CALLS
+from bridge.protocol.services import MAX_REQUESTS
 
 
 def connected(**options: Any) -> ClientCore:
@@ -46,7 +48,7 @@ def tell(core: ClientCore, now: float = 0.0, **operation: Any) -> Any:
 
 def test_advertise_publish_unadvertise():
     core = connected()
-    number = core.advertise("/a", "std_msgs/String", latch=True, queue_size=5)
+    number = core.publications.advertise("/a", "std_msgs/String", latch=True, queue_size=5)
     (advertise,) = sent(core)
     assert advertise == {
         "op": "advertise",
@@ -56,66 +58,66 @@ def test_advertise_publish_unadvertise():
         "latch": True,
         "queue_size": 5,
     }
-    assert json.loads(core.publish(number, {"data": "x"})) == {
+    assert json.loads(core.publications.publish(number, {"data": "x"})) == {
         "op": "publish",
         "topic": "/a",
         "msg": {"data": "x"},
     }
     assert sent(core) == []
-    core.unadvertise(number)
+    core.publications.unadvertise(number)
     assert sent(core) == [{"op": "unadvertise", "id": advertise["id"], "topic": "/a"}]
 
 
 def test_one_topic_advertised_twice_is_once_on_the_wire():
     core = connected()
-    one, two = core.advertise("/a", "p/T"), core.advertise("a", "p/msg/T")
+    one, two = core.publications.advertise("/a", "p/T"), core.publications.advertise("a", "p/msg/T")
     assert len(sent(core)) == 1
-    core.unadvertise(one)
+    core.publications.unadvertise(one)
     assert sent(core) == []
-    assert json.loads(core.publish(two, {}))["topic"] == "/a"
-    core.unadvertise(two)
+    assert json.loads(core.publications.publish(two, {}))["topic"] == "/a"
+    core.publications.unadvertise(two)
     assert len(sent(core)) == 1
 
 
 def test_one_topic_advertised_as_two_things_is_refused():
     core = connected()
-    core.advertise("/a", "p/T")
+    core.publications.advertise("/a", "p/T")
     with pytest.raises(TypeConflictError, match=r"/a is already advertised as p/T.*p/U"):
-        core.advertise("/a", "p/U")
+        core.publications.advertise("/a", "p/U")
     with pytest.raises(TypeConflictError, match="latch"):
-        core.advertise("/a", "p/T", latch=True)
+        core.publications.advertise("/a", "p/T", latch=True)
     assert len(sent(core)) == 1
 
 
 def test_a_message_that_cannot_leave_is_named():
     core = connected()
-    number = core.advertise("/a", "p/T")
+    number = core.publications.advertise("/a", "p/T")
     with pytest.raises(EncodeError, match=r"^a message of /a cannot be published: x\.y is NaN"):
-        core.publish(number, {"x": {"y": math.nan}})
+        core.publications.publish(number, {"x": {"y": math.nan}})
 
 
 def test_the_limits_of_a_published_message():
     core = connected(max_size=100)
-    number = core.advertise("/a", "p/T")
-    room = 100 - len(core.publish(number, {"d": ""}))
-    assert len(core.publish(number, {"d": "x" * room})) == 100
+    number = core.publications.advertise("/a", "p/T")
+    room = 100 - len(core.publications.publish(number, {"d": ""}))
+    assert len(core.publications.publish(number, {"d": "x" * room})) == 100
     with pytest.raises(EncodeError, match="bytes"):
-        core.publish(number, {"d": "x" * (room + 1)})
+        core.publications.publish(number, {"d": "x" * (room + 1)})
 
 
 def test_the_depth_of_a_published_message():
     core = connected()
-    number = core.advertise("/a", "p/T")
+    number = core.publications.advertise("/a", "p/T")
 
     def nested(levels: int) -> dict[str, Any]:
         return {"a": nested(levels - 1)} if levels else {}
 
     receiver = connected()
-    receiver.subscribe("/a")
-    deepest = core.publish(number, nested(MAX_DEPTH - 2))
+    receiver.subscriptions.subscribe("/a")
+    deepest = core.publications.publish(number, nested(MAX_DEPTH - 2))
     assert isinstance(receiver.receive(deepest, 0.0), MessageReceived), "what leaves can also arrive"
     with pytest.raises(EncodeError, match="nested deeper"):
-        core.publish(number, nested(MAX_DEPTH - 1))
+        core.publications.publish(number, nested(MAX_DEPTH - 1))
 
 
 @pytest.mark.parametrize(
@@ -125,9 +127,9 @@ def test_the_depth_of_a_published_message():
 @pytest.mark.parametrize("form", ["p/T", "p/msg/T"])
 def test_the_form_of_type_names_follows_the_server(version, message_type, service_type, form):
     core = connected(ros_version=version)
-    core.advertise("/a", form)
-    core.subscribe("/b", form)
-    core.advertise_service("/c", "q/S")
+    core.publications.advertise("/a", form)
+    core.subscriptions.subscribe("/b", form)
+    core.services.advertise("/c", "q/S")
     assert [operation["type"] for operation in sent(core)] == [message_type, message_type, service_type]
 
 
@@ -136,7 +138,7 @@ def test_the_form_of_type_names_follows_the_server(version, message_type, servic
 
 def test_subscribe_and_unsubscribe():
     core = connected()
-    number = core.subscribe("/a", "p/T", throttle_rate=100, queue_length=3)
+    number = core.subscriptions.subscribe("/a", "p/T", throttle_rate=100, queue_length=3)
     (subscribe,) = sent(core)
     assert subscribe == {
         "op": "subscribe",
@@ -147,52 +149,52 @@ def test_subscribe_and_unsubscribe():
         "queue_length": 3,
     }
     assert tell(core, op="publish", topic="/a", msg={"d": 1}) == MessageReceived("/a", {"d": 1}, (number,))
-    core.unsubscribe(number)
+    core.subscriptions.unsubscribe(number)
     assert sent(core) == [{"op": "unsubscribe", "id": subscribe["id"], "topic": "/a"}]
     assert tell(core, op="publish", topic="/a", msg={}) is None
 
 
 def test_the_type_is_left_out_if_unknown():
     core = connected()
-    core.subscribe("/a")
+    core.subscriptions.subscribe("/a")
     (subscribe,) = sent(core)
     assert "type" not in subscribe
 
 
 def test_several_subscriptions_share_one_on_the_wire():
     core = connected()
-    slow = core.subscribe("/a", throttle_rate=100, queue_length=2)
+    slow = core.subscriptions.subscribe("/a", throttle_rate=100, queue_length=2)
     (first,) = sent(core)
-    fast = core.subscribe("a", "p/T", throttle_rate=50)
+    fast = core.subscriptions.subscribe("a", "p/T", throttle_rate=50)
     (second,) = sent(core)
     assert second == first | {"throttle_rate": 50, "type": "p/T"}
-    same = core.subscribe("/a", throttle_rate=50)
+    same = core.subscriptions.subscribe("/a", throttle_rate=50)
     assert sent(core) == []
     assert tell(core, 0.0, op="publish", topic="/a", msg={}).subscriptions == (slow, fast, same)
     assert tell(core, 0.06, op="publish", topic="/a", msg={}).subscriptions == (fast, same)
     assert tell(core, 0.11, op="publish", topic="/a", msg={}).subscriptions == (slow, fast, same)
-    core.unsubscribe(fast)
+    core.subscriptions.unsubscribe(fast)
     assert sent(core) == []
-    core.unsubscribe(same)
+    core.subscriptions.unsubscribe(same)
     assert sent(core) == [second | {"throttle_rate": 100}]
-    core.unsubscribe(slow)
+    core.subscriptions.unsubscribe(slow)
     assert sent(core) == [{"op": "unsubscribe", "id": first["id"], "topic": "/a"}]
 
 
 def test_a_topic_is_known_with_and_without_its_slash():
     core = connected()
-    number = core.subscribe("a")
+    number = core.subscriptions.subscribe("a")
     assert tell(core, op="publish", topic="/a", msg={}).subscriptions == (number,)
     assert tell(core, op="publish", topic="a", msg={}).subscriptions == (number,)
 
 
 def test_one_topic_subscribed_as_two_types_is_refused():
     core = connected()
-    core.subscribe("/a", "p/T")
-    core.subscribe("/a", "p/msg/T")
-    core.subscribe("/a")
+    core.subscriptions.subscribe("/a", "p/T")
+    core.subscriptions.subscribe("/a", "p/msg/T")
+    core.subscriptions.subscribe("/a")
     with pytest.raises(TypeConflictError, match=r"/a is already subscribed to as p/T, not as p/U"):
-        core.subscribe("/a", "p/U")
+        core.subscriptions.subscribe("/a", "p/U")
 
 
 @pytest.mark.parametrize("bad", [-1, 0.0, 1.5, True, None, "5"])
@@ -200,26 +202,26 @@ def test_one_topic_subscribed_as_two_types_is_refused():
 def test_what_would_kill_a_subscription_is_refused(option, bad):
     core = connected()
     with pytest.raises(OptionError, match=f"{option} of topic /a"):
-        core.subscribe("/a", **{option: bad})
+        core.subscriptions.subscribe("/a", **{option: bad})
     assert sent(core) == []
 
 
 def test_a_topic_of_unknown_type_is_asked_for_until_it_brings_something():
     core = connected()
-    core.subscribe("/typed", "p/T")
-    assert not core.ask_again()
-    core.subscribe("/a")
+    core.subscriptions.subscribe("/typed", "p/T")
+    assert not core.subscriptions.ask_again()
+    core.subscriptions.subscribe("/a")
     sent(core)
     for _ in range(3):
-        assert core.ask_again()
+        assert core.subscriptions.ask_again()
         assert [operation["topic"] for operation in sent(core)] == ["/a"]
     tell(core, op="publish", topic="/a", msg={})
-    assert not core.ask_again()
+    assert not core.subscriptions.ask_again()
     assert sent(core) == []
     core.lost()
     core.restore()
     sent(core)
-    assert core.ask_again(), "the server may have forgotten it"
+    assert core.subscriptions.ask_again(), "the server may have forgotten it"
 
 
 @pytest.mark.parametrize(
@@ -233,21 +235,21 @@ def test_a_topic_of_unknown_type_is_asked_for_until_it_brings_something():
 )
 def test_stamps_show_the_version(header, version):
     core = connected()
-    core.subscribe("/a")
-    core.subscribe("/b")
+    core.subscriptions.subscribe("/a")
+    core.subscriptions.subscribe("/b")
     tell(core, op="publish", topic="/a", msg={"no": "header"})
     tell(core, op="publish", topic="/b", msg={"header": header})
-    assert core.seen_version == version
+    assert core.subscriptions.seen_version == version
 
 
 @pytest.mark.parametrize("name", ["", "/a b", 'x"', "/a\\"])
 def test_bad_names_are_refused_before_anything_is_sent(name):
     core = connected()
     for attempt in (
-        lambda: core.advertise(name, "p/T"),
-        lambda: core.subscribe(name),
-        lambda: core.call(name, {}),
-        lambda: core.advertise_service(name, "p/T"),
+        lambda: core.publications.advertise(name, "p/T"),
+        lambda: core.subscriptions.subscribe(name),
+        lambda: core.calls.send(name, {}),
+        lambda: core.services.advertise(name, "p/T"),
     ):
         with pytest.raises(NameFormError):
             attempt()
@@ -259,7 +261,7 @@ def test_bad_names_are_refused_before_anything_is_sent(name):
 
 def test_a_call_and_its_answer():
     core = connected()
-    call = core.call("/s", {"a": 1})
+    call = core.calls.send("/s", {"a": 1})
     assert sent(core) == [{"op": "call_service", "id": call, "service": "/s", "args": {"a": 1}}]
     answer = {"op": "service_response", "service": "/s", "id": call, "values": {"b": 2}, "result": True}
     assert tell(core, **answer) == CallAnswered(call, ok=True, values={"b": 2})
@@ -279,14 +281,14 @@ def test_a_call_and_its_answer():
 )
 def test_answers_as_servers_give_them(answer, ok, values):
     core = connected()
-    call = core.call("/s", {})
+    call = core.calls.send("/s", {})
     assert tell(core, op="service_response", id=call, **answer) == CallAnswered(call, ok=ok, values=values)
 
 
 def test_an_answer_that_nobody_waits_for_is_passed_over():
     core = connected()
-    call = core.call("/s", {})
-    core.forget_call(call)
+    call = core.calls.send("/s", {})
+    core.calls.forget(call)
     assert tell(core, op="service_response", id=call, values={}, result=True) is None
     assert tell(core, op="service_response", id="other", values={}, result=True) is None
     assert isinstance(tell(core, op="service_response", values={}, result=True), Unusable)
@@ -294,11 +296,11 @@ def test_an_answer_that_nobody_waits_for_is_passed_over():
 
 def test_calls_are_bounded():
     core = connected()
-    calls = [core.call("/s", {}) for _ in range(MAX_CALLS)]
+    calls = [core.calls.send("/s", {}) for _ in range(MAX_CALLS)]
     with pytest.raises(SlowPeerError, match="/s"):
-        core.call("/s", {})
-    core.forget_call(calls[0])
-    core.call("/s", {})
+        core.calls.send("/s", {})
+    core.calls.forget(calls[0])
+    core.calls.send("/s", {})
 
 
 # Serving
@@ -306,33 +308,33 @@ def test_calls_are_bounded():
 
 def test_a_request_and_its_answer():
     core = connected()
-    core.advertise_service("/s", "p/T")
+    core.services.advertise("/s", "p/T")
     assert sent(core) == [{"op": "advertise_service", "service": "/s", "type": "p/T"}]
     request = tell(core, op="call_service", service="/s", id="x1", args={"a": 1})
     assert isinstance(request, ServiceRequested)
     assert (request.service, request.args) == ("/s", {"a": 1})
-    core.answer(request.ticket, {"b": 2})
+    core.services.answer(request.ticket, {"b": 2})
     answer = {"op": "service_response", "service": "/s", "values": {"b": 2}, "result": True, "id": "x1"}
     assert sent(core) == [answer]
-    core.answer(request.ticket, {"b": 2})
+    core.services.answer(request.ticket, {"b": 2})
     assert sent(core) == [], "only once"
 
 
 def test_a_request_without_args_or_id_and_a_refusal():
     core = connected()
-    core.advertise_service("s", "p/T")
+    core.services.advertise("s", "p/T")
     sent(core)
     request = tell(core, op="call_service", service="/s")
     assert request.args == {}
-    core.answer(request.ticket, "no", ok=False)
+    core.services.answer(request.ticket, "no", ok=False)
     assert sent(core) == [{"op": "service_response", "service": "/s", "values": "no", "result": False}]
 
 
 def test_what_cannot_be_served_is_refused_on_the_spot():
     core = connected()
-    core.advertise_service("/s", "p/T")
+    core.services.advertise("/s", "p/T")
     with pytest.raises(TypeConflictError):
-        core.advertise_service("s", "p/T")
+        core.services.advertise("s", "p/T")
     sent(core)
     assert tell(core, op="call_service", service="/other", id=1) is None
     assert tell(core, op="call_service", service="/s", id=2, args=[1]) is None
@@ -340,19 +342,19 @@ def test_what_cannot_be_served_is_refused_on_the_spot():
         assert isinstance(tell(core, op="call_service", service="/s", id=f"n{number}"), ServiceRequested)
     assert tell(core, op="call_service", service="/s", id=3) is None
     assert [(answer["id"], answer["result"]) for answer in sent(core)] == [(1, False), (2, False), (3, False)]
-    core.unadvertise_service("s")
+    core.services.unadvertise("s")
     assert sent(core) == [{"op": "unadvertise_service", "service": "/s"}]
     assert tell(core, op="call_service", service="/s", id=4) is None
 
 
 def test_an_answer_that_cannot_leave_can_still_be_a_refusal():
     core = connected()
-    core.advertise_service("/s", "p/T")
+    core.services.advertise("/s", "p/T")
     request = tell(core, op="call_service", service="/s", id="x")
     sent(core)
     with pytest.raises(EncodeError):
-        core.answer(request.ticket, {"a": math.nan})
-    core.answer(request.ticket, "it is NaN", ok=False)
+        core.services.answer(request.ticket, {"a": math.nan})
+    core.services.answer(request.ticket, "it is NaN", ok=False)
     assert [answer["values"] for answer in sent(core)] == ["it is NaN"]
 
 
@@ -361,15 +363,15 @@ def test_an_answer_that_cannot_leave_can_still_be_a_refusal():
 
 def test_everything_is_restored():
     core = connected()
-    number = core.advertise("/a", "p/T", latch=True)
-    core.advertise("/b", "p/T")
-    core.subscribe("/c", "p/T", throttle_rate=5)
-    core.advertise_service("/s", "p/T")
+    number = core.publications.advertise("/a", "p/T", latch=True)
+    core.publications.advertise("/b", "p/T")
+    core.subscriptions.subscribe("/c", "p/T", throttle_rate=5)
+    core.services.advertise("/s", "p/T")
     before = sent(core)
-    last = json.loads(core.publish(number, {"last": 1}))
+    last = json.loads(core.publications.publish(number, {"last": 1}))
     core.lost()
     assert sent(core) == []
-    core.subscribe("/later")
+    core.subscriptions.subscribe("/later")
     assert sent(core) == [], "there is no one to tell"
     core.restore()
     restored = sent(core)
@@ -389,25 +391,25 @@ def test_everything_is_restored():
 
 def test_what_was_taken_back_is_not_restored():
     core = connected()
-    advertisement, subscription = core.advertise("/a", "p/T"), core.subscribe("/b")
-    core.advertise_service("/s", "p/T")
+    advertisement, subscription = core.publications.advertise("/a", "p/T"), core.subscriptions.subscribe("/b")
+    core.services.advertise("/s", "p/T")
     core.lost()
-    core.unadvertise(advertisement)
-    core.unsubscribe(subscription)
-    core.unadvertise_service("/s")
+    core.publications.unadvertise(advertisement)
+    core.subscriptions.unsubscribe(subscription)
+    core.services.unadvertise("/s")
     core.restore()
     assert sent(core) == []
 
 
 def test_calls_and_requests_end_with_the_connection():
     core = connected()
-    core.advertise_service("/s", "p/T")
-    call = core.call("/x", {})
+    core.services.advertise("/s", "p/T")
+    call = core.calls.send("/x", {})
     request = tell(core, op="call_service", service="/s", id="x")
     core.lost()
     core.restore()
     sent(core)
-    core.answer(request.ticket, {})
+    core.services.answer(request.ticket, {})
     assert sent(core) == []
     assert tell(core, op="service_response", id=call, values={}, result=True) is None
 
@@ -450,7 +452,7 @@ def test_status_messages_are_taken(operation, level, text):
 )
 def test_what_is_unusable_says_so(data):
     core = connected()
-    core.subscribe("/a")
+    core.subscriptions.subscribe("/a")
     event = core.receive(data, 0.0)
     assert isinstance(event, Unusable)
     assert 10 < len(event.reason) < 300
@@ -505,17 +507,17 @@ operations = st.fixed_dictionaries(
 @given(st.lists(st.binary(max_size=80) | (junk | operations).map(json.dumps), max_size=6))
 def test_nothing_that_arrives_raises_or_changes_what_is_wanted(arrivals):
     core = connected()
-    core.advertise("/a", "p/T")
-    subscription = core.subscribe("/a")
-    core.advertise_service("/s", "p/T")
-    core.call("/s", {})
+    core.publications.advertise("/a", "p/T")
+    subscription = core.subscriptions.subscribe("/a")
+    core.services.advertise("/s", "p/T")
+    core.calls.send("/s", {})
     wanted = sent(core)[:3]
     for data in arrivals:
         event = core.receive(data, 0.0)
         if isinstance(event, MessageReceived):
             assert event.subscriptions == (subscription,)
         elif isinstance(event, ServiceRequested):
-            core.answer(event.ticket, {"ok": True})
+            core.services.answer(event.ticket, {"ok": True})
     assert all(answer["op"] == "service_response" for answer in sent(core))
     core.lost()
     core.restore()
@@ -578,13 +580,13 @@ class Wishes(RuleBasedStateMachine):
 
     @rule(topic=st.sampled_from(TOPICS))
     def advertise(self, topic: str) -> None:
-        self.advertisements[self.core.advertise(topic, "p/T")] = topic
+        self.advertisements[self.core.publications.advertise(topic, "p/T")] = topic
 
     @rule(data=st.data())
     @precondition(lambda self: self.advertisements)
     def unadvertise(self, data: Any) -> None:
         number = data.draw(st.sampled_from(sorted(self.advertisements)))
-        self.core.unadvertise(number)
+        self.core.publications.unadvertise(number)
         del self.advertisements[number]
 
     @rule(
@@ -594,7 +596,7 @@ class Wishes(RuleBasedStateMachine):
         length=st.sampled_from([0, 5]),
     )
     def subscribe(self, topic: str, type_name: str | None, rate: int, length: int) -> None:
-        number = self.core.subscribe(topic, type_name, throttle_rate=rate, queue_length=length)
+        number = self.core.subscriptions.subscribe(topic, type_name, throttle_rate=rate, queue_length=length)
         assert number not in self.subscriptions
         self.subscriptions[number] = (topic, rate, length)
 
@@ -602,27 +604,27 @@ class Wishes(RuleBasedStateMachine):
     @precondition(lambda self: self.subscriptions)
     def unsubscribe(self, data: Any) -> None:
         number = data.draw(st.sampled_from(sorted(self.subscriptions)))
-        self.core.unsubscribe(number)
+        self.core.subscriptions.unsubscribe(number)
         del self.subscriptions[number]
 
     @rule(service=st.sampled_from(["/s", "/t"]))
     def toggle_service(self, service: str) -> None:
         if service in self.services:
-            self.core.unadvertise_service(service)
+            self.core.services.unadvertise(service)
         else:
-            self.core.advertise_service(service, "p/T")
+            self.core.services.advertise(service, "p/T")
         self.services ^= {service}
 
     @rule()
     def ask_again(self) -> None:
-        self.core.ask_again()
+        self.core.subscriptions.ask_again()
 
     @rule(name=st.text(max_size=3), rate=st.sampled_from([-1, 0.5, None]))
     def want_nonsense(self, name: str, rate: Any) -> None:
         for attempt in (
-            lambda: self.core.subscribe("/a", throttle_rate=rate),
-            lambda: self.core.advertise(f" {name}", "p/T"),
-            lambda: self.core.advertise("/a", f" {name}"),
+            lambda: self.core.subscriptions.subscribe("/a", throttle_rate=rate),
+            lambda: self.core.publications.advertise(f" {name}", "p/T"),
+            lambda: self.core.publications.advertise("/a", f" {name}"),
         ):
             with pytest.raises(BridgeError):
                 attempt()
@@ -648,9 +650,9 @@ class Wishes(RuleBasedStateMachine):
     @invariant()
     def the_server_knows_what_is_wanted(self) -> None:
         for operation in sent(self.core):
-            assert self.core.connected
+            assert self.core.wire.connected
             self.server.hear(operation)
-        if not self.core.connected:
+        if not self.core.wire.connected:
             return
         assert set(self.server.advertised) == set(self.advertisements.values())
         assert self.server.services == self.services

@@ -44,7 +44,7 @@ async def test_no_answer():
         begun = time.monotonic()
         with pytest.raises(NoAnswerError) as caught:
             await ros.call("/mute", timeout=0.1)
-        assert time.monotonic() - begun < 5
+        assert time.monotonic() - begun < 30
         assert str(caught.value) == f"service /mute at {fake.uri} did not answer within 0.1 s"
 
 
@@ -53,7 +53,7 @@ async def test_a_late_answer_is_nobodys():
         fake.serve("/s", lambda args: args)
         with pytest.raises(NoAnswerError):
             await ros.call("/s", {"n": 1}, timeout=0.05)
-        assert not ros._session.core._calls
+        assert not ros._session.core.calls
         assert await ros.call("/s", {"n": 2}) == {"n": 2}
         assert ros.unusable == 0
 
@@ -74,7 +74,7 @@ async def test_a_lost_connection_fails_what_waits():
         await fake.wait_for_op("call_service")
         await fake.cut()
         with pytest.raises(DisconnectedError, match=r"was lost .* while /mute was to answer"):
-            await asyncio.wait_for(call, 5)
+            await asyncio.wait_for(call, 30)
 
 
 async def test_closing_fails_what_waits():
@@ -84,7 +84,7 @@ async def test_closing_fails_what_waits():
             call = asyncio.create_task(ros.call("/mute", timeout=30))
             await fake.wait_for_op("call_service")
         with pytest.raises(DisconnectedError, match="was closed"):
-            await asyncio.wait_for(call, 5)
+            await asyncio.wait_for(call, 30)
         with pytest.raises(DisconnectedError, match="this client was closed"):
             await ros.call("/mute")
         assert ros.state is State.CLOSED
@@ -137,7 +137,8 @@ async def test_a_handler_that_fails(outcome, said, caplog):
         return outcome
 
     async with FakeRosbridge() as fake, connect(fake.uri) as server, connect(fake.uri) as caller:
-        await server.advertise_service("/s", "p/T", handler, handler_timeout=0.1)
+        limit = 0.1 if outcome is None else 30
+        await server.advertise_service("/s", "p/T", handler, handler_timeout=limit)
         await fake.wait_for_op("advertise_service")
         with pytest.raises(ServiceError) as caught:
             await caller.call("/s")
@@ -161,8 +162,8 @@ async def test_closing_ends_what_is_being_handled():
             await server.advertise_service("/s", "p/T", handler)
             await fake.wait_for_op("advertise_service")
             call = asyncio.create_task(caller.call("/s", timeout=0.5))
-            await asyncio.wait_for(began.wait(), 5)
-        await asyncio.wait_for(ended.wait(), 5)
+            await asyncio.wait_for(began.wait(), 30)
+        await asyncio.wait_for(ended.wait(), 30)
         with pytest.raises(NoAnswerError):
             await call
 
