@@ -29,6 +29,7 @@ import contextlib
 import itertools
 import json
 import math
+import socket
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -113,6 +114,7 @@ class FakeRosbridge:
         self.services: dict[str, Callable[[dict[str, Any]], Any]] = {}
         self._clients: set[_Client] = set()
         self._server: Server | None = None
+        self._place: socket.socket | None = None
         self._numbers = itertools.count(1)
         self._calls: dict[str, tuple[_Client, Any]] = {}
         self._news = asyncio.Event()
@@ -130,10 +132,18 @@ class FakeRosbridge:
 
     async def __aexit__(self, *_exception: object) -> None:
         await self.vanish()
+        if self._place is not None:
+            self._place.close()
 
     async def come_back(self) -> None:
         """Listen (again), knowing nothing of what was before."""
         assert self._server is None, "it is here already"
+        if self._place is None:
+            # bound and never listening: while nobody serves there, nobody else is given the port
+            self._place = socket.socket()
+            self._place.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            self._place.bind(("127.0.0.1", self.port))
+            self.port = self._place.getsockname()[1]
         self.types.clear()
         self.latched.clear()
         self._server = await serve(
@@ -145,8 +155,8 @@ class FakeRosbridge:
             max_size=None,
             process_request=self._answer_http,
             server_header=SERVER,
+            reuse_address=True,
         )
-        self.port = next(iter(self._server.sockets)).getsockname()[1]
 
     async def vanish(self) -> None:
         """Cut every connection without a goodbye, and listen no more."""
@@ -157,13 +167,13 @@ class FakeRosbridge:
             server.close(close_connections=False)
         await self.cut()
         if server is not None:
-            await asyncio.wait_for(server.wait_closed(), 5)
+            await asyncio.wait_for(server.wait_closed(), 30)
 
     async def cut(self) -> None:
         """Cut every connection without a goodbye, but go on listening."""
         for client in list(self._clients):
             client.connection.transport.abort()
-        await self._until(lambda: not self._clients, 5, "all connections to be gone")
+        await self._until(lambda: not self._clients, 30, "all connections to be gone")
 
     async def hang_up(self, code: int = 1001) -> None:
         """Close every connection as the protocol wants it."""
@@ -197,13 +207,13 @@ class FakeRosbridge:
         ]
 
     async def wait_for_op(
-        self, op: str, *, count: int = 1, timeout: float = 10, **fields: Any
+        self, op: str, *, count: int = 1, timeout: float = 30, **fields: Any
     ) -> dict[str, Any]:
         """Wait until so many operations of one kind, with the given fields, have been received; the last of them."""
         await self._until(lambda: len(self.ops(op, **fields)) >= count, timeout, f"{count} {op} {fields}")
         return self.ops(op, **fields)[count - 1]
 
-    async def wait_for_connections(self, count: int, timeout: float = 10) -> None:
+    async def wait_for_connections(self, count: int, timeout: float = 30) -> None:
         """Wait until so many connections were ever made."""
         await self._until(lambda: self.connections >= count, timeout, f"{count} connections")
 

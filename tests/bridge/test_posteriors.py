@@ -265,7 +265,7 @@ async def test_silence_ends_it(calling):
 
 
 async def test_more_can_be_said_of_the_connection(calling):
-    calling.server = connect(calling.fake.uri, connect_timeout=5)
+    calling.server = connect(calling.fake.uri, connect_timeout=30)
     assert await calling(lambda posterior: None, count=1) == 1
 
 

@@ -30,10 +30,10 @@ def delays(monkeypatch: pytest.MonkeyPatch) -> list[float]:
 
 async def gone_and_back(fake: FakeRosbridge, ros: Ros) -> None:
     await fake.vanish()
-    await ros.wait_for_state(State.RECONNECTING, 10)
+    await ros.wait_for_state(State.RECONNECTING, 30)
     fake.received.clear()
     await fake.come_back()
-    await ros.wait_for_state(State.CONNECTED, 20)
+    await ros.wait_for_state(State.CONNECTED, 30)
 
 
 async def test_everything_is_restored():
@@ -60,7 +60,7 @@ async def test_everything_is_restored():
             assert after == [before[1], before[-1], before[2], before[0]]
             # In both directions, on the same handles.
             await fake.publish("/in", {"n": 2})
-            assert (await subscription.next(5)).msg == {"n": 2}
+            assert (await subscription.next(30)).msg == {"n": 2}
             await publication.publish({"n": 3})
             await fake.wait_for_op("publish", msg={"n": 3})
             async with connect(fake.uri) as other:
@@ -91,7 +91,7 @@ async def test_an_iteration_goes_on():
             await fake.publish("/a", {"n": n})
             if n < 2:
                 await gone_and_back(fake, ros)
-        await asyncio.wait_for(reader, 5)
+        await asyncio.wait_for(reader, 30)
         assert got == [0, 1, 2]
         assert ros.reconnections == 2
 
@@ -100,7 +100,7 @@ async def test_nothing_is_published_into_the_void():
     async with FakeRosbridge() as fake, connect(fake.uri) as ros:
         publication = await ros.advertise("/a", "p/T")
         await fake.vanish()
-        await ros.wait_for_state(State.RECONNECTING, 10)
+        await ros.wait_for_state(State.RECONNECTING, 30)
         with pytest.raises(DisconnectedError, match=f"there is no connection to {fake.uri} now"):
             await publication.publish({"n": 1})
         with pytest.raises(DisconnectedError):
@@ -110,11 +110,11 @@ async def test_nothing_is_published_into_the_void():
         new = await ros.advertise("/new", "p/T")
         await publication.close()
         await fake.come_back()
-        await ros.wait_for_state(State.CONNECTED, 20)
+        await ros.wait_for_state(State.CONNECTED, 30)
         await fake.wait_for_op("subscribe", topic="/later")
         assert fake.ops("publish") == []
         await fake.publish("/later", {"n": 2})
-        assert (await later.next(5)).msg == {"n": 2}
+        assert (await later.next(30)).msg == {"n": 2}
         await new.publish({"n": 3})
         await fake.wait_for_op("publish", topic="/new")
 
@@ -131,12 +131,13 @@ async def test_the_waits_double_up_to_five_seconds(delays):
         assert "refused" in ros.last_error
 
 
-async def test_a_server_that_drops_everyone_is_not_stormed(delays):
+async def test_a_server_that_drops_everyone_is_not_stormed(delays, monkeypatch):
+    monkeypatch.setattr("bridge.session.STEADY", 600.0)
     async with FakeRosbridge() as fake, connect(fake.uri) as ros:
         for number in range(6):
             await fake.cut()
             await fake.wait_for_connections(number + 2)
-            await ros.wait_for_state(State.CONNECTED, 10)
+            await ros.wait_for_state(State.CONNECTED, 30)
         assert 0.8 * 3.2 <= max(delays) <= 3.2
 
 
@@ -146,7 +147,7 @@ async def test_a_steady_connection_begins_with_the_first_wait_again(delays, monk
         for number in range(6):
             await fake.cut()
             await fake.wait_for_connections(number + 2)
-            await ros.wait_for_state(State.CONNECTED, 10)
+            await ros.wait_for_state(State.CONNECTED, 30)
         assert max(delays) <= 0.1
 
 
@@ -156,28 +157,25 @@ async def test_it_comes_back_whatever_was_there_meanwhile(trouble):
         if trouble == "refuses":
             fake.refuses = 503
             await fake.cut()
-            await ros.wait_for_state(State.RECONNECTING, 10)
-            await asyncio.sleep(0.3)
-            assert "HTTP 503" in ros.last_error
+            await asyncio.wait_for(_until(lambda: "HTTP 503" in ros.last_error), 30)
             fake.refuses = None
         else:
             await fake.vanish()
             greeter = await asyncio.start_server(
                 lambda _r, w: w.write(b"220 mail\r\n"), "127.0.0.1", fake.port
             )
-            await asyncio.sleep(0.3)
+            await asyncio.wait_for(_until(lambda: "220 mail" in ros.last_error), 30)
             greeter.close()
-            assert "220 mail" in ros.last_error
             await fake.come_back()
-        await ros.wait_for_state(State.CONNECTED, 20)
+        await ros.wait_for_state(State.CONNECTED, 30)
 
 
 async def test_a_goodbye_of_the_server_is_told():
     async with FakeRosbridge() as fake, connect(fake.uri) as ros:
         await fake.hang_up(1001)
-        await ros.wait_for_state(State.RECONNECTING, 10)
+        await ros.wait_for_state(State.RECONNECTING, 30)
         assert ros.last_error == "the server closed it (code 1001)"
-        await ros.wait_for_state(State.CONNECTED, 10)
+        await ros.wait_for_state(State.CONNECTED, 30)
 
 
 async def test_a_goodbye_without_hanging_up_is_not_waited_for(monkeypatch):
@@ -186,24 +184,24 @@ async def test_a_goodbye_without_hanging_up_is_not_waited_for(monkeypatch):
         fake.freeze()
         (client,) = fake._clients
         client.connection.transport.write(b"\x88\x02\x03\xe9")
-        await ros.wait_for_state(State.RECONNECTING, 3)
+        await ros.wait_for_state(State.RECONNECTING, 30)
         assert ros.last_error == "the server closed it (code 1001)"
 
 
 async def test_a_silent_peer_is_noticed():
     async with FakeRosbridge() as fake, connect(fake.uri, ping_interval=0.2, ping_timeout=0.2) as ros:
         fake.freeze()
-        await ros.wait_for_state(State.RECONNECTING, 5)
-        assert "nothing was heard from the server for 0." in ros.last_error
-        await ros.wait_for_state(State.CONNECTED, 10)
+        await ros.wait_for_state(State.RECONNECTING, 30)
+        assert "nothing was heard from the server for " in ros.last_error
+        await ros.wait_for_state(State.CONNECTED, 30)
 
 
 async def test_a_quiet_server_that_answers_pings_is_kept():
     async with (
         FakeRosbridge(silent=True) as fake,
-        connect(fake.uri, ping_interval=0.05, ping_timeout=0.3) as ros,
+        connect(fake.uri, ping_interval=0.05, ping_timeout=1.0) as ros,
     ):
-        await asyncio.sleep(0.5)
+        await asyncio.sleep(2)
         assert (ros.state, ros.reconnections, fake.connections) == (State.CONNECTED, 0, 1)
 
 
@@ -224,30 +222,30 @@ async def test_a_message_that_is_too_large_ends_the_connection_and_says_so():
         subscription = ros.subscribe("/a", "p/T", queue_size=5)
         await fake.wait_for_op("subscribe")
         await fake.publish("/a", {"n": "x" * 2000})
-        await ros.wait_for_state(State.RECONNECTING, 10)
+        await ros.wait_for_state(State.RECONNECTING, 30)
         assert (
             ros.last_error
             == "the server sent a message of more than 1000 bytes (max_size allows larger ones)"
         )
         await fake.wait_for_op("subscribe", count=2)
         await fake.publish("/a", {"n": 1})
-        assert (await subscription.next(5)).msg == {"n": 1}
+        assert (await subscription.next(30)).msg == {"n": 1}
 
 
 async def test_a_peer_that_breaks_the_protocol():
     async with FakeRosbridge() as fake, connect(fake.uri) as ros:
         (client,) = fake._clients
         client.connection.transport.write(b"\xff\xff not a frame")
-        await ros.wait_for_state(State.RECONNECTING, 10)
+        await ros.wait_for_state(State.RECONNECTING, 30)
         assert "broke the WebSocket protocol" in ros.last_error
-        await ros.wait_for_state(State.CONNECTED, 10)
+        await ros.wait_for_state(State.CONNECTED, 30)
 
 
 async def test_waiting_for_a_state_is_bounded():
     async with FakeRosbridge() as fake, connect(fake.uri) as ros:
         await ros.wait_for_state(State.CONNECTED, 1)
         await fake.vanish()
-        await ros.wait_for_state(State.RECONNECTING, 10)
+        await ros.wait_for_state(State.RECONNECTING, 30)
         with pytest.raises(StateTimeoutError) as caught:
             await ros.wait_for_state(State.CONNECTED, 0.05)
         assert str(caught.value).startswith(
@@ -268,7 +266,7 @@ async def test_closing_while_it_reconnects_ends_it():
         async with connect(fake.uri) as ros:
             subscription = ros.subscribe("/a", "p/T")
             await fake.vanish()
-            await ros.wait_for_state(State.RECONNECTING, 10)
+            await ros.wait_for_state(State.RECONNECTING, 30)
         assert ros.state is State.CLOSED
         await fake.come_back()
         await asyncio.sleep(0.4)
@@ -287,7 +285,7 @@ async def test_closing_from_the_callback():
         ros = connect(fake.uri, on_state=on_state)
         async with ros:
             await fake.cut()
-            await ros.wait_for_state(State.CLOSED, 10)
+            await ros.wait_for_state(State.CLOSED, 30)
         await asyncio.gather(*closing)
 
 
@@ -298,7 +296,7 @@ async def test_a_callback_that_fails_breaks_nothing(caplog):
     async with FakeRosbridge() as fake, connect(fake.uri, on_state=on_state) as ros:
         await fake.cut()
         await fake.wait_for_connections(2)
-        await ros.wait_for_state(State.CONNECTED, 10)
+        await ros.wait_for_state(State.CONNECTED, 30)
         assert "on_state failed" in caplog.text
 
 
@@ -310,7 +308,7 @@ async def test_a_peer_that_does_not_say_goodbye_is_not_waited_for(monkeypatch):
         fake.freeze()
         begun = time.monotonic()
         await ros.close()
-        assert time.monotonic() - begun < 4
+        assert time.monotonic() - begun < 30
 
 
 async def test_nothing_is_left_open():
@@ -335,22 +333,22 @@ async def test_the_first_message_after_a_loss_says_how_long_it_was_dark():
         subscription = ros.subscribe("/a", "p/T")
         await fake.wait_for_op("subscribe")
         await fake.publish("/a", {"n": 0})
-        assert (await subscription.next(10)).blind_seconds == 0
+        assert (await subscription.next(30)).blind_seconds == 0
         begun = time.monotonic()
         await fake.vanish()
         await asyncio.sleep(0.5)
         fake.received.clear()
         await fake.come_back()
-        await fake.wait_for_op("subscribe", timeout=20)
+        await fake.wait_for_op("subscribe")
         late = ros.subscribe("/b", "p/T")
         await fake.wait_for_op("subscribe", count=2)
         for topic in ("/a", "/a", "/b"):
             await fake.publish(topic, {"n": 1})
-        first, second = await subscription.next(10), await subscription.next(10)
+        first, second = await subscription.next(30), await subscription.next(30)
         assert 0.5 <= first.blind_seconds <= time.monotonic() - begun
         assert second.blind_seconds == 0
         assert subscription.blind_seconds == first.blind_seconds
-        assert (await late.next(10)).blind_seconds == 0
+        assert (await late.next(30)).blind_seconds == 0
         assert late.blind_seconds == 0
 
 
@@ -361,7 +359,7 @@ async def test_losses_without_a_message_between_add_up():
             await gone_and_back(fake, ros)
         await fake.wait_for_op("subscribe")
         await fake.publish("/a", {})
-        message = await subscription.next(10)
+        message = await subscription.next(30)
         assert message.blind_seconds == subscription.blind_seconds > 0
         await subscription.close()
         await gone_and_back(fake, ros)
@@ -376,8 +374,8 @@ async def test_darkness_is_told_even_if_its_message_is_dropped(queue_size):
         await fake.wait_for_op("subscribe")
         for n in range(20):
             await fake.publish("/a", {"n": n})
-        await asyncio.wait_for(_until(lambda: subscription.lost == 20 - queue_size), 10)
-        messages = [await subscription.next(10) for _ in range(queue_size)]
+        await asyncio.wait_for(_until(lambda: subscription.lost == 20 - queue_size), 30)
+        messages = [await subscription.next(30) for _ in range(queue_size)]
         assert [message.msg["n"] for message in messages] == list(range(20 - queue_size, 20))
         dark = [message.blind_seconds for message in messages]
         assert dark == [subscription.blind_seconds] + [0.0] * (queue_size - 1)
@@ -392,11 +390,11 @@ async def test_silence_counts_from_the_last_sign_of_life():
         subscription = ros.subscribe("/a", "p/T")
         await fake.wait_for_op("subscribe")
         fake.freeze()
-        await ros.wait_for_state(State.RECONNECTING, 20)
-        await ros.wait_for_state(State.CONNECTED, 20)
+        await ros.wait_for_state(State.RECONNECTING, 30)
+        await ros.wait_for_state(State.CONNECTED, 30)
         await fake.wait_for_op("subscribe", count=2)
         await fake.publish("/a", {})
-        assert (await subscription.next(10)).blind_seconds >= 0.7
+        assert (await subscription.next(30)).blind_seconds >= 0.7
 
 
 async def _until(condition: Any) -> None:

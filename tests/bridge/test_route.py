@@ -24,7 +24,7 @@ from bridge.errors import AccessRefusedError, BridgeError, OptionError, Unreacha
 from bridge.route import shown
 
 TOKEN = "s3cret-token"
-PATIENCE = 10.0
+PATIENCE = 60.0
 
 
 def openssl(*words: str) -> None:

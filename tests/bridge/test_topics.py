@@ -33,7 +33,7 @@ async def test_a_message_goes_round():
         publication = await ros.advertise("/a", "std_msgs/msg/Float64MultiArray")
         before = time.time_ns(), time.monotonic_ns()
         await publication.publish({"data": np.array([0.5, 1.0])})
-        message = await subscription.next(5)
+        message = await subscription.next(30)
         assert message == Message(
             "/a", {"data": [0.5, 1.0]}, message.received_ns, message.received_monotonic_ns
         )
@@ -72,7 +72,7 @@ async def test_messages_of_one_moment_leave_in_one_piece():
         assert len(written) == 1
         await two.publish({"n": 3})
         assert len(written) == 2
-        assert [(await subscription.next(5)).msg["n"] for _ in range(2)] == [2, 3]
+        assert [(await subscription.next(30)).msg["n"] for _ in range(2)] == [2, 3]
         assert (await fake.wait_for_op("publish", topic="/a"))["msg"] == {"n": 1}
 
 
@@ -120,8 +120,8 @@ async def test_iteration_ends_with_the_subscription_or_the_client():
             with pytest.raises(ServiceError):
                 await ros.call("/answers/after/the/messages")
             await one.close()
-            assert await asyncio.wait_for(readers[0], 5) == [1, 2]
-        assert await asyncio.wait_for(readers[1], 5) == [1, 2]
+            assert await asyncio.wait_for(readers[0], 30) == [1, 2]
+        assert await asyncio.wait_for(readers[1], 30) == [1, 2]
         with pytest.raises(DisconnectedError, match="/a is closed"):
             await two.next(1)
 
@@ -191,21 +191,21 @@ async def test_a_slow_reader_loses_its_own_oldest_messages_and_nobody_elses():
         await fake.wait_for_op("subscribe")
         for n in range(50):
             await fake.publish("/a", {"n": n})
-        assert [(await fast.next(5)).msg["n"] for _ in range(50)] == list(range(50))
+        assert [(await fast.next(30)).msg["n"] for _ in range(50)] == list(range(50))
         assert (slow.lost, fast.lost) == (45, 0)
-        assert [(await slow.next(5)).msg["n"] for _ in range(5)] == [45, 46, 47, 48, 49]
+        assert [(await slow.next(30)).msg["n"] for _ in range(5)] == [45, 46, 47, 48, 49]
         await fake.publish("/a", {"n": 50})
-        assert (await slow.next(5)).msg["n"] == 50
+        assert (await slow.next(30)).msg["n"] == 50
         assert slow.lost == 45
 
 
 async def test_two_readers_of_one_subscription_are_told():
     async with FakeRosbridge() as fake, connect(fake.uri) as ros:
         subscription = ros.subscribe("/a", "p/T")
-        first = asyncio.create_task(subscription.next(5))
+        first = asyncio.create_task(subscription.next(30))
         await asyncio.sleep(0)
         with pytest.raises(ConcurrentReadError, match="/a"):
-            await subscription.next(5)
+            await subscription.next(30)
         await fake.wait_for_op("subscribe")
         await fake.publish("/a", {"n": 1})
         assert (await first).msg == {"n": 1}
@@ -214,34 +214,34 @@ async def test_two_readers_of_one_subscription_are_told():
 async def test_a_wait_in_vain_can_be_given_up_and_begun_again():
     async with FakeRosbridge() as fake, connect(fake.uri) as ros:
         subscription = ros.subscribe("/a", "p/T")
-        waiting = asyncio.create_task(subscription.next(5))
+        waiting = asyncio.create_task(subscription.next(30))
         await asyncio.sleep(0)
         waiting.cancel()
         with pytest.raises(asyncio.CancelledError):
             await waiting
         await fake.wait_for_op("subscribe")
         await fake.publish("/a", {"n": 1})
-        assert (await subscription.next(5)).msg == {"n": 1}
+        assert (await subscription.next(30)).msg == {"n": 1}
 
 
 async def test_each_wait_ends_at_its_own_time():
-    async with FakeRosbridge() as fake, connect(fake.uri) as ros, asyncio.timeout(30):
+    async with FakeRosbridge() as fake, connect(fake.uri) as ros, asyncio.timeout(60):
         subscription = ros.subscribe("/a", "p/T")
         await fake.wait_for_op("subscribe")
         await fake.publish("/a", {"n": 1})
-        await subscription.next(0.2)  # its alarm rings in the middle of the next wait
+        await subscription.next(1.5)  # its alarm rings in the middle of the next wait
         begun = time.monotonic()
-        with pytest.raises(NoMessageError, match="within 0.5 s"):
-            await subscription.next(0.5)
-        assert time.monotonic() - begun >= 0.5
+        with pytest.raises(NoMessageError, match="within 2 s"):
+            await subscription.next(2)
+        assert time.monotonic() - begun >= 2
         await fake.publish("/a", {"n": 2})
         await subscription.next(600)  # its alarm is far away
         with pytest.raises(NoMessageError, match="within 0.1 s"):
             await subscription.next(0.1)
         await fake.publish("/a", {"n": 3})
-        await subscription.next(0.1)  # its alarm rings while nobody has a limit
+        await subscription.next(1.5)  # its alarm rings while nobody has a limit
         waiting = asyncio.create_task(anext(subscription))
-        await asyncio.sleep(0.3)
+        await asyncio.sleep(2)
         assert not waiting.done()
         await fake.publish("/a", {"n": 4})
         assert (await waiting).msg == {"n": 4}
@@ -271,7 +271,7 @@ async def test_who_was_answered_at_once_stays_awake_for_the_next_answer(
         waiting = asyncio.create_task(subscription.next(0.2))
         await asyncio.sleep(0)
         with pytest.raises(ConcurrentReadError):
-            await subscription.next(5)
+            await subscription.next(30)
         with pytest.raises(NoMessageError, match="within 0.2 s"):
             await waiting
         monkeypatch.setattr(handles, "_AWAKE", 1e-9)
@@ -329,15 +329,15 @@ async def test_a_wait_is_bounded_even_if_rosapi_says_nothing():
             NoMessageError, match=r"within 0\.1 s; nor did it answer .*: is it a rosbridge server\?$"
         ):
             await ros.subscribe("/quiet", "p/T").next(0.1)
-        assert time.monotonic() - begun < 5
+        assert time.monotonic() - begun < 30
 
 
 async def test_what_the_server_says_about_it_is_passed_on():
     async with FakeRosbridge(statuses=True) as fake, connect(fake.uri) as ros:
         with pytest.raises(
-            NoMessageError, match=r"within 0\.2 s; the server said: type is required: /a is not known$"
+            NoMessageError, match=r"within 2 s; the server said: type is required: /a is not known$"
         ):
-            await ros.subscribe("/a").next(0.2)
+            await ros.subscribe("/a").next(2)
         assert [status.level for status in ros.statuses] == ["error"]
         # What it said before a wait is not about that wait.
         with pytest.raises(NoMessageError, match=r"within 0\.1 s$"):
@@ -352,7 +352,7 @@ async def test_a_topic_of_unknown_type_is_found_when_it_appears(monkeypatch):
         fake.know("/late", "p/T")
         await fake.wait_for_op("subscribe", count=4, topic="/late")
         await fake.publish("/late", {"n": 1})
-        assert (await subscription.next(5)).msg == {"n": 1}
+        assert (await subscription.next(30)).msg == {"n": 1}
         asked = len(fake.ops("subscribe"))
         await asyncio.sleep(0.3)
         assert len(fake.ops("subscribe")) <= asked + 1, "it is not asked for any more"
@@ -370,7 +370,7 @@ async def test_what_was_subscribed_before_connecting_is_asked_for_too(monkeypatc
             fake.know("/late", "p/T")
             await fake.wait_for_op("subscribe", count=4)
             await fake.publish("/late", {"n": 1})
-            assert (await subscription.next(5)).msg == {"n": 1}
+            assert (await subscription.next(30)).msg == {"n": 1}
 
 
 async def test_a_nan_is_not_published():
@@ -464,7 +464,7 @@ async def test_a_late_server():
         await fake.publish("/a", {"n": 1})
         with pytest.raises(NoMessageError):
             await subscription.next(0.05)
-        assert (await subscription.next(5)).msg == {"n": 1}
+        assert (await subscription.next(30)).msg == {"n": 1}
 
 
 @pytest.mark.parametrize(
@@ -489,7 +489,7 @@ async def test_nonsense_is_counted_and_survived(nonsense):
         await fake.wait_for_op("subscribe")
         await fake.say(nonsense)
         await fake.publish("/a", {"n": 1})
-        assert (await subscription.next(5)).msg == {"n": 1}
+        assert (await subscription.next(30)).msg == {"n": 1}
         assert ros.unusable == 1
         assert ros.reconnections == 0
 
@@ -501,7 +501,7 @@ async def test_much_nonsense_does_not_fill_the_log(caplog):
         for _ in range(100):
             await fake.say("{")
         await fake.publish("/a", {})
-        await subscription.next(5)
+        await subscription.next(30)
         assert ros.unusable == 100
         assert sum("no JSON" in record.getMessage() for record in caplog.records) == 7
 
@@ -515,7 +515,7 @@ async def test_servers_that_differ():
         await fake.wait_for_op("subscribe")
         await fake.publish("/a/b", {"n": math.nan, "path": "x/y"})
         await fake.publish("/a/b", {"n": math.inf})
-        got = [(await subscription.next(5)).msg for _ in range(3)]
+        got = [(await subscription.next(30)).msg for _ in range(3)]
         assert got == [{"n": None, "path": "x/y"}, {"n": None, "path": "x/y"}, {"n": None}]
         assert ros.unusable == 0
 
@@ -529,7 +529,7 @@ async def test_a_message_in_many_frames():
             iter(['{"op": "publish", "top', 'ic": "/a", ', "", '"msg": {"n": "', "ä", '"}}'])
         )
         await fake.publish("/a", {"n": 2})
-        assert [(await subscription.next(5)).msg["n"] for _ in range(2)] == ["ä", 2]
+        assert [(await subscription.next(30)).msg["n"] for _ in range(2)] == ["ä", 2]
 
 
 @pytest.mark.parametrize("ros", [1, 2])
@@ -539,7 +539,7 @@ async def test_type_names_as_the_server_wants_them(ros):
         subscription = client.subscribe("/a", "std_msgs/msg/String")
         publication = await client.advertise("/a", "std_msgs/msg/String")
         await publication.publish({"data": "x"})
-        assert (await subscription.next(5)).msg == {"data": "x"}
+        assert (await subscription.next(30)).msg == {"data": "x"}
 
 
 # Which ROS
@@ -562,7 +562,7 @@ async def test_stamps_tell_the_version(ros):
         subscription = client.subscribe("/a", "p/T")
         await fake.wait_for_op("subscribe")
         await fake.publish("/a", {"header": stamps.header(1, ros_version=ros)})
-        await subscription.next(5)
+        await subscription.next(30)
         assert client.ros_version == ros
         assert await client.detect_ros_version() == ros
         assert fake.ops("call_service") == []
@@ -580,7 +580,7 @@ async def test_a_silent_server_does_not_hang_the_question():
     async with FakeRosbridge(silent=True) as fake, connect(fake.uri) as client:
         begun = time.monotonic()
         assert await client.detect_ros_version(0.2) is None
-        assert time.monotonic() - begun < 5
+        assert time.monotonic() - begun < 30
 
 
 async def test_what_was_told_counts():

@@ -139,7 +139,7 @@ async def test_arrays_are_paired_with_the_pose_before_them(tmp_path):
     assert types["/boat/raw"] == types["/boat/sensors"] == "std_msgs/Float64MultiArray"
     for frame in json.loads((tmp_path / "numbers.json").read_text())["frames"]:
         assert frame["true_position"] is not None
-        assert 0 < frame["true_position_age_ms"] < 500
+        assert 0 < frame["true_position_age_ms"] < 10_000
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
@@ -269,7 +269,7 @@ async def test_a_viewer_says_which_results_never_came():
     async with FakeRosbridge() as fake, Process("viewer", "--uri", fake.uri, "--count", "1") as viewer:
         await fake.wait_for_op("subscribe", topic="/boat/true_pose", timeout=LIMIT)
         await fake.publish("/bm/frame", frame_message({"sec": 1, "nanosec": 0}, 1, published=True))
-        await asyncio.sleep(1)  # a report and a result as near as this do not belong together
+        await asyncio.sleep(2)  # a report and a result as near as this do not belong together
         await say_result(fake, 2)
         code, out, err = await viewer.ended()
     assert code == 0
