@@ -338,7 +338,7 @@ async def test_what_the_server_says_about_it_is_passed_on():
             NoMessageError, match=r"within 2 s; the server said: type is required: /a is not known$"
         ):
             await ros.subscribe("/a").next(2)
-        assert [status.level for status in ros.statuses] == ["error"]
+        assert {status.level for status in ros.statuses} == {"error"}  # it may have been asked again
         # What it said before a wait is not about that wait.
         with pytest.raises(NoMessageError, match=r"within 0\.1 s$"):
             await ros.subscribe("/b", "p/T").next(0.1)
