@@ -186,7 +186,7 @@ def _drawing() -> Iterator[Show]:
         return Group(words, picture(heard, axes, width=console.width, rows=rows, colour=colour))
 
     if not console.is_terminal:
-        yield lambda heard, axes: console.print(drawn(heard, axes))
+        yield lambda heard, axes: console.print(drawn(heard, axes), soft_wrap=True)  # a line stays one
         return
     newest: list[tuple[Heard, list[Axis]]] = []
     shown = -1.0

@@ -106,10 +106,13 @@ async def test_json_and_a_file_at_once(stage, stack, tmp_path):
 
 async def test_pictures_without_colour(stage, stack, boat):
     _, uri = stack
-    listen = stage.start("listen", "-d", str(boat), "--uri", uri, "--plot", "--count", "2")
+    command = ("listen", "-d", str(boat), "--uri", uri, "--plot", "--count", "2")
+    listen = stage.start(*command, environment={"COLUMNS": "40"})
     assert await listen.end() == 0
     assert "\x1b" not in listen.out
     assert listen.out.count("@@") == 2
+    words = [each for each in listen.out.splitlines() if "; mean " in each]
+    assert [each.endswith(" ms") for each in words] == [True, True], words
 
 
 @pytest.mark.parametrize("asked", [{}, {"NO_COLOR": "1"}])
