@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import functools
 import os
 import signal
@@ -26,6 +27,9 @@ _SIGNALS = {
     signal.SIGTERM: (ExitCode.TERMINATED, "asked to end (SIGTERM)"),
     signal.SIGHUP: (ExitCode.HANGUP, "the terminal was closed (SIGHUP)"),
 }
+
+_FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO})
+"""What an operating system says where a disk, or whatever else the output goes to, takes nothing more."""
 
 _MOMENT = 0.002
 """Seconds until a signal's exception that was dropped is raised again."""
@@ -72,13 +76,14 @@ def _outcome(command: Callable[[], int | None]) -> int:
     """Run a command, tell its failure, and give its exit code; from then on signals are ignored."""
     try:
         code = int(command() or ExitCode.DONE)
+        sys.stdout.flush()  # at its own end Python could only complain
     except KeyboardInterrupt:
         code = ExitCode.INTERRUPTED
         say("interrupted (Ctrl-C)")
     except BrokenPipeError:
         # whoever read our output has what it wanted (as `| head` does)
         code = ExitCode.DONE
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _drop_output()
     except StoppedError as stopped:
         code = stopped.exit_code
         if PARENT_VARIABLE not in os.environ:
@@ -86,7 +91,13 @@ def _outcome(command: Callable[[], int | None]) -> int:
             say(str(stopped))
     except Exception as error:
         code = exit_code_of(error)
-        if code == ExitCode.BUG and not isinstance(error, ReportedError):
+        if isinstance(error, OSError) and error.errno in _FULL:
+            code = ExitCode.USAGE
+            _drop_output()
+            say(
+                f"error: the output can't be written: {error.strerror}; free some space, or send it elsewhere"
+            )
+        elif code == ExitCode.BUG and not isinstance(error, ReportedError):
             say_lines(traceback.format_exc().rstrip())
             say("error: this is a bug in rosbayes; please report it with the lines above")
         else:
@@ -94,6 +105,13 @@ def _outcome(command: Callable[[], int | None]) -> int:
     for number in _SIGNALS:
         signal.signal(number, signal.SIG_IGN)
     return code
+
+
+def _drop_output() -> None:
+    """Let what still waits for standard output go nowhere: it can't be written."""
+    null = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(null, sys.stdout.fileno())
+    os.close(null)
 
 
 def run_async(main: Coroutine[Any, Any, int | None]) -> int:

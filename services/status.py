@@ -58,8 +58,15 @@ def run_directories() -> list[Path]:
     places = {Path(tempfile.gettempdir())}
     if runtime := os.environ.get("XDG_RUNTIME_DIR"):
         places.add(Path(runtime))
-    found = [path for place in places for path in place.glob(f"{PRIVATE}*") if path.is_dir()]
-    return sorted(path for path in found if path.stat().st_uid == os.getuid())
+    return sorted(path for place in places for path in place.glob(f"{PRIVATE}*") if _is_own_directory(path))
+
+
+def _is_own_directory(path: Path) -> bool:
+    """Whether it is a directory of this user; a run may end meanwhile, and others' may be closed to us."""
+    try:
+        return path.is_dir() and path.stat().st_uid == os.getuid()
+    except OSError:
+        return False
 
 
 def _status_sockets(directory: Path) -> list[Path]:

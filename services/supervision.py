@@ -54,8 +54,9 @@ _TAIL_LINES = 20
 def _place() -> Path:
     """Where this user's runs have their private directories."""
     runtime = os.environ.get("XDG_RUNTIME_DIR", "")
-    usable = runtime and len(runtime) < 40 and os.access(runtime, os.W_OK | os.X_OK)
-    return Path(runtime if usable else tempfile.gettempdir())
+    # A relative one counts for nothing, by its specification; behind a long one there is no room for the sockets' names.
+    usable = Path(runtime).is_absolute() and len(os.fsencode(runtime)) < 40
+    return Path(runtime if usable and os.access(f"{runtime}/.", os.W_OK | os.X_OK) else tempfile.gettempdir())
 
 
 def make_private_directory() -> Path:

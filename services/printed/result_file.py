@@ -108,11 +108,20 @@ class _Lines:
             raise _not_writable(path, error) from error
 
     def _write(self, line: bytes) -> None:
+        written = 0
         try:
-            while line:
-                line = line[os.write(self._file, line) :]
+            while written < len(line):
+                written += os.write(self._file, line[written:])
         except OSError as error:
+            self._take_back(written)
             raise _not_writable(self._path, error) from error
+
+    def _take_back(self, written: int) -> None:
+        """Cut off the line that was begun, so that others can be added when there is room, unless another process wrote since."""
+        with contextlib.suppress(OSError):
+            end = os.lseek(self._file, 0, os.SEEK_CUR)
+            if written and os.fstat(self._file).st_size == end:
+                os.ftruncate(self._file, end - written)
 
     def close(self) -> None:
         """Everything is in the file already."""

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -65,3 +66,33 @@ Held()
     )
     assert ended.returncode == 0
     assert "ValueError: lost" in ended.stderr
+
+
+@pytest.mark.parametrize("printed", ["print(1)", "print(1, flush=True)", "put_json(1)", "Console().print(1)"])
+def test_an_output_that_takes_nothing_more_is_one_sentence(printed):
+    code = f"""
+from rich.console import Console
+from services.command_line import ends_well, make_app
+from services.logs import put_json
+app = make_app("print")
+
+@app.command()
+@ends_well
+def say():
+    {printed}
+
+app()
+"""
+    with Path("/dev/full").open("w") as full:
+        ended = subprocess.run(
+            [sys.executable, "-c", code],
+            check=False,
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            timeout=60,
+        )
+    assert (ended.returncode, ended.stderr) == (
+        ExitCode.USAGE,
+        "error: the output can't be written: No space left on device; free some space, or send it elsewhere\n",
+    )

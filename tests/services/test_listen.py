@@ -1,6 +1,8 @@
 """What the command `listen` says, draws and saves of a posterior that came."""
 
+import contextlib
 import csv
+import errno
 import json
 import os
 from dataclasses import replace
@@ -279,3 +281,28 @@ class TestFiles:
         (tmp_path / "out.jsonl").write_text('{"frame": 1')
         with pytest.raises(SettingsError, match="its last line has no end"):
             open_result_file(tmp_path / "out.jsonl")
+
+    @pytest.mark.parametrize("name", ["out.jsonl", "out.csv"])
+    def test_a_full_disk_leaves_whole_lines(self, tmp_path, monkeypatch, name):
+        posterior = made([1, 2, 3], "room")
+        with contextlib.closing(open_result_file(tmp_path / name)) as file:
+            file.add(posterior, axes_of(posterior, None))
+            whole = (tmp_path / name).read_bytes()
+            room = [10]
+            write = os.write
+
+            def into_little_room(number, data):
+                data = data[: room[0]]
+                if not data:
+                    raise OSError(errno.ENOSPC, "No space left on device")
+                room[0] -= len(data)
+                return write(number, data)
+
+            monkeypatch.setattr("os.write", into_little_room)
+            with pytest.raises(SettingsError, match="No space left"):
+                file.add(posterior, axes_of(posterior, None))
+            monkeypatch.undo()
+        assert (tmp_path / name).read_bytes() == whole
+        with contextlib.closing(open_result_file(tmp_path / name)) as file:
+            file.add(posterior, axes_of(posterior, None))
+        assert len((tmp_path / name).read_bytes().splitlines()) == len(whole.splitlines()) + 1

@@ -6,6 +6,7 @@ import io
 import socket
 import subprocess
 import sys
+from pathlib import Path
 
 import msgspec
 import pytest
@@ -327,3 +328,20 @@ def test_the_health_check_starts_fast():
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60
     )
     assert done.stdout.strip() == "[]"
+
+
+def test_a_run_that_ends_while_runs_are_looked_for_is_none(tmp_path, monkeypatch):
+    for name in ("rosbayes-aaaaaaaa", "rosbayes-bbbbbbbb"):
+        (tmp_path / name).mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
+    is_directory = Path.is_dir
+
+    def and_then_it_goes(path):
+        seen = is_directory(path)
+        if path.name == "rosbayes-aaaaaaaa" and seen:
+            path.rmdir()
+        return seen
+
+    monkeypatch.setattr(Path, "is_dir", and_then_it_goes)
+    assert status.run_directories() == [tmp_path / "rosbayes-bbbbbbbb"]

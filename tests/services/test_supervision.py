@@ -84,6 +84,16 @@ def test_the_private_directory_is_private(tmp_path, monkeypatch):
         directory.rmdir()
 
 
+@pytest.mark.parametrize("runtime", ["", ".", "relative", "/nonexistent", sys.executable, "/" + "x" * 60])
+def test_a_runtime_directory_that_is_none_is_passed_over(tmp_path, monkeypatch, runtime):
+    (tmp_path / "relative").mkdir()
+    (tmp_path / "other").mkdir()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", runtime)
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "other"))
+    assert make_private_directory().parent == tmp_path / "other"
+
+
 def test_a_child_ends_when_its_parent_is_killed(tmp_path):
     child_code = (
         "import time; from services.supervision import end_with_parent; end_with_parent();"
