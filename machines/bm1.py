@@ -1,7 +1,7 @@
 """A BM1 as data: its tables, what a frame starts with, why it stopped, and what every kernel can do."""
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Final, Protocol, TypeVar
 
@@ -32,9 +32,9 @@ class BM1Machine:
     """
 
     parameters: BM1Parameters
-    prior: npt.NDArray[np.uint16]
-    tables: tuple[npt.NDArray[np.uint16], ...]
-    rng_table: npt.NDArray[np.uint32] | None = None
+    prior: npt.NDArray[np.uint16] = field(repr=False)
+    tables: tuple[npt.NDArray[np.uint16], ...] = field(repr=False)
+    rng_table: npt.NDArray[np.uint32] | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         """Check shapes and codes, and keep copies that nobody can write to."""

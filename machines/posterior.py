@@ -1,6 +1,6 @@
 """From counts to probabilities: over all boards of a model, and in one call for a notebook."""
 
-from collections.abc import Sequence
+from collections.abc import Sequence, Sized
 from typing import TypeAlias, cast
 
 import numpy as np
@@ -104,6 +104,8 @@ def posterior(
     """
     from machines.kernel import make_kernel
 
+    if not isinstance(readings, Sized):
+        raise StartError(f"Readings are a list, one for each sensor column; {readings!r} is none.")
     parameters = machine.parameters
     addresses: tuple[int, ...] | npt.NDArray[np.integer]
     if parameters.replicas == 1 and parameters.sensor_mode is SensorMode.COLUMN:

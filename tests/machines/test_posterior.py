@@ -218,3 +218,8 @@ def test_what_cells_and_replicas_can_not_take_is_refused(machine, change, readin
     with pytest.raises(StartError) as refusal:
         posterior(of(machine, **change), readings)
     assert sentence in str(refusal.value)
+
+
+def test_what_is_no_list_of_readings_is_said_in_a_sentence(machine):
+    with pytest.raises(StartError, match=r"^Readings are a list, one for each sensor column; 3 is none\.$"):
+        posterior(machine, 3)

@@ -58,6 +58,9 @@ class Distribution:
         """As it is written: P(A | B, C)."""
         return _title(self.symbol, self.given)
 
+    def __repr__(self) -> str:
+        return f"Distribution({self.title}, {_sizes(self.table)})"
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Potential:
@@ -70,6 +73,9 @@ class Potential:
 
     scope: tuple[Symbol, ...]
     table: NDArray[np.float64]
+
+    def __repr__(self) -> str:
+        return f"Potential({', '.join(each.name for each in self.scope)}, {_sizes(self.table)})"
 
 
 Factor: TypeAlias = Distribution | Potential
@@ -244,6 +250,10 @@ def _evaluated(title: str, what: str, formula: Formula, given: tuple[Symbol, ...
 def _title(symbol: Symbol, given: tuple[Symbol, ...]) -> str:
     names = ", ".join(each.name for each in given)
     return f"P({symbol.name} | {names})" if names else f"P({symbol.name})"
+
+
+def _sizes(table: NDArray[np.float64]) -> str:
+    return " x ".join(map(str, table.shape))
 
 
 def _shown(symbol: Symbol, at: int) -> str:

@@ -44,7 +44,7 @@ class JointDistribution:
 
     name: str
     factors: tuple[Factor, ...]
-    symbols: tuple[Symbol, ...] = field(init=False)
+    symbols: tuple[Symbol, ...] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         """Check that the factors belong together.
@@ -152,6 +152,13 @@ class Question:
     known: tuple[Symbol, ...]
     given: Mapping[str, int]
     prior_select: Symbol | None
+
+    def __repr__(self) -> str:
+        known = [*(each.name for each in self.observed), *(f"{name}={at}" for name, at in self.given.items())]
+        asked = " | ".join(
+            ", ".join(names) for names in ([each.name for each in self.searched], known) if names
+        )
+        return f"Question({self.joint.name!r}, P({asked}))"
 
     @property
     def observed(self) -> tuple[Symbol, ...]:

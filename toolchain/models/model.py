@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
@@ -61,7 +61,7 @@ class Known:
     """
 
     name: str
-    table: NDArray[np.float64]
+    table: NDArray[np.float64] = field(repr=False)
     bits: int = 0
     offset: float = 0.0
     step: float = 1.0
@@ -71,7 +71,7 @@ class Known:
     path: str = ""
     floor: float = 0.0
     states: tuple[str, ...] = ()
-    normal: Normal | None = None
+    normal: Normal | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         """Check the table by itself.
@@ -117,7 +117,7 @@ class PriorSelect:
     """
 
     name: str
-    table: NDArray[np.float64]
+    table: NDArray[np.float64] = field(repr=False)
     bits: int = 0
     offset: float = 0.0
     step: float = 1.0
@@ -205,6 +205,15 @@ class Model:
             self._default_prior()  # checks that its rows have this model's lines
         prior.flags.writeable = False
         object.__setattr__(self, "prior", prior)
+
+    def __repr__(self) -> str:
+        searched = ", ".join(f"{dimension.label}[{dimension.size}]" for dimension in self.searched)
+        known = ", ".join(each.name for each in self._all_known())
+        return (
+            f"Model({self.name!r}, P({searched} | {known}))"
+            if known
+            else f"Model({self.name!r}, P({searched}))"
+        )
 
     def _all_known(self) -> tuple[Known | PriorSelect, ...]:
         return self.known if self.prior_select is None else (*self.known, self.prior_select)

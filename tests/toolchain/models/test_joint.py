@@ -308,3 +308,16 @@ def test_the_boat_as_a_joint_distribution_is_the_boat():
     for ours, theirs in zip(asked.known, expected.known, strict=True):
         assert ours.table == pytest.approx(theirs.table, abs=1e-15)
         assert ours.normal.mean == pytest.approx(theirs.normal.mean)
+
+
+def test_a_notebook_shows_a_network_and_a_question_in_a_line():
+    assert repr(SPRINKLER) == (
+        "JointDistribution(name='sprinkler', "
+        "factors=(Distribution(P(R), 2), Distribution(P(S | R), 2 x 2), Distribution(P(G | S, R), 2 x 2 x 2)))"
+    )
+    assert repr(potential([R, S], [[1, 2], [3, 4]])) == "Potential(R, S, 2 x 2)"
+    assert (
+        repr(SPRINKLER.ask(searched=[R], known=[G], given={"S": "yes"}))
+        == "Question('sprinkler', P(R | G, S=1))"
+    )
+    assert repr(SPRINKLER.ask(searched=[R], known=[])) == "Question('sprinkler', P(R))"

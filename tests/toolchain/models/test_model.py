@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from toolchain.errors import ModelError
-from toolchain.models.model import Known, Model, cell_centres, dimension, interval
+from toolchain.models.model import Known, Model, PriorSelect, cell_centres, dimension, interval
 
 
 def known(name="K", values=3, lines=4, **fields):
@@ -91,3 +91,16 @@ def test_refused_models(fields, sentence):
 def test_refused_dimensions(make):
     with pytest.raises(ModelError, match="searched dimension"):
         make()
+
+
+def test_a_notebook_shows_a_model_in_a_line():
+    known = Known(name="k", table=np.full((2, 4), 0.5))
+    select = PriorSelect(name="hour", table=np.full((3, 4), 0.25))
+    searched = (dimension("y", size=2), dimension("x", size=2))
+    assert (
+        repr(Model(name="m", searched=searched, known=(known,), prior_select=select))
+        == "Model('m', P(y[2], x[2] | k, hour))"
+    )
+    assert repr(Model(name="m", searched=searched, known=())) == "Model('m', P(y[2], x[2]))"
+    assert repr(known).startswith("Known(name='k', bits=2, ")
+    assert "array" not in repr(known) + repr(select)
