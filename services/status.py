@@ -1,4 +1,4 @@
-"""The whole stack in one screen: asks every process of a run at its status socket, all at once."""
+"""The command `status`: asks every process of a run at its status socket, all at once, and shows what they say."""
 
 from __future__ import annotations
 
@@ -7,46 +7,24 @@ import os
 import sys
 import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import msgspec
 import typer
 
 from services.command_line import ends_well, make_app, run_async
 from services.errors import ExitCode, SettingsError
+from services.printed.stack_status import SilentProcess, StackStatus, plain, screen
 from services.settings import load_settings
-from services.sockets.status_socket import STATUS_LIMIT, SUFFIX, BoardStatus, FrameCounts, ProcessStatus
+from services.sockets.status_socket import STATUS_LIMIT, SUFFIX, ProcessStatus
 from services.supervision import PRIVATE
-
-if TYPE_CHECKING:
-    from rich.console import RenderableType
 
 ANSWER_TIME = 1.0
 """Seconds that all processes together have to answer."""
 
 WATCH_EVERY = 1.0
-_SHOWN = 200
-"""Characters of a sentence or name that are shown: what answers may be anything."""
-
 _PLAIN_WIDTH = 140
 _ORDER = ("hub", "master", "subscriber", "publisher", "pcie-app")
-
-
-class SilentProcess(msgspec.Struct, frozen=True):
-    """A process that has a status socket, or that the master works with, but did not answer."""
-
-    name: str
-    why: str
-
-
-class StackStatus(msgspec.Struct, frozen=True, kw_only=True):
-    """All processes of one run; `why` has a sentence for each that is not ready."""
-
-    directory: str
-    ready: bool
-    why: list[str]
-    processes: list[ProcessStatus]
-    silent: list[SilentProcess]
 
 
 class _SilentError(Exception):
@@ -162,129 +140,6 @@ async def find_run() -> Path:
     return alive[0]
 
 
-# --- what the user sees ------------------------------------------------------------------------
-
-
-def _plain(text: str) -> str:
-    """A text that can't write over the terminal."""
-    kept = "".join(each if each.isprintable() else "?" for each in text[:_SHOWN])
-    return kept if len(text) <= _SHOWN else f"{kept}..."
-
-
-def _duration(seconds: float) -> str:
-    if seconds < 100:
-        return f"{seconds:.1f} s"
-    minutes, rest = divmod(int(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02}:{rest:02}"
-
-
-def _counts(frames: FrameCounts | None) -> tuple[str, str, str, str, str]:
-    if frames is None:
-        return "", "", "", "", ""
-    number = "" if frames.last_number is None else f"{frames.last_number}, "
-    last = "none yet" if frames.last_age_s is None else f"{number}{_duration(frames.last_age_s)} ago"
-    lost = ", ".join(f"{count} {_plain(reason)}" for reason, count in frames.lost.items())
-    return str(frames.received), str(frames.completed), f"{frames.rate:.1f}", last, lost or "none"
-
-
-def _boards(stack: StackStatus) -> list[BoardStatus]:
-    """The boards by number: as pcie-app sees them, with the restarts that they know themselves."""
-    boards: dict[int, BoardStatus] = {}
-    for process in stack.processes:
-        for board in process.boards:
-            known = boards.get(board.index)
-            if known is None:
-                boards[board.index] = board
-                continue
-            seen, own = (known, board) if known.image else (board, known)
-            restarts = max(seen.restarts, own.restarts)
-            boards[board.index] = msgspec.structs.replace(seen, restarts=restarts)
-    return [boards[index] for index in sorted(boards)]
-
-
-def screen(stack: StackStatus) -> RenderableType:
-    """One screen: the verdict, the processes, their connections, the boards."""
-    from rich.console import Group
-    from rich.table import Table
-    from rich.text import Text
-
-    restarts = {peer.name: peer.restarts for process in stack.processes for peer in process.peers}
-    parts: list[RenderableType] = []
-    if stack.ready:
-        parts.append(Text(f"{stack.directory}: all {len(stack.processes)} processes are ready", "green"))
-    else:
-        parts.append(Text(f"{stack.directory}: not ready", "bold red"))
-        parts.extend(Text(f"  {_plain(sentence)}", "red") for sentence in stack.why)
-
-    parts.extend(
-        Text(
-            f"deployment {_plain(process.deployment[:12])} of {_plain(process.folder)}, generation {process.generation}"
-        )
-        for process in stack.processes
-        if process.folder
-    )
-
-    table = Table(box=None, pad_edge=False)
-    table.add_column("process")
-    table.add_column("ready")
-    for heading in ("pid", "up", "restarts", "received", "completed", "per s"):
-        table.add_column(heading, justify="right", no_wrap=True)
-    table.add_column("last frame", no_wrap=True)
-    table.add_column("lost")
-    for process in stack.processes:
-        table.add_row(
-            Text(_plain(process.name)),
-            Text("yes", "green") if process.ready else Text("no", "red"),
-            str(process.pid),
-            _duration(process.uptime_s),
-            str(restarts.get(process.name, sum(board.restarts for board in process.boards[:1])))
-            if process.name in restarts or process.name.startswith("board")
-            else "",
-            *map(Text, _counts(process.frames)),
-        )
-    for silent in stack.silent:
-        table.add_row(Text(_plain(silent.name)), Text("no answer", "red"))
-    parts.append(table)
-
-    connections = [(process.name, each) for process in stack.processes for each in process.connections]
-    if connections:
-        table = Table(box=None, pad_edge=False)
-        for heading in ("rosbridge of", "server", "state", "reconnections"):
-            table.add_column(heading)
-        for name, connection in connections:
-            table.add_row(
-                Text(_plain(name)),
-                Text(_plain(connection.uri)),
-                Text(_plain(connection.state), "green" if connection.state == "connected" else "red"),
-                str(connection.reconnections),
-            )
-        parts.extend([Text(""), table])
-
-    parts.extend(
-        Text(f"\n{_plain(process.name)}: {hub.clients} clients, {hub.topics} topics, {hub.services} services")
-        for process in stack.processes
-        if (hub := process.hub) is not None
-    )
-
-    boards = _boards(stack)
-    if boards:
-        table = Table(box=None, pad_edge=False)
-        for heading in ("board", "state", "image", "restarts", "last cycles", "endpoint"):
-            table.add_column(heading)
-        for board in boards:
-            table.add_row(
-                str(board.index),
-                Text(_plain(board.state), "green" if board.state in {"programmed", "blank"} else "red"),
-                Text(_plain(board.image[:12])),
-                str(board.restarts),
-                "" if board.last_cycles is None else str(board.last_cycles),
-                Text(_plain(board.endpoint)),
-            )
-        parts.extend([Text(""), table])
-    return Group(*parts)
-
-
 async def show(directory: Path, *, watch: bool, json: bool) -> int:
     """Print a run's status, once or every second.
 
@@ -324,7 +179,7 @@ async def show(directory: Path, *, watch: bool, json: bool) -> int:
     finally:
         if live is not None:
             live.stop()
-    names = ", ".join(_plain(each.name) for each in stack.silent)
+    names = ", ".join(plain(each.name) for each in stack.silent)
     killed = f" (sockets of killed processes: {names})" if names else ""
     msg = f"no process of rosbayes answers in {directory}{killed}; is the stack started, with this BM_RUN_DIRECTORY?"
     raise SettingsError(msg)

@@ -14,6 +14,7 @@ from rich.console import Console
 
 from services import ready, status
 from services.errors import SettingsError
+from services.printed.stack_status import screen
 from services.sockets.status_socket import (
     BoardStatus,
     ConnectionStatus,
@@ -41,7 +42,7 @@ async def served(directory, **processes):
 
 def shown(stack):
     out = io.StringIO()
-    Console(file=out, width=140).print(status.screen(stack))
+    Console(file=out, width=140).print(screen(stack))
     return out.getvalue()
 
 

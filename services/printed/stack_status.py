@@ -1,0 +1,172 @@
+"""A whole stack in one screen: the verdict, its processes, their connections, its boards."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import msgspec
+
+from services.sockets.status_socket import BoardStatus, FrameCounts, ProcessStatus
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from rich.console import RenderableType
+    from rich.table import Table
+
+_SHOWN = 200
+"""Characters of a sentence or name that are shown: what answers may be anything."""
+
+
+class SilentProcess(msgspec.Struct, frozen=True):
+    """A process that has a status socket, or that the master works with, but did not answer."""
+
+    name: str
+    why: str
+
+
+class StackStatus(msgspec.Struct, frozen=True, kw_only=True):
+    """All processes of one run; `why` has a sentence for each that is not ready."""
+
+    directory: str
+    ready: bool
+    why: list[str]
+    processes: list[ProcessStatus]
+    silent: list[SilentProcess]
+
+
+def plain(text: str) -> str:
+    """A text that can't write over the terminal."""
+    kept = "".join(each if each.isprintable() else "?" for each in text[:_SHOWN])
+    return kept if len(text) <= _SHOWN else f"{kept}..."
+
+
+def screen(stack: StackStatus) -> RenderableType:
+    """One screen of all that is known of a stack."""
+    from rich.console import Group
+    from rich.text import Text
+
+    parts: list[RenderableType] = [*_verdict(stack), _processes(stack)]
+    if any(process.connections for process in stack.processes):
+        parts += [Text(""), _connections(stack)]
+    parts += [
+        Text(f"\n{plain(process.name)}: {hub.clients} clients, {hub.topics} topics, {hub.services} services")
+        for process in stack.processes
+        if (hub := process.hub) is not None
+    ]
+    if boards := _boards_by_number(stack):
+        parts += [Text(""), _boards(boards)]
+    return Group(*parts)
+
+
+def _verdict(stack: StackStatus) -> Iterator[RenderableType]:
+    from rich.text import Text
+
+    if stack.ready:
+        yield Text(f"{stack.directory}: all {len(stack.processes)} processes are ready", "green")
+    else:
+        yield Text(f"{stack.directory}: not ready", "bold red")
+        yield from (Text(f"  {plain(sentence)}", "red") for sentence in stack.why)
+    for process in stack.processes:
+        if process.folder:
+            model = f"deployment {plain(process.deployment[:12])} of {plain(process.folder)}"
+            yield Text(f"{model}, generation {process.generation}")
+
+
+def _processes(stack: StackStatus) -> Table:
+    from rich.table import Table
+    from rich.text import Text
+
+    restarts = {peer.name: peer.restarts for process in stack.processes for peer in process.peers}
+    table = Table(box=None, pad_edge=False)
+    table.add_column("process")
+    table.add_column("ready")
+    for heading in ("pid", "up", "restarts", "received", "completed", "per s"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    table.add_column("last frame", no_wrap=True)
+    table.add_column("lost")
+    for process in stack.processes:
+        known = restarts.get(process.name)
+        if known is None and process.name.startswith("board"):
+            known = sum(board.restarts for board in process.boards[:1])
+        table.add_row(
+            Text(plain(process.name)),
+            Text("yes", "green") if process.ready else Text("no", "red"),
+            str(process.pid),
+            _duration(process.uptime_s),
+            "" if known is None else str(known),
+            *map(Text, _counts(process.frames)),
+        )
+    for silent in stack.silent:
+        table.add_row(Text(plain(silent.name)), Text("no answer", "red"))
+    return table
+
+
+def _connections(stack: StackStatus) -> Table:
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(box=None, pad_edge=False)
+    for heading in ("rosbridge of", "server", "state", "reconnections"):
+        table.add_column(heading)
+    for process in stack.processes:
+        for connection in process.connections:
+            table.add_row(
+                Text(plain(process.name)),
+                Text(plain(connection.uri)),
+                Text(plain(connection.state), "green" if connection.state == "connected" else "red"),
+                str(connection.reconnections),
+            )
+    return table
+
+
+def _boards(boards: list[BoardStatus]) -> Table:
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(box=None, pad_edge=False)
+    for heading in ("board", "state", "image", "restarts", "last cycles", "endpoint"):
+        table.add_column(heading)
+    for board in boards:
+        table.add_row(
+            str(board.index),
+            Text(plain(board.state), "green" if board.state in {"programmed", "blank"} else "red"),
+            Text(plain(board.image[:12])),
+            str(board.restarts),
+            "" if board.last_cycles is None else str(board.last_cycles),
+            Text(plain(board.endpoint)),
+        )
+    return table
+
+
+def _boards_by_number(stack: StackStatus) -> list[BoardStatus]:
+    """The boards as pcie-app sees them, with the restarts that they know themselves."""
+    boards: dict[int, BoardStatus] = {}
+    for process in stack.processes:
+        for board in process.boards:
+            known = boards.get(board.index)
+            if known is None:
+                boards[board.index] = board
+                continue
+            seen, own = (known, board) if known.image else (board, known)
+            restarts = max(seen.restarts, own.restarts)
+            boards[board.index] = msgspec.structs.replace(seen, restarts=restarts)
+    return [boards[index] for index in sorted(boards)]
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 100:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(int(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02}:{rest:02}"
+
+
+def _counts(frames: FrameCounts | None) -> tuple[str, str, str, str, str]:
+    """Received, completed, per second, last frame, lost."""
+    if frames is None:
+        return "", "", "", "", ""
+    number = "" if frames.last_number is None else f"{frames.last_number}, "
+    last = "none yet" if frames.last_age_s is None else f"{number}{_duration(frames.last_age_s)} ago"
+    lost = ", ".join(f"{count} {plain(reason)}" for reason, count in frames.lost.items())
+    return str(frames.received), str(frames.completed), f"{frames.rate:.1f}", last, lost or "none"
