@@ -185,16 +185,15 @@ def _tables(machine: BM1Machine, real: bool) -> Iterator[str]:
 def _interface(machine: BM1Machine) -> Iterator[str]:
     """The module's ports and the registers that the host writes."""
     parameters = machine.parameters
-    lines, counter = parameters.replicas * parameters.lines, parameters.counter_bits
+    counter = parameters.counter_bits
     places = Places(parameters)
     address_bits = (places.end - 1).bit_length()
     bank_bits = _bank_bits(parameters)
     last = CYCLE_BITS - 1
     several = parameters.replicas > 1
     # replicas' cycles and reasons are read as words; a single machine's are ports, as registers of their own
-    read_bits = max(
-        (places.outcomes + OUTCOME_WORDS * parameters.replicas - 1 if several else lines - 1).bit_length(), 1
-    )
+    readable = places.outcomes + OUTCOME_WORDS * parameters.replicas if several else parameters.lines
+    read_bits = max((readable - 1).bit_length(), 1)
     data_bits = WORD_BITS if several else counter
     yield f"""
 module bm1 (
@@ -222,6 +221,24 @@ module bm1 (
         f"{RUN_UNTIL + 1}: run_until[{last}:{WORD_BITS}] <= write_data;",
         f"{BANK}: bank <= write_data[{bank_bits - 1}:0];",
     ]
+    for declaration, write in _inputs_of_frames(machine, places):
+        yield declaration
+        writes.append(write)
+    if several:
+        yield f"  reg [{parameters.replicas - 1}:0] halt;"
+        for word in range(places.end - places.halt):
+            low = word * WORD_BITS
+            count = min(WORD_BITS, parameters.replicas - low)
+            writes.append(
+                f"{places.halt + word}: halt[{low + count - 1}:{low}] <= write_data[{count - 1}:0];"
+            )
+    joined = "\n      ".join(writes)
+    yield f"  always @(posedge clk)\n    if (write) case (write_address)\n      {joined}\n      default: ;\n    endcase\n"
+
+
+def _inputs_of_frames(machine: BM1Machine, places: Places) -> Iterator[tuple[str, str]]:
+    """The registers of what changes with the frames, addresses and codes: each one's declaration, and what writes it."""
+    parameters = machine.parameters
     registers = [
         (f"address_{replica}_0", max(parameters.prior_bits, 1), PRIOR_ADDRESSES + replica)
         for replica in range(parameters.replicas)
@@ -233,26 +250,16 @@ module bm1 (
                 registers.append((_input(parameters, replica, column, line), bits, place))
                 place += 1
     for name, bits, place in registers:
-        yield f"  reg [{bits - 1}:0] {name};"
-        writes.append(f"{place}: {name} <= write_data[{bits - 1}:0];")
+        yield f"  reg [{bits - 1}:0] {name};", f"{place}: {name} <= write_data[{bits - 1}:0];"
     if parameters.prior_mode is PriorMode.WRITTEN:
         width = parameters.prob_bits
-        for number in range(lines):
+        for number in range(parameters.replicas * parameters.lines):
             replica, line = divmod(number, parameters.lines)
-            yield f"  reg [{width - 1}:0] prior_{replica}_{line} = {machine.prior[0, line]};"
-            writes.append(
-                f"{places.prior_codes + number}: prior_{replica}_{line} <= write_data[{width - 1}:0];"
+            name = f"prior_{replica}_{line}"
+            yield (
+                f"  reg [{width - 1}:0] {name} = {machine.prior[0, line]};",
+                f"{places.prior_codes + number}: {name} <= write_data[{width - 1}:0];",
             )
-    if several:
-        yield f"  reg [{parameters.replicas - 1}:0] halt;"
-        for word in range(places.end - places.halt):
-            low = word * WORD_BITS
-            count = min(WORD_BITS, parameters.replicas - low)
-            writes.append(
-                f"{places.halt + word}: halt[{low + count - 1}:{low}] <= write_data[{count - 1}:0];"
-            )
-    joined = "\n      ".join(writes)
-    yield f"  always @(posedge clk)\n    if (write) case (write_address)\n      {joined}\n      default: ;\n    endcase\n"
 
 
 def _bank_bits(parameters: BM1Parameters) -> int:
@@ -367,24 +374,12 @@ def _frame(parameters: BM1Parameters) -> Iterator[str]:
 endmodule"""
 
 
-def _frame_of_replicas(parameters: BM1Parameters) -> Iterator[str]:
-    """Replicas' sequence of a frame: each stops by itself, and its counts, cycles and reason are kept from then on.
-
-    All that run have run equally long, so there is one cycle counter; generators step while any runs.
-    """
-    replicas, lines = range(parameters.replicas), parameters.lines
-
-    def all_of(name: str, operator: str) -> str:
-        return f" {operator} ".join(f"{name}_{replica}" for replica in replicas)
-
-    yield _LIMITS
-    yield f"  reg [{parameters.counter_bits - 1}:0] result [0:{parameters.replicas * lines - 1}];"
-    for replica in replicas:
-        first = replica * lines
-        captures = "\n      ".join(
-            f"result[{first + line}] <= count_{replica}_{line};" for line in range(lines)
-        )
-        yield f"""
+def _end_of_replica(replica: int, lines: int) -> str:
+    """Why and when a replica stops: its counts go into its part of `result`, its cycles and its reason are kept."""
+    captures = "\n      ".join(
+        f"result[{replica * lines + line}] <= count_{replica}_{line};" for line in range(lines)
+    )
+    return f"""
   wire stop_{replica} = overflow_{replica} | at_max | at_slice;
   assign enable_{replica} = state == RUN & running_{replica} & ~stop_{replica};
   wire over_{replica} = state == RUN & running_{replica} & stop_{replica} | state == LOAD & ~again & hopeless_{replica};
@@ -411,6 +406,22 @@ def _frame_of_replicas(parameters: BM1Parameters) -> Iterator[str]:
         reason_{replica} <= overflow_{replica} ? {StopReason.OVERFLOW} : at_max ? {StopReason.MAX_CYCLES} : {StopReason.SLICE};
       end
     end"""
+
+
+def _frame_of_replicas(parameters: BM1Parameters) -> Iterator[str]:
+    """Replicas' sequence of a frame: each stops by itself, and its counts, cycles and reason are kept from then on.
+
+    All that run have run equally long, so there is one cycle counter; generators step while any runs.
+    """
+    replicas = range(parameters.replicas)
+
+    def all_of(name: str, operator: str) -> str:
+        return f" {operator} ".join(f"{name}_{replica}" for replica in replicas)
+
+    yield _LIMITS
+    yield f"  reg [{parameters.counter_bits - 1}:0] result [0:{parameters.replicas * parameters.lines - 1}];"
+    for replica in replicas:
+        yield _end_of_replica(replica, parameters.lines)
     words = []
     for replica in replicas:
         words += [
