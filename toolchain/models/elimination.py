@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from heapq import heapify, heappop, heappush
 from itertools import count
 from typing import TYPE_CHECKING
 
@@ -76,9 +77,13 @@ def eliminate(terms: Iterable[Term], names: Iterable[str], sizes: Mapping[str, i
             holding[name].add(number)
     unions = {name: _union(left[number] for number in sorted(holding[name])) for name in holding}
     costs = {name: math.prod(sizes[other] for other in unions[name]) for name in holding}
+    # The name breaks ties: the same question gives the same sums, to the bit. What has another cost by now is there again.
+    cheapest = [(cost, name) for name, cost in costs.items()]
+    heapify(cheapest)
     while holding:
-        # The name breaks ties: the same question gives the same sums, to the bit.
-        name = min(holding, key=lambda each: (costs[each], each))
+        cost, name = heappop(cheapest)
+        if name not in holding or cost != costs[name]:
+            continue
         touched = [left.pop(number) for number in sorted(holding.pop(name))]
         scope = unions[name]
         if not touched:
@@ -95,6 +100,7 @@ def eliminate(terms: Iterable[Term], names: Iterable[str], sizes: Mapping[str, i
             holding[other] = {each for each in holding[other] if each in left} | {number}
             unions[other] = _union(left[each] for each in sorted(holding[other]))
             costs[other] = math.prod(sizes[each] for each in unions[other])
+            heappush(cheapest, (costs[other], other))
     return list(left.values())
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from itertools import combinations
+from operator import itemgetter
 from typing import TYPE_CHECKING, Final, TypeAlias
 
 import numpy as np
@@ -217,8 +217,22 @@ class Question:
         Where not all are independent, some two are not, whatever the others do (d-separation has this property).
         """
         cut = {symbol.name for symbol in self.searched} | set(self.given)
+        factors, terms = self._factors(active, observed)
+        among_all = Links(terms, factors, cut)
+        # What two need is a part of what all need: no path of theirs is shorter than the one there. Only pairs that could
+        # have the shortest are looked at, for there may be thousands.
+        least = sorted(
+            (
+                (length, one, other)
+                for at, one in enumerate(observed)
+                for other, length in among_all.lengths(one, observed[at + 1 :]).items()
+            ),
+            key=itemgetter(0),
+        )
         found: tuple[list[str], str] | None = None
-        for one, other in combinations(observed, 2):
+        for length, one, other in least:
+            if found is not None and len(found[0]) <= length:
+                break
             factors, terms = self._factors(active, [one, other])
             links = Links(terms, factors, cut)
             path = links.path(one, other)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import replace
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -15,6 +15,11 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from toolchain.models.elimination import Term
+
+_LONGEST_DRAWN: Final = 12
+"""Symbols of a path that is told whole."""
+_SHOWN: Final = 4
+"""Arcs at either end of one that is not."""
 
 
 class Links:
@@ -36,12 +41,12 @@ class Links:
 
     def components(self) -> list[set[str]]:
         """Return the sets of symbols that are joined, in a fixed order."""
-        left = dict.fromkeys(self._neighbours)
-        found = []
-        while left:
-            component = set(self._paths_from(next(iter(left))))
-            found.append(component)
-            left = {name: None for name in left if name not in component}
+        found: list[set[str]] = []
+        placed: set[str] = set()
+        for name in self._neighbours:
+            if name not in placed:
+                found.append(set(self._reached(name)))
+                placed |= found[-1]
         return found
 
     def joined(self, observed: Sequence[str]) -> bool:
@@ -50,33 +55,50 @@ class Links:
 
     def path(self, start: str, end: str) -> list[str]:
         """Return the shortest path between two symbols; empty where they are not joined."""
-        return self._paths_from(start).get(end, [])
+        before = self._reached(start)
+        if end not in before:
+            return []
+        path = [end]
+        while path[-1] != start:
+            path.append(before[path[-1]])
+        return path[::-1]
 
-    def _paths_from(self, start: str) -> dict[str, list[str]]:
-        paths = {start: [start]}
+    def lengths(self, start: str, ends: Sequence[str]) -> dict[str, int]:
+        """Return how many symbols the shortest path to each of some has, both ends counted, where there is one."""
+        before = self._reached(start)
+        count = {start: 1}
+        for name in before:  # nearer ones come first
+            count.setdefault(name, count[before[name]] + 1)
+        return {end: count[end] for end in ends if end in count}
+
+    def _reached(self, start: str) -> dict[str, str]:
+        """Return every symbol that is joined to one, and from which symbol the shortest path comes to it."""
+        before = {start: start}
         waiting = deque([start])
         while waiting:
             name = waiting.popleft()
             for other in self._neighbours.get(name, ()):
-                if other not in paths:
-                    paths[other] = [*paths[name], other]
+                if other not in before:
+                    before[other] = name
                     waiting.append(other)
-        return paths
+        return before
 
     def drawn(self, path: Sequence[str]) -> str:
-        """Return a path as arrows; a common child stands between its two parents."""
-        text = path[0]
-        for before, after in pairwise(path):
-            factor = self._neighbours[before][after]
-            if not isinstance(factor, Distribution):
-                text += f" -- {after}"
-            elif factor.symbol.name == after:
-                text += f" -> {after}"
-            elif factor.symbol.name == before:
-                text += f" <- {after}"
-            else:
-                text += f" -> {factor.symbol.name} <- {after}"
-        return text
+        """Return a path as arrows; a common child stands between its two parents, and a long path is told by its ends."""
+        arrows = [self._arrow(before, after) for before, after in pairwise(path)]
+        if len(path) > _LONGEST_DRAWN:
+            arrows[_SHOWN:-_SHOWN] = [f" ... {path[-1 - _SHOWN]}"]
+        return path[0] + "".join(arrows)
+
+    def _arrow(self, before: str, after: str) -> str:
+        factor = self._neighbours[before][after]
+        if not isinstance(factor, Distribution):
+            return f" -- {after}"
+        if factor.symbol.name == after:
+            return f" -> {after}"
+        if factor.symbol.name == before:
+            return f" <- {after}"
+        return f" -> {factor.symbol.name} <- {after}"
 
 
 def _is_arc(factor: Factor, name: str, other: str) -> bool:
@@ -85,23 +107,27 @@ def _is_arc(factor: Factor, name: str, other: str) -> bool:
 
 def relevant(factors: Iterable[Factor], asked: set[str]) -> list[Factor]:
     """Leave out what sums to 1: distributions of symbols that nothing left depends on and nobody asks for."""
-    left = list(factors)
+    kept = list(factors)
     uses: dict[str, int] = {}
-    for factor in left:
+    own: dict[str, int] = {}
+    for number, factor in enumerate(kept):
+        if isinstance(factor, Distribution):
+            own[factor.symbol.name] = number
         for symbol in factor.scope:
             uses[symbol.name] = uses.get(symbol.name, 0) + 1
-    while True:
-        kept: list[Factor] = []
-        for factor in left:
-            name = factor.symbol.name if isinstance(factor, Distribution) else ""
-            if isinstance(factor, Distribution) and name not in asked and uses[name] == 1:
-                for symbol in factor.scope:
-                    uses[symbol.name] -= 1
-            else:
-                kept.append(factor)
-        if len(kept) == len(left):
-            return kept
-        left = kept
+    gone: set[int] = set()
+    waiting = list(own)
+    while waiting:
+        name = waiting.pop()
+        if name not in own or name in asked or uses[name] > 1:
+            continue
+        number = own.pop(name)
+        gone.add(number)
+        for symbol in kept[number].scope:
+            uses[symbol.name] -= 1
+            if uses[symbol.name] == 1:
+                waiting.append(symbol.name)
+    return [factor for number, factor in enumerate(kept) if number not in gone]
 
 
 def without_idle(factor: Factor) -> Factor:

@@ -90,8 +90,12 @@ def _probability(text: Scanner, builder: NetworkBuilder) -> None:
             case "property":
                 text.skip(";")
             case "table":
+                if not np.isnan(values).all():
+                    raise text.error(f"{child} has rows or a table before this one")
                 values[:] = text.numbers(";", values.size, f"the table of {child}").reshape(values.shape)
             case "default":
+                if default is not None:
+                    raise text.error(f"{child} has two defaults")
                 default = text.numbers(";", shape[0], f"the default of {child}")
             case "(":
                 labels = text.words(")", "the parents' states", MAX_PARENTS)

@@ -63,7 +63,7 @@ class NetworkBuilder:
     def name(self, name: str) -> None:
         """Take the network's name; the file's stands for `unknown` and the like."""
         if name.lower() not in {"unknown", "network", "unnamed", "default", ""}:
-            self._name = name[:MAX_NAME]
+            self._name = "".join(each for each in name if each.isprintable())[:MAX_NAME]
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -100,6 +100,8 @@ class NetworkBuilder:
         """
         if not 0 < len(name) <= MAX_NAME:
             raise place.error(f"a variable's name has {len(name)} characters, expected 1 to {MAX_NAME}")
+        if not name.isprintable():
+            raise place.error(f"the variable {name!r} has a character in its name that can't be printed")
         if name in self._symbols:
             raise place.error(f"the variable {name!r} is there twice")
         if len(self._symbols) == MAX_VARIABLES:
@@ -111,6 +113,8 @@ class NetworkBuilder:
             kind = IntegerType(0, count - 1) if isinstance(states, int) else LabelType(*states)
             if any(len(label) > MAX_NAME for label in kind.labels):
                 raise place.error(f"a state of {name} has more than {MAX_NAME} characters")
+            if wrong := next((label for label in kind.labels if not label.isprintable()), None):
+                raise place.error(f"the state {wrong!r} of {name} has a character that can't be printed")
             self._symbols[name] = Symbol(name, kind, on_missing=self._on_missing)
         except ModelError as reason:
             raise place.error(f"variable {name}: {reason}") from None

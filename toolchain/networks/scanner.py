@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from typing import TYPE_CHECKING, Final
 
@@ -203,23 +204,25 @@ class Scanner:
         return self._signs.fullmatch(piece) is not None
 
     def _floats(self, words: list[str], wanted: int, what: str, begin: int) -> NDArray[np.float64]:
+        """Turn words into numbers; a word beyond the wanted ones may be all that follows, and is only counted."""
         try:
-            values = np.array([_float(word) for word in words])
+            values = np.array([_float(word) for word in words[:wanted]])
         except ValueError:
             wrong = next(word for word in words if not _is_float(word))
-            at = self._text.find(wrong.split()[0], begin)
+            at = self._text.find(wrong, begin)
             self._start, self._end = at, at + 1
             raise self.error(f"{_shown(wrong)} in {what} is no number") from None
-        if len(values) != wanted:
-            count = f"more than {wanted}" if len(values) > wanted else str(len(values))
+        if len(words) != wanted:
+            count = f"more than {wanted}" if len(words) > wanted else str(len(words))
             raise self.error(f"{what} has {count} numbers, expected {wanted}")
         return values
 
 
 def _float(word: str) -> float:
-    if "_" in word:  # Python's own way to write digits
+    number = float(word)
+    if "_" in word or math.isnan(number):  # the former is Python's own way to write digits
         raise ValueError
-    return float(word)
+    return number
 
 
 def _is_float(word: str) -> bool:

@@ -25,7 +25,7 @@ from casestudies.boat.model import model as boat_model
 from toolchain.errors import ModelError
 from toolchain.models.distribution import conditional_normal, potential, table, uniform
 from toolchain.models.fusion import exact_posterior
-from toolchain.models.joint import JointDistribution
+from toolchain.models.joint import JointDistribution, Question
 from toolchain.models.symbol import IntegerType, IntervalType, LabelType, Symbol
 
 YES_NO = LabelType("no", "yes")
@@ -175,6 +175,39 @@ def test_a_hidden_variable_on_the_path_can_be_searched_too():
         joint.ask(["s"], ["k", "l"]).model()
     model = joint.ask(["s", "h"], ["k", "l"]).model()
     assert exact_posterior(model, [1, 0]) == pytest.approx(enumerated(joint, ["s", "h"], ["k", "l"], [1, 0]))
+
+
+def long_chain(length):
+    """Return v0 -> v1 -> v2 and so on."""
+    return chain(*(f"v{number}" for number in range(length)), arrows=">" * (length - 1))
+
+
+def test_a_long_path_is_told_by_its_ends():
+    with pytest.raises(ModelError) as caught:
+        long_chain(40).ask(["v0"], ["v1", "v39"]).model()
+    assert "v1 -> v2 -> v3 -> v4 -> v5 ... v35 -> v36 -> v37 -> v38 -> v39 joins them" in str(caught.value)
+
+
+def test_a_refusal_looks_only_at_pairs_that_could_have_the_shortest_path(monkeypatch):
+    looked_at = []
+    whole = Question._factors
+
+    def counted(self, active, observed):
+        looked_at.append(tuple(observed))
+        return whole(self, active, observed)
+
+    monkeypatch.setattr(Question, "_factors", counted)
+    with pytest.raises(ModelError, match="v50 and v51 are not independent"):
+        long_chain(200).ask(["v0"], [f"v{number}" for number in (*range(10, 200, 4), 51)]).model()
+    assert len(looked_at) < 5, looked_at
+
+
+def test_a_long_chain_is_summed_over():
+    joint = long_chain(3000)
+    far = joint.ask(["v0"], ["v2999"]).model().known[0].table
+    assert far[:, 0] == pytest.approx(far[:, 1])
+    near = joint.ask(["v0"], ["v2"]).model().known[0].table
+    assert near == pytest.approx(joint.factors[2].table @ joint.factors[1].table)
 
 
 def test_a_common_effect_that_is_searched_joins_its_causes():
