@@ -7,7 +7,7 @@ and of the machine (counts). Codes beside model is what quantising loses, machin
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -16,6 +16,7 @@ from machines.bm1 import Start, addressed_codes
 from machines.encode import decode_code
 from machines.parameters import RngReset
 from toolchain.analysis.emulation import inputs_of_boards
+from toolchain.analysis.intervals import Interval, bootstrap, bootstrap_rows, share_of_frames
 from toolchain.errors import BuildError, ModelError
 from toolchain.models.fusion import exact_posterior, fuse
 
@@ -29,24 +30,10 @@ if TYPE_CHECKING:
     from toolchain.analysis.readings import Readings
     from toolchain.models.model import Model
 
-RESAMPLES: Final = 1000
-LEVEL: Final = 0.95
-"""Of every confidence interval."""
-
 EXPECTED_COUNT: Final = 5.0
 """z-scores are taken of lines that are expected to count at least so often: below, a count is not near normal."""
 
-_NORMAL_95: Final = 1.959964
 _TIE: Final = 1e-9
-
-
-@dataclass(frozen=True, slots=True)
-class Interval:
-    """A figure and its 95 % confidence interval."""
-
-    value: float
-    low: float
-    high: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -143,9 +130,9 @@ class _Differences:
             return None
         columns = np.array([np.mean(replicas, axis=0) for replicas in self._frames.values()])
         return Difference(
-            total_variation=_bootstrap(columns[:, 0], np.mean),
-            kl_bits=_bootstrap(columns[:, 1], np.mean),
-            map_agreement=_share(float(columns[:, 2].mean()), len(columns)),
+            total_variation=bootstrap(columns[:, 0], np.mean),
+            kl_bits=bootstrap(columns[:, 1], np.mean),
+            map_agreement=share_of_frames(float(columns[:, 2].mean()), len(columns)),
         )
 
 
@@ -180,13 +167,8 @@ def measure(
         raise BuildError(message)
     parameters = boards.parameters
     banks = max(1, min(banks, parameters.rng_banks if parameters.rng_reset is RngReset.BANK else banks))
-    of_machine, of_codes, of_sampling = _Differences(), _Differences(), _Differences()
-    lengths: dict[int, list[list[int]]] = {}
-    weights: list[NDArray[np.float64]] = []
-    places: list[int] = []
-    posteriors_asked = impossible = without = overflow = 0
+    found = _Findings(boards, readings, banks)
     for place in range(len(readings) // replicas * replicas):
-        frame = place // replicas
         exact = None
         if model is not None:
             addresses, row = readings.of_model(place)
@@ -195,66 +177,102 @@ def measure(
             except ModelError:
                 advance()
                 continue
-        posteriors_asked += 1
-        of_board, prior_row = readings.of_machine(place, boards.machines[0])
+        found.add(place, place // replicas, exact)
+        advance()
+    if not found.posteriors:
+        message = f"none of the readings ({readings.source}) is possible in the model"
+        raise ModelError(message)
+    return found.summary()
+
+
+@dataclass(slots=True)
+class _Findings:
+    """What was found reading after reading.
+
+    Attributes:
+        boards: The machine.
+        readings: The frames.
+        banks: Sets of seeds that each is run with.
+        lengths: By frame, and in it by replica: the cycles of each run.
+        places: Where the readings stand for which some line can count.
+        weights: Of these, each line's probability to count in a cycle: float64[lines].
+        posteriors: Readings that were run.
+        impossible: Those for which no line can count.
+        without: Runs without a posterior.
+        overflow: Runs that a full counter ended.
+    """
+
+    boards: EmulatedBoards
+    readings: Readings
+    banks: int
+    of_machine: _Differences = field(default_factory=_Differences)
+    of_codes: _Differences = field(default_factory=_Differences)
+    of_sampling: _Differences = field(default_factory=_Differences)
+    lengths: dict[int, list[list[int]]] = field(default_factory=dict)
+    places: list[int] = field(default_factory=list)
+    weights: list[NDArray[np.float64]] = field(default_factory=list)
+    posteriors: int = 0
+    impossible: int = 0
+    without: int = 0
+    overflow: int = 0
+
+    def add(self, place: int, frame: int, exact: NDArray[np.float64] | None) -> None:
+        """Run the reading at a place with every bank; `exact` is the model's posterior, where there is a model."""
+        boards, banks = self.boards, self.banks
+        inputs, prior_row = self.readings.of_machine(place, boards.machines[0])
         likelihood = np.concatenate(
             [
                 _line_probabilities(machine, own, prior_row)
                 for machine, own in zip(
-                    boards.machines, inputs_of_boards(of_board, boards.machines), strict=True
+                    boards.machines, inputs_of_boards(inputs, boards.machines), strict=True
                 )
             ]
         )
-        ran = [boards.run(of_board, prior_row, _bank(boards, frame, run, banks)) for run in range(banks)]
+        ran = [boards.run(inputs, prior_row, _bank(boards, frame, run, banks)) for run in range(banks)]
         posteriors = [posterior for each in ran if (posterior := each.posterior) is not None]
-        without += banks - len(posteriors)
-        overflow += sum(any(reason.name == "OVERFLOW" for reason in each.reasons) for each in ran)
-        lengths.setdefault(frame, []).append([each.length for each in ran])
+        self.posteriors += 1
+        self.without += banks - len(posteriors)
+        self.overflow += sum(any(reason.name == "OVERFLOW" for reason in each.reasons) for each in ran)
+        self.lengths.setdefault(frame, []).append([each.length for each in ran])
         if not likelihood.any():
-            impossible += 1
+            self.impossible += 1
         else:
             codes = fuse(likelihood, ())
-            of_sampling.add(frame, posteriors, codes)
-            weights.append(likelihood)
-            places.append(place)
+            self.of_sampling.add(frame, posteriors, codes)
+            self.weights.append(likelihood)
+            self.places.append(place)
             if exact is not None:
-                of_codes.add(frame, [codes], exact)
+                self.of_codes.add(frame, [codes], exact)
         if exact is not None:
-            of_machine.add(frame, posteriors, exact)
-        advance()
-    if not posteriors_asked:
-        message = f"none of the readings ({readings.source}) is possible in the model"
-        raise ModelError(message)
-    lengths_found = np.array([np.max(each, axis=0) for each in lengths.values()])
-    # replicas that ran for themselves: of the cycles of these a count's z-score is taken
-    by_themselves = np.array([length for each in lengths.values() for length in each])
-    return Accuracy(
-        frames=len(lengths),
-        posteriors=posteriors_asked,
-        banks=banks,
-        impossible=impossible / posteriors_asked,
-        without=without / (posteriors_asked * banks),
-        overflow=overflow / (posteriors_asked * banks),
-        machine=of_machine.summary(),
-        quantising=of_codes.summary(),
-        sampling=of_sampling.summary(),
-        z=_z_scores(boards, readings, places, weights, int(np.median(by_themselves[by_themselves > 0])))
-        if (by_themselves > 0).any()
-        else None,
-        cycles=Cycles(
-            median=_bootstrap(lengths_found, np.median),
-            percentile_95=_bootstrap(lengths_found, lambda a, **k: np.quantile(a, 0.95, **k)),
-            worst=int(lengths_found.max()),
-        ),
-    )
+            self.of_machine.add(frame, posteriors, exact)
 
-
-def code_posterior(
-    machine: BM1Machine, addresses: tuple[int, ...], prior_address: int
-) -> NDArray[np.float64] | None:
-    """Return exact inference on a whole machine's codes, float64[lines]; None where no line can count."""
-    weights = _line_probabilities(machine, addresses, prior_address)
-    return fuse(weights, ()) if weights.any() else None
+    def summary(self) -> Accuracy:
+        """Return all of it as shares, averages and intervals."""
+        lengths = np.array([np.max(each, axis=0) for each in self.lengths.values()])
+        # replicas that ran for themselves: of the cycles of these a count's z-score is taken
+        by_themselves = np.array([length for each in self.lengths.values() for length in each])
+        runs = self.posteriors * self.banks
+        z = None
+        if (by_themselves > 0).any():
+            usual = int(np.median(by_themselves[by_themselves > 0]))
+            z = _z_scores(self.boards, self.readings, self.places, self.weights, usual)
+        return Accuracy(
+            frames=len(self.lengths),
+            posteriors=self.posteriors,
+            banks=self.banks,
+            impossible=self.impossible / self.posteriors,
+            without=self.without / runs,
+            overflow=self.overflow / runs,
+            machine=self.of_machine.summary(),
+            quantising=self.of_codes.summary(),
+            sampling=self.of_sampling.summary(),
+            z=z,
+            cycles=Cycles(
+                median=bootstrap(lengths, np.median),
+                percentile_95=bootstrap(lengths, lambda a, **k: np.quantile(a, 0.95, **k)),
+                worst=int(lengths.max()),
+            ),
+        )
 
 
 def _bank(boards: EmulatedBoards, frame: int, run: int, banks: int) -> int:
@@ -318,31 +336,7 @@ def _z_scores(
         cycles=cycles,
         counts=counts,
         draws=len(table),
-        rms=_bootstrap_rows(table, root_mean_square),
-        mean=_bootstrap_rows(table, mean),
+        rms=bootstrap_rows(table, root_mean_square),
+        mean=bootstrap_rows(table, mean),
         beyond_three=beyond / counts,
     )
-
-
-def _bootstrap(values: NDArray[np.float64], statistic: Callable[..., NDArray[np.float64]]) -> Interval:
-    """A statistic over frames (the first axis), and its percentile bootstrap interval: whole frames are drawn."""
-    chosen = np.random.default_rng(0).integers(0, len(values), (RESAMPLES, len(values)))
-    drawn = np.asarray(values)[chosen].reshape(RESAMPLES, -1)
-    low, high = np.quantile(statistic(drawn, axis=1), [(1 - LEVEL) / 2, (1 + LEVEL) / 2]).tolist()
-    return Interval(float(statistic(values.reshape(-1), axis=0)), low, high)
-
-
-def _bootstrap_rows(rows: NDArray[np.float64], statistic: Callable[[NDArray[np.float64]], float]) -> Interval:
-    chosen = np.random.default_rng(0).integers(0, len(rows), (RESAMPLES, len(rows)))
-    low, high = np.quantile(
-        [statistic(rows[each]) for each in chosen], [(1 - LEVEL) / 2, (1 + LEVEL) / 2]
-    ).tolist()
-    return Interval(statistic(rows), low, high)
-
-
-def _share(share: float, frames: int) -> Interval:
-    """A share of frames and its Wilson interval, which is right where all of them agree too."""
-    square = _NORMAL_95**2 / frames
-    middle = (share + square / 2) / (1 + square)
-    half = _NORMAL_95 / (1 + square) * math.sqrt(share * (1 - share) / frames + square / (4 * frames))
-    return Interval(share, max(0.0, middle - half), min(1.0, middle + half))

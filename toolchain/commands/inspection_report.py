@@ -12,7 +12,8 @@ from toolchain.analysis.resources import Pcie
 from toolchain.report import loss_heading, many_sentence
 
 if TYPE_CHECKING:
-    from toolchain.analysis.accuracy import Difference, Interval
+    from toolchain.analysis.accuracy import Difference
+    from toolchain.analysis.intervals import Interval
     from toolchain.commands.inspect import Inspection
 
 

@@ -6,8 +6,9 @@ import pytest
 from machines.bm1 import BM1Machine
 from machines.parameters import BM1Parameters
 from tests.toolchain.corridor import corridor, machine_of
-from toolchain.analysis.accuracy import _bootstrap, _difference, _share, code_posterior, measure
+from toolchain.analysis.accuracy import _difference, _line_probabilities, measure
 from toolchain.analysis.emulation import EmulatedBoards, split
+from toolchain.analysis.intervals import bootstrap, share_of_frames
 from toolchain.analysis.readings import MISSING, Readings, sample_readings
 from toolchain.deployment import Stop
 from toolchain.errors import ModelError
@@ -28,15 +29,16 @@ def test_a_difference_by_hand():
     assert not _difference(np.array([0.6, 0.4, 0.0]), theirs)[2]
 
 
-def test_exact_inference_on_codes():
+def test_how_often_codes_let_lines_count():
     machine = BM1Machine(
         BM1Parameters(lines=3, sensor_bits=(1,)),
         np.array([[255, 128, 64]], dtype=np.uint16),
         (np.array([[255, 128, 0], [255, 255, 255]], dtype=np.uint16),),
     )
-    assert code_posterior(machine, (0,), 0) == pytest.approx([0.8, 0.2, 0])
+    chances = _line_probabilities(machine, (0,), 0)
+    assert chances / chances.sum() == pytest.approx([0.8, 0.2, 0])
     zero = BM1Machine(machine.parameters, np.zeros((1, 3), dtype=np.uint16), machine.tables)
-    assert code_posterior(zero, (0,), 0) is None
+    assert not _line_probabilities(zero, (0,), 0).any()
 
 
 def test_a_machine_beside_its_model():
@@ -137,9 +139,9 @@ def test_readings_that_the_model_finds_impossible():
 
 def test_intervals():
     values = np.random.default_rng(1).normal(10, 2, (400, 1))
-    interval = _bootstrap(values, np.mean)
+    interval = bootstrap(values, np.mean)
     assert interval.low < interval.value < interval.high
     assert interval.high - interval.low == pytest.approx(2 * 1.96 * 2 / 20, rel=0.25)
-    all_agree = _share(1.0, 20)
+    all_agree = share_of_frames(1.0, 20)
     assert all_agree.high == 1
     assert all_agree.low == pytest.approx(0.839, abs=0.001)  # Wilson's, from a table

@@ -1,0 +1,54 @@
+"""Confidence intervals: how far a figure over some frames is to be trusted."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
+RESAMPLES: Final = 1000
+LEVEL: Final = 0.95
+"""Of every confidence interval."""
+
+_NORMAL_95: Final = 1.959964
+
+
+@dataclass(frozen=True, slots=True)
+class Interval:
+    """A figure and its 95 % confidence interval."""
+
+    value: float
+    low: float
+    high: float
+
+
+def bootstrap(values: NDArray[np.float64], statistic: Callable[..., NDArray[np.float64]]) -> Interval:
+    """A statistic over frames (the first axis), and its percentile bootstrap interval: whole frames are drawn."""
+    chosen = np.random.default_rng(0).integers(0, len(values), (RESAMPLES, len(values)))
+    drawn = np.asarray(values)[chosen].reshape(RESAMPLES, -1)
+    low, high = np.quantile(statistic(drawn, axis=1), [(1 - LEVEL) / 2, (1 + LEVEL) / 2]).tolist()
+    return Interval(float(statistic(values.reshape(-1), axis=0)), low, high)
+
+
+def bootstrap_rows(rows: NDArray[np.float64], statistic: Callable[[NDArray[np.float64]], float]) -> Interval:
+    """A statistic of a table's rows, and its percentile bootstrap interval: whole rows are drawn."""
+    chosen = np.random.default_rng(0).integers(0, len(rows), (RESAMPLES, len(rows)))
+    low, high = np.quantile(
+        [statistic(rows[each]) for each in chosen], [(1 - LEVEL) / 2, (1 + LEVEL) / 2]
+    ).tolist()
+    return Interval(statistic(rows), low, high)
+
+
+def share_of_frames(share: float, frames: int) -> Interval:
+    """A share of frames and its Wilson interval, which is right where all of them agree too."""
+    square = _NORMAL_95**2 / frames
+    middle = (share + square / 2) / (1 + square)
+    half = _NORMAL_95 / (1 + square) * math.sqrt(share * (1 - share) / frames + square / (4 * frames))
+    return Interval(share, max(0.0, middle - half), min(1.0, middle + half))
