@@ -17,21 +17,36 @@ if TYPE_CHECKING:
 _DPI: Final = 75
 _COLOURS: Final = ("#4477aa", "#ee6677", "#228833", "#ccbb44", "#66ccee", "#aa3377", "#bbbbbb")
 _MARKERS: Final = "osD^v<>P"
+_SUFFIXES: Final = (".png", ".svg", ".pdf")
 _KINDS_INSIDE: Final = 5
 """More of them would lie on the points: they stand beside the picture."""
 
 
-def check_pictures_possible() -> None:
+def check_pictures_possible(path: Path | None = None) -> None:
     """Find out before a long run that its picture can't be drawn.
 
     Raises:
-        BuildError: matplotlib is not installed.
+        BuildError: matplotlib is not installed, the file can't be written, or its name is not a picture's.
     """
     if find_spec("matplotlib") is None:
         message = (
             "a plot needs matplotlib, which is not installed: run pip install matplotlib, or leave out --plot"
         )
         raise BuildError(message)
+    if path is None:
+        return
+    if path.suffix not in _SUFFIXES:
+        message = f"{path} is no picture's name: expected one that ends in {', '.join(_SUFFIXES)}"
+        raise BuildError(message)
+    there = path.exists()
+    try:
+        with path.open("ab"):
+            pass
+        if not there:
+            path.unlink()
+    except OSError as reason:
+        message = f"{path} can't be written: {reason.strerror or reason}; name another file"
+        raise BuildError(message) from None
 
 
 def draw_sweep(path: Path, name: str, points: Sequence[Point], front: Sequence[Point]) -> None:
@@ -160,5 +175,5 @@ def _save(figure: Any, path: Path) -> None:
     try:
         figure.savefig(path, dpi=_DPI, metadata={"Software": None} if path.suffix == ".png" else None)
     except (OSError, ValueError) as reason:
-        message = f"{path} can't be written: {getattr(reason, 'strerror', None) or reason}; name a file that ends in .png"
+        message = f"{path} can't be written: {getattr(reason, 'strerror', None) or reason}"
         raise BuildError(message) from None

@@ -105,6 +105,17 @@ class Results:
                 raise BuildError(message) from None
             self.points[point.key] = point
 
+    def check_writable(self) -> None:
+        """Find out before a long run that its results can't be kept; makes the file where it is not there.
+
+        Raises:
+            BuildError: The file can't be written.
+        """
+        try:
+            os.close(self._opened())
+        except OSError as reason:
+            raise self._not_writable(reason) from None
+
     def append(self, point: Point) -> None:
         """Add a point: one write, and it is on the disk.
 
@@ -116,18 +127,23 @@ class Results:
             if self._torn_at is not None:
                 os.truncate(self.path, self._torn_at)
                 self._torn_at = None
-            descriptor = os.open(self.path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
+            descriptor = self._opened()
             try:
                 written = os.write(descriptor, line.encode())
                 os.fsync(descriptor)
             finally:
                 os.close(descriptor)
         except OSError as reason:
-            message = f"{self.path} can't be written: {reason.strerror or reason}"
-            raise BuildError(message) from None
+            raise self._not_writable(reason) from None
         if written != len(line):
             message = f"{self.path} can't be written: the disk is full"
             raise BuildError(message)
+
+    def _opened(self) -> int:
+        return os.open(self.path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
+
+    def _not_writable(self, reason: OSError) -> BuildError:
+        return BuildError(f"{self.path} can't be written: {reason.strerror or reason}")
 
 
 def pareto(points: Sequence[Point]) -> list[Point]:

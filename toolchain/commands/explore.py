@@ -93,7 +93,7 @@ def run_explore(path: Path, results: Path, plot: Path | None, options: ExploreOp
     if plot is not None:
         from toolchain.analysis.pictures import check_pictures_possible
 
-        check_pictures_possible()
+        check_pictures_possible(plot)
     device = device_named(options.device)
     sweep = _sweep(options)
     model = read_model(path, options.question, Unread(settings=options.settings, bits=options.bits))
@@ -105,6 +105,7 @@ def run_explore(path: Path, results: Path, plot: Path | None, options: ExploreOp
     frames = Frames(model, options.frames, seed=options.seed, recorded=_recorded(model, options))
     kept = Results(results)
     found = tasks(model, sweep, frames, device)
+    kept.check_writable()
     there = sum(task.key in kept.points for task in found)
     typer.echo(
         f"{len(found)} machines of {model.name} over {frames.columns(found[0].options.replicas).source}"
@@ -249,6 +250,7 @@ def run_claims_command(directory: Path, *, frames: int, seed: int) -> None:
     except OSError as reason:
         message = f"{directory} can't be made: {reason.strerror or reason}"
         raise BuildError(message) from None
+    check_pictures_possible(directory / CLAIMS_PICTURE)
     with _progress(experiments()) as advance:
         claims = run_claims(frames=frames, fault_frames=min(frames, CLAIM_FRAMES), seed=seed, advance=advance)
     for heading, courses in (

@@ -66,7 +66,7 @@ def _read_csv(path: Path, columns: Sequence[str]) -> Recording:
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             lines = csv.reader(_lines(path, file), strict=True)
-            heading = next(lines, [])
+            heading = [name.strip() for name in next(lines, [])]
             places = {column: _place(path, heading, column) for column in found}
             for line in lines:
                 if not line:
@@ -78,10 +78,16 @@ def _read_csv(path: Path, columns: Sequence[str]) -> Recording:
                 _check_rows(path, rows)
                 for column, place in places.items():
                     found[column].append(_cell(line[place]))
+            if not rows:
+                message = f"{path} has a heading and no rows"
+                raise ModelError(message)
     except OSError as reason:
         message = f"{path} can't be read: {reason.strerror or reason}"
         raise ModelError(message) from None
-    except (UnicodeDecodeError, csv.Error) as reason:
+    except UnicodeDecodeError:
+        message = f"{path} is no CSV file: it is not UTF-8 text, at the line after {lines.line_num} or later"
+        raise ModelError(message) from None
+    except csv.Error as reason:
         message = f"{path} is no CSV file: {reason}"
         raise ModelError(message) from None
     return Recording(path, rows, found)
@@ -110,10 +116,22 @@ def _check_topics(path: Path, topics: Sequence[str], there: set[str]) -> None:
 
 
 def _place(path: Path, heading: Sequence[str], column: str) -> int:
-    if column not in heading:
+    if heading.count(column) == 1:
+        return heading.index(column)
+    if column in heading:
+        message = (
+            f"{path} has the column {column!r} {heading.count(column)} times; give each a name of its own"
+        )
+    elif not heading:
+        message = f"{path} is empty; expected a heading with the columns' names"
+    elif len(heading) == 1 and (sign := next((each for each in ";\t|" if each in heading[0]), None)):
+        message = (
+            f"{path} has {sign!r} between its values, expected commas: its heading is {heading[0][:80]!r}; write it anew, "
+            "with points in the numbers"
+        )
+    else:
         message = f"{path} has no column {column!r}; it has {_listed(heading)}"
-        raise ModelError(message)
-    return heading.index(column)
+    raise ModelError(message)
 
 
 def _cell(text: str) -> object:

@@ -18,6 +18,7 @@ from machines.parameters import RngKind, SensorMode
 from tests.toolchain.corridor import corridor
 from toolchain.analysis.device import DEVICES
 from toolchain.analysis.explore import Frames, Sweep, explore, run_task, tasks
+from toolchain.analysis.pictures import check_pictures_possible
 from toolchain.analysis.sweep_results import Point, Results, pareto
 from toolchain.command import app
 from toolchain.deployment import Stop
@@ -321,6 +322,34 @@ def test_a_plot(case):
     result = run(case, *lists, "--plot", str(plot))
     assert result.exit_code == 0, result.stderr
     assert plot.read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    ("option", "name", "sentence"),
+    [
+        ("-o", "nowhere/r.jsonl", "can't be written: No such file or directory"),
+        ("--plot", "nowhere/sweep.png", "can't be written: No such file or directory"),
+        ("--plot", "sweep.bmp", "is no picture's name: expected one that ends in .png, .svg, .pdf"),
+    ],
+)
+def test_what_cannot_be_written_is_found_before_anything_is_measured(case, option, name, sentence):
+    if option == "--plot":
+        pytest.importorskip("matplotlib")
+    result = run(case, "--prob-bits", "4", "--targets", "15", option, str(case.parent / name))
+    assert result.exit_code == 2
+    assert sentence in result.stderr
+    assert result.stderr.splitlines()[-1].startswith("error: ")
+    assert "machines of" not in result.stderr
+    results = case.parent / "r.jsonl"
+    assert not results.exists() or not results.stat().st_size
+
+
+def test_looking_whether_a_picture_can_be_written_leaves_nothing(tmp_path):
+    pytest.importorskip("matplotlib")
+    (tmp_path / "old.png").write_bytes(b"a picture")
+    check_pictures_possible(tmp_path / "old.png")
+    check_pictures_possible(tmp_path / "new.png")
+    assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"a picture"]
 
 
 @pytest.mark.parametrize(

@@ -38,12 +38,28 @@ def test_a_csv_file(tmp_path):
         ("a,b\n1,2\n", "c", "has no column 'c'; it has a, b"),
         ("a,b\n1,2\n3\n", "a", "line 3: 1 values, but the heading has 2"),
         ('a,b\n1,"2\n', "a", "is no CSV file"),
-        ("", "a", "has no column 'a'"),
+        ("", "a", "is empty; expected a heading"),
+        ("a,b\n", "a", "has a heading and no rows"),
+        ("a,b,a\n1,2,3\n", "a", "has the column 'a' 2 times"),
+        ("a;b\n1,5;2\n", "a", "has ';' between its values, expected commas"),
+        ("a\tb\n1\t2\n", "a", r"has '\\t' between its values, expected commas"),
     ],
 )
 def test_damaged_csv_files(tmp_path, text, column, sentence):
     with pytest.raises(ModelError, match=sentence):
         read_recording(csv_file(tmp_path, text), [column])
+
+
+def test_a_heading_with_spaces_after_its_commas(tmp_path):
+    recording = read_recording(csv_file(tmp_path, "time, range , door\n0, 1.5, open\n"), ["range", "door"])
+    assert recording.columns == {"range": [1.5], "door": ["open"]}
+
+
+def test_a_csv_file_of_another_encoding(tmp_path):
+    path = tmp_path / "readings.csv"
+    path.write_bytes("a,b\n1,sí\n".encode("latin-1"))
+    with pytest.raises(ModelError, match="is no CSV file: it is not UTF-8 text"):
+        read_recording(path, ["b"])
 
 
 def test_what_is_not_there(tmp_path):
