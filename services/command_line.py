@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import errno
 import functools
 import os
@@ -10,6 +11,7 @@ import signal
 import sys
 import traceback
 from collections.abc import Callable, Coroutine
+from pathlib import Path
 from typing import Any, NoReturn, ParamSpec
 
 import typer
@@ -28,8 +30,17 @@ _SIGNALS = {
     signal.SIGHUP: (ExitCode.HANGUP, "the terminal was closed (SIGHUP)"),
 }
 
-_FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO})
-"""What an operating system says where a disk, or whatever else the output goes to, takes nothing more."""
+_FULL = "the output can't be written: {}; free some space, or send it elsewhere"
+_TOO_MANY = "this process can't open what it needs: {}; allow more (ulimit -n), or end what holds them"
+_EXHAUSTED = {
+    errno.ENOSPC: _FULL,
+    errno.EDQUOT: _FULL,
+    errno.EFBIG: _FULL,
+    errno.EIO: _FULL,
+    errno.EMFILE: _TOO_MANY,
+    errno.ENFILE: _TOO_MANY,
+}
+"""What is said where the operating system has no more of something, which is no bug of ours; by its number for it."""
 
 _MOMENT = 0.002
 """Seconds until a signal's exception that was dropped is raised again."""
@@ -91,12 +102,10 @@ def _outcome(command: Callable[[], int | None]) -> int:
             say(str(stopped))
     except Exception as error:
         code = exit_code_of(error)
-        if isinstance(error, OSError) and error.errno in _FULL:
+        if isinstance(error, OSError) and error.errno in _EXHAUSTED:
             code = ExitCode.USAGE
+            say(f"error: {_EXHAUSTED[error.errno].format(error.strerror)}")
             _drop_output()
-            say(
-                f"error: the output can't be written: {error.strerror}; free some space, or send it elsewhere"
-            )
         elif code == ExitCode.BUG and not isinstance(error, ReportedError):
             say_lines(traceback.format_exc().rstrip())
             say("error: this is a bug in rosbayes; please report it with the lines above")
@@ -109,9 +118,8 @@ def _outcome(command: Callable[[], int | None]) -> int:
 
 def _drop_output() -> None:
     """Let what still waits for standard output go nowhere: it can't be written."""
-    null = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(null, sys.stdout.fileno())
-    os.close(null)
+    with contextlib.suppress(OSError), Path(os.devnull).open("wb") as null:
+        os.dup2(null.fileno(), sys.stdout.fileno())
 
 
 def run_async(main: Coroutine[Any, Any, int | None]) -> int:
@@ -148,7 +156,7 @@ def run_async(main: Coroutine[Any, Any, int | None]) -> int:
                 return int(code or 0)
         raise stopped_by(stopped[0])
 
-    with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
+    with contextlib.closing(main), asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
         return runner.run(guarded())
 
 

@@ -329,6 +329,8 @@ class Master:
             return
         if self._at_publisher >= RESULTS_UNDER_WAY or not self._peers.publisher.ready:
             return
+        if self._count is not None and self._published + self._at_publisher >= self._count:
+            return  # until it is known whether those at the publisher are enough
         waiting = self._readings.get()
         if waiting is None:
             return

@@ -96,3 +96,30 @@ app()
         ExitCode.USAGE,
         "error: the output can't be written: No space left on device; free some space, or send it elsewhere\n",
     )
+
+
+def test_too_few_files_that_may_be_open_are_one_sentence():
+    code = """
+import resource
+from services.command_line import ends_well, make_app, run_async
+app = make_app("wait")
+
+async def work():
+    return 0
+
+@app.command()
+@ends_well
+def wait():
+    resource.setrlimit(resource.RLIMIT_NOFILE, (3, 3))
+    run_async(work())
+
+app()
+"""
+    ended = subprocess.run(
+        [sys.executable, "-W", "error", "-c", code], check=False, capture_output=True, text=True, timeout=60
+    )
+    assert ended.returncode == ExitCode.USAGE
+    assert "Traceback" not in ended.stderr
+    assert ended.stderr.endswith(
+        "error: this process can't open what it needs: Too many open files; allow more (ulimit -n), or end what holds them\n"
+    )

@@ -12,7 +12,16 @@ from services.running.reload import LOST_IN_RELOAD
 from services.running.run import Master
 from services.settings import Settings
 from services.sockets.control_socket import ReloadOrder
-from services.sockets.records import Frame, FrameFailed, Prepare, Prepared, Reading, Switched
+from services.sockets.records import (
+    Frame,
+    FrameFailed,
+    FrameResult,
+    Prepare,
+    Prepared,
+    Published,
+    Reading,
+    Switched,
+)
 from tests.integration.conftest import build_boat
 from toolchain.deployment import load_deployment
 
@@ -109,6 +118,33 @@ async def test_too_many_without_a_reload_end_the_run(run):
     read(run, 1)
     with pytest.raises(OverflowedQueueError, match="the slow part"):
         run._end.result()
+
+
+async def test_no_more_is_published_than_was_asked_for(boat):
+    """A publisher that waits for its server has several results at once; it will publish them all."""
+    run = Master(Settings(queue="all"), boat, once=False, count=3, json=False)
+    for role in ("subscriber", "publisher", "pcie-app"):
+        peer = run._peers._by_role[role] = Peer(role, None, None)
+        peer.protocol, peer.ready = App(), True
+    read(run, 10)
+
+    def computed():
+        run.take(run._peers.app, FrameResult(run._peers.app.protocol.frames[-1].number, [], 0, 0, 0, 0))
+
+    def published(number, outcome):
+        run.take(run._peers.publisher, Published(number, outcome, None, 0, 1.0, 1, 1))
+
+    for _ in range(5):
+        computed()
+    assert len(run._peers.app.protocol.frames) == 3
+    published(1, "no posterior")  # so one more is needed
+    assert len(run._peers.app.protocol.frames) == 4
+    computed()
+    for number in (2, 3, 4):
+        assert not run._end.done()
+        published(number, "published")
+    assert run._end.done()
+    assert len(run._peers.app.protocol.frames) == 4
 
 
 async def test_a_reload_ends_with_its_run(boat, run):
