@@ -9,6 +9,7 @@ import json
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -22,6 +23,9 @@ import websockets
 ROOT = Path(__file__).resolve().parents[2]
 BIN = Path(sys.executable).parent
 MARK = "ROSBAYES_TEST_RUN"
+PATIENCE = 60.0
+"""Seconds for what happens within one where nothing else runs."""
+PID_MAX = int(Path("/proc/sys/kernel/pid_max").read_text())
 READING = {"D1": 71, "D2": 50, "D3": 50, "B1": 45, "B2": 0, "B3": 90}
 """What a boat in the middle of the map sees."""
 
@@ -53,7 +57,7 @@ class Running:
     def err(self) -> str:
         return self._err.read_text()
 
-    async def end(self, timeout: float = 40) -> int:
+    async def end(self, timeout: float = PATIENCE) -> int:
         """Its exit code."""
         deadline = time.monotonic() + timeout
         while self.process.poll() is None:
@@ -61,7 +65,7 @@ class Running:
             await asyncio.sleep(0.02)
         return self.process.returncode
 
-    async def says(self, pattern: str, timeout: float = 20, times: int = 1) -> re.Match[str]:
+    async def says(self, pattern: str, timeout: float = PATIENCE, times: int = 1) -> re.Match[str]:
         """Wait for a line on its standard error."""
         deadline = time.monotonic() + timeout
         while len(found := list(re.finditer(pattern, self.err))) < times:
@@ -81,13 +85,28 @@ class Stage:
         self.where = where
         self.run = uuid.uuid4().hex
         self.running: list[Running] = []
+        self._places: list[socket.socket] = []
 
     def start(self, *command: str, environment: dict[str, str] | None = None) -> Running:
         running = Running(self.where, self.run, *command, environment=environment)
         self.running.append(running)
         return running
 
+    def place(self) -> int:
+        """A port that is free, and the next one; both stay this test's: bound, never listening, nobody else is given them."""
+        while True:
+            one, two = socket.socket(), socket.socket()
+            self._places += [one, two]
+            for place in (one, two):
+                place.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            one.bind(("127.0.0.1", 0))
+            with contextlib.suppress(OSError, OverflowError):
+                two.bind(("127.0.0.1", one.getsockname()[1] + 1))
+                return one.getsockname()[1]
+
     async def hub(self, port: int = 0) -> tuple[Running, str]:
+        """A hub and its address; another one may follow it at its port."""
+        port = port or self.place()
         hub = self.start("hub", "--port", str(port))
         return hub, (await hub.says(r"ws://\S+"))[0]
 
@@ -108,7 +127,15 @@ class Stage:
                     found.setdefault(name, []).append(process)
         return found
 
-    async def nothing_left(self, *except_for: str, timeout: float = 8) -> None:
+    def boards(self) -> list[psutil.Process]:
+        """The processes of the boards in their order, without that from which they were forked."""
+        found = {each.pid: each for each in self.processes()["board"]}
+        parent = next(pid for pid in {each.ppid() for each in found.values()} if pid in found)
+        first = found.pop(parent)
+        # process numbers begin again from below now and then
+        return sorted(found.values(), key=lambda each: (each.pid - first.pid) % PID_MAX)
+
+    async def nothing_left(self, *except_for: str, timeout: float = PATIENCE) -> None:
         """All processes but the named have ended, and no socket or private directory is left."""
         deadline = time.monotonic() + timeout
         while left := {name: all_ for name, all_ in self.processes().items() if name not in except_for}:
@@ -124,7 +151,9 @@ class Stage:
                 with contextlib.suppress(psutil.Error):
                     process.kill()
         for running in self.running:
-            running.process.wait(10)
+            running.process.wait(PATIENCE)
+        for place in self._places:
+            place.close()
 
 
 class Robot:
@@ -137,6 +166,7 @@ class Robot:
         self.order: list[str] = []
         self._tasks: list[asyncio.Task] = []
         self._publishing: asyncio.Task | None = None
+        self._values: dict = {}
         self._socket = None
 
     async def __aenter__(self):
@@ -170,18 +200,23 @@ class Robot:
                     kept = self.results if message["topic"] == "/BMresults" else self.frames
                     kept.append(message["msg"])
 
-    async def publish(self, **values) -> None:
-        stamp = divmod(time.time_ns(), 10**9)
-        msg = {"header": {"stamp": {"sec": stamp[0], "nanosec": stamp[1]}, "frame_id": "map"}, **values}
+    async def publish(self, **values) -> int:
+        """Publish a reading; its stamp."""
+        stamp_ns = time.time_ns()
+        stamp = dict(zip(("sec", "nanosec"), divmod(stamp_ns, 10**9), strict=True))
+        msg = {"header": {"stamp": stamp, "frame_id": "map"}, **values}
         await self._socket.send(json.dumps({"op": "publish", "topic": "/boat/sensors", "msg": msg}))
+        return stamp_ns
 
     async def keep_publishing(self, rate: float = 20, **values) -> None:
         """Publish in the background until the test is over; a lost server is waited for."""
 
+        self._values = values or READING
+
         async def publish() -> None:
             while True:
                 try:
-                    await self.publish(**(values or READING))
+                    await self.publish(**self._values)
                 except (websockets.ConnectionClosed, OSError):
                     with contextlib.suppress(OSError, websockets.WebSocketException):
                         await self.connect()
@@ -191,16 +226,58 @@ class Robot:
         self._tasks.append(self._publishing)
 
     async def stop_publishing(self) -> None:
-        """Publish no more in the background, and hear the results of what was published."""
+        """Publish no more in the background, and hear the results of what was published: nothing is under way then."""
         self._publishing.cancel()
-        await asyncio.sleep(0.5)
+        with contextlib.suppress(asyncio.CancelledError):
+            await self._publishing
+        await self.answer(await self.publish(**self._values))
 
-    async def have(self, count: int, timeout: float = 25) -> None:
+    async def answer(self, stamp_ns: int) -> tuple[dict, dict | None]:
+        """Wait for what comes of the reading with a stamp: its frame's report, and the result unless there is none."""
+        deadline = time.monotonic() + PATIENCE
+        while True:
+            before = 0
+            for frame in self.frames:
+                published = frame["status"][0]["level"] == 0
+                if stamp_of(frame) == stamp_ns and len(self.results) >= before + published:
+                    return frame, self.results[before] if published else None
+                before += published
+            assert time.monotonic() < deadline, "nothing came of the reading"
+            await asyncio.sleep(0.01)
+
+    async def have(self, count: int, timeout: float = PATIENCE) -> None:
         """Wait until so many results have come."""
         deadline = time.monotonic() + timeout
         while len(self.results) < count:
             assert time.monotonic() < deadline, f"{len(self.results)} results of {count}"
             await asyncio.sleep(0.01)
+
+
+def stamp_of(message: dict) -> int:
+    """A message's stamp in ns, as either ROS writes it."""
+    stamp = message["header"]["stamp"]
+    seconds, rest = stamp.get("sec", stamp.get("secs")), stamp.get("nanosec", stamp.get("nsecs"))
+    return seconds * 10**9 + rest
+
+
+async def until_subscribed(uri: str, topic: str) -> None:
+    """Wait until somebody hears a topic at a hub."""
+    async with asyncio.timeout(PATIENCE), websockets.connect(uri) as asking:
+        while True:
+            call = {"op": "call_service", "service": "/rosapi/subscribers", "args": {"topic": topic}}
+            await asking.send(json.dumps(call))
+            if json.loads(await asking.recv())["values"]["subscribers"]:
+                return
+            await asyncio.sleep(0.02)
+
+
+async def status_of(runs: Path, name: str) -> dict:
+    """What a process of a run says of itself."""
+    reader, writer = await asyncio.open_unix_connection(runs / f"{name}.status.sock")
+    try:
+        return json.loads(await reader.read())
+    finally:
+        writer.close()
 
 
 @pytest.fixture

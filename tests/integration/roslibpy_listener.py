@@ -2,7 +2,7 @@
 
     python roslibpy_listener.py URI FILE COUNT [READING_JSON]
 
-Writes one JSON line per message heard and ends after COUNT results, or 90 s.
+Writes one JSON line per message heard and ends after COUNT results, or 240 s.
 """
 
 import json
@@ -23,7 +23,7 @@ TOPICS = {
 def main(uri: str, file: str, count: int, reading: dict | None) -> int:
     host, port = uri.removeprefix("ws://").rsplit(":", 1)
     ros = roslibpy.Ros(host=host, port=int(port))
-    ros.run(timeout=10)
+    ros.run(timeout=60)
     heard = []
     results = [0]
 
@@ -39,7 +39,7 @@ def main(uri: str, file: str, count: int, reading: dict | None) -> int:
         topic.subscribe(keep(topic.name))
     publisher = roslibpy.Topic(ros, "/boat/sensors", "boat_msgs/Sensors")
     print("listening", file=sys.stderr, flush=True)
-    deadline = time.monotonic() + 90
+    deadline = time.monotonic() + 240
     while results[0] < count and time.monotonic() < deadline:
         if reading is not None:
             seconds, nanoseconds = divmod(time.time_ns(), 10**9)

@@ -65,10 +65,8 @@ async def posteriors(stage, deployment, messages, *flags):
         await robot.stop_publishing()
         found = []
         for message in messages:
-            before = len(robot.results)
-            await robot.publish(**message)
-            await robot.have(before + 1)
-            found.append(robot.results[-1]["data"])
+            _, result = await robot.answer(await robot.publish(**message))
+            found.append(result["data"])
         return found, master
 
 

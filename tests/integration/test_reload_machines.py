@@ -7,7 +7,6 @@ import asyncio
 import json
 import shutil
 import signal
-import socket
 
 import numpy as np
 import pytest
@@ -16,8 +15,8 @@ import websockets
 from bridge.results import read_posterior
 from machines.posterior import joint_posterior
 from tests.integration import test_prior, test_replicas
-from tests.integration.conftest import READING, Robot
-from tests.integration.test_reload import LOOP, looping, other_boat, regenerate, reload_, status_of, until
+from tests.integration.conftest import PATIENCE, READING, Robot, status_of
+from tests.integration.test_reload import LOOP, looping, other_boat, regenerate, reload_, until
 from toolchain.deployment import load_deployment
 
 __all__ = ["other_boat"]  # a fixture
@@ -70,7 +69,7 @@ async def have_of(robot, generation, count=3):
     async def have():
         return sum(each == generation for each, _, _ in by_generation(robot)) >= count
 
-    await until(have, timeout=40)
+    await until(have)
 
 
 async def test_replicas_of_cells(stage, tmp_path):
@@ -122,28 +121,12 @@ async def test_several_outputs(stage, boat, other_boat, tmp_path):
         await have_of(robot, 1)
         await robot.stop_publishing()
         while len(second) < 5 or second != robot.results[-len(second) :]:
-            second.append(json.loads(await asyncio.wait_for(listener.recv(), 20))["msg"])
+            second.append(json.loads(await asyncio.wait_for(listener.recv(), PATIENCE))["msg"])
     assert set(robot.generations()) == {0, 1}
 
 
-def free_ports(count):
-    """Ports of this machine that nobody has; each with the next one free for programming."""
-    found = []
-    while len(found) < count:
-        with socket.socket() as one, socket.socket() as two:
-            one.bind(("127.0.0.1", 0))
-            port = one.getsockname()[1]
-            try:
-                two.bind(("127.0.0.1", port + 1))
-            except OSError:
-                continue
-            if not {port - 1, port, port + 1} & set(found):
-                found.append(port)
-    return found
-
-
 async def test_boards_over_tcp(stage, boat, other_boat):
-    ports = free_ports(4)
+    ports = [stage.place() for _ in range(4)]  # each with the next one, for programming
     boards = []
     for at, port in enumerate(ports):
         boards.append(stage.start("board", "--listen", f"tcp://127.0.0.1:{port}", "--index", str(at)))
@@ -158,7 +141,7 @@ async def test_boards_over_tcp(stage, boat, other_boat):
         await have_of(robot, generation)
     assert sorted(robot.generations()) == [0, 1, 2]
     master.send(signal.SIGINT)
-    assert await master.end(12) == 130
+    assert await master.end() == 130
     # they hold the last image, which a master of another deployment takes for somebody else's
     refused = stage.start(
         "master", "--once", "-d", str(other_boat), "--uri", robot.uri, "--boards", endpoints
@@ -172,7 +155,7 @@ async def test_boards_over_tcp(stage, boat, other_boat):
 async def test_a_master_that_is_killed_in_a_reload_leaves_nothing(stage, boat, other_boat, flags):
     _, robot, master, runs = await looping(stage, boat, *flags, witness=(boat, other_boat))
     images = [board.image_hash for board in load_deployment(other_boat, images=False).boards]
-    boards = sorted(stage.processes()["board"], key=lambda each: each.pid)[1:]  # the first is their parent
+    boards = stage.boards()
     await robot.stop_publishing()  # no frame may wait for the board that stops now
     boards[3].suspend()
     reloading = reload_(stage, runs, "-d", str(other_boat))

@@ -3,12 +3,10 @@
 message ──▶ subscriber ──▶ master ──▶ pcie-app ──▶ INPUTS of one or two boards ──▶ R posteriors on the wire
 """
 
-import asyncio
 import json
 import re
 import subprocess
 import textwrap
-import time
 
 import numpy as np
 import pytest
@@ -116,21 +114,6 @@ def wanted(deployment, message, number):
     return expected_of_replicas(images, frame)
 
 
-async def answer(robot, message):
-    """What is published for a message, which its frame's stamp is found by."""
-    stamp_ns = time.time_ns()
-    stamp = {"sec": stamp_ns // 10**9, "nanosec": stamp_ns % 10**9}
-    await robot.publish(**message, header={"stamp": stamp, "frame_id": "map"})
-    deadline = time.monotonic() + 25
-    while True:
-        assert time.monotonic() < deadline, "nothing was published for the message"
-        reports = [read_frame_report(frame, 0) for frame in robot.frames]
-        found = [at for at, report in enumerate(reports) if report.stamp_ns == stamp_ns]
-        if found and len(robot.results) > (place := sum(report.published for report in reports[: found[0]])):
-            return reports[found[0]], robot.results[place]
-        await asyncio.sleep(0.01)
-
-
 @pytest.mark.parametrize(
     ("options", "flags"),
     [
@@ -160,7 +143,8 @@ async def test_what_is_published_is_what_the_machines_count(stage, tmp_path, opt
         await robot.have(1)
         await robot.stop_publishing()
         for message in messages:
-            report, result = await answer(robot, message)
+            frame, result = await robot.answer(await robot.publish(**message))
+            report = read_frame_report(frame, 0)
             of_replicas = wanted(deployment, message, report.number)
             exact = [
                 joint_posterior(

@@ -1,5 +1,6 @@
 """Machines, images and board processes for the tests of the boards."""
 
+import contextlib
 import dataclasses
 import multiprocessing
 import os
@@ -20,6 +21,8 @@ from pcie_shim.misbehaviour import Misbehaviour
 from pcie_shim.programming_file import Image, Partition, interface_words
 
 _FORK = multiprocessing.get_context("fork")
+_PLACES: list[socket.socket] = []
+"""Bound and never listening, until the tests end."""
 
 
 def machine(
@@ -211,14 +214,16 @@ def _codes_of(
 
 
 def tcp_endpoint() -> str:
-    """An endpoint whose port is free, and so is the next one, for programming."""
+    """An endpoint whose port is free, and so is the next one, for programming; nobody else is given them."""
     while True:
-        with socket.create_server(("127.0.0.1", 0)) as first:
-            port = first.getsockname()[1]
-            try:
-                socket.create_server(("127.0.0.1", port + 1)).close()
-            except OSError:
-                continue
+        first, second = socket.socket(), socket.socket()
+        _PLACES.extend((first, second))
+        for place in (first, second):
+            place.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        first.bind(("127.0.0.1", 0))
+        port = first.getsockname()[1]
+        with contextlib.suppress(OSError, OverflowError):
+            second.bind(("127.0.0.1", port + 1))
             return f"tcp://127.0.0.1:{port}"
 
 
