@@ -46,7 +46,11 @@ def hub(
         Path | None, typer.Option(metavar="FILE", help="Tokens that clients must show, one a line.")
     ] = None,
     origin: Annotated[
-        list[str] | None, typer.Option(help="Web page that may connect, besides this machine's; repeatable.")
+        list[str] | None,
+        typer.Option(
+            metavar="ORIGIN",
+            help="Web page that may connect, such as https://robot.example, besides this machine's; repeatable.",
+        ),
     ] = None,
     announce: Annotated[
         str | None,
