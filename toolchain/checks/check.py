@@ -265,15 +265,16 @@ def _columns(machine: CheckedMachine) -> Iterator[Finding]:
                 what="each of its values has the same code on every line, so its readings change nothing",
                 advice="leave it out, or use more --prob-bits",
             )
+    # A bare name as a path is searched for like the name itself.
     paths = Counter(
-        (variable.source, variable.path) for variable in machine.deployment.variables if variable.path
+        (variable.source, variable.path or variable.name) for variable in machine.deployment.variables
     )
     for (source, path), count in paths.items():
         if count > 1:
             names = [
                 variable.name
                 for variable in machine.deployment.variables
-                if (variable.source, variable.path) == (source, path)
+                if (variable.source, variable.path or variable.name) == (source, path)
             ]
             yield Finding(
                 severity=Severity.WARNING,
@@ -381,7 +382,7 @@ def _files(directory: Path, deployment: Deployment, images: Sequence[Image]) -> 
     """Files of the hardware project that are not what follows from the images."""
     words = {
         Change.NEW: "is not there",
-        Change.CHANGED: "is not as it was built",
+        Change.CHANGED: "says something else than the images and deployment.toml",
         Change.REMOVED: "is left from before",
     }
     for part, files in (

@@ -126,7 +126,8 @@ def _guarded(path: Path, what: str, call: Callable[[], object]) -> object:
 
 def _line(path: Path, frames: traceback.StackSummary) -> int | None:
     """Return the line of the user's file in which something was raised, or None."""
-    lines = [frame.lineno for frame in frames if Path(frame.filename) in {path, path.resolve()}]
+    file = path.resolve()  # Python calls it by an absolute path, which may still have a link or `..` in it
+    lines = [frame.lineno for frame in frames if Path(frame.filename).resolve() == file]
     return lines[-1] if lines else None
 
 

@@ -373,6 +373,17 @@ def test_columns_without_effect_and_readings_used_twice():
     assert only(findings, "same-reading").about == "A and B"
 
 
+def test_a_bare_path_is_the_reading_of_that_name():
+    place = interval("x", 0, 10, cells=10)
+    (x,) = cell_centres(place)
+    known = tuple(
+        normal(name, mean=x, sigma=2.0, values=15, floor=0.05, path=path)
+        for name, path in (("D", ""), ("E", "D"), ("F", "F"))
+    )
+    finding = only(check_model(model(known=known), OPTIONS), "same-reading")
+    assert (finding.about, finding.what) == ("D and E", "they are all read from D")
+
+
 # What can't be built
 
 
@@ -426,7 +437,7 @@ def test_files_of_a_deployment(deployment):
     (deployment / "bm1.tcl").unlink()
     memories, project = check_deployment(deployment)
     assert (memories.check, memories.about) == ("files", "bm_arch/Memory_MIFs/board0_prior.mif")
-    assert memories.what == "is not as it was built"
+    assert memories.what == "says something else than the images and deployment.toml"
     assert memories.advice == f"use 'toolchain regenerate memories {deployment}'"
     assert (project.about, project.what) == ("bm1.tcl", "is not there")
 

@@ -60,6 +60,16 @@ def test_values_are_read_as_their_parameters_types(case):
     assert model.name == f"12 {type(Path()).__name__} False COARSE 2 7"
 
 
+def test_a_mistake_has_its_line_however_the_folder_is_named(case, tmp_path, monkeypatch):
+    case("def model():\n    return 1 / 0")
+    (tmp_path / "beside").mkdir()
+    (tmp_path / "link").symlink_to(tmp_path)
+    monkeypatch.chdir(tmp_path / "beside")
+    for folder in ("..", "../link", "../beside/.."):
+        with pytest.raises(ModelError, match=r"model\.py, line 2: model\(\) raised ZeroDivisionError"):
+            load_model(Path(folder), {})
+
+
 @pytest.mark.parametrize(
     ("settings", "sentence"),
     [
