@@ -37,7 +37,7 @@ KEPT = 512
 """Readings kept until their result comes."""
 BITS_CYCLES = 1 << 13
 """Longer frames are not computed anew: the reference kernel takes seconds for them, and more results would come meanwhile."""
-PATIENCE_S = 60.0
+PATIENCE_S = 180.0
 """Seconds until the server is there, and until the first result."""
 
 
