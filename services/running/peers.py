@@ -214,14 +214,6 @@ class Peers:
             role = next(role for role, text in given.items() if text)
             msg = f"--fused runs subscriber, publisher and pcie-app in the master's own process; take --connect or --{role} away"
             raise SettingsError(msg)
-        common = ["--deployment", str(settings.deployment), "--log-level", settings.log_level]
-        rosbridge = [*(["--uri", settings.uri] if settings.uri else [])]
-        rosbridge += [
-            "--ros-version",
-            settings.ros_version,
-            "--connect-timeout",
-            str(settings.connect_timeout),
-        ]
         boards = list(settings.boards)
         if not given["pcie-app"] and directory is not None:
             endpoints = [board.endpoint for board in deployment.boards]
@@ -230,27 +222,6 @@ class Peers:
                 command = [*own_command("board"), "--boards", str(len(boards)), "--directory", str(directory)]
                 command += ["--restarts", "0" if self._once else str(RESTARTS)]
                 self._boards = Child("the boards' process", command, directory=directory)
-        arguments = {
-            "subscriber": [
-                *common,
-                *rosbridge,
-                "--first-data-timeout",
-                str(settings.first_data_timeout),
-                *(["--queue", settings.queue] if settings.queue else []),
-            ],
-            "publisher": [*common, *rosbridge, "--seen-timeout", str(settings.seen_timeout)],
-            "pcie-app": [
-                *common,
-                *(["--boards", ",".join(boards)] if boards else []),
-                *(["--stop", settings.stop] if settings.stop else []),
-                "--peer-timeout",
-                str(settings.peer_timeout + self._compiling_time),
-                "--board-timeout",
-                str(settings.board_timeout),
-                # nobody else can have programmed boards of this run
-                *(["--reprogram"] if self._boards is not None else []),
-            ],
-        }
         self.board_endpoints = tuple(boards)
         if settings.fused:
             self._by_role = {role: Peer(role, None, None) for role in given}
@@ -262,9 +233,28 @@ class Peers:
             else:
                 assert directory is not None  # noqa: S101 - made above for whoever has no endpoint
                 endpoint = endpoint_in(directory, role)
-                command = [*own_command(role), "--listen", str(endpoint), *arguments[role]]
+                command = [*own_command(role), "--listen", str(endpoint), *self._arguments(role)]
                 child = Child(role, command, directory=directory)
             self._by_role[role] = Peer(role, endpoint, child)
+
+    def _arguments(self, role: str) -> list[str]:
+        """The flags that a child is started with, so that it works by the settings of the run."""
+        settings = self._settings
+        flags = ["--deployment", str(settings.deployment), "--log-level", settings.log_level]
+        if role == "pcie-app":
+            flags += ["--boards", ",".join(self.board_endpoints)] if self.board_endpoints else []
+            flags += ["--stop", settings.stop] if settings.stop else []
+            flags += ["--peer-timeout", str(settings.peer_timeout + self._compiling_time)]
+            flags += ["--board-timeout", str(settings.board_timeout)]
+            # nobody else can have programmed boards of this run
+            flags += ["--reprogram"] if self._boards is not None else []
+            return flags
+        flags += ["--uri", settings.uri] if settings.uri else []
+        flags += ["--ros-version", settings.ros_version, "--connect-timeout", str(settings.connect_timeout)]
+        if role == "publisher":
+            return [*flags, "--seen-timeout", str(settings.seen_timeout)]
+        flags += ["--first-data-timeout", str(settings.first_data_timeout)]
+        return [*flags, "--queue", settings.queue] if settings.queue else flags
 
     @property
     def _compiling_time(self) -> float:
