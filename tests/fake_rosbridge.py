@@ -167,7 +167,7 @@ class FakeRosbridge:
             server.close(close_connections=False)
         await self.cut()
         if server is not None:
-            await asyncio.wait_for(server.wait_closed(), 30)
+            await asyncio.wait_for(server.wait_closed(), 120)
 
     async def cut(self) -> None:
         """Cut every connection without a goodbye, but go on listening."""

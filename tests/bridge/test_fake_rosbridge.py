@@ -16,7 +16,7 @@ from tests.fake_rosbridge import SERVER, FakeRosbridge
 def speak_roslibpy(port: int) -> dict[str, object]:
     """All that the fake offers, as roslibpy sees it (which blocks, so: in a thread)."""
     ros = roslibpy.Ros("127.0.0.1", port)
-    ros.run(timeout=60)
+    ros.run(timeout=240)
     try:
         got: list[object] = []
         roslibpy.Topic(ros, "/chatter", "std_msgs/String").subscribe(got.append)
@@ -27,7 +27,7 @@ def speak_roslibpy(port: int) -> dict[str, object]:
             talker.publish({"data": "hello"})
             time.sleep(0.05)
         echo = roslibpy.Service(ros, "/echo", "p/Echo")
-        answer = echo.call(roslibpy.ServiceRequest({"n": 1}), timeout=60)
+        answer = echo.call(roslibpy.ServiceRequest({"n": 1}), timeout=240)
         return {
             "got": got[0],
             "topics": ros.get_topics(),
@@ -54,7 +54,7 @@ async def test_roslibpy_gets_along_with_the_fake_and_with_our_client():
 
 
 async def hear(client: ClientConnection) -> object:
-    return json.loads(await asyncio.wait_for(client.recv(), 30))
+    return json.loads(await asyncio.wait_for(client.recv(), 120))
 
 
 async def test_it_says_that_it_is_a_fake():
@@ -83,7 +83,7 @@ async def test_a_zombie_serves_nothing_more(zombies):
         if zombies:
             with pytest.raises(TimeoutError):
                 await asyncio.wait_for(client.recv(), 0.1)
-            await asyncio.wait_for(await client.ping(), 30)
+            await asyncio.wait_for(await client.ping(), 120)
         else:
             await hear(client)
         assert [received.op is None for received in fake.received] == [True, True, False]

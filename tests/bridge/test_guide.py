@@ -156,7 +156,7 @@ async def test_the_door_of_the_guide(tmp_path):
         ],
         check=True,
         capture_output=True,
-        timeout=60,
+        timeout=240,
     )
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.load_cert_chain(certificate, key)

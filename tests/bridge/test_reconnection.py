@@ -91,7 +91,7 @@ async def test_an_iteration_goes_on():
             await fake.publish("/a", {"n": n})
             if n < 2:
                 await gone_and_back(fake, ros)
-        await asyncio.wait_for(reader, 30)
+        await asyncio.wait_for(reader, 120)
         assert got == [0, 1, 2]
         assert ros.reconnections == 2
 
@@ -157,14 +157,14 @@ async def test_it_comes_back_whatever_was_there_meanwhile(trouble):
         if trouble == "refuses":
             fake.refuses = 503
             await fake.cut()
-            await asyncio.wait_for(_until(lambda: "HTTP 503" in ros.last_error), 30)
+            await asyncio.wait_for(_until(lambda: "HTTP 503" in ros.last_error), 120)
             fake.refuses = None
         else:
             await fake.vanish()
             greeter = await asyncio.start_server(
                 lambda _r, w: w.write(b"220 mail\r\n"), "127.0.0.1", fake.port
             )
-            await asyncio.wait_for(_until(lambda: "220 mail" in ros.last_error), 30)
+            await asyncio.wait_for(_until(lambda: "220 mail" in ros.last_error), 120)
             greeter.close()
             await fake.come_back()
         await ros.wait_for_state(State.CONNECTED, 30)
@@ -374,7 +374,7 @@ async def test_darkness_is_told_even_if_its_message_is_dropped(queue_size):
         await fake.wait_for_op("subscribe")
         for n in range(20):
             await fake.publish("/a", {"n": n})
-        await asyncio.wait_for(_until(lambda: subscription.lost == 20 - queue_size), 30)
+        await asyncio.wait_for(_until(lambda: subscription.lost == 20 - queue_size), 120)
         messages = [await subscription.next(30) for _ in range(queue_size)]
         assert [message.msg["n"] for message in messages] == list(range(20 - queue_size, 20))
         dark = [message.blind_seconds for message in messages]

@@ -28,7 +28,7 @@ PATIENCE = 60.0
 
 
 def openssl(*words: str) -> None:
-    subprocess.run(["openssl", *words], check=True, capture_output=True, timeout=60)
+    subprocess.run(["openssl", *words], check=True, capture_output=True, timeout=240)
 
 
 @pytest.fixture(scope="module")

@@ -74,7 +74,7 @@ async def test_a_lost_connection_fails_what_waits():
         await fake.wait_for_op("call_service")
         await fake.cut()
         with pytest.raises(DisconnectedError, match=r"was lost .* while /mute was to answer"):
-            await asyncio.wait_for(call, 30)
+            await asyncio.wait_for(call, 120)
 
 
 async def test_closing_fails_what_waits():
@@ -84,7 +84,7 @@ async def test_closing_fails_what_waits():
             call = asyncio.create_task(ros.call("/mute", timeout=30))
             await fake.wait_for_op("call_service")
         with pytest.raises(DisconnectedError, match="was closed"):
-            await asyncio.wait_for(call, 30)
+            await asyncio.wait_for(call, 120)
         with pytest.raises(DisconnectedError, match="this client was closed"):
             await ros.call("/mute")
         assert ros.state is State.CLOSED
@@ -162,8 +162,8 @@ async def test_closing_ends_what_is_being_handled():
             await server.advertise_service("/s", "p/T", handler)
             await fake.wait_for_op("advertise_service")
             call = asyncio.create_task(caller.call("/s", timeout=0.5))
-            await asyncio.wait_for(began.wait(), 30)
-        await asyncio.wait_for(ended.wait(), 30)
+            await asyncio.wait_for(began.wait(), 120)
+        await asyncio.wait_for(ended.wait(), 120)
         with pytest.raises(NoAnswerError):
             await call
 

@@ -89,7 +89,7 @@ class PretendStack:
 
     async def _serve(self) -> None:
         for number in itertools.count(1):
-            await self.fake.wait_for_op("publish", topic=self.topic, count=number, timeout=60)
+            await self.fake.wait_for_op("publish", topic=self.topic, count=number, timeout=240)
             message = self.fake.ops("publish", topic=self.topic)[number - 1]["msg"]
             answer = self.answer(number, message)
             if isinstance(answer, str):

@@ -27,7 +27,7 @@ def run(*command, **variables):
         capture_output=True,
         check=False,
         text=True,
-        timeout=60,
+        timeout=240,
         cwd=ROOT,
     )
 

@@ -298,7 +298,7 @@ def build(model: Path, directory: Path, *options: str) -> Path:
         ],
         check=True,
         capture_output=True,
-        timeout=60,
+        timeout=240,
     )
     return directory
 

@@ -23,7 +23,7 @@ TOPICS = {
 def main(uri: str, file: str, count: int, reading: dict | None) -> int:
     host, port = uri.removeprefix("ws://").rsplit(":", 1)
     ros = roslibpy.Ros(host=host, port=int(port))
-    ros.run(timeout=60)
+    ros.run(timeout=240)
     heard = []
     results = [0]
 

@@ -48,7 +48,7 @@ def built(folder, *, select, options=()):
         ],
         check=True,
         capture_output=True,
-        timeout=60,
+        timeout=240,
     )
     return folder / "built"
 

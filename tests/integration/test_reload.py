@@ -49,7 +49,7 @@ def other_boat(tmp_path_factory):
 
 def regenerate(part, directory, *options):
     command = [BIN / "toolchain", "regenerate", part, directory, *options]
-    subprocess.run(command, check=True, capture_output=True, timeout=60)
+    subprocess.run(command, check=True, capture_output=True, timeout=240)
 
 
 @cache

@@ -53,7 +53,7 @@ def built(folder, *options):
         ],
         check=True,
         capture_output=True,
-        timeout=60,
+        timeout=240,
     )
     return folder / "built"
 
@@ -218,7 +218,7 @@ async def test_alone_the_commands_are_a_pipe(stage, tmp_path):
         input=line + line.replace("[1, 2, 3]", "[1, 2]"),
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=240,
         check=False,
     )
     first = json.loads(ran.stdout.splitlines()[0])

@@ -358,7 +358,7 @@ def test_a_misbehaving_board_fails_the_frame_and_comes_back(
     assert cluster.is_open(0)
     with pytest.raises(BoardGoneError, match=r"Board 1 at unix:.* is not open \(.*\): open it again"):
         cluster.run(frame(**OWN))
-    cluster.reopen(1, timeout=60)
+    cluster.reopen(1, timeout=240)
     for stop in ("own", "slices"):
         failing.run(frame(stop=stop, bank=3))
     cluster.close()
@@ -410,7 +410,7 @@ def test_a_failure_in_a_later_slice(start_board: StartBoard) -> None:
 
 def test_a_killed_board_is_gone_and_its_successor_is_programmed(boards: list[BoardProcess]) -> None:
     parts = images(80, (3, 2))
-    with MiniCluster.open(endpoints_of(boards), parts, timeout=60) as cluster:
+    with MiniCluster.open(endpoints_of(boards), parts, timeout=240) as cluster:
         cluster.run(frame())
         boards[0].kill()
         with pytest.raises(BoardGoneError, match=r"Board 0: .* is gone: "):

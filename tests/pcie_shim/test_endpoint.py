@@ -48,7 +48,7 @@ def test_a_unix_socket_is_its_owners_alone_and_goes_away(folder: Path) -> None:
     endpoint = Endpoint(path=str(folder / "a.sock"))
     server = listen(endpoint)
     assert stat.S_IMODE((folder / "a.sock").stat().st_mode) == 0o600
-    with connect(endpoint, timeout=60):
+    with connect(endpoint, timeout=240):
         pass
     remove_listener(endpoint, server)
     assert list(folder.iterdir()) == []
@@ -60,7 +60,7 @@ def test_a_dead_processs_socket_is_replaced_and_a_served_one_is_not(folder: Path
     server = listen(endpoint)
     with pytest.raises(EndpointError, match="another process listens there"):
         listen(endpoint)
-    connect(endpoint, timeout=60).close()
+    connect(endpoint, timeout=240).close()
     server.close()
 
 
@@ -70,7 +70,7 @@ def test_a_socket_whose_queue_is_full_is_served_and_not_waited_for(folder: Path)
         server = stack.enter_context(socket.socket(socket.AF_UNIX))
         server.bind(endpoint.path)
         server.listen(0)
-        stack.enter_context(connect(endpoint, timeout=60))
+        stack.enter_context(connect(endpoint, timeout=240))
         with pytest.raises(EndpointError, match="another process listens there"):
             listen(endpoint)
 
@@ -95,5 +95,5 @@ def test_nothing_listening_is_said_in_time(folder: Path) -> None:
 def test_small_frames_are_sent_at_once_over_tcp() -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         endpoint = Endpoint(host="127.0.0.1", port=server.getsockname()[1])
-        with connect(endpoint, timeout=60) as connection:
+        with connect(endpoint, timeout=240) as connection:
             assert connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)

@@ -46,7 +46,7 @@ def test_several_say_once_that_they_are_there_and_that_one_is_back(start, tmp_pa
     assert re.fullmatch(r"board \d was killed by SIGKILL; restarting it\n", boards.stderr.readline())
     assert re.fullmatch(r"board \d listens again at unix:.*/board\d\.sock\n", boards.stderr.readline())
     boards.send_signal(signal.SIGINT)
-    _, rest = boards.communicate(timeout=30)
+    _, rest = boards.communicate(timeout=120)
     assert (boards.returncode, rest) == (130, "interrupted (Ctrl-C)\n")
 
 
@@ -60,7 +60,7 @@ def test_one_alone(start, tmp_path, several):
     board = start(*one)
     assert board.stderr.readline() == f"board 0 listens at unix:{tmp_path}/board0.sock\n"
     board.send_signal(signal.SIGTERM)
-    _, rest = board.communicate(timeout=30)
+    _, rest = board.communicate(timeout=120)
     assert (board.returncode, rest) == (143, "asked to end (SIGTERM)\n")
 
 
@@ -70,7 +70,7 @@ def test_a_masters_boards_say_nothing(start, tmp_path):
         assert boards.poll() is None
         time.sleep(0.02)
     boards.send_signal(signal.SIGTERM)
-    _, said = boards.communicate(timeout=30)
+    _, said = boards.communicate(timeout=120)
     assert said == ""
 
 
@@ -80,7 +80,7 @@ def test_a_second_signal_close_behind_the_first_changes_nothing(start, tmp_path)
         boards.stderr.readline()
         boards.send_signal(signal.SIGINT)
         boards.send_signal(signal.SIGTERM)
-        _, rest = boards.communicate(timeout=30)
+        _, rest = boards.communicate(timeout=120)
         assert (boards.returncode, rest) in {
             (130, "interrupted (Ctrl-C)\n"),
             (143, "asked to end (SIGTERM)\n"),

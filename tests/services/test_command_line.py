@@ -47,7 +47,7 @@ def wait():
 app()
 """
     ended = subprocess.run(
-        [sys.executable, "-c", code], check=False, capture_output=True, text=True, timeout=60
+        [sys.executable, "-c", code], check=False, capture_output=True, text=True, timeout=240
     )
     assert (ended.returncode, ended.stderr) == (ExitCode.TERMINATED, "asked to end (SIGTERM)\n")
 
@@ -62,7 +62,7 @@ class Held:
 Held()
 """
     ended = subprocess.run(
-        [sys.executable, "-c", code], check=False, capture_output=True, text=True, timeout=60
+        [sys.executable, "-c", code], check=False, capture_output=True, text=True, timeout=240
     )
     assert ended.returncode == 0
     assert "ValueError: lost" in ended.stderr
@@ -90,7 +90,7 @@ app()
             stdout=full,
             stderr=subprocess.PIPE,
             text=True,
-            timeout=60,
+            timeout=240,
         )
     assert (ended.returncode, ended.stderr) == (
         ExitCode.USAGE,
@@ -116,7 +116,7 @@ def wait():
 app()
 """
     ended = subprocess.run(
-        [sys.executable, "-W", "error", "-c", code], check=False, capture_output=True, text=True, timeout=60
+        [sys.executable, "-W", "error", "-c", code], check=False, capture_output=True, text=True, timeout=240
     )
     assert ended.returncode == ExitCode.USAGE
     assert "Traceback" not in ended.stderr

@@ -76,7 +76,7 @@ def deployment(tmp_path_factory):
     )
     target = ("--uri", "ws://127.0.0.1:1", "--topic", "/r", "--type", "std_msgs/Float64")
     command = [BIN / "toolchain", "build", where, "-o", where / "built", *target]
-    subprocess.run(command, check=True, capture_output=True, timeout=60)
+    subprocess.run(command, check=True, capture_output=True, timeout=240)
     return where / "built"
 
 
@@ -90,7 +90,7 @@ def test_a_line_with_too_few_addresses_is_named(deployment, tmp_path):
             input='{"addresses": [0, 1, 0]}\n\n{"addresses": [0, 1]}\n',
             capture_output=True,
             text=True,
-            timeout=60,
+            timeout=240,
             check=False,
         )
     finally:
@@ -116,7 +116,7 @@ def test_flags_that_mean_nothing_are_refused_at_once(deployment, command, said):
         [BIN / command[0], *command[1:], "-d", deployment],
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=240,
         check=False,
     )
     assert done.returncode == 2

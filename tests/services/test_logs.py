@@ -54,7 +54,7 @@ except ValueError:
     logging.getLogger("bridge").exception("failed")
 """
     done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=240, check=True
     )
     ours, theirs, *trace = done.stderr.splitlines()
     assert f"warning: frame=7 {HARMLESS} reason=" in ours

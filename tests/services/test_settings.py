@@ -69,7 +69,7 @@ def test_an_empty_variable_names_no_folder(name, monkeypatch):
 def test_a_hub_with_a_wrong_variable_says_one_sentence():
     command = [Path(sys.executable).parent / "hub", "--port", "0"]
     environment = os.environ | {"BM_X": "1"}
-    ended = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60, check=False)
+    ended = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=240, check=False)
     assert ended.returncode == 2
     assert ended.stderr.count("\n") == 1
     assert ended.stderr.startswith("error: environment variable BM_X is no setting")

@@ -21,7 +21,7 @@ def written(level):
         capture_output=True,
         text=True,
         check=True,
-        timeout=60,
+        timeout=240,
     )
     return [line.split(" ", 1)[1] for line in done.stderr.splitlines()]
 

@@ -105,7 +105,7 @@ def test_systemd_takes_the_unit(name, text, tmp_path):
         ["systemd-analyze", "verify", "--man=no", str(unit)],
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=240,
         check=False,
     )
     about_it = [line for line in checked.stderr.splitlines() if name in line or str(tmp_path) in line]

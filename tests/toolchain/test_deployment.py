@@ -408,7 +408,7 @@ def test_an_absent_image_is_named(with_images):
 def test_a_subscriber_needs_no_numpy():
     code = "import sys, toolchain.deployment, toolchain.address; print('numpy' in sys.modules)"
     done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=240
     )
     assert done.stdout == "False\n"
 

@@ -81,7 +81,7 @@ def test_the_message_types_can_be_printed():
         capture_output=True,
         text=True,
         check=True,
-        timeout=60,
+        timeout=240,
     )
     assert "# boat_msgs/Sensors" in done.stdout
     assert "uint16 B3" in done.stdout

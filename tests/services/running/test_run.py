@@ -155,12 +155,12 @@ async def test_a_reload_ends_with_its_run(boat, run):
     for peer in peers:
         peer.protocol = Service(peer, asked if peer is app else None)
     reloading = asyncio.ensure_future(run._reloads.order(ReloadOrder(str(boat.directory))))
-    await asyncio.wait_for(asked.wait(), 20)
+    await asyncio.wait_for(asked.wait(), 120)
     run.take(subscriber, msgspec.structs.replace(READ, generation=1))
     told = len(subscriber.protocol.asked)
     reloading.cancel()
     with pytest.raises(asyncio.CancelledError):
-        await asyncio.wait_for(reloading, 20)
+        await asyncio.wait_for(reloading, 120)
     assert len(subscriber.protocol.asked) == told
     assert run.status().frames.lost == {LOST_IN_RELOAD: 1}
     assert [type(each) for each in publisher.protocol.asked] == [Prepare]

@@ -29,7 +29,7 @@ async def said(directory, data):
     """What is answered to some bytes."""
     reader, writer = await asyncio.open_unix_connection(control_socket.control_socket(directory))
     writer.write(data)
-    answer = await asyncio.wait_for(reader.read(), 20)
+    answer = await asyncio.wait_for(reader.read(), 120)
     writer.close()
     return json.loads(answer)
 
@@ -57,12 +57,12 @@ async def test_an_order_is_obeyed_and_answered(directory):
     async with control_served(directory, obey):
         path = control_socket.control_socket(directory)
         assert stat.S_IMODE(path.stat().st_mode) == 0o600
-        assert await give_order(path, ReloadOrder("/a"), timeout=20) == "done so"
-        assert await give_order(path, ReloadOrder(), timeout=20) == "done so"
+        assert await give_order(path, ReloadOrder("/a"), timeout=120) == "done so"
+        assert await give_order(path, ReloadOrder(), timeout=120) == "done so"
     assert heard == ["/a", ""]
     assert not path.exists()
     with pytest.raises(ControlError, match="no master takes orders at .*is a master --loop running"):
-        await give_order(path, ReloadOrder(), timeout=20)
+        await give_order(path, ReloadOrder(), timeout=120)
 
 
 async def test_a_refusal_keeps_its_sentence_and_code(directory):
@@ -72,7 +72,7 @@ async def test_a_refusal_keeps_its_sentence_and_code(directory):
 
     async with control_served(directory, obey):
         with pytest.raises(ReportedError, match="^another shape$") as refused:
-            await give_order(control_socket.control_socket(directory), ReloadOrder(), timeout=20)
+            await give_order(control_socket.control_socket(directory), ReloadOrder(), timeout=120)
     assert refused.value.exit_code == 2
 
 
@@ -123,7 +123,7 @@ async def test_an_end_in_the_middle_is_told(directory):
 
     async with control_served(directory, obey):
         ordering = asyncio.ensure_future(
-            give_order(control_socket.control_socket(directory), ReloadOrder(), timeout=20)
+            give_order(control_socket.control_socket(directory), ReloadOrder(), timeout=120)
         )
         await begun.wait()
     with pytest.raises(NotReloadedError, match="ended before it was done"):

@@ -65,16 +65,16 @@ async def test_it_ends(changed, tmp_path, asked):
             ),
         )
         protocol.send(own_hello("master", hash_))
-        await asyncio.wait_for(closed.wait(), 20)
+        await asyncio.wait_for(closed.wait(), 120)
         return said
 
     serving = asyncio.ensure_future(service())
-    await asyncio.wait_for(listens.wait(), 20)
+    await asyncio.wait_for(listens.wait(), 120)
     said = await greet(now.hash if asked == "what is there now" else "f" * 64)
     assert isinstance(said[-1], Trouble)
     if asked == "what is there now":
         with pytest.raises(OutdatedError, match="start this anew"):
-            await asyncio.wait_for(serving, 20)
+            await asyncio.wait_for(serving, 120)
         assert not (tmp_path / "s.sock").exists()
     else:
         await greet("e" * 64)

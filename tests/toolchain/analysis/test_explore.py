@@ -415,7 +415,7 @@ def test_ctrl_c_keeps_what_is_done(case):
     ):
         time.sleep(0.05)
     child.send_signal(signal.SIGINT)
-    out, err = child.communicate(timeout=60)
+    out, err = child.communicate(timeout=240)
     assert child.returncode == 130, err
     assert "ended by SIGINT" in err
     assert "Traceback" not in err

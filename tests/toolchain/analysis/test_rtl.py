@@ -91,7 +91,7 @@ def test_it_is_verilog(tmp_path, others):
     machine = machine_of(corridor(3), **others)
     path = tmp_path / "bm1.v"
     path.write_text(verilog(machine, tables=True))
-    subprocess.run(["iverilog", "-g2005", "-t", "null", str(path)], check=True, timeout=60)
+    subprocess.run(["iverilog", "-g2005", "-t", "null", str(path)], check=True, timeout=240)
 
 
 def test_what_has_no_logic():

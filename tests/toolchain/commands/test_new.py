@@ -90,7 +90,7 @@ def test_the_robot_ends_quietly_at_ctrl_c(here):
     try:
         assert robot.stdout.readline() == b"connecting\n"
         robot.send_signal(signal.SIGINT)
-        _, said = robot.communicate(timeout=30)
+        _, said = robot.communicate(timeout=120)
     finally:
         robot.kill()
     assert (robot.returncode, said) == (0, b"")

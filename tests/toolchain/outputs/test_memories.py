@@ -135,7 +135,7 @@ def read_by_srec_cat(path, folder):
                 "-binary",
             ],
             check=True,
-            timeout=60,
+            timeout=240,
             capture_output=True,
         )
         data, size = binary.read_bytes(), -(-bits // 8)
@@ -333,7 +333,7 @@ def test_the_script_names_the_sources_and_compiles_every_board(tmp_path):
             cwd=tmp_path,
             capture_output=True,
             text=True,
-            timeout=60,
+            timeout=240,
         )
 
     expected = []
