@@ -45,9 +45,7 @@ BOUND = 2.5
 """What a cycle may take, in times of the floor and the boards' computing together."""
 WINDOW = 4
 """Readings under way at once when frames per second are measured."""
-
-
-FUSED_TOPIC = BOAT_TOPIC + "_fused"
+TOPICS = {"processes": BOAT_TOPIC, "fused": BOAT_TOPIC + "_fused"}
 
 
 @dataclass
@@ -172,6 +170,56 @@ def quantile(values: list[float], share: float) -> float:
     return sorted(values)[min(len(values) - 1, int(share * len(values)))]
 
 
+async def measure(
+    ros: Ros,
+    echo: Process,
+    masters: dict[str, Process],
+    stacks: dict[str, Measured],
+    some: list[dict[str, int]],
+    floor: list[float],
+    each_turn: int,
+) -> float:
+    """Give the echo and the stacks their turns; what is found goes into `stacks` and `floor` (us).
+
+    Returns:
+        How many answers the echo gives in a second.
+    """
+    to_echo = await ros.advertise("/bench/reading", BOAT_TYPE)
+    publications = {name: await ros.advertise(TOPICS[name], BOAT_TYPE) for name in stacks}
+    results = ros.subscribe("/BMresults", "std_msgs/Float64MultiArray")
+    echoes = ros.subscribe("/bench/echo", "std_msgs/Float64MultiArray")
+    await echo.line("listening")
+    for master in masters.values():
+        await master.line("pcie-app: 4 boards")
+    await asyncio.sleep(0.5)
+    warm = some[: max(20, len(some) // 10)]
+    await one_by_one(to_echo, echoes, warm, [])
+    for name in stacks:
+        await one_by_one(publications[name], results, warm, [])
+    pids = {name: processes_of(master.pid) for name, master in masters.items()}
+    before = {name: cpu_of(pids[name]) for name in stacks}
+    for at in range(0, len(some), each_turn):
+        turn = some[at : at + each_turn]
+        await one_by_one(to_echo, echoes, turn, floor)
+        for name, measured in stacks.items():
+            await one_by_one(publications[name], results, turn, measured.cycle)
+        # not in the timed turns: to hear /bm/frame too is work for hub and client
+        for name, measured in stacks.items():
+            await collect_stages(ros, publications[name], results, turn[: len(turn) // 4 + 1], measured)
+    for name, measured in stacks.items():
+        used = cpu_of(pids[name])
+        measured.cpu = {
+            command: (seconds - before[name][command])
+            / len(measured.cycle + measured.stages["compute"])
+            * 1e6
+            for command, seconds in used.items()
+        }
+    floor_per_second = await per_second(to_echo, echoes, some)
+    for name, measured in stacks.items():
+        measured.per_second = await per_second(publications[name], results, some)
+    return floor_per_second
+
+
 async def bench(arguments: argparse.Namespace) -> int:
     """Measure in turns, so that a noisy machine is noisy for all; print the table, write the JSON."""
     console = Console(stderr=True)
@@ -179,7 +227,6 @@ async def bench(arguments: argparse.Namespace) -> int:
     some = readings(seed, arguments.frames)
     floor: list[float] = []
     stacks = {"processes": Measured(), "fused": Measured()}
-    topics = {"processes": BOAT_TOPIC, "fused": FUSED_TOPIC}
     with tempfile.TemporaryDirectory(prefix="bench-rosbayes-") as folder:
         where = Path(folder)
         hub, echo = (Process(name, where / f"{name}.log") for name in ("hub", "echo"))
@@ -189,48 +236,14 @@ async def bench(arguments: argparse.Namespace) -> int:
             uri = (await hub.line(r"ws://\S+"))[0]
             await echo.start(sys.executable, "-P", "-m", "scripts.benches.echo", uri, str(LINES))
             for name, master in masters.items():
-                await build("boat", where / f"boat-{name}", uri, topics[name], BOAT_TYPE)
+                await build("boat", where / f"boat-{name}", uri, TOPICS[name], BOAT_TYPE)
                 flags = ["--fused"] if name == "fused" else []
                 await master.start(
                     *("master", "--loop", "-d", str(where / f"boat-{name}"), "--uri", uri, "--queue", "all"),
                     *flags,
                 )
             async with connect(uri) as ros:
-                to_echo = await ros.advertise("/bench/reading", BOAT_TYPE)
-                publications = {name: await ros.advertise(topics[name], BOAT_TYPE) for name in stacks}
-                results = ros.subscribe("/BMresults", "std_msgs/Float64MultiArray")
-                echoes = ros.subscribe("/bench/echo", "std_msgs/Float64MultiArray")
-                await echo.line("listening")
-                for master in masters.values():
-                    await master.line("pcie-app: 4 boards")
-                await asyncio.sleep(0.5)
-                warm = some[: max(20, len(some) // 10)]
-                await one_by_one(to_echo, echoes, warm, [])
-                for name in stacks:
-                    await one_by_one(publications[name], results, warm, [])
-                pids = {name: processes_of(master.pid) for name, master in masters.items()}
-                before = {name: cpu_of(pids[name]) for name in stacks}
-                for at in range(0, len(some), arguments.turn):
-                    turn = some[at : at + arguments.turn]
-                    await one_by_one(to_echo, echoes, turn, floor)
-                    for name, measured in stacks.items():
-                        await one_by_one(publications[name], results, turn, measured.cycle)
-                    # not in the timed turns: to hear /bm/frame too is work for hub and client
-                    for name, measured in stacks.items():
-                        await collect_stages(
-                            ros, publications[name], results, turn[: len(turn) // 4 + 1], measured
-                        )
-                for name, measured in stacks.items():
-                    used = cpu_of(pids[name])
-                    measured.cpu = {
-                        command: (seconds - before[name][command])
-                        / len(measured.cycle + measured.stages["compute"])
-                        * 1e6
-                        for command, seconds in used.items()
-                    }
-                floor_per_second = await per_second(to_echo, echoes, some)
-                for name, measured in stacks.items():
-                    measured.per_second = await per_second(publications[name], results, some)
+                floor_per_second = await measure(ros, echo, masters, stacks, some, floor, arguments.turn)
         finally:
             await asyncio.gather(*(process.end() for process in (*masters.values(), echo, hub)))
     figures = {
