@@ -65,9 +65,11 @@ class Ros:
         There are servers that drop what they have not yet read when a client goes. So a client that published
         first waits for an answer, which comes after all that it sent before; a third of a second at most.
         """
-        if self._publishes and self._session.state is State.CONNECTED:
-            await ask_rosapi(self._session, "get_time", {}, FAREWELL_TIMEOUT)
-        await self._session.close()
+        try:
+            if self._publishes and self._session.state is State.CONNECTED:
+                await ask_rosapi(self._session, "get_time", {}, FAREWELL_TIMEOUT)
+        finally:  # who is cancelled meanwhile is closed too
+            await self._session.close()
 
     def together(self) -> AbstractContextManager[None]:
         """Have what is published inside leave in one piece: ``with ros.together(): ...``.

@@ -35,7 +35,7 @@ from bridge.events import (
 )
 from bridge.protocol import ClientCore
 from bridge.route import Route
-from bridge.websocket import WebSocket, open_websocket
+from bridge.websocket import CLOSE_TIMEOUT, WebSocket, open_websocket
 
 #: Seconds before the first attempt to reconnect, and at most before any.
 FIRST_DELAY: Final = 0.1
@@ -166,6 +166,7 @@ class Session:
         self.unusable = 0
         self.statuses: deque[StatusReceived] = deque(maxlen=KEPT_STATUSES)
         self._status_at = 0.0
+        self._lost_at = 0.0
         self._said = 0
         self.receivers: dict[int, Callable[[Message], None]] = {}
         self.on_blind: set[Callable[[float], None]] = set()
@@ -181,7 +182,7 @@ class Session:
         self._websocket: WebSocket | None = None
         self._connected_at = 0.0
         self._delay = FIRST_DELAY
-        self._reconnecting: asyncio.Task[None] | None = None
+        self._reconnecting: asyncio.Task[None] | None = None  # the last one, done or not
         self._asking: asyncio.TimerHandle | None = None
         self._in_a_row = 0
         self._turn = asyncio.Lock()  # fair: who waits longer comes first
@@ -215,12 +216,13 @@ class Session:
             return
         websocket, self._websocket = self._websocket, None
         self.core.lost()
-        if self._reconnecting is not None:
-            self._reconnecting.cancel()
+        # all but the one that closes: a service's handler may
+        ending = {*self._serving, *([self._reconnecting] if self._reconnecting is not None else [])}
+        ending -= {asyncio.current_task()}
+        for task in ending:
+            task.cancel()
         self._fail_calls(f"the client of {self.uri} was closed")
         self._set_state(State.CLOSED, reason)
-        for task in self._serving:
-            task.cancel()
         for end in self.on_closed:
             end()
         self.on_closed.clear()
@@ -229,6 +231,8 @@ class Session:
                 await websocket.close()
             finally:
                 websocket.abandon()
+        if ending:
+            await asyncio.wait(ending, timeout=CLOSE_TIMEOUT)
 
     async def _connect(self, seconds: float) -> None:
         websocket = await open_websocket(
@@ -265,6 +269,7 @@ class Session:
         self._blind_since = websocket.last_heard
         self.core.lost()
         self.last_error = reason
+        self._lost_at = time.monotonic()
         _log.warning("the connection to %s is lost: %s", self.uri, reason)
         self._fail_calls(f"the connection to {self.uri} was lost ({reason})")
         if websocket.loop.time() - self._connected_at >= STEADY:
@@ -473,7 +478,9 @@ class Session:
         return answer.values
 
     def said_since(self, since: float) -> str:
-        """What the server said last, if after ``since`` (``time.monotonic()``), as the end of a sentence."""
+        """What the server said last, or how it was lost, if after ``since`` (``time.monotonic()``): the end of a sentence."""
+        if self._lost_at > since:
+            return f"; meanwhile the connection was lost: {self.last_error}"
         return f"; the server said: {self.statuses[-1].text[:200]}" if self._status_at > since else ""
 
     # Receiving

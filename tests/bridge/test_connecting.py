@@ -289,3 +289,59 @@ async def test_cancelling_an_attempt_leaves_nothing_behind():
             await attempt
         assert ros.state is State.CLOSED
         await asyncio.wait_for(gone.wait(), 30)
+
+
+async def test_a_client_that_is_cancelled_at_its_farewell_is_closed():
+    """Else it would go on for good: heard by nobody, and connecting again whenever it is lost."""
+    async with FakeRosbridge(silent=True) as fake:
+        ros = connect(fake.uri)
+        await ros.__aenter__()
+        publication = await ros.advertise("/a", "std_msgs/String")
+        await publication.publish({"data": "x"})
+        closing = asyncio.create_task(ros.close())
+        await fake.wait_for_op("call_service")
+        closing.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await closing
+        assert ros.state is State.CLOSED
+
+
+async def test_closing_leaves_no_task_behind():
+    async with FakeRosbridge() as fake:
+        before = asyncio.all_tasks()
+        ros = connect(fake.uri)
+        await ros.__aenter__()
+        await fake.hang_up()
+        await ros.wait_for_state(State.RECONNECTING, 30)
+        await ros.close()
+        mine = {task for task in asyncio.all_tasks() - before if "bridge" in repr(task.get_coro())}
+        assert not {task for task in mine if "fake" not in repr(task.get_coro())}
+
+
+async def test_a_service_may_close_its_client():
+    async with FakeRosbridge() as fake, connect(fake.uri) as ros:
+        finished = asyncio.Event()
+
+        async def handler(_args: dict[str, Any]) -> dict[str, Any]:
+            await ros.close()
+            finished.set()
+            return {}
+
+        await ros.advertise_service("/bye", "std_srvs/Empty", handler)
+        async with connect(fake.uri) as other:
+            await fake.wait_for_op("advertise_service")
+            with contextlib.suppress(BridgeError):
+                await other.call("/bye", timeout=1)
+            await asyncio.wait_for(finished.wait(), 30)
+        assert ros.state is State.CLOSED
+
+
+async def test_a_silence_in_which_the_connection_was_lost_says_so():
+    async with FakeRosbridge() as fake, connect(fake.uri, max_size=2000) as ros:
+        subscription = ros.subscribe("/a", "std_msgs/String")
+        await fake.wait_for_op("subscribe", topic="/a")
+        waiting = asyncio.create_task(subscription.next(timeout=3))
+        await asyncio.sleep(0)
+        await fake.publish("/a", {"data": "x" * 5000})
+        with pytest.raises(BridgeError, match=r"a message of more than 2000 bytes \(max_size allows"):
+            await waiting
