@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import asyncio
 import sys
 import time
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
+from pathlib import Path
 
-from scripts.processes import run_script
+from scripts.processes import Process, run_script
 from scripts.verifications import real_rosbridge
 
 SERVER_LIMIT = 15.0
@@ -68,6 +70,26 @@ KINDS = {
     ),
     "hub": Kind("hub", ("hub", "--host", "127.0.0.1", "--port", "PORT"), ready=r"ws://\S+", keeps_order=True),
 }
+
+
+async def serving(kind: Kind, port: int, log: Path) -> Process:
+    """Start a server on a port of loopback, and wait until it serves.
+
+    Raises:
+        CheckError: it does not in time.
+    """
+    server = Process(kind.name, log)
+    try:
+        await server.start(*(word.replace("PORT", str(port)) for word in kind.command))
+        async with asyncio.timeout(SERVER_LIMIT):
+            await server.line(kind.ready)
+    except TimeoutError:
+        await server.end()
+        raise CheckError(f"the {kind.name} did not serve within {SERVER_LIMIT:g} s") from None
+    except BaseException:
+        await server.end()
+        raise
+    return server
 
 
 def on_servers(

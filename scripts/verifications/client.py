@@ -26,7 +26,7 @@ from bridge.errors import BridgeError, EncodeError, GoalError, NoMessageError, S
 from bridge.protocol import Compression
 from bridge.serialised import MessageTypes
 from scripts.processes import ROOT, Process
-from scripts.verifications.checks import KINDS, SERVER_LIMIT, CheckError, Kind, Tally, expect, on_servers
+from scripts.verifications.checks import KINDS, CheckError, Kind, Tally, expect, on_servers, serving
 
 LIMIT = 240.0
 """Seconds after which the verification gives up, whatever it waits for."""
@@ -74,13 +74,7 @@ class Stand:
         """
         self._started += 1
         log = OUT / f"{self.kind.name.replace(' ', '-')}-{self._started}.log"
-        self._server = Process(self.kind.name, log)
-        await self._server.start(*(word.replace("PORT", str(self.port)) for word in self.kind.command))
-        try:
-            async with asyncio.timeout(SERVER_LIMIT):
-                await self._server.line(self.kind.ready)
-        except TimeoutError:
-            raise CheckError(f"the {self.kind.name} did not serve within {SERVER_LIMIT:g} s") from None
+        self._server = await serving(self.kind, self.port, log)
 
     async def stop(self, *, kill: bool = False) -> None:
         """End the server, or kill it."""

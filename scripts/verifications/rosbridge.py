@@ -28,7 +28,16 @@ from websockets.exceptions import ConnectionClosed, InvalidHandshake
 
 from casestudies.boat import geometry
 from scripts.processes import BOAT_TOPIC, ROOT, Process, build
-from scripts.verifications.checks import KINDS, SERVER_LIMIT, CheckError, Kind, Tally, expect, on_servers
+from scripts.verifications.checks import (
+    KINDS,
+    SERVER_LIMIT,
+    CheckError,
+    Kind,
+    Tally,
+    expect,
+    on_servers,
+    serving,
+)
 from services.errors import ServiceError
 
 OUT = ROOT / "out" / "verify"
@@ -259,13 +268,7 @@ class Stand:
         self._started += 1
         log = self.folder / f"server-{self._started}.log"
         self._logs.append(log)
-        self._server = Process(self.kind.name, log)
-        await self._server.start(*(word.replace("PORT", str(self.port)) for word in self.kind.command))
-        try:
-            async with asyncio.timeout(SERVER_LIMIT):
-                await self._server.line(self.kind.ready)
-        except TimeoutError:
-            raise CheckError(f"the {self.kind.name} did not serve within {SERVER_LIMIT:g} s") from None
+        self._server = await serving(self.kind, self.port, log)
 
     async def stop_server(self) -> None:
         """End the server."""
