@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from typing import Annotated, TypeVar
+from typing import Annotated, Final, TypeVar
 from urllib.parse import urlsplit
 
 from pydantic import AfterValidator, Field
+
+NAME_MAX: Final = 200
+"""Characters of a name."""
 
 _TYPE = re.compile(r"[A-Za-z]\w*/(?:msg/)?[A-Za-z]\w*")
 _TOPIC = re.compile(r"/?[A-Za-z]\w*(?:/\w+)*")
@@ -72,13 +75,21 @@ def _message_path(path: str) -> str:
     return path
 
 
+def _printable(name: str) -> str:
+    if not name.isprintable():
+        message = f"{name!r} has a character that can't be printed"
+        raise ValueError(message)
+    return name
+
+
 WebSocketUri = Annotated[str, AfterValidator(websocket_uri)]
 Topic = Annotated[str, AfterValidator(_topic)]
 MessageType = Annotated[str, AfterValidator(_message_type)]
 MessagePath = Annotated[str, AfterValidator(_message_path)]
 PathOrName = Annotated[str, AfterValidator(lambda path: path and _message_path(path))]
 """Empty where a variable is searched by its name."""
-Name = Annotated[str, Field(min_length=1, max_length=200)]
+Name = Annotated[str, Field(min_length=1, max_length=NAME_MAX), AfterValidator(_printable)]
+"""One line that a terminal shows as it is: names come from networks' files too."""
 Sha256 = Annotated[str, AfterValidator(_sha256)]
 Step = Annotated[float, AfterValidator(_not_zero)]
 

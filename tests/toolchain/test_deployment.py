@@ -105,7 +105,11 @@ def test_tables_are_arrays_of_tables(folder):
         assert text.count(f"\n{header}\n") == count
 
 
-NAMES = st.text(st.characters(codec="utf-8", exclude_categories=("Cs",)), min_size=1, max_size=20)
+NAMES = st.text(
+    st.characters(codec="utf-8", exclude_categories=("C", "Z"), include_characters=" "),
+    min_size=1,
+    max_size=20,
+)
 FLOATS = st.floats(allow_nan=False, allow_infinity=False)
 
 

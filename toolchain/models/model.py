@@ -15,6 +15,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from toolchain.deployment import Dimension, Variable
+from toolchain.deployment_fields import NAME_MAX
 from toolchain.errors import ModelError
 
 if TYPE_CHECKING:
@@ -176,8 +177,11 @@ class Model:
         """Check that the parts belong together.
 
         Raises:
-            ModelError: A wrong shape or a name that is there twice; says which.
+            ModelError: A wrong shape, a name that is none or is there twice; says which.
         """
+        if not (0 < len(self.name) <= NAME_MAX and self.name.isprintable()):
+            message = f"the model's name is {self.name[:NAME_MAX]!r}, expected 1 to {NAME_MAX} characters that can be printed"
+            raise ModelError(message)
         if not self.searched:
             message = f"model {self.name!r} searches nothing: it needs at least one searched dimension"
             raise ModelError(message)
@@ -333,5 +337,5 @@ def _first(reason: ValidationError) -> str:
     detail = reason.errors()[0]
     if detail["type"] == "value_error":
         return str(detail["ctx"]["error"])
-    what = detail["msg"].removeprefix("Input should be ")
+    what = detail["msg"].removeprefix("Input should be ").removeprefix("String should have ")
     return f"{detail['loc'][0]} = {detail['input']!r}, expected {what}"

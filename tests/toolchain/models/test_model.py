@@ -53,7 +53,8 @@ def changed(at, to):
         (lambda: Known(name="K", table=changed((1, 2), 0.4)), r"sums to 0.9 over its values on line 2"),
         (lambda: Known(name="K", table=changed((1, 2), np.nan)), "no probability"),
         (lambda: Known(name="K", table=changed((slice(None), 1), [1.5, -0.5])), "no probability"),
-        (lambda: known(name=""), "variable ''"),
+        (lambda: known(name=""), "variable '': name = '', expected at least 1 character"),
+        (lambda: known(name="a\x1b[2J"), r"'a\\x1b\[2J' has a character that can't be printed"),
         (lambda: known(step=0.0), "a step of 0"),
         (lambda: known(values=5, bits=2), "serves 5 values, but 2 bits hold 3"),
         (lambda: known(on_range="ignore"), "on_range = 'ignore', expected 'error', 'clamp' or 'missing'"),
@@ -70,6 +71,9 @@ def test_refused_variables(make, sentence):
         ({"known": (known(), known())}, "has the known variable 'K' twice"),
         ({"searched": (dimension("x", size=2), dimension("x", size=2))}, "searched dimension 'x' twice"),
         ({"searched": ()}, "searches nothing"),
+        ({"name": ""}, "the model's name is '', expected 1 to 200 characters that can be printed"),
+        ({"name": "a\nb"}, r"the model's name is 'a\\nb', expected"),
+        ({"name": "x" * 201}, "expected 1 to 200 characters"),
         ({"prior": np.full(3, 1 / 3)}, r"prior P\(S\) has shape \(3,\), expected \(4,\)"),
         ({"prior": np.full(4, 0.3)}, r"prior P\(S\) sums to 1.2; a distribution sums to 1"),
     ],
@@ -86,6 +90,7 @@ def test_refused_models(fields, sentence):
         lambda: interval("x", 0, 1, cells=0),
         lambda: dimension("x", size=0),
         lambda: dimension("", size=1),
+        lambda: dimension("a\nb", size=1),
     ],
 )
 def test_refused_dimensions(make):
