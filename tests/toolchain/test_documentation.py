@@ -92,8 +92,11 @@ def test_the_models_page_works_as_printed(tmp_path, monkeypatch):
     for name, language in (("garden.bif", "bif"), ("walks.csv", "csv")):
         (text,) = blocks(language)
         (tmp_path / "build" / name).write_text(text)
+    (boiler,) = blocks("python")
+    (tmp_path / "build" / "boiler").mkdir()
+    (tmp_path / "build" / "boiler" / "model.py").write_text(boiler)
     commands = re.findall(r"^    (toolchain .*)$", MODELS, re.MULTILINE)
-    assert len(commands) == 6
+    assert len(commands) == 7
     for command in commands:
         result = CliRunner().invoke(app, shlex.split(command)[1:])
         assert result.exit_code == 0, f"{command}\n{result.stderr}"
