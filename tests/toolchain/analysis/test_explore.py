@@ -407,7 +407,7 @@ def test_ctrl_c_keeps_what_is_done(case):
         cwd=root,
         env=os.environ | {"NO_COLOR": "1"},
     )
-    limit = time.monotonic() + 60
+    limit = time.monotonic() + 200
     while (
         not (results.exists() and results.stat().st_size)
         and child.poll() is None
