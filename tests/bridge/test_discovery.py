@@ -13,7 +13,7 @@ from bridge.discovery import DiscoveryError, Robot, UnknownRobotError, announced
 
 LOOPBACK = ("127.0.0.1",)
 #: No wait may take longer; answers come within fractions of a second where nothing else runs.
-PATIENCE = 30.0
+PATIENCE = 60.0
 
 
 def _name(what: str) -> str:

@@ -25,7 +25,7 @@ from bridge.posteriors import listen, posteriors
 from bridge.results import FrameReport
 from tests.fake_rosbridge import FakeRosbridge
 
-PATIENCE = 30.0
+PATIENCE = 60.0
 
 
 def report(number, *, published=True, deployment="boat"):

@@ -16,7 +16,7 @@ import pytest
 
 from bridge.client import State, connect
 
-PATIENCE = 20.0
+PATIENCE = 60.0
 _GUID = b"258EAFA5-E914-47DA-95CA-C5AB0DC85B11"
 
 

@@ -15,7 +15,7 @@ from bridge.errors import NoAnswerError, NoMessageError, ServiceError
 from bridge.serialised import MessageTypes
 from tests.bridge.doubles import DEPTH, Double
 
-PATIENCE = 10.0
+PATIENCE = 60.0
 TYPE = "std_msgs/Float64MultiArray"
 VALUES = [1.5, 2.5, -3.0]
 MSG = {"layout": {"dim": [], "data_offset": 0}, "data": VALUES}

@@ -174,7 +174,9 @@ class Robot:
         return self
 
     async def connect(self) -> None:
-        self._socket = await websockets.connect(self.uri, max_size=1 << 22)
+        self._socket = await websockets.connect(
+            self.uri, max_size=1 << 22, open_timeout=PATIENCE, ping_interval=None
+        )
         for topic, type_ in (
             ("/BMresults", "std_msgs/Float64MultiArray"),
             ("/bm/frame", "diagnostic_msgs/DiagnosticArray"),
@@ -262,7 +264,7 @@ def stamp_of(message: dict) -> int:
 
 async def until_subscribed(uri: str, topic: str) -> None:
     """Wait until somebody hears a topic at a hub."""
-    async with asyncio.timeout(PATIENCE), websockets.connect(uri) as asking:
+    async with asyncio.timeout(PATIENCE), websockets.connect(uri, open_timeout=None) as asking:
         while True:
             call = {"op": "call_service", "service": "/rosapi/subscribers", "args": {"topic": topic}}
             await asking.send(json.dumps(call))

@@ -310,7 +310,7 @@ async def test_a_corrected_table_in_the_same_folder(stage, boat, tmp_path):
     _, robot, master, runs = await looping(stage, folder, witness=(before, folder))
     source = model / "model.py"
     source.write_text(source.read_text().replace("sigma=BEARING_SIGMA", "sigma=2 * BEARING_SIGMA"))
-    regenerate("memories", folder, "--model", str(model), *size)
+    await asyncio.to_thread(regenerate, "memories", folder, "--model", str(model), *size)
     assert load_deployment(folder).hash != load_deployment(before).hash
     # a service that dies now still finds the deployment that is in force
     stage.processes()["subscriber"][0].kill()

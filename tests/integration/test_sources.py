@@ -92,7 +92,7 @@ class Robots:
         return header(time.time_ns() - round(late_s * 1e9), "robot", 2)
 
     async def _first(self) -> None:
-        async with connect(self.uris[0], ros_version="2") as ros:
+        async with connect(self.uris[0], ros_version="2", connect_timeout=PATIENCE) as ros:
             ranges = await ros.advertise("/range", "sensor_msgs/Range")
             cells = await ros.advertise("/cells", "std_msgs/UInt8MultiArray")
             while True:
@@ -104,7 +104,7 @@ class Robots:
     async def _second(self) -> None:
         beams = np.full(360, np.float32(7))
         beams[0], beams[90] = 4.0, 1.0
-        async with connect(self.uris[1], ros_version="2") as ros:
+        async with connect(self.uris[1], ros_version="2", connect_timeout=PATIENCE) as ros:
             scans = await ros.advertise("/scan", "sensor_msgs/LaserScan")
             imus = await ros.advertise("/imu", "sensor_msgs/Imu")
             while True:
@@ -129,23 +129,21 @@ async def robots(stage):
 
 
 @pytest.fixture
-def deployment(stage, robots):
+async def deployment(stage, robots):
     case = stage.where / "corridor"
     case.mkdir()
     (case / "model.py").write_text(MODEL)
     sources = stage.where / "sources.toml"
     one, two = robots.uris
     sources.write_text(SOURCES.format(one=one, two=two))
-    subprocess.run(
-        [
-            *(str(BIN / "toolchain"), "build", str(case), "-o", str(stage.where / "out")),
-            *("--sources", str(sources), "--tolerance", "0.5"),
-        ],
-        check=True,
-        capture_output=True,
-        timeout=PATIENCE,
-    )
+    await build(case, stage.where / "out", sources, "--tolerance", "0.5")
     return stage.where / "out"
+
+
+async def build(case, directory, sources, *options):
+    """Build a deployment, while the robots go on publishing."""
+    command = [BIN / "toolchain", "build", case, "-o", directory, "--sources", sources, *options]
+    await asyncio.to_thread(subprocess.run, command, check=True, capture_output=True, timeout=240)
 
 
 async def test_the_subscriber_alone(stage, deployment):
@@ -215,8 +213,7 @@ async def test_a_beam_that_is_not_there(stage, deployment):
     sources = stage.where / "sources.toml"
     sources.write_text(sources.read_text().replace("ranges[90]", "ranges[360]"))
     case = stage.where / "corridor"
-    command = [str(BIN / "toolchain"), "build", str(case), "-o", str(deployment), "--sources", str(sources)]
-    subprocess.run(command, check=True, capture_output=True, timeout=PATIENCE)
+    await build(case, deployment, sources)
     subscriber = stage.start("subscriber", "-d", str(deployment))
     assert await subscriber.end() == 4
     said = subscriber.err.splitlines()[-1]

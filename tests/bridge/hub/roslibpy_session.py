@@ -11,7 +11,7 @@ from typing import Any
 
 import roslibpy
 
-PATIENCE = 30
+PATIENCE = 60
 
 
 def _topics(ros: roslibpy.Ros, other: roslibpy.Ros) -> dict[str, Any]:
