@@ -351,7 +351,9 @@ class Peers:
         try:
             first = True
             while True:
-                await self._connect(peer, self._settings.peer_timeout if first else _RECONNECT_PATIENCE)
+                # a process of the master's own is seen to end: while it lives it is merely slow, on a busy computer
+                patience = _RECONNECT_PATIENCE if peer.child is not None or not first else 0.0
+                await self._connect(peer, max(patience, self._settings.peer_timeout))
                 first = False
                 closing = asyncio.ensure_future(peer.closed.wait())
                 while not closing.done():
@@ -419,7 +421,12 @@ class Peers:
                 await open_connection(peer.endpoint, make)
             except OSError as error:
                 if time.monotonic() > deadline:
-                    msg = f"no {peer.role} answers at {peer.where} within {patience:g} s ({error.strerror or error}); is it running?"
+                    mend = (
+                        "is it running?"
+                        if child is None
+                        else "it was started, and is not there yet: is the computer too busy?"
+                    )
+                    msg = f"no {peer.role} answers at {peer.where} within {patience:g} s ({error.strerror or error}); {mend}"
                     raise ChildDiedError(msg) from error
                 await asyncio.sleep(_CONNECT_EVERY)
             else:
