@@ -111,7 +111,7 @@ async def test_several_outputs(stage, boat, other_boat, tmp_path):
         regenerate("deployment", folder)
     _, robot, master, runs = await looping(stage, folders[0], witness=folders)
     second = []
-    async with websockets.connect(robot.uri) as listener:
+    async with websockets.connect(robot.uri, open_timeout=PATIENCE) as listener:
         await listener.send(json.dumps({"op": "subscribe", "topic": "/second"}))
         reloading = reload_(stage, runs, "-d", str(folders[1]))
         assert await reloading.end() == 0, reloading.err + master.err
