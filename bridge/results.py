@@ -196,7 +196,7 @@ class Posterior:
         means: dict[str, float] = {}
         for label, size in zip(self.labels, self.sizes, strict=True):
             marginal = self.marginal(label)
-            means[label] = float(marginal @ range(size) / marginal.sum())
+            means[label] = float(marginal / marginal.sum() @ range(size))
         return means
 
     def marginal(self, *labels: str) -> "NDArray[np.float64]":

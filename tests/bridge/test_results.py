@@ -116,6 +116,9 @@ class TestReading:
         posterior = read_posterior({"data": [0.25, 0.75]}, 0)
         assert (posterior.sizes, posterior.labels, posterior.best()) == ((2,), ("cell",), {"cell": 1})
 
+    def test_values_of_any_size_have_a_mean(self):
+        assert read_posterior({"data": [0, 0, 0, 4e307, 4e307]}, 0).mean() == {"cell": 3.5}
+
     def test_a_posterior_behind_an_offset(self):
         message = posterior_message([9.0, 0.5, 0.5], 1, 2)
         message["layout"]["data_offset"] = 1
