@@ -152,6 +152,7 @@ async def connect_along(
 
     Raises:
         UnreachableError: the proxy does not let through.
+        OptionError: a proxy that needs a package which is not installed.
         OSError: what the system says.
     """
     loop = asyncio.get_running_loop()

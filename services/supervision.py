@@ -60,7 +60,11 @@ def _place() -> Path:
 
 
 def make_private_directory() -> Path:
-    """A directory for this run's sockets that only this user can enter (0700)."""
+    """A directory for this run's sockets that only this user can enter (0700).
+
+    Raises:
+        ServiceError: There is no place that it can be made in.
+    """
     try:
         return Path(tempfile.mkdtemp(prefix=PRIVATE, dir=_place()))
     except OSError as error:

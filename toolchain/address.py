@@ -45,7 +45,7 @@ def to_address(variable: Variable, value: object) -> int | None:
             return _missing(variable, "is an empty array")
         message = f"variable {variable.name}: {_shown(value)} is {_kind(value)}, not a number"
         raise NotANumberError(message)
-    if value != value:  # noqa: PLR0124 (NaN; math.isnan fails on integers beyond a double)
+    if value != value:  # noqa: PLR0124 - NaN; math.isnan fails on integers beyond a double
         return _missing(variable, "is NaN")
 
     try:

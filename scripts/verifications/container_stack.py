@@ -20,7 +20,7 @@ from scripts.verifications.checks import CheckError, expect
 
 OUT: Final = ROOT / "out" / "verify-containers"
 ENGINE: Final = ROOT / "scripts" / "container-engine"
-CLIENT: Final = Path(__file__).with_name("containers_client.py")
+CLIENT: Final = Path(__file__).resolve().with_name("containers_client.py")
 
 UP_LIMIT, FLOW_LIMIT = 240.0, 180.0
 """Seconds until all services are healthy, and until results flow: ten times what a quiet machine takes."""

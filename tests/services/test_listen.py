@@ -161,7 +161,7 @@ class TestPicture:
     def test_nobody_is_shown_colours_who_wants_none(self, monkeypatch):
         options = {"force_terminal": True, "color_system": "truecolor"}
         assert in_colour(Console(**options))
-        assert not in_colour(Console(file=open(os.devnull, "w")))  # noqa: SIM115, PTH123
+        assert not in_colour(Console(file=open(os.devnull, "w")))  # noqa: SIM115, PTH123 - a device, which needs no closing
         monkeypatch.setenv("NO_COLOR", "1")
         assert not in_colour(Console(**options))
 

@@ -132,7 +132,11 @@ def cell_spread(model: Model, known: Known) -> NDArray[np.float64]:
 
 
 def mean_slopes(model: Model, known: Known) -> NDArray[np.float64]:
-    """Return how a variable's mean changes from cell to cell: float64[dimensions, lines], per cell."""
+    """Return how a variable's mean changes from cell to cell: float64[dimensions, lines], per cell.
+
+    Raises:
+        ModelError: The variable has no mean: its table is not one of normals.
+    """
     if known.normal is None:
         message = f"{known.name} is not normal around a mean that the model says; fit it with --method counts"
         raise ModelError(message)
