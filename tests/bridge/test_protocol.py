@@ -239,7 +239,7 @@ def test_stamps_show_the_version(header, version):
     core.subscriptions.subscribe("/b")
     tell(core, op="publish", topic="/a", msg={"no": "header"})
     tell(core, op="publish", topic="/b", msg={"header": header})
-    assert core.subscriptions.seen_version == version
+    assert core.subscriptions.seen_version == core.ros_version == version
 
 
 @pytest.mark.parametrize("name", ["", "/a b", 'x"', "/a\\"])
