@@ -10,6 +10,7 @@ from machines.parameters import SensorMode
 from pcie_shim.programming_file import interface_room
 from toolchain.analysis.resources import Pcie, estimate
 from toolchain.errors import BuildError
+from toolchain.outputs.rng_table import LENGTH
 from toolchain.partition import partition_lines
 
 if TYPE_CHECKING:
@@ -27,6 +28,7 @@ def boards_needed(
     interface: tuple[int, int] = (20, 1200),
     largest_lines: int = 4096,
     pcie: Pcie = Pcie.HARD,
+    table_length: int = LENGTH,
 ) -> tuple[int, str]:
     """Return the fewest boards that hold a machine, and a sentence that says why.
 
@@ -36,13 +38,16 @@ def boards_needed(
         interface: Inputs and results of a board's registers, at least; a larger machine gets a larger one.
         largest_lines: Lines that the register map has room for on a board.
         pcie: What the PCIe controllers are made of.
+        table_length: Numbers in the table of random numbers, where one is played.
 
     Raises:
         BuildError: Not even a line a board fits, or generators that no FPGA has.
     """
 
     def on(lines: int) -> Estimate:
-        return estimate(with_lines(parameters, lines), device, interface=interface, pcie=pcie)
+        return estimate(
+            with_lines(parameters, lines), device, interface=interface, pcie=pcie, table_length=table_length
+        )
 
     room = interface_room(parameters)
     largest_lines = min(largest_lines, room[1] // parameters.replicas)

@@ -15,6 +15,7 @@ from machines.bm1 import Start, addressed_codes
 from machines.encode import decode_code
 from toolchain.analysis.emulation import one_replica
 from toolchain.analysis.logic import logic_of
+from toolchain.outputs.rng_table import table_length
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -78,7 +79,7 @@ def energy(machines: Sequence[BM1Machine], readings: Readings) -> Energy:
     ends = np.cumsum([machine.parameters.lines for machine in machines]).tolist()
     for machine, end in zip(machines, ends, strict=True):
         p = machine.parameters
-        logic = logic_of(p, whole_words=False)
+        logic = logic_of(p, whole_words=False, table_length=table_length(machine))
         parts = {part.name: part for part in logic.parts}
         generators = parts["generators"]
         cells = p.replicas * p.lines * p.columns

@@ -198,7 +198,8 @@ def tasks(model: Model, sweep: Sweep, frames: Frames, device: Device) -> list[Ta
     Raises:
         BuildError: Nothing is left, or nothing was there.
     """
-    found, refused = [], ""
+    found: dict[str, Task] = {}
+    refused = ""
     for options in sweep.options():
         try:
             check_options(options)
@@ -219,11 +220,12 @@ def tasks(model: Model, sweep: Sweep, frames: Frames, device: Device) -> list[Ta
             "banks": sweep.banks,
             "device": device.name,
         }
-        found.append(Task(options, hashlib.sha256(json.dumps(words, sort_keys=True).encode()).hexdigest()))
+        key = hashlib.sha256(json.dumps(words, sort_keys=True).encode()).hexdigest()
+        found.setdefault(key, Task(options, key))  # 0 steps and the number that they are make one machine
     if not found:
         message = f"none of these machines can be built: {refused}"
         raise BuildError(message)
-    return found
+    return list(found.values())
 
 
 def run_task(model: Model, task: Task, frames: Frames, device: Device, banks: int) -> Point:

@@ -24,9 +24,6 @@ CYCLE_BITS: Final = 64
 WORD_BITS: Final = 32
 """A register of the interface holds this many bits, used or not (thesis 3.2: 20 inputs, 1200 results)."""
 
-PLACE_BITS: Final = (LENGTH - 1).bit_length()
-"""Bits of a place in a table of random numbers."""
-
 _CONTROL_BITS: Final = 4
 """Of the frame's sequence, and whether it has just begun."""
 _REASON_BITS: Final = 3
@@ -166,7 +163,12 @@ class Logic:
 
 
 def logic_of(
-    parameters: BM1Parameters, *, inputs: int = 0, results: int = 0, whole_words: bool = True
+    parameters: BM1Parameters,
+    *,
+    inputs: int = 0,
+    results: int = 0,
+    whole_words: bool = True,
+    table_length: int = LENGTH,
 ) -> Logic:
     """Return what a machine's logic takes, its tables left out.
 
@@ -175,6 +177,7 @@ def logic_of(
         inputs: Input registers of the interface, as many as the machine's at least.
         results: Result registers of the interface, as many as the machine's at least.
         whole_words: Whether those have 32 bits each, or as many as the machine uses.
+        table_length: Numbers in the table of random numbers, where one is played.
 
     Raises:
         BuildError: Generators that no FPGA has.
@@ -187,7 +190,7 @@ def logic_of(
     cells = lines * p.columns
     generators = p.columns * (1 if p.shared else p.lines)  # replicas share them
     # Where a table is played, a generator is a place in it, which counts up.
-    state = p.rng.lfsr_bits or PLACE_BITS
+    state = p.rng.lfsr_bits or max(1, (table_length - 1).bit_length())
     steps = p.steps_per_clock if p.rng.lfsr_bits else 0
     places = 0 if p.rng.lfsr_bits else generators * state
     seeds = p.rng_banks if p.rng_banks > 1 and p.rng_reset is RngReset.BANK else 0

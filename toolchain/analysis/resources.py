@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final
 from toolchain.analysis.logic import Logic, logic_of
 from toolchain.analysis.table_memories import MLAB_ALMS, MLAB_SHARE, Memories, Tables, place_tables
 from toolchain.errors import BuildError
+from toolchain.outputs.rng_table import LENGTH
 
 if TYPE_CHECKING:
     from machines.parameters import BM1Parameters
@@ -99,6 +100,7 @@ def estimate(
     interface: tuple[int, int],
     pcie: Pcie = Pcie.HARD,
     tables: Tables = Tables.CELL,
+    table_length: int = LENGTH,
 ) -> Estimate:
     """Return what a machine takes of a device.
 
@@ -108,6 +110,7 @@ def estimate(
         interface: Inputs and results of the interface; each is a register of 32 bits.
         pcie: What the PCIe controller is made of.
         tables: How tables lie in memory blocks.
+        table_length: Numbers in the table of random numbers, where one is played.
 
     Raises:
         BuildError: Generators that no FPGA has, or a controller that the device has not.
@@ -115,12 +118,12 @@ def estimate(
     if pcie is Pcie.HARD and not device.hard_pcie:
         message = f"{device.title} has no hard PCIe controller: use --pcie soft"
         raise BuildError(message)
-    logic = logic_of(parameters, inputs=interface[0], results=interface[1])
+    logic = logic_of(parameters, inputs=interface[0], results=interface[1], table_length=table_length)
     soft = tuple(elements / ELEMENTS_PER_ALM for elements in SOFT_PCIE_ELEMENTS)
     return Estimate(
         device=device,
         logic=logic,
-        memories=place_tables(parameters, device, tables),
+        memories=place_tables(parameters, device, tables, table_length),
         pcie=pcie,
         pcie_alms=(0.0, 0.0) if pcie is Pcie.HARD else (soft[0], soft[1]),
     )

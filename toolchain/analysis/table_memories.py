@@ -60,7 +60,9 @@ def _table_bits(parameters: BM1Parameters) -> list[int]:
     return [bits for bits in (parameters.prior_bits, *sensors) if bits]
 
 
-def place_tables(parameters: BM1Parameters, device: Device, tables: Tables) -> Memories:
+def place_tables(
+    parameters: BM1Parameters, device: Device, tables: Tables, table_length: int = LENGTH
+) -> Memories:
     """Put tables into memory blocks, the largest first, and the others into memory LABs."""
     width, room = parameters.prob_bits, math.floor(device.usable * device.blocks)
     logic_tables = mlabs = 0
@@ -70,7 +72,7 @@ def place_tables(parameters: BM1Parameters, device: Device, tables: Tables) -> M
         if parameters.rng.lfsr_bits
         else math.ceil(parameters.columns * (1 if parameters.shared else parameters.lines) / 2)
     )
-    blocks = copies * _blocks(LENGTH, width)
+    blocks = copies * _blocks(table_length, width)
     alms = 0.0
     for bits in sorted(_table_bits(parameters), reverse=True):
         if tables is Tables.COLUMN:

@@ -16,7 +16,7 @@ from toolchain.build import build_date, build_deployment, check_options, machine
 from toolchain.commands.named_model import model_file, read_model
 from toolchain.deployment import parse_interface
 from toolchain.errors import BuildError
-from toolchain.outputs.rng_table import read_table
+from toolchain.outputs.rng_table import LENGTH, read_table
 from toolchain.report import REPORT_NAME
 from toolchain.sources import read_sources
 
@@ -62,7 +62,12 @@ def on_device(options: BuildOptions, model: Model, name: str | None) -> tuple[Bu
         parameters = machine_parameters(model, options)
     except MachineError as reason:
         raise BuildError(str(reason)) from None
-    count, why = boards_needed(parameters, device, interface=options.interface or DEFAULT_INTERFACE)
+    count, why = boards_needed(
+        parameters,
+        device,
+        interface=options.interface or DEFAULT_INTERFACE,
+        table_length=LENGTH if options.rng_table is None else options.rng_table.size,
+    )
     if options.partitions > count:
         why += f" --partitions {options.partitions} asks for more."
     return replace(options, partitions=max(count, options.partitions)), why

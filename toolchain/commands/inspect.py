@@ -26,6 +26,7 @@ from toolchain.commands.named_model import NetworkQuestion, Unread, read_model
 from toolchain.deployment import load_deployment
 from toolchain.errors import BuildError, DeploymentError
 from toolchain.options import Scale
+from toolchain.outputs.rng_table import table_length
 from toolchain.quantise import quantise
 from toolchain.report import REPORT_NAME
 
@@ -148,7 +149,14 @@ def inspect(
     )
     interface = (section.interface_sensors, section.interface_results)
     resources = tuple(
-        estimate(machine.parameters, device, interface=interface, pcie=options.pcie) for machine in machines
+        estimate(
+            machine.parameters,
+            device,
+            interface=interface,
+            pcie=options.pcie,
+            table_length=table_length(machine),
+        )
+        for machine in machines
     )
     side_by_side = None
     wide = whole.parameters.shared and whole.parameters.sensor_mode is SensorMode.COLUMN
@@ -159,6 +167,7 @@ def inspect(
             interface=(interface[0], max(interface[1], section.results)),
             pcie=options.pcie,
             tables=Tables.COLUMN,
+            table_length=table_length(whole),
         )
     banks = options.banks or (SLOW_BANKS if _is_slow(whole) else BANKS)
     with counting(len(readings)) as advance:

@@ -15,8 +15,15 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from machines.bm1 import BM1Machine
+
 LENGTH: Final = 1 << 16
 """Numbers of a table that is made here: a multiple of every number of codes."""
+
+
+def table_length(machine: BM1Machine) -> int:
+    """Return how many numbers a machine's table of random numbers has; where it plays none, one that is made."""
+    return LENGTH if machine.rng_table is None else machine.rng_table.size
 
 
 def random_table(prob_bits: int) -> NDArray[np.uint32]:

@@ -145,6 +145,15 @@ def test_keys_are_those_of_older_files():
     ]
 
 
+def test_a_machine_that_two_combinations_make_is_one():
+    frames = Frames(corridor(), 3, seed=1)
+    each = tasks(corridor(), sweep(steps_per_clock=(0, 8), prob_bits=(8,), target_counts=(15,)), frames, D8)
+    assert len(each) == 1
+    kinds = (RngKind.TABLE, RngKind.IDEAL, RngKind.LFSR16)
+    swept = sweep(steps_per_clock=(0, 1), prob_bits=(8,), target_counts=(15,), rngs=kinds)
+    assert len(tasks(corridor(), swept, frames, D8)) == 4
+
+
 def test_a_sweep_goes_on_where_it_stopped(tmp_path):
     model = corridor()
     readings = Frames(model, 5, seed=1)

@@ -47,6 +47,14 @@ def test_tables_in_bits_and_blocks():
     assert on_d8(replace(deep, prior_bits=9)).memories.blocks == 3
 
 
+def test_a_table_of_random_numbers_is_as_long_as_the_users():
+    played = replace(with_lines(BOAT, 8), rng=RngKind.TABLE, steps_per_clock=1)
+    made, own = on_d8(played), on_d8(played, table_length=500)
+    # 7 generators, 4 copies: of 65,536 words of 8 bits, or of 500
+    assert made.memories.blocks - own.memories.blocks == 4 * (32 - 1)
+    assert made.logic.registers - own.logic.registers == 7 * (16 - 9)
+
+
 def test_a_controller_of_logic_takes_8000_to_30000_elements():
     hard, soft = on_d8(BOAT), on_d8(BOAT, pcie=Pcie.SOFT)
     assert hard.pcie_alms == (0, 0)
