@@ -21,7 +21,6 @@ from pcie_shim.errors import (
     PcieShimError,
 )
 from services import options
-from services.boards import TICK, Boards, frame_failed, result_record
 from services.command_line import ends_well, make_app, raise_on_signals
 from services.errors import (
     ExitCode,
@@ -31,6 +30,7 @@ from services.errors import (
     exit_code_of,
 )
 from services.logs import get_logger
+from services.mini_cluster import TICK, Boards, frame_failed, result_record
 from services.settings import load_settings
 from services.sockets.local_socket import BlockingRecordSocket, check_hello, own_hello
 from services.sockets.records import (

@@ -11,9 +11,9 @@ import orjson
 
 from machines.bm1 import StopReason
 from pcie_shim.errors import FrameInputError
-from services.boards import Boards, result_record
 from services.errors import InputLineError
 from services.logs import say
+from services.mini_cluster import Boards, result_record
 from services.results import REASON_WORDS, counts_of
 from services.sockets.records import Addresses, Frame
 

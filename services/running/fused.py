@@ -14,8 +14,8 @@ from types import TracebackType
 from typing import Any, Self, TypeVar, cast
 
 from pcie_shim.errors import BoardError, PcieShimError
-from services.boards import TICK, Boards, frame_failed, result_record
 from services.errors import exit_code_of
+from services.mini_cluster import TICK, Boards, frame_failed, result_record
 from services.pcie_app import ROLE as PCIE_APP
 from services.pcie_app import Progress
 from services.publisher import ROLE as PUBLISHER

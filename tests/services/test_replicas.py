@@ -10,9 +10,9 @@ from bridge.results import read_frame_report, read_posterior
 from machines.bm1 import StopReason
 from machines.parameters import SensorMode
 from pcie_shim.errors import FrameInputError
-from services.boards import machine_inputs
 from services.errors import VariableError
 from services.frames import FrameAssembler
+from services.mini_cluster import machine_inputs
 from services.printed.result_picture import axes_of
 from services.results import FrameReport, Inferred, posterior_layout, times_of
 from services.sockets.records import BoardOutcome, FrameResult, Publish

@@ -9,9 +9,9 @@ import sys
 import pytest
 
 from pcie_shim.endpoint import Endpoint
-from services.boards import Boards
 from services.errors import NotReloadedError, SettingsError, ShapeError, StoppedError
 from services.generations import Generations
+from services.mini_cluster import Boards
 from services.running.new_deployment import forget, keep, read_new
 from services.settings import Settings
 from services.sockets.records import Hello, NotReloaded, Prepare, Prepared, Switch, Switched
