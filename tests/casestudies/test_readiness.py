@@ -12,7 +12,7 @@ from services.ready import ask
 
 
 async def asked(directory, name="boat-viewer"):
-    return await asyncio.to_thread(ask, str(directory), name)
+    return await asyncio.to_thread(ask, str(directory), name, 30)
 
 
 async def test_ready_once_it_has_worked(tmp_path, monkeypatch):

@@ -26,6 +26,12 @@ from services.sockets.status_socket import (
 )
 
 
+@pytest.fixture(autouse=True)
+def _patience(monkeypatch):
+    """Who answers has the time to, however busy the machine."""
+    monkeypatch.setattr(status, "ANSWER_TIME", 30.0)
+
+
 def process(*, is_ready=True, why="fine", **more):
     return ProcessStatus(ready=is_ready, why=why, **more)
 
@@ -100,6 +106,7 @@ async def test_those_who_do_not_answer_are_waited_for_together(tmp_path, monkeyp
             asked_now -= 1
 
     monkeypatch.setattr(status, "_answer", counting)
+    monkeypatch.setattr(status, "ANSWER_TIME", 3.0)
     async with served(tmp_path, master=process()):
         stack = await status.ask_stack(tmp_path)
     assert most == 5
@@ -240,7 +247,10 @@ async def test_exit_codes_and_json(places):
     assert nothing.stderr.count("\n") == 1
     assert nothing.stderr.startswith("error: no run")
     async with served(run, master=process()):
-        whole = await asyncio.to_thread(subprocess_status, places, "--json")
+        async with asyncio.timeout(120):
+            # on a busy machine the answer may come too late for it once
+            while (whole := await asyncio.to_thread(subprocess_status, places, "--json")).returncode == 6:
+                pass
         assert whole.returncode == 0
         stack = msgspec.json.decode(whole.stdout, type=status.StackStatus)
         assert stack.directory == str(run)
@@ -270,9 +280,11 @@ async def test_watching_prints_a_line_every_second_until_it_is_ended(places):
             stdout=asyncio.subprocess.PIPE,
             stderr=asyncio.subprocess.PIPE,
         )
-        for _ in range(2):
-            line = await asyncio.wait_for(watching.stdout.readline(), 120)
-            assert msgspec.json.decode(line, type=status.StackStatus).ready
+        found = 0
+        async with asyncio.timeout(120):
+            while found < 2:  # on a busy machine an answer may come too late for a line
+                line = await watching.stdout.readline()
+                found += msgspec.json.decode(line, type=status.StackStatus).ready
         watching.terminate()
         assert await asyncio.wait_for(watching.wait(), 120) == 143
         assert b"Traceback" not in await watching.stderr.read()
@@ -287,11 +299,11 @@ async def test_the_health_check_is_the_process_own_word(tmp_path):
         subscriber=process(why="connected"),
         master=process(is_ready=False, why="no result for 12 s"),
     ):
-        assert await asyncio.to_thread(ready.ask, str(tmp_path), "subscriber") == (
+        assert await asyncio.to_thread(ready.ask, str(tmp_path), "subscriber", 30) == (
             True,
             "subscriber: connected",
         )
-        assert await asyncio.to_thread(ready.ask, str(tmp_path), "master") == (
+        assert await asyncio.to_thread(ready.ask, str(tmp_path), "master", 30) == (
             False,
             "master: no result for 12 s",
         )

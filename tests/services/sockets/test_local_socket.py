@@ -104,7 +104,7 @@ def test_the_blocking_socket_sends_large_records_whole_and_sees_the_end():
     with BlockingRecordSocket(ours, "them") as sender:
         assert sender.receive() == []
         assert sender.send(record)
-    reader.join(10)
+    reader.join(60)
     assert got == [record]
 
 

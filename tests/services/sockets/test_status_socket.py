@@ -36,7 +36,7 @@ def counts(completed, lost=None):
 
 def asked(path):
     with socket.socket(socket.AF_UNIX) as connection:
-        connection.settimeout(20)
+        connection.settimeout(60)
         connection.connect(str(path))
         data = b""
         while part := connection.recv(65536):
