@@ -115,6 +115,12 @@ def _guarded(path: Path, what: str, call: Callable[[], object]) -> object:
         place = f", line {error.lineno}" if error.lineno else ""  # a file that is no text has none
         message = f"{error.filename or path}{place}: {error.msg}"
         raise ModelError(message) from None
+    except SystemExit as error:
+        line = _line(path, traceback.extract_tb(error.__traceback__))
+        where = f"{path}, line {line}" if line else str(path)
+        said = "" if error.code is None else f" with {error.code!r}"
+        message = f"{where}: {what} ended the program{said}; expected a model"
+        raise ModelError(message) from None
     except Exception as error:
         line = _line(path, traceback.extract_tb(error.__traceback__))
         where = f"{path}, line {line}" if line else str(path)
@@ -132,7 +138,11 @@ def _line(path: Path, frames: traceback.StackSummary) -> int | None:
 
 
 def _arguments(path: Path, function: Callable[..., object], settings: Mapping[str, str]) -> dict[str, Any]:
-    parameters = inspect.signature(function).parameters
+    parameters = {
+        key: parameter
+        for key, parameter in inspect.signature(function).parameters.items()
+        if parameter.kind not in {inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD}
+    }
     hints = _guarded(path, "an annotation", lambda: get_type_hints(function))
     if not isinstance(hints, dict):  # never: get_type_hints returns one
         raise TypeError

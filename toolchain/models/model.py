@@ -21,6 +21,11 @@ from toolchain.errors import ModelError
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
+MAX_LINES: Final = 2**24
+"""Values of what is searched, over all boards: 4,096 boards of as many lines as the register map has room for."""
+MAX_VALUES: Final = 2**16 - 1
+"""A column has at most 16 address bits, and its top address means a missing reading."""
+
 _SUM_TOLERANCE: Final = 1e-6
 
 
@@ -179,11 +184,16 @@ class Model:
         Raises:
             ModelError: A wrong shape, a name that is none or is there twice; says which.
         """
-        if not (0 < len(self.name) <= NAME_MAX and self.name.isprintable()):
-            message = f"the model's name is {self.name[:NAME_MAX]!r}, expected 1 to {NAME_MAX} characters that can be printed"
+        name = self.name if isinstance(self.name, str) else ""  # a user's file is not type-checked
+        if not (0 < len(name) <= NAME_MAX and name.isprintable()):
+            message = f"the model's name is {str(self.name)[:NAME_MAX]!r}, expected 1 to {NAME_MAX} characters that can be printed"
             raise ModelError(message)
         if not self.searched:
             message = f"model {self.name!r} searches nothing: it needs at least one searched dimension"
+            raise ModelError(message)
+        if self.lines > MAX_LINES:
+            sizes = " x ".join(str(each.size) for each in self.searched)
+            message = f"model {self.name!r} searches {sizes} = {self.lines} values; the most is {MAX_LINES}"
             raise ModelError(message)
         for kind, names in (
             ("known variable", [known.name for known in self._all_known()]),
@@ -314,6 +324,9 @@ def _keep_table(variable: Known | PriorSelect, what: str) -> None:
     table = np.array(variable.table, dtype=np.float64)
     if table.ndim != 2 or 0 in table.shape:
         message = f"{what} has shape {table.shape}, expected (values, lines)"
+        raise ModelError(message)
+    if len(table) > MAX_VALUES:
+        message = f"{what} has {len(table)} values; a column serves at most {MAX_VALUES}: use a larger step"
         raise ModelError(message)
     table.flags.writeable = False
     object.__setattr__(variable, "table", table)

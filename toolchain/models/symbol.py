@@ -20,6 +20,11 @@ _NO_AND_YES: Final = ({"false", "true"}, {"no", "yes"}, {"off", "on"})
 _YES: Final = {"true", "yes", "on"}
 
 
+def _is_whole(number: object) -> bool:
+    """Whether it is an integer of Python or of NumPy; a user's file is not type-checked."""
+    return isinstance(number, int | np.integer)
+
+
 @dataclass(frozen=True, slots=True)
 class IntegerType:
     """The whole numbers `low` to `high`; with `wraps` they lie on a circle, and `high` is beside `low`."""
@@ -32,8 +37,11 @@ class IntegerType:
         """Refuse an empty range.
 
         Raises:
-            ModelError: `high` is below `low`.
+            ModelError: `high` is below `low`, or one is no whole number.
         """
+        if not (_is_whole(self.low) and _is_whole(self.high)):
+            message = f"an integer type from {self.low!r} to {self.high!r}: expected whole numbers"
+            raise ModelError(message)
         if self.high < self.low:
             message = f"an integer type from {self.low} to {self.high} has no values"
             raise ModelError(message)
@@ -75,8 +83,11 @@ class IntervalType:
         """Refuse what can't be cut.
 
         Raises:
-            ModelError: No intervals, or `high` is not above `low`.
+            ModelError: No intervals or no whole number of them, or `high` is not above `low`.
         """
+        if not _is_whole(self.intervals):
+            message = f"[{self.low:g}, {self.high:g}] can't be cut into {self.intervals!r} intervals: expected a whole number"
+            raise ModelError(message)
         if self.intervals < 1 or not (math.isfinite(self.low) and self.low < self.high < math.inf):
             message = f"[{self.low:g}, {self.high:g}] can't be cut into {self.intervals} intervals"
             raise ModelError(message)

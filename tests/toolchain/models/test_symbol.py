@@ -64,6 +64,11 @@ def test_a_label_is_its_value_or_the_labels_are_listed():
     ("make", "sentence"),
     [
         (lambda: IntegerType(3, 2), "from 3 to 2 has no values"),
+        (lambda: IntegerType(0, 3.5), "an integer type from 0 to 3.5: expected whole numbers"),
+        (
+            lambda: IntervalType(0, 1, 4.0),
+            r"\[0, 1\] can't be cut into 4.0 intervals: expected a whole number",
+        ),
         (lambda: IntervalType(1, 1, 3), r"\[1, 1\] can't be cut"),
         (lambda: IntervalType(0, 1, 0), "into 0 intervals"),
         (lambda: IntervalType(float("-inf"), 1, 2), "can't be cut"),
