@@ -116,7 +116,12 @@ def _guarded(path: Path, what: str, call: Callable[[], object]) -> object:
         message = f"{error.filename or path}{place}: {error.msg}"
         raise ModelError(message) from None
     except SystemExit as error:
-        line = _line(path, traceback.extract_tb(error.__traceback__))
+        frames = traceback.extract_tb(error.__traceback__)
+        if Path(frames[-1].filename).is_relative_to(
+            _TOOLCHAIN
+        ):  # a signal has ended the command, not the file
+            raise
+        line = _line(path, frames)
         where = f"{path}, line {line}" if line else str(path)
         said = "" if error.code is None else f" with {error.code!r}"
         message = f"{where}: {what} ended the program{said}; expected a model"

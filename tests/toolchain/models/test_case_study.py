@@ -1,5 +1,6 @@
 """A user's model.py: found, called with --set values, and every mistake in it a sentence with its line."""
 
+import subprocess
 import sys
 import textwrap
 from pathlib import Path
@@ -122,6 +123,21 @@ def test_mistakes_in_the_file(case, text, sentence):
     assert sentence in str(caught.value)
     assert str(folder / "model.py") in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_a_signal_ends_the_command_in_the_middle_of_a_model(case):
+    folder = case("import os, signal, time\nos.kill(os.getpid(), signal.SIGTERM)\ntime.sleep(60)")
+    code = "from toolchain.command import main; main()"
+    target = ["--uri", "ws://robot:9090", "--topic", "/t", "--type", "a/B"]
+    ended = subprocess.run(
+        [sys.executable, "-c", code, "build", str(folder), "-o", str(folder / "built"), *target],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert ended.returncode == 143
+    assert ended.stderr.splitlines()[-1] == "error: ended by SIGTERM; what was asked for is not complete"
 
 
 def test_what_the_file_itself_refuses_is_said_in_its_own_words(case):
