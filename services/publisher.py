@@ -11,6 +11,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import AsyncIterator
+from functools import partial
 from typing import Annotated, Any, Literal
 
 import msgspec
@@ -114,7 +115,7 @@ class ResultTopics:
                             uri,
                             connect_timeout=settings.connect_timeout,
                             ros_version=settings.ros_version,
-                            on_state=on_state,
+                            on_state=None if on_state is None else partial(on_state, uri),
                         )
                     )
                 self._outputs.append((by_uri[uri], await by_uri[uri].advertise(output.topic, output.type)))
@@ -134,6 +135,14 @@ class ResultTopics:
         self._generation = generation
         self._layout = posterior_layout(deployment)
         self._report = FrameReport(deployment, self._version, generation)
+
+    def served_by(self, uri: str) -> tuple[str, str]:
+        """How a sentence names the topics of a server, and the server: nothing and `rosbridge` where it is the only one."""
+        if len(self.rosbridges) == 1:
+            return "", "rosbridge"
+        topics = [publication.topic for ros, publication in self._outputs if ros is self.rosbridges.get(uri)]
+        which = f" for {' and '.join(topics)}" if topics else ""
+        return which, f"rosbridge at {uri}"
 
     def watch(self) -> None:
         """Subscribe to the first output, so that a result can be seen on the wire."""
@@ -156,8 +165,13 @@ class ResultTopics:
 
     @property
     def must_wait(self) -> bool:
-        """Whether a server is away, or has not taken what was sent before."""
-        return any(publication.must_wait for _, publication in self._outputs)
+        """Whether no server is there, or one that is has not taken what was sent before."""
+        there = self._there()
+        return not there or any(publication.must_wait for publication in there)
+
+    def _there(self) -> list[Publication]:
+        """The outputs whose servers are connected."""
+        return [publication for ros, publication in self._outputs if ros.state is State.CONNECTED]
 
     async def publish(self, publish: Publish, *, look: bool) -> Published:
         """Publish a frame's data and then its posterior, where it has one, once the servers take them.
@@ -167,42 +181,39 @@ class ResultTopics:
             look: wait until the result was seen on the wire, or the settings' time is over.
         """
         inferred = Inferred(publish.result)
-        if all(ros.state is not State.CONNECTED for ros, _ in self._outputs):
-            return _became_of(publish, inferred, "rosbridge away")
-        try:
-            for _, publication in self._outputs:
-                await publication.ready()
-        except BridgeError as error:
-            return self._away(publish, inferred, error)
-        published = self.publish_or_say(publish, inferred)
+        ready = [publication.ready() for publication in self._there()]
+        for error in await asyncio.gather(*ready, return_exceptions=True):
+            if isinstance(error, BridgeError):
+                get_logger(ROLE).warning(str(error), frame=publish.result.number)
+            elif error is not None:
+                raise error
+        published = self.publish_now(publish, inferred)
         if look and published.outcome == "published" and inferred.posterior is not None:
             seen = await self._seen(inferred.posterior.tolist(), self._settings.seen_timeout)
             published = msgspec.structs.replace(published, seen=seen)
         return published
 
-    def publish_or_say(self, publish: Publish, inferred: Inferred) -> Published:
-        """Publish a frame's data and its posterior at once, or say that it could not be."""
-        try:
-            return self._publish_now(publish, inferred)
-        except BridgeError as error:
-            return self._away(publish, inferred, error)
+    def publish_now(self, publish: Publish, inferred: Inferred) -> Published:
+        """Publish a frame's data and its posterior at once, wherever a server takes them, and say what became of it.
 
-    def _away(self, publish: Publish, inferred: Inferred, error: BridgeError) -> Published:
-        get_logger(ROLE).warning(str(error), frame=publish.result.number)
-        return _became_of(publish, inferred, "rosbridge away")
-
-    def _publish_now(self, publish: Publish, inferred: Inferred) -> Published:
+        The frame's data go to the first output's server. A result is published if it went to one output at least.
+        """
         started = time.monotonic_ns()
         times = times_of(publish, started, self._previous_out_ns)
         posterior = inferred.posterior
+        missed = 0
         with self._outputs[0][0].together():
-            if self._frames is not None:
-                self._frames.publish_nowait(self._report.message(publish, inferred, times, time.time_ns()))
+            report = self._report.message(publish, inferred, times, time.time_ns())
+            told = self._frames is not None and _sent(self._frames, report)
             if posterior is not None:
                 for _, publication in self._outputs:
-                    publication.publish_nowait({"layout": self._layout, "data": posterior})
+                    missed += not _sent(publication, {"layout": self._layout, "data": posterior})
         self._previous_out_ns = time.monotonic_ns() - started
-        return _became_of(publish, inferred, "no posterior" if posterior is None else "published")
+        if posterior is None:
+            return _became_of(publish, inferred, "no posterior" if told else "rosbridge away")
+        if missed == len(self._outputs):
+            return _became_of(publish, inferred, "rosbridge away")
+        return _became_of(publish, inferred, "published", missed)
 
     async def publish_array(self, values: Any) -> None:
         """Publish probabilities (float64, one per line) on every output."""
@@ -210,7 +221,16 @@ class ResultTopics:
             await publication.publish({"layout": self._layout, "data": values})
 
 
-def _became_of(publish: Publish, inferred: Inferred, outcome: str) -> Published:
+def _sent(publication: Publication, message: dict[str, Any]) -> bool:
+    """Whether a message went out: its server is there, and takes it at once."""
+    try:
+        publication.publish_nowait(message)
+    except BridgeError:
+        return False
+    return True
+
+
+def _became_of(publish: Publish, inferred: Inferred, outcome: str, missed: int = 0) -> Published:
     posterior = inferred.posterior
     return Published(
         number=publish.result.number,
@@ -220,6 +240,7 @@ def _became_of(publish: Publish, inferred: Inferred, outcome: str) -> Published:
         best_probability=float(posterior[inferred.best]) if posterior is not None else 0.0,
         cycles=max((board.cycles for board in publish.result.boards), default=0),
         total_ns=time.monotonic_ns() - publish.received_tick,
+        missed=missed,
     )
 
 
@@ -272,7 +293,7 @@ class Publisher:
         elif isinstance(record, Publish):
             if not (self._once or self._busy or self._topics.must_wait):
                 # the usual case: nothing to wait for, and so no other task to wake
-                self._tell(self._topics.publish_or_say(record, Inferred(record.result)))
+                self._tell(self._topics.publish_now(record, Inferred(record.result)))
                 return
             self._busy = True  # until the queue is empty again: results stay in order
             try:
@@ -306,9 +327,13 @@ class Publisher:
                 ms=f"{published.total_ns / 1e6:.2f}",
             )
 
-    def _state_changed(self, state: State, reason: str) -> None:
-        if state is State.RECONNECTING:
-            self._link.notice("warning", f"rosbridge is gone ({reason}); results are lost until it is back")
+    def _state_changed(self, uri: str, state: State, reason: str) -> None:
+        if state is not State.RECONNECTING:
+            return
+        topics, rosbridge = self._topics.served_by(uri)
+        self._link.notice(
+            "warning", f"{rosbridge} is gone ({reason}); results{topics} are lost until it is back"
+        )
 
     async def run(self) -> int:
         """Serve until a signal; raises what ends it."""

@@ -49,6 +49,9 @@ from toolchain.deployment import Deployment
 RESULTS_UNDER_WAY = 8
 """Results that the publisher may have unanswered; then frames wait, and `queue` says which."""
 
+MISSED = "on some topics only"
+"""What is counted of results that went to one of several servers, while another was away."""
+
 _PROGRESS_EVERY = 1.0
 _GRACE = 2.0
 
@@ -153,6 +156,8 @@ class Master:
         text = f"{self._published} results published in {elapsed:.1f} s"
         self._losses["passed over"] += self._readings.passed_over
         self._readings.passed_over = 0
+        missed = self._losses.pop(MISSED, 0)
+        text += f", {missed} of them {MISSED}" if missed else ""
         losses = ", ".join(f"{count} {reason}" for reason, count in self._losses.items() if count)
         return f"{text}; not published: {losses}" if losses else text
 
@@ -416,6 +421,8 @@ class Master:
         if record.outcome == "published":
             self._published += 1
             self._last = (record.number, time.monotonic_ns())
+            if record.missed:
+                self._losses[MISSED] += 1
             if self._json:
                 print_json(record, self._in_force)
             elif self._once:

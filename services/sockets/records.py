@@ -143,7 +143,8 @@ class Published(Record, tag="published", frozen=True):
 
     `outcome` is "published", "no posterior" or "rosbridge away"; `seen` says whether it was seen on
     the wire (None where nobody looked). `best_line` has `best_probability`; `total_ns` is the time
-    from the reading's receipt to the result's sending.
+    from the reading's receipt to the result's sending. `missed` counts the outputs that it did not go to, of several,
+    because their servers were away.
     """
 
     number: int
@@ -153,6 +154,7 @@ class Published(Record, tag="published", frozen=True):
     best_probability: float
     cycles: int
     total_ns: int
+    missed: int = 0
 
 
 class Prepare(Record, tag="prepare", frozen=True):

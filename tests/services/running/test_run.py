@@ -9,7 +9,7 @@ from services.errors import OverflowedQueueError
 from services.frames import QUEUE_ALL_DEPTH, WaitingFrames
 from services.running.peers import Peer
 from services.running.reload import LOST_IN_RELOAD
-from services.running.run import Master
+from services.running.run import MISSED, Master
 from services.settings import Settings
 from services.sockets.control_socket import ReloadOrder
 from services.sockets.records import (
@@ -145,6 +145,14 @@ async def test_no_more_is_published_than_was_asked_for(boat):
         published(number, "published")
     assert run._end.done()
     assert len(run._peers.app.protocol.frames) == 4
+
+
+async def test_a_result_that_went_to_some_servers_only_is_counted(run):
+    run.take(run._peers.publisher, Published(1, "published", None, 0, 1.0, 1, 1, missed=1))
+    run.take(run._peers.publisher, Published(2, "published", None, 0, 1.0, 1, 1))
+    run.take(run._peers.publisher, Published(3, "rosbridge away", None, 0, 1.0, 1, 1))
+    assert run.status().frames.lost == {MISSED: 1, "rosbridge away": 1}
+    assert run._summary().endswith(", 1 of them on some topics only; not published: 1 rosbridge away")
 
 
 async def test_a_reload_ends_with_its_run(boat, run):

@@ -1,0 +1,95 @@
+"""Results that go to several servers, one of which may be away."""
+
+import asyncio
+from contextlib import asynccontextmanager
+
+import numpy as np
+import pytest
+
+from bridge.client import State
+from services.publisher import ResultTopics
+from services.settings import Settings
+from services.sockets.records import BoardOutcome, FrameResult, Publish
+from tests.fake_rosbridge import FakeRosbridge
+from tests.integration.conftest import build_boat
+from toolchain.deployment import Output, load_deployment
+
+REASON = 1
+"""Of a board that stopped: a counter had reached its target."""
+
+
+@pytest.fixture(scope="module")
+def boat(tmp_path_factory):
+    return load_deployment(build_boat(tmp_path_factory.mktemp("boat") / "deployment"))
+
+
+@asynccontextmanager
+async def topics_of(boat, first, second):
+    deployment = boat.model_copy(
+        update={
+            "outputs": (
+                Output(topic="/BMresults", uri=first.uri),
+                Output(topic="/second", uri=second.uri),
+            )
+        }
+    )
+    topics = ResultTopics(Settings(), deployment)
+    async with topics.opened():
+        yield topics
+
+
+def result(boat, number, count=1):
+    boards = [
+        BoardOutcome(np.full(board.lines, count, "<u4").tobytes(), 9, REASON if count else 4)
+        for board in boat.boards
+    ]
+    return Publish(FrameResult(number, boards, 0, 0, 0, 0), 0, 0, 0, 0, 0)
+
+
+async def gone(topics, fake):
+    await fake.vanish()
+    ros = topics.rosbridges[fake.uri]
+    if ros.state is State.CONNECTED:
+        await ros.wait_for_state(State.RECONNECTING, 30)
+
+
+async def test_results_go_on_where_a_server_is(boat):
+    async with FakeRosbridge() as first, FakeRosbridge() as second, topics_of(boat, first, second) as topics:
+        both = await topics.publish(result(boat, 1), look=False)
+        assert (both.outcome, both.missed) == ("published", 0)
+        await second.wait_for_op("publish", topic="/second")
+        await gone(topics, second)
+        assert not topics.must_wait  # for nobody who is there
+        for number in (2, 3):
+            one = await topics.publish(result(boat, number), look=False)
+            assert (one.outcome, one.missed) == ("published", 1)
+        await first.wait_for_op("publish", topic="/BMresults", count=3)
+        assert len(first.ops("publish", topic="/bm/frame")) == 3
+        await second.come_back()
+        await topics.rosbridges[second.uri].wait_for_state(State.CONNECTED, 30)
+        await gone(topics, first)
+        other = await topics.publish(result(boat, 4), look=False)
+        assert (other.outcome, other.missed) == ("published", 1)
+        await second.wait_for_op("publish", topic="/second", count=2)
+        # whose data would be on the first
+        assert (await topics.publish(result(boat, 5, count=0), look=False)).outcome == "rosbridge away"
+        await gone(topics, second)
+        assert topics.must_wait
+        assert (await topics.publish(result(boat, 6), look=False)).outcome == "rosbridge away"
+
+
+async def test_a_server_that_takes_nothing_keeps_nobody_else_from_results(boat, monkeypatch):
+    async with FakeRosbridge() as first, FakeRosbridge() as second, topics_of(boat, first, second) as topics:
+        monkeypatch.setattr("bridge.handles.Publication.ready.__defaults__", (0.2,))
+        second.freeze()
+        (frozen,) = (publication for _, publication in topics._outputs if publication.topic == "/second")
+        for _ in range(10_000):  # what the two sockets hold, and then some
+            if frozen.must_wait:
+                break
+            frozen.publish_nowait({"data": [0.5] * 20000})
+            await asyncio.sleep(0)
+        assert topics.must_wait
+        one = await topics.publish(result(boat, 1), look=False)
+        assert (one.outcome, one.missed) == ("published", 1)
+        await first.wait_for_op("publish", topic="/BMresults")
+        second.thaw()
