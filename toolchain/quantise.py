@@ -15,12 +15,16 @@ import numpy as np
 from machines.encode import decode_code, encode_probability
 from machines.parameters import PROB_BITS_MAX, SensorMode
 from toolchain.errors import ReadingError
+from toolchain.models.conditional import middle_bin
 from toolchain.options import Scale
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
     from toolchain.models.model import Known, Model
+
+_HALVINGS: Final = 12
+"""Of the range in which a floor is looked for, on a scale of powers: better than the two digits that are told."""
 
 _ROUNDING: Final = 1e-12
 """A divergence below it, in bits, is that of float64 from itself."""
@@ -114,7 +118,7 @@ def quantise(
         losses.append(loss)
         vanished = (served == 0) & (ratios > 0)
         if known.floor and vanished.any():
-            floors.append(floor := _vanished_floor(known, ratios, vanished, prob_bits))
+            floors.append(floor := _vanished_floor(known, ratios, vanished, prob_bits, scale))
             warnings.append(f"Variable {known.name}: {floor.what}; {floor.advice}.")
         if loss.dead_values:
             warnings.append(
@@ -246,19 +250,44 @@ def _loss(name: str, bits: int, exact: NDArray[np.float64], quantised: NDArray[n
 
 
 def _vanished_floor(
-    known: Known, ratios: NDArray[np.float64], vanished: NDArray[np.bool_], prob_bits: int
+    known: Known, ratios: NDArray[np.float64], vanished: NDArray[np.bool_], prob_bits: int, scale: Scale
 ) -> VanishedFloor:
     """Say that a variable's floor is too low for the codes, and how high or wide would do."""
     least = float(ratios[vanished].min())
-    enough = known.floor * 0.5 ** (prob_bits + 1) / least
     needed = math.ceil(-math.log2(least) - 1)
-    wider = f" or --prob-bits {needed}" if needed <= PROB_BITS_MAX else ""
+    ways = [f"a floor of about {enough:.2g}"] if (enough := _enough_floor(known, prob_bits, scale)) else []
+    ways += [f"--prob-bits {needed}"] if needed <= PROB_BITS_MAX else []
     return VanishedFloor(
         name=known.name,
         what=(
             f"its outlier floor of {known.floor:g} vanishes at {np.count_nonzero(vanished.any(axis=1))} of its "
-            f"{known.values} values (below 2^-{prob_bits + 1} of the largest probability there), so that one outlier "
+            f"{known.values} values (below 2^-{prob_bits + 1 if prob_bits > 1 else 1} of the largest probability there), so that one outlier "
             "makes the true line impossible"
         ),
-        advice=f"use a floor of about {enough:.2g}{wider}",
+        advice=f"use {' or '.join(ways) or 'no narrower distribution than the codes hold'}",
     )
+
+
+def _enough_floor(known: Known, prob_bits: int, scale: Scale) -> float:
+    """Return a floor that no code loses, two digits rounded up; 0 where none up to the peak itself does.
+
+    More of it raises the largest probabilities too, so that it is not in proportion to what is lost.
+    """
+    peak = known.table.max(axis=0)
+    if known.normal is not None:
+        peak = middle_bin(np.broadcast_to(abs(known.step) / np.asarray(known.normal.sigma), peak.shape))
+    # the table as it would be without a floor, up to a factor a line
+    bare = np.maximum(known.table * (1 + known.values * known.floor * peak) - known.floor * peak, 0)
+
+    def holds(floor: float) -> bool:
+        table = bare + floor * peak
+        return bool(encode_probability(scaled(table / table.sum(axis=0), scale), prob_bits).all())
+
+    low, high = math.log(known.floor), math.log(1.0)
+    if not holds(1.0):
+        return 0.0
+    for _ in range(_HALVINGS):
+        middle = (low + high) / 2
+        low, high = (low, middle) if holds(math.exp(middle)) else (middle, high)
+    digit = 10.0 ** (math.floor(high / math.log(10)) - 1)
+    return math.ceil(math.exp(high) / digit) * digit

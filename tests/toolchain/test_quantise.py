@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from machines.encode import decode_code, encode_probability
 from machines.errors import ParameterError
-from toolchain.models.conditional import normal
+from toolchain.models.conditional import normal, wrapped_normal
 from toolchain.models.model import Known, Model, dimension
 from toolchain.options import Scale
 from toolchain.quantise import quantise, scaled
@@ -116,11 +116,35 @@ def test_a_floor_that_vanishes_is_said_and_how_to_keep_it():
     assert "below 2^-9" in warning
     needed = float(warning.split("a floor of about ")[1].split(" ")[0])
     bits = int(warning.split("--prob-bits ")[1].rstrip("."))
-    assert not with_floor(1.1 * needed).warnings
+    assert not with_floor(needed).warnings
+    assert with_floor(0.9 * needed).warnings
     assert not with_floor(1e-3, bits).warnings
     assert with_floor(1e-3, bits - 1).warnings
     assert not with_floor(0.05).warnings
     assert not with_floor(0.0).warnings  # a Gaussian's tails vanish, and that is what tails do
+
+
+@pytest.mark.parametrize("prob_bits", [2, 3, 5])
+@pytest.mark.parametrize("scale", [Scale.ADDRESS, Scale.COLUMN])
+def test_the_floor_that_is_advised_is_enough_and_not_too_much(prob_bits, scale):
+    def floors(floor):
+        known = wrapped_normal(
+            "B", mean=np.arange(0.0, 360, 9), sigma=np.linspace(15, 40, 40), values=36, step=10, floor=floor
+        )
+        model = Model(name="m", searched=(dimension("s", size=40),), known=(known,))
+        return quantise(model, prob_bits=prob_bits, scale=scale).floors
+
+    (found,) = floors(1e-3)
+    needed = float(found.advice.removeprefix("use a floor of about ").split()[0])
+    assert floors(needed) == ()
+    assert floors(0.85 * needed)
+
+
+def test_codes_of_one_bit_hold_no_floor():
+    (found,) = with_floor(0.02, prob_bits=1).floors
+    assert "below 2^-1 of the largest" in found.what
+    bits = int(found.advice.removeprefix("use --prob-bits "))
+    assert not with_floor(0.02, bits).warnings
 
 
 def test_scaling_never_exceeds_one_and_keeps_rows_of_zeros():

@@ -207,6 +207,11 @@ def _mass(
     return np.where((lower < 0) & (upper > 0), 1 - tails_lower - tails_upper, same_side)
 
 
+def middle_bin(bin_in_sigmas: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the mass of a bin where the mean is at its middle: what a floor is a share of."""
+    return 1 - 2 * _upper_tail(bin_in_sigmas / 2)
+
+
 def _with_outliers(
     table: NDArray[np.float64], shape: Normal, bin_in_sigmas: NDArray[np.float64]
 ) -> NDArray[np.float64]:
@@ -217,7 +222,6 @@ def _with_outliers(
     if shape.outliers:
         table = (1 - shape.outliers) * table + shape.outliers / len(table)
     if shape.floor:
-        peak = 1 - 2 * _upper_tail(bin_in_sigmas / 2)
-        table = table + shape.floor * peak
+        table = table + shape.floor * middle_bin(bin_in_sigmas)
     normalised: NDArray[np.float64] = table / table.sum(axis=0)
     return normalised
