@@ -136,7 +136,7 @@ class Scanner:
             float64[wanted].
 
         Raises:
-            NetworkFileError: A word that is no number, or more or fewer of them.
+            NetworkFileError: A word that is no number, more or fewer of them, or brackets that don't match.
         """
         stop = self._text.find(end, self._end)
         if stop < 0:
@@ -144,6 +144,8 @@ class Scanner:
             raise self.error(f"the end of the file stands where {end!r} is expected")
         piece = self._text[self._end : stop]
         begin, self._start, self._end = self._end, stop, stop + len(end)
+        if "(" in between and piece.count("(") != piece.count(")"):
+            raise self.error(f"the brackets of {what} don't match")
         for sign in between:
             piece = piece.replace(sign, " ")
         return self._floats(piece.split(maxsplit=wanted), wanted, what, begin)

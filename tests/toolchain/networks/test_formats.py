@@ -324,6 +324,11 @@ MISTAKES = [
     ),
     (*changed("dog.net", "data = ( 0.15 0.85 );", ""), 8, "the potential of family_out has no data"),
     (*changed("dog.net", "( 0.15 0.85 )", "( 0.15 0.85 0.1 )"), 8, "more than 2 numbers, expected 2"),
+    (
+        *changed("dog.net", "( 0.15 0.85 )", "(( 0.15 0.85 )"),
+        8,
+        "brackets of the data of family_out don't match",
+    ),
     (*changed("dog.net", "( 0.15 0.85 )", "( 0.15 0.8 0.01 0.04 )"), 8, "more than 2 numbers, expected 2"),
     (*changed("dog.net", "dog_out | bowel", "dog_out bowel"), 10, "'bowel_problem' stands where '|' or ')'"),
     ("dog.net", NET + "class A { class B {", 17, "'B' stands where '=' is expected"),
