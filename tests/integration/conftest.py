@@ -23,7 +23,7 @@ import websockets
 ROOT = Path(__file__).resolve().parents[2]
 BIN = Path(sys.executable).parent
 MARK = "ROSBAYES_TEST_RUN"
-PATIENCE = 60.0
+PATIENCE = 180.0
 """Seconds for what happens within one where nothing else runs."""
 PID_MAX = int(Path("/proc/sys/kernel/pid_max").read_text())
 READING = {"D1": 71, "D2": 50, "D3": 50, "B1": 45, "B2": 0, "B3": 90}

@@ -24,7 +24,7 @@ from bridge.stamps import stamp
 from tests.casestudies.pretend_stack import frame_message
 from tests.integration.conftest import BIN, ROOT, Running
 
-PATIENCE = 60
+PATIENCE = 180
 
 
 def programs(page: str) -> list[str]:

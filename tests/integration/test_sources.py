@@ -21,7 +21,7 @@ from bridge.stamps import header
 from tests.fake_rosbridge import FakeRosbridge
 from tests.integration.conftest import BIN
 
-PATIENCE = 60
+PATIENCE = 180
 MODEL = """
 import numpy as np
 from toolchain.models.model import Known, Model, dimension

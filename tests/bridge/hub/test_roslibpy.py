@@ -27,7 +27,7 @@ async def test_what_users_of_roslibpy_do(transport: str) -> None:
             stderr=asyncio.subprocess.PIPE,
         )
         try:
-            output, complaints = await asyncio.wait_for(session.communicate(), 110)
+            output, complaints = await asyncio.wait_for(session.communicate(), 240)
         finally:
             if session.returncode is None:
                 session.kill()

@@ -18,7 +18,7 @@ from casestudies.boat.geometry import map_grid
 from tests.casestudies.pretend_stack import PretendStack, certain, frame_message, posterior_message
 from tests.fake_rosbridge import FakeRosbridge
 
-LIMIT = 60
+LIMIT = 180
 GRID = map_grid()
 
 
