@@ -34,6 +34,7 @@ from bridge.protocol import Compression
 from bridge.results import (
     FRAME_TOPIC,
     FRAME_TYPE,
+    MAX_RESULT,
     RESULTS_TOPIC,
     RESULTS_TYPE,
     WAITING,
@@ -347,7 +348,7 @@ def listen(
         BadResultError: something else than a posterior came on its topic.
         BridgeError: the server is not there, or is none.
     """
-    ros = connect(server) if isinstance(server, str) else server
+    ros = connect(server, max_size=MAX_RESULT) if isinstance(server, str) else server
     taken = 0
 
     async def begin() -> Posteriors:

@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 
 RESULTS_TOPIC: Final = "/BMresults"
 RESULTS_TYPE: Final = "std_msgs/Float64MultiArray"
+#: Bytes of a posterior as JSON at most: of 64 boards with 4096 lines each, 26 a number, and room for the rest.
+MAX_RESULT: Final = 1 << 23
 FRAME_TOPIC: Final = "/bm/frame"
 FRAME_TYPE: Final = "diagnostic_msgs/DiagnosticArray"
 REPLICA: Final = "replica"

@@ -28,7 +28,7 @@ from websockets.exceptions import (
     InvalidURI,
     PayloadTooBig,
 )
-from websockets.frames import DATA_OPCODES, Frame
+from websockets.frames import DATA_OPCODES, CloseCode, Frame
 from websockets.protocol import Event, State
 from websockets.uri import WebSocketURI, parse_uri
 
@@ -338,6 +338,11 @@ class WebSocket(ClientConnection):
                 f"the server sent a message of more than {self.protocol.max_message_size} bytes "
                 "(max_size allows larger ones)"
             )
+        if (
+            self.protocol.close_rcvd is not None
+            and self.protocol.close_rcvd.code == CloseCode.MESSAGE_TOO_BIG
+        ):
+            return "the server closed it: a message was larger than it takes (code 1009)"
         if self.protocol.close_rcvd is not None:
             return f"the server closed it (code {self.protocol.close_rcvd.code})"
         if self.protocol.close_sent is not None:

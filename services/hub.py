@@ -12,7 +12,9 @@ import typer
 
 from bridge.hub.door import Door, is_loopback, read_tokens, tls_context
 from bridge.hub.graph import Graph
+from bridge.hub.limits import HubLimits
 from bridge.hub.server import serve_hub
+from bridge.json_codec import MAX_SIZE
 from services.command_line import ends_well, make_app, run_async
 from services.errors import SettingsError
 from services.logs import log_libraries, say
@@ -52,6 +54,12 @@ def hub(
             help="Web page that may connect, such as https://robot.example, besides this machine's; repeatable.",
         ),
     ] = None,
+    message_bytes: Annotated[
+        int,
+        typer.Option(
+            min=1 << 10, max=1 << 28, help="Largest message, both ways; a larger one closes its sender."
+        ),
+    ] = MAX_SIZE,
     announce: Annotated[
         str | None,
         typer.Option(metavar="NAME", help="Announce it on the network under this name (see `discover`)."),
@@ -108,6 +116,7 @@ def hub(
                 host,
                 port,
                 door=door,
+                limits=HubLimits(message_bytes=message_bytes, client_bytes=4 * max(message_bytes, MAX_SIZE)),
                 ros_version=ros,
                 on_ready=on_ready,
                 on_graph=graphs.append,

@@ -16,7 +16,7 @@ from rich.text import Text
 from bridge.client import State, connect
 from bridge.errors import BadResultError, LabelError, NoResultError
 from bridge.posteriors import posteriors
-from bridge.results import RESULTS_TOPIC, Heard, Posterior
+from bridge.results import MAX_RESULT, RESULTS_TOPIC, Heard, Posterior
 from services import options
 from services.command_line import ends_well, make_app, run_async
 from services.errors import SettingsError
@@ -125,6 +125,7 @@ async def hear(
             connect_timeout=settings.connect_timeout,
             ros_version=settings.ros_version,
             on_state=_Told(uri).state_changed,
+            max_size=MAX_RESULT,
         ) as ros,
         posteriors(
             ros, topic=topic, deployment=deployment.name if deployment else None, queue_size=_QUEUE_SIZE

@@ -19,8 +19,8 @@ import numpy as np
 import typer
 
 from bridge.client import Publication, Ros, State, Subscription, connect
-from bridge.errors import BridgeError, NoMessageError
-from bridge.results import FRAME_TOPIC, FRAME_TYPE
+from bridge.errors import BridgeError, DisconnectedError, NoMessageError, SlowPeerError
+from bridge.results import FRAME_TOPIC, FRAME_TYPE, MAX_RESULT
 from machines.bm1 import StopReason
 from services import options
 from services.command_line import ends_well, make_app, run_async
@@ -116,6 +116,7 @@ class ResultTopics:
                             connect_timeout=settings.connect_timeout,
                             ros_version=settings.ros_version,
                             on_state=None if on_state is None else partial(on_state, uri),
+                            max_size=MAX_RESULT,
                         )
                     )
                 self._outputs.append((by_uri[uri], await by_uri[uri].advertise(output.topic, output.type)))
@@ -225,7 +226,7 @@ def _sent(publication: Publication, message: dict[str, Any]) -> bool:
     """Whether a message went out: its server is there, and takes it at once."""
     try:
         publication.publish_nowait(message)
-    except BridgeError:
+    except (DisconnectedError, SlowPeerError):
         return False
     return True
 

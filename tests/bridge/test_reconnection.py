@@ -178,6 +178,13 @@ async def test_a_goodbye_of_the_server_is_told():
         await ros.wait_for_state(State.CONNECTED, 30)
 
 
+async def test_a_server_that_takes_no_message_of_that_size_is_told():
+    async with FakeRosbridge() as fake, connect(fake.uri) as ros:
+        await fake.hang_up(1009)
+        await ros.wait_for_state(State.RECONNECTING, 30)
+        assert ros.last_error == "the server closed it: a message was larger than it takes (code 1009)"
+
+
 async def test_a_goodbye_without_hanging_up_is_not_waited_for(monkeypatch):
     monkeypatch.setattr("bridge.websocket.CLOSE_TIMEOUT", 0.2)
     async with FakeRosbridge() as fake, connect(fake.uri) as ros:

@@ -293,3 +293,18 @@ async def test_the_guides_programs(stage, text):
 
 def test_every_program_of_the_guide_is_run():
     assert len(GUIDE) == (ROOT / "docs/listening.md").read_text().count("```python") == 2
+
+
+async def test_a_posterior_larger_than_most_messages(stage):
+    """The hub takes it if told to; listen does by itself."""
+    hub = stage.start("hub", "--port", "0", "--message-bytes", "4000000")
+    uri = (await hub.says(r"ws://\S+"))[0]
+    listening = stage.start("listen", "--uri", uri, "--count", "1", "--json")
+    await listening.says("listening on")
+    async with connect(uri, max_size=4_000_000) as ros:
+        results = await ros.advertise("/BMresults", "std_msgs/Float64MultiArray")
+        while listening.process.poll() is None:
+            await results.publish({"data": [1 / 60_001] * 60_000})
+            await asyncio.sleep(0.5)
+    assert await listening.end() == 0, listening.err
+    assert json.loads(listening.out)["sizes"] == [60_000]

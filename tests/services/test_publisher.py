@@ -93,3 +93,10 @@ async def test_a_server_that_takes_nothing_keeps_nobody_else_from_results(boat, 
         assert (one.outcome, one.missed) == ("published", 1)
         await first.wait_for_op("publish", topic="/BMresults")
         second.thaw()
+
+
+async def test_the_largest_posterior_goes_out(boat):
+    async with FakeRosbridge() as first, FakeRosbridge() as second, topics_of(boat, first, second) as topics:
+        await topics.publish_array(np.full(64 * 4096, np.nextafter(1 / 262145, 1)))
+        said = await first.wait_for_op("publish", topic="/BMresults")
+        assert len(said["msg"]["data"]) == 64 * 4096
