@@ -100,6 +100,7 @@ def _relations(machine: CheckedMachine) -> Iterator[Finding]:
         bank, line = divmod(first.group, 1 if parameters.shared else parameters.lines)
         where = f"bank {bank}" + ("" if parameters.shared else f", line {line} of board 0")
         bits = " and ".join(f"bit {bit} of {names[column]}" for column, bit in first.bits)
+        apart = len({column for column, _ in first.bits}) == count
         same = count == 2 and first.bits[0][1] == first.bits[1][1]
         severity = Severity.ERROR if count < 4 else Severity.WARNING
         if not parameters.shared and not same:
@@ -110,7 +111,7 @@ def _relations(machine: CheckedMachine) -> Iterator[Finding]:
             check="rng-relation",
             about=f"rng = {parameters.rng}",
             what=(
-                f"in {len(related)} of {found.groups} {what_groups} {count} random bits of different columns "
+                f"in {len(related)} of {found.groups} {what_groups} {count} random bits of {'different' if apart else 'several'} columns "
                 f"{'are the same' if count == 2 else 'XOR to 0'} in every cycle ({where}: {bits}), so these columns are not "
                 "independent"
             ),

@@ -1,6 +1,7 @@
 """What `toolchain check` says of readings and lines holds on the machine, and every mistake has its finding."""
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -300,11 +301,24 @@ def test_related_columns_name_the_bits():
     options = replace(OPTIONS, rng=RngKind.LFSR8, prob_bits=7, max_cycles=255)
     related = found(check_model(model_of([[0.9, 0.1], [0.1, 0.9]], known=known), options), "rng-relation")
     assert related[0].severity is Severity.ERROR
-    assert "random bits of different columns" in related[0].what
+    assert "3 random bits of several columns XOR to 0 in every cycle" in related[0].what
     assert "use a wider --rng" in related[0].advice
     cells = replace(options, shared=False, rng_banks=3)
     related = found(check_model(model_of([[0.9, 0.1], [0.1, 0.9]], known=known), cells), "rng-relation")
     assert "of 6 lines in a bank" in related[0].what
+
+
+def test_bits_of_one_column_in_a_relation_are_not_called_those_of_different_ones():
+    place = interval("x", 0, 10, cells=10)
+    (x,) = cell_centres(place)
+    known = tuple(normal(name, mean=x, sigma=2.0, values=15, floor=0.05) for name in "ABCD")
+    options = replace(OPTIONS, rng=RngKind.LFSR8, prob_bits=7, rng_banks=2)
+    said = [each.what for each in found(check_model(model(known=known), options), "rng-relation")]
+    said = [what for what in said if "random bits of" in what]
+    assert said
+    for what in said:
+        names = re.findall(r"bit \d of (the prior|\w)", what)
+        assert ("of different columns" in what) == (len(set(names)) == len(names)), what
 
 
 @pytest.mark.parametrize(
