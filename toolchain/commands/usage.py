@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import math
+import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NoReturn, cast
@@ -16,6 +18,7 @@ from toolchain.commands.one_line import one_line, shown
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+_FULL: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 _TYPES: Final = {int: "NUMBER", float: "NUMBER", str: "TEXT"}
 
 
@@ -38,9 +41,22 @@ class CommandLine(typer.Typer):
         check_values(command)
         try:
             code = command.main(arguments, standalone_mode=False)
+            sys.stdout.flush()  # at its own end Python could only complain
         except typer.TyperException as error:
             if type(error).__name__ != "NoArgsIsHelpError":  # its help is printed already
                 print(f"error: {one_line(usage_sentence(error))}", file=sys.stderr, flush=True)
+            sys.exit(2)
+        except OSError as error:
+            if error.errno not in _FULL or error.filename is not None:
+                raise
+            # at its own end Python would complain once more
+            with Path(os.devnull).open("wb") as null:
+                os.dup2(null.fileno(), sys.stdout.fileno())
+            print(
+                f"error: the output can't be written: {error.strerror}; free some space, or send it elsewhere",
+                file=sys.stderr,
+                flush=True,
+            )
             sys.exit(2)
         sys.exit(code if isinstance(code, int) else 0)
 

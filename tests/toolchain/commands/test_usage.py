@@ -1,8 +1,10 @@
 """Mistakes in a command line: one sentence that says what, where, what was expected, and where to read on."""
 
 import importlib
+import subprocess
 import sys
 from enum import StrEnum
+from pathlib import Path
 from typing import Annotated
 
 import pytest
@@ -124,3 +126,27 @@ def test_every_command_has_it(capsys, name):
         app(["--qqq"])
     assert ended.value.code == 2
     assert capsys.readouterr().err == "error: painter has no --qqq; painter --help says more\n"
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["paint", "shed"]])
+def test_a_full_disk_behind_the_output_is_one_sentence(arguments):
+    program = (
+        "from toolchain.commands.usage import CommandLine\n"
+        "app = CommandLine()\n"
+        "app.callback()(lambda: None)\n"
+        "app.command('paint')(lambda wall: print('painted', wall))\n"
+        "app()"
+    )
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(
+            [sys.executable, "-c", program, *arguments],
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            timeout=120,
+            check=False,
+        )
+    assert done.stderr == (
+        "error: the output can't be written: No space left on device; free some space, or send it elsewhere\n"
+    )
+    assert done.returncode == 2
