@@ -48,6 +48,7 @@ RESTARTS_WITHIN = 60.0
 """A process may be restarted three times in 60 s; then its master gives up."""
 
 _PR_SET_PDEATHSIG = 1
+_DYING_TIME = 5.0
 _TAIL_LINES = 20
 
 
@@ -182,12 +183,30 @@ def _is_abandoned(directory: Path) -> bool:
         os.close(handle)
 
 
+def _is_dying(process: str) -> bool:
+    """Whether the process has been killed, but not yet every thread of it: what it has locked is locked till then."""
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+    except OSError:
+        return False
+
+
+def _is_abandoned_soon(directory: Path) -> bool:
+    """Whether the master whose directory it was is gone; one that is just dying is waited for."""
+    deadline = time.monotonic() + _DYING_TIME
+    while not (abandoned := _is_abandoned(directory)):
+        if not _is_dying(os.environ.get(PARENT_VARIABLE, "")) or time.monotonic() > deadline:
+            break
+        time.sleep(0.001)
+    return abandoned
+
+
 def leave_private_directory() -> None:
     """In a child that ends: take the run's directory away if it is empty and the parent did not."""
     directory = os.environ.get(DIRECTORY_VARIABLE)
     if directory:
         remove_dead_sockets(Path(directory))
-        if _is_abandoned(Path(directory)):
+        if _is_abandoned_soon(Path(directory)):
             for kept in Path(directory).glob(f"{KEPT}*"):
                 shutil.rmtree(kept, ignore_errors=True)
         with contextlib.suppress(OSError):

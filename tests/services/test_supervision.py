@@ -186,3 +186,36 @@ def test_a_directory_that_is_taken_for_an_abandoned_one_while_it_is_made_is_made
     assert len(made) == 3
     assert private.path.is_dir()
     private.remove()
+
+
+KILLED_IN_PART = """
+import ctypes, os, platform, subprocess, sys, threading, time
+from services.supervision import DIRECTORY_VARIABLE, KEPT, PARENT_VARIABLE, PrivateDirectory
+directory = PrivateDirectory().path
+(directory / f"{KEPT}3").mkdir()
+variables = {PARENT_VARIABLE: str(os.getpid()), DIRECTORY_VARIABLE: str(directory)}
+code = "import time; from services.supervision import end_with_parent; end_with_parent(); print(flush=True); time.sleep(100)"
+child = subprocess.Popen([sys.executable, "-c", code], env=os.environ | variables, stdout=subprocess.PIPE)
+child.stdout.readline()
+print(child.pid, directory, flush=True)
+threading.Thread(target=lambda: (time.sleep(1), os._exit(0))).start()
+exit_of_this_thread = {"x86_64": 60, "aarch64": 93}[platform.machine()]
+ctypes.CDLL(None).syscall(exit_of_this_thread, 0)
+"""
+
+
+def test_a_parent_of_which_a_thread_still_dies_is_waited_for(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-c", KILLED_IN_PART],
+        env=os.environ | {"TMPDIR": str(tmp_path), "XDG_RUNTIME_DIR": ""},
+        stdout=subprocess.PIPE,
+        text=True,
+        timeout=PATIENCE,
+        check=True,
+    )
+    child_pid = int(done.stdout.split()[0])
+    deadline = time.monotonic() + PATIENCE
+    while psutil.pid_exists(child_pid) and psutil.Process(child_pid).status() != psutil.STATUS_ZOMBIE:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    assert list(tmp_path.iterdir()) == []
