@@ -184,29 +184,23 @@ def _is_abandoned(directory: Path) -> bool:
 
 
 def _is_dying(process: str) -> bool:
-    """Whether the process has been killed, but not yet every thread of it: what it has locked is locked till then."""
+    """Whether the process has been killed, but not yet every thread of it: till then it keeps its locks and sockets."""
     try:
-        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+        ended = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+        return ended and len(list(Path(f"/proc/{process}/task").iterdir())) > 1
     except OSError:
         return False
-
-
-def _is_abandoned_soon(directory: Path) -> bool:
-    """Whether the master whose directory it was is gone; one that is just dying is waited for."""
-    deadline = time.monotonic() + _DYING_TIME
-    while not (abandoned := _is_abandoned(directory)):
-        if not _is_dying(os.environ.get(PARENT_VARIABLE, "")) or time.monotonic() > deadline:
-            break
-        time.sleep(0.001)
-    return abandoned
 
 
 def leave_private_directory() -> None:
     """In a child that ends: take the run's directory away if it is empty and the parent did not."""
     directory = os.environ.get(DIRECTORY_VARIABLE)
     if directory:
+        deadline = time.monotonic() + _DYING_TIME
+        while _is_dying(os.environ.get(PARENT_VARIABLE, "")) and time.monotonic() < deadline:
+            time.sleep(0.001)
         remove_dead_sockets(Path(directory))
-        if _is_abandoned_soon(Path(directory)):
+        if _is_abandoned(Path(directory)):
             for kept in Path(directory).glob(f"{KEPT}*"):
                 shutil.rmtree(kept, ignore_errors=True)
         with contextlib.suppress(OSError):

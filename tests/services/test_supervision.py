@@ -190,10 +190,13 @@ def test_a_directory_that_is_taken_for_an_abandoned_one_while_it_is_made_is_made
 
 
 KILLED_IN_PART = """
-import ctypes, os, platform, subprocess, sys, threading, time
+import ctypes, os, platform, socket, subprocess, sys, threading, time
 from services.supervision import DIRECTORY_VARIABLE, KEPT, PARENT_VARIABLE, PrivateDirectory
 directory = PrivateDirectory().path
 (directory / f"{KEPT}3").mkdir()
+listener = socket.socket(socket.AF_UNIX)
+listener.bind(str(directory / "master.status.sock"))
+listener.listen()
 variables = {PARENT_VARIABLE: str(os.getpid()), DIRECTORY_VARIABLE: str(directory)}
 code = "import time; from services.supervision import end_with_parent; end_with_parent(); print(flush=True); time.sleep(100)"
 child = subprocess.Popen([sys.executable, "-c", code], env=os.environ | variables, stdout=subprocess.PIPE)
