@@ -31,7 +31,6 @@ from services.supervision import (
     RESTARTS_WITHIN,
     end_with_parent,
     how_it_ended,
-    leave_private_directory,
     remove_dead_sockets,
 )
 
@@ -154,7 +153,6 @@ class BoardProcesses:
                     self._ended(at, os.waitstatus_to_exitcode(status))
         finally:
             self._end_all()
-            leave_private_directory()
 
     def _fork(self, at: int) -> None:
         parent = os.getpid()

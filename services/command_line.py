@@ -19,7 +19,7 @@ import uvloop
 
 from services.errors import ExitCode, ReportedError, StoppedError, exit_code_of
 from services.logs import log_by_lines, say, say_lines
-from services.supervision import PARENT_VARIABLE
+from services.supervision import PARENT_VARIABLE, leave_private_directory
 from toolchain.commands.usage import CommandLine
 
 Parameters = ParamSpec("Parameters")
@@ -113,6 +113,7 @@ def _outcome(command: Callable[[], int | None]) -> int:
             say(f"error: {error}")
     for number in _SIGNALS:
         signal.signal(number, signal.SIG_IGN)
+    leave_private_directory()  # also where it ended before it had anything open
     return code
 
 

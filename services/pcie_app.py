@@ -53,7 +53,7 @@ from services.sockets.status_socket import (
     status_thread,
 )
 from services.standard_input import compute_lines
-from services.supervision import end_with_parent, leave_private_directory
+from services.supervision import end_with_parent
 from toolchain.deployment import Deployment
 
 ROLE = "pcie-app"
@@ -154,7 +154,6 @@ class PcieApp:
             if self._master is not None:
                 self._master.close()
             remove_listener(self._endpoint, listener)
-            leave_private_directory()
 
     def _accept(self, listener: socket.socket) -> None:
         connection = BlockingRecordSocket(listener.accept()[0], self._where)

@@ -1,5 +1,7 @@
 """How a process with one blocking thread takes a signal, wherever it stands."""
 
+import os
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -7,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from services.errors import ExitCode
+from services.supervision import DIRECTORY_VARIABLE, KEPT
 
 _STANDS = {
     "in a function that C code calls back": """
@@ -50,6 +53,33 @@ app()
         [sys.executable, "-c", code], check=False, capture_output=True, text=True, timeout=240
     )
     assert (ended.returncode, ended.stderr) == (ExitCode.TERMINATED, "asked to end (SIGTERM)\n")
+
+
+def test_a_child_that_ends_before_it_has_anything_open_tidies_up_after_a_killed_master(tmp_path):
+    left = tmp_path / "run"
+    (left / f"{KEPT}1").mkdir(parents=True)
+    with socket.socket(socket.AF_UNIX) as killed:
+        killed.bind(str(left / "master.status.sock"))
+    code = """
+import signal
+from services.command_line import ends_well, make_app, raise_on_signals
+app = make_app("wait")
+
+@app.command()
+@ends_well
+def wait():
+    raise_on_signals()
+    signal.raise_signal(signal.SIGTERM)
+
+app()
+"""
+    ended = subprocess.run(
+        [sys.executable, "-c", code],
+        check=False,
+        env=os.environ | {DIRECTORY_VARIABLE: str(left)},
+        timeout=240,
+    )
+    assert (ended.returncode, left.exists()) == (ExitCode.TERMINATED, False)
 
 
 def test_another_exception_that_is_dropped_is_told_as_ever():
