@@ -11,7 +11,6 @@ import signal
 import sys
 import traceback
 from collections.abc import Callable, Coroutine
-from pathlib import Path
 from typing import Any, NoReturn, ParamSpec
 
 import typer
@@ -20,7 +19,7 @@ import uvloop
 from services.errors import ExitCode, ReportedError, StoppedError, exit_code_of
 from services.logs import log_by_lines, say, say_lines
 from services.supervision import PARENT_VARIABLE, leave_private_directory
-from toolchain.commands.usage import CommandLine
+from toolchain.commands.usage import UNWRITABLE, CommandLine, drop_output, output_unwritable
 
 Parameters = ParamSpec("Parameters")
 
@@ -30,17 +29,7 @@ _SIGNALS = {
     signal.SIGHUP: (ExitCode.HANGUP, "the terminal was closed (SIGHUP)"),
 }
 
-_FULL = "the output can't be written: {}; free some space, or send it elsewhere"
-_TOO_MANY = "this process can't open what it needs: {}; allow more (ulimit -n), or end what holds them"
-_EXHAUSTED = {
-    errno.ENOSPC: _FULL,
-    errno.EDQUOT: _FULL,
-    errno.EFBIG: _FULL,
-    errno.EIO: _FULL,
-    errno.EMFILE: _TOO_MANY,
-    errno.ENFILE: _TOO_MANY,
-}
-"""What is said where the operating system has no more of something, which is no bug of ours; by its number for it."""
+_TOO_MANY = frozenset({errno.EMFILE, errno.ENFILE})
 
 _MOMENT = 0.002
 """Seconds until a signal's exception that was dropped is raised again."""
@@ -94,7 +83,7 @@ def _outcome(command: Callable[[], int | None]) -> int:
     except BrokenPipeError:
         # whoever read our output has what it wanted (as `| head` does)
         code = ExitCode.DONE
-        _drop_output()
+        drop_output()
     except StoppedError as stopped:
         code = stopped.exit_code
         if PARENT_VARIABLE not in os.environ:
@@ -102,10 +91,16 @@ def _outcome(command: Callable[[], int | None]) -> int:
             say(str(stopped))
     except Exception as error:
         code = exit_code_of(error)
-        if isinstance(error, OSError) and error.errno in _EXHAUSTED:
+        # where the operating system has no more of something, it is no bug of ours
+        if isinstance(error, OSError) and error.errno in UNWRITABLE:
             code = ExitCode.USAGE
-            say(f"error: {_EXHAUSTED[error.errno].format(error.strerror)}")
-            _drop_output()
+            say(f"error: {output_unwritable(error)}")
+            drop_output()
+        elif isinstance(error, OSError) and error.errno in _TOO_MANY:
+            code = ExitCode.USAGE
+            say(
+                f"error: this process can't open what it needs: {error.strerror}; allow more (ulimit -n), or end what holds them"
+            )
         elif code == ExitCode.BUG and not isinstance(error, ReportedError):
             say_lines(traceback.format_exc().rstrip())
             say("error: this is a bug in rosbayes; please report it with the lines above")
@@ -115,12 +110,6 @@ def _outcome(command: Callable[[], int | None]) -> int:
         signal.signal(number, signal.SIG_IGN)
     leave_private_directory()  # also where it ended before it had anything open
     return code
-
-
-def _drop_output() -> None:
-    """Let what still waits for standard output go nowhere: it can't be written."""
-    with contextlib.suppress(OSError), Path(os.devnull).open("wb") as null:
-        os.dup2(null.fileno(), sys.stdout.fileno())
 
 
 def run_async(main: Coroutine[Any, Any, int | None]) -> int:

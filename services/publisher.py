@@ -204,8 +204,9 @@ class ResultTopics:
         posterior = inferred.posterior
         missed = 0
         with self._outputs[0][0].together():
-            report = self._report.message(publish, inferred, times, time.time_ns())
-            told = self._frames is not None and _sent(self._frames, report)
+            told = self._frames is not None and _sent(
+                self._frames, self._report.message(publish, inferred, times, time.time_ns())
+            )
             if posterior is not None:
                 for _, publication in self._outputs:
                     missed += not _sent(publication, {"layout": self._layout, "data": posterior})

@@ -49,6 +49,7 @@ RESTARTS_WITHIN = 60.0
 
 _PR_SET_PDEATHSIG = 1
 _DYING_TIME = 5.0
+"""Seconds that a killed parent's last threads are waited for."""
 _TAIL_LINES = 20
 
 
@@ -193,7 +194,10 @@ def _is_dying(process: str) -> bool:
 
 
 def leave_private_directory() -> None:
-    """In a child that ends: take the run's directory away if it is empty and the parent did not."""
+    """In a child that ends: take the run's directory away, if its master is gone or nothing is in it.
+
+    Every child does so; the last one finds no other's sockets in it. Does nothing in a process that nobody supervises.
+    """
     directory = os.environ.get(DIRECTORY_VARIABLE)
     if directory:
         deadline = time.monotonic() + _DYING_TIME

@@ -16,6 +16,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -58,10 +59,10 @@ class Case:
         )
 
 
-def case(lines: int, sensors: int, seed: int, **others: object) -> Case:
+def case(lines: int, sensors: int, seed: int, **others: Any) -> Case:
     """A machine of these sizes."""
     width = others.get("prob_bits", 8) if others.get("sensor_mode") is SensorMode.THRESHOLD else ADDRESS_BITS
-    return Case(BM1Parameters(lines=lines, sensor_bits=(width,) * sensors, **others), seed)  # type: ignore[arg-type]  # keyword arguments by name
+    return Case(BM1Parameters(lines=lines, sensor_bits=(width,) * sensors, **others), seed)
 
 
 SIMULATED = (

@@ -384,9 +384,8 @@ class Peers:
     def _awaited(self, peer: Peer) -> Awaited | None:
         settings = self._settings
         if not peer.greeted:
-            opening = (
-                self._compiling_time if peer.role == "pcie-app" else 0
-            )  # it greets when the boards are open
+            # pcie-app greets when the boards are open
+            opening = self._compiling_time if peer.role == "pcie-app" else 0.0
             return Awaited("greet", peer.since, settings.peer_timeout + opening)
         if not peer.ready:
             boards = len(self._in_force.deployment.boards)

@@ -14,7 +14,6 @@ from services.errors import OtherPeerError, OutdatedError, SettingsError
 from services.settings import Settings
 from services.sockets.local_socket import RecordProtocol, check_hello, own_hello
 from services.sockets.records import AnyRecord, Hello, Notice, Record, Trouble
-from services.supervision import leave_private_directory
 from toolchain.deployment import Deployment, load_deployment
 from toolchain.errors import ToolchainError
 
@@ -110,7 +109,6 @@ class MasterLink:
             await asyncio.sleep(0)
         if self._listener is not None:
             remove_listener(self._endpoint, self._listener)
-        leave_private_directory()
         if self._outdated is not None and kind is asyncio.CancelledError:
             raise self._outdated from None
 

@@ -248,7 +248,6 @@ async def status_served(directory: Path | None, name: str, tell: Tell) -> AsyncI
         sampling.cancel()
         server.close()
         remove_listener(endpoint, listener)
-        leave_private_directory()
 
 
 @contextlib.contextmanager

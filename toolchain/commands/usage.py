@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import math
 import os
@@ -18,7 +19,8 @@ from toolchain.commands.one_line import one_line, shown
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-_FULL: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
+UNWRITABLE: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO})
+"""Numbers of the system's errors that say that what is written finds no place."""
 _TYPES: Final = {int: "NUMBER", float: "NUMBER", str: "TEXT"}
 
 
@@ -47,18 +49,23 @@ class CommandLine(typer.Typer):
                 print(f"error: {one_line(usage_sentence(error))}", file=sys.stderr, flush=True)
             sys.exit(2)
         except OSError as error:
-            if error.errno not in _FULL or error.filename is not None:
+            if error.errno not in UNWRITABLE or error.filename is not None:
                 raise
-            # at its own end Python would complain once more
-            with Path(os.devnull).open("wb") as null:
-                os.dup2(null.fileno(), sys.stdout.fileno())
-            print(
-                f"error: the output can't be written: {error.strerror}; free some space, or send it elsewhere",
-                file=sys.stderr,
-                flush=True,
-            )
+            drop_output()
+            print(f"error: {output_unwritable(error)}", file=sys.stderr, flush=True)
             sys.exit(2)
         sys.exit(code if isinstance(code, int) else 0)
+
+
+def output_unwritable(error: OSError) -> str:
+    """The sentence for standard output that finds no place."""
+    return f"the output can't be written: {error.strerror}; free some space, or send it elsewhere"
+
+
+def drop_output() -> None:
+    """Let what still waits for standard output go nowhere, if it can't be written: at its end Python would complain once more."""
+    with contextlib.suppress(OSError), Path(os.devnull).open("wb") as null:
+        os.dup2(null.fileno(), sys.stdout.fileno())
 
 
 def name_values(command: Any, parent: typer.Context | None = None) -> None:

@@ -20,7 +20,9 @@ import threading
 from collections import defaultdict
 from typing import Any, ClassVar, cast
 
+import tornado.httpserver
 import tornado.ioloop
+import tornado.netutil
 import tornado.web
 import tornado.websocket
 
@@ -168,8 +170,10 @@ class Connection(tornado.websocket.WebSocketHandler):  # type: ignore[misc]  # t
 
 async def main() -> None:
     """Serve at any free port of loopback."""
-    server = tornado.web.Application([(r"/.*", Connection)]).listen(0, "127.0.0.1")
-    port = next(iter(server._sockets.values())).getsockname()[1]  # noqa: SLF001 - Tornado tells it nowhere else
+    sockets = tornado.netutil.bind_sockets(0, "127.0.0.1")
+    server = tornado.httpserver.HTTPServer(tornado.web.Application([(r"/.*", Connection)]))
+    server.add_sockets(sockets)
+    port = sockets[0].getsockname()[1]
     print(f"ws://127.0.0.1:{port}", flush=True)
     await asyncio.Event().wait()
 
