@@ -8,8 +8,8 @@ from typing import Final
 
 from bridge.client import Ros, Subscription
 from bridge.errors import BadResultError, DisconnectedError
-from bridge.posteriors import Posteriors, posteriors
 from casestudies.truths import TRUTH_TYPE, Instance, Truth, Truths, read_truth
+from posteriors.listening import Posteriors, posteriors
 
 _QUEUE_SIZE: Final = 256
 _PATIENCE_S: Final = 1.0

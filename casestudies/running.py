@@ -13,7 +13,7 @@ import uvloop
 
 from bridge.errors import BridgeError
 from casestudies.errors import CaseStudyError
-from toolchain.commands.usage import CommandLine
+from terminal.command_line import CommandLine
 
 _ENDING_SIGNALS = {
     signal.SIGINT: "interrupted (Ctrl-C)",

@@ -11,8 +11,8 @@ from typing import Annotated, Any, Final
 from pydantic import BaseModel, BeforeValidator, ConfigDict, FiniteFloat, ValidationError
 
 from bridge.errors import BadResultError
-from bridge.results import FrameReport, Heard, Posterior
 from bridge.stamps import stamp_ns
+from posteriors.results import FrameReport, Heard, Posterior
 
 TRUTH_TYPE: Final = "geometry_msgs/PoseStamped"
 

@@ -12,9 +12,10 @@ from pathlib import Path
 
 from bridge.errors import BridgeError
 from casestudies.errors import CaseStudyError
-from services.command_line import run_async
-from services.errors import ExitCode, ServiceError, StoppedError
+from services.errors import ServiceError
 from services.supervision import ask_for_end_with_parent, own_command
+from terminal.errors import ExitCode, StoppedError
+from terminal.running import run_async
 from toolchain.errors import ToolchainError
 
 ROOT = Path(__file__).resolve().parent.parent

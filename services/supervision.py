@@ -20,8 +20,9 @@ from collections import deque
 from collections.abc import Iterable
 from pathlib import Path
 
-from services.errors import ExitCode, ReportedError, ServiceError
-from services.logs import say
+from services.errors import ReportedError, ServiceError
+from terminal.errors import ExitCode
+from terminal.logs import say
 
 PARENT_VARIABLE = "ROSBAYES_PARENT"
 """Names the process whose end ends this one; set by `Child`."""
@@ -35,7 +36,7 @@ RUN_DIRECTORY_VARIABLE = "BM_RUN_DIRECTORY"
 STATUS_SUFFIX = ".status.sock"
 CONTROL_SUFFIX = ".control.sock"
 KEPT = "deployment-"
-"""How the folders begin in which a run keeps the deployments of its children (`services.running.new_deployment`)."""
+"""How the folders begin in which a run keeps the deployments of its children (`services.master.new_deployment`)."""
 
 PRIVATE = "rosbayes-"
 """How a run's private directory begins; what follows is tempfile's."""

@@ -9,9 +9,9 @@ import typer
 
 # NumPy and what needs it are imported where they are used: --help answers at once.
 from machines.parameters import PriorMode, RngKind, RngReset, SensorMode
+from terminal.command_line import CommandLine
+from terminal.refusals import one_sentence
 from toolchain.commands import design, flags, regenerate
-from toolchain.commands.refusals import one_sentence
-from toolchain.commands.usage import CommandLine
 from toolchain.deployment import Queue, Stop
 from toolchain.learning.fit_options import FitMethod, FitOptions, FitPrior
 from toolchain.options import BuildOptions, OnMissing

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from toolchain.sources import SourcesFile
+    from toolchain.deployment.sources import SourcesFile
 
 
 class Scale(StrEnum):

@@ -6,8 +6,8 @@ from typing import Any, Final
 
 import orjson
 
+from bridge.client.protocol.events import GoalStatus
 from bridge.errors import BridgeError
-from bridge.events import GoalStatus
 from bridge.hub.calls import Asker, asker_of, note_takeover
 from bridge.hub.delivery import Delivery
 from bridge.hub.graph import Action, Client, Graph

@@ -21,8 +21,9 @@ from typing import Any, Final
 
 import orjson
 
+from bridge.codecs.fragments import Reassembler
+from bridge.codecs.json_codec import could_be_deeper, decode, depth
 from bridge.errors import BridgeError
-from bridge.fragments import Reassembler
 from bridge.hub.actions import Actions
 from bridge.hub.calls import Calls
 from bridge.hub.definitions import Definitions, RosVersion
@@ -33,7 +34,6 @@ from bridge.hub.operations import Operation, RefusedError, is_round, text
 from bridge.hub.outbox import Outbox
 from bridge.hub.rosapi import NODE, ROSOUT, Rosapi
 from bridge.hub.topics import Topics
-from bridge.json_codec import could_be_deeper, decode, depth
 from bridge.stamps import stamp
 
 log = logging.getLogger(__name__)

@@ -11,7 +11,7 @@ import orjson
 
 from bridge.errors import BridgeError
 from bridge.hub.delivery import Delivery, fragment_size_of
-from bridge.hub.forms import compression_of
+from bridge.hub.encodings import compression_of
 from bridge.hub.graph import Client, Graph, Service
 from bridge.hub.limits import HubLimits
 from bridge.hub.operations import (

@@ -284,7 +284,7 @@ def _bytes(value: Any) -> bytes:
 
 
 def _typed_array(elements: str) -> _Convert:
-    from bridge.cbor_codec import typed_array
+    from bridge.codecs.cbor_codec import typed_array
 
     nothing = float("nan") if elements[0] == "f" else 0
 

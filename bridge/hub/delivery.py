@@ -5,7 +5,7 @@ from typing import Final
 
 import orjson
 
-from bridge.hub.forms import as_png
+from bridge.hub.encodings import as_png
 from bridge.hub.graph import Client
 from bridge.hub.limits import HubLimits
 from bridge.hub.outbox import Lane

@@ -7,8 +7,8 @@ the same topic, and gets its messages under the name that it used.
 
 from dataclasses import dataclass, field
 
-from bridge.fragments import Reassembler
-from bridge.hub.forms import Compression
+from bridge.codecs.fragments import Reassembler
+from bridge.hub.encodings import Compression
 from bridge.hub.operations import OperationId
 from bridge.hub.outbox import Lane, Outbox
 from bridge.names import same_type
@@ -38,7 +38,7 @@ class Client:
         wants_status: whether it asked to be told what is refused.
         status_lane: the way of its status messages, once there was one.
         publishing: what it published last with a known envelope.
-        envelopes: what it publishes, by the envelopes that are known (see `bridge.envelope`).
+        envelopes: what it publishes, by the envelopes that are known (see `bridge.codecs.envelope`).
         doomed: why it is to be disconnected, empty while it may stay.
         has_output: whether it is on the broker's list of those to be served.
     """

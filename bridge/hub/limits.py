@@ -3,8 +3,8 @@
 from dataclasses import dataclass, fields
 from typing import Final
 
+from bridge.codecs.json_codec import MAX_DEPTH, MAX_SIZE
 from bridge.hub.errors import HubError
-from bridge.json_codec import MAX_DEPTH, MAX_SIZE
 
 #: orjson writes at most this depth; one level is the operation around a message.
 _DEEPEST: Final = 250
@@ -15,7 +15,7 @@ class HubLimits:
     """Bounds of one hub. Sizes are bytes, times are seconds; all are at least 1 (times: above 0).
 
     What comes in fragments may have ``message_bytes`` characters when it is complete, and four times as many while
-    it is not (see `bridge.fragments.Reassembler`).
+    it is not (see `bridge.codecs.fragments.Reassembler`).
 
     What goes beyond a bound is refused and logged, as the reference server does with everything wrong: the
     client is not told, but for calls, which are answered ``result: false``. Only what harms others costs the

@@ -13,7 +13,7 @@ from collections import deque
 from math import inf
 from typing import TYPE_CHECKING, Final
 
-from bridge.fragments import split
+from bridge.codecs.fragments import split
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -14,12 +14,12 @@ from typing import Any, Final
 
 import orjson
 
+from bridge.codecs.json_codec import depth
 from bridge.errors import BridgeError
 from bridge.hub.definitions import Definitions
 from bridge.hub.graph import Graph
 from bridge.hub.limits import HubLimits
 from bridge.hub.operations import RefusedError
-from bridge.json_codec import depth
 from bridge.names import MAX_NAME, absolute, ros1_type, ros2_type, same_type
 
 #: The node that offers these services, and the beginning of their names, which no client can take.

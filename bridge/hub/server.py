@@ -23,14 +23,14 @@ from websockets.http11 import Request
 from websockets.protocol import State
 from websockets.server import ServerProtocol
 
-from bridge.frames import UNKNOWN, UNSOUND, frame_end, only_message, unmasked, whole_messages
+from bridge.hub.access import Door, choose_subprotocol
 from bridge.hub.broker import Broker
 from bridge.hub.definitions import RosVersion
-from bridge.hub.door import Door, choose_subprotocol
 from bridge.hub.errors import HubError
 from bridge.hub.graph import Client, Graph
 from bridge.hub.limits import HubLimits
 from bridge.hub.outbox import Outbox
+from bridge.transport.frames import UNKNOWN, UNSOUND, frame_end, only_message, unmasked, whole_messages
 
 log = logging.getLogger(__name__)
 

@@ -20,7 +20,7 @@ from casestudies.boat.messages import (
     readings_message,
 )
 from casestudies.running import command, run, say
-from toolchain.commands.usage import CommandLine
+from terminal.command_line import CommandLine
 
 
 def normalise_distance(raw: float) -> int:

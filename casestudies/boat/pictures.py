@@ -6,12 +6,12 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
 
-from bridge.results import Posterior
 from casestudies.boat.geometry import BEACONS, map_grid
 from casestudies.boat.shares import Part, StageShare
 from casestudies.errors import OutputError
 from casestudies.grid import Grid
 from casestudies.truths import Instance, Truth
+from posteriors.results import Posterior
 
 POSITIONS_SHOWN: Final = 4
 """As many as the thesis shows."""

@@ -28,7 +28,7 @@ from casestudies.boat.messages import (
     true_pose,
 )
 from casestudies.running import command, run, say
-from toolchain.commands.usage import CommandLine
+from terminal.command_line import CommandLine
 
 _SHORE = 2.0  # waypoints keep this far from the map's edge
 _SEEDS = 1_000_000

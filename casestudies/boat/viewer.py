@@ -16,7 +16,7 @@ from casestudies.boat.messages import TRUE_POSE_TOPIC
 from casestudies.errors import CaseStudyError
 from casestudies.running import command, fail, run, say
 from casestudies.written import check_writable, write_numbers
-from toolchain.commands.usage import CommandLine
+from terminal.command_line import CommandLine
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID

@@ -21,7 +21,7 @@ from casestudies.errors import CaseStudyError, DataFileError, OutputError
 from casestudies.mrclam.recording import LANDMARKS
 from casestudies.running import command, fail, say
 from casestudies.written import check_writable
-from toolchain.commands.usage import CommandLine
+from terminal.command_line import CommandLine
 
 LARGEST_FILE: Final = 1 << 28
 """Bytes of a file that are read at most; the largest of the collection have some 20 million."""

@@ -28,14 +28,14 @@ from casestudies.mrclam.recording import (
 )
 from casestudies.running import command, fail, run, say
 from casestudies.written import check_writable, write_numbers
-from toolchain.commands.usage import CommandLine
+from terminal.command_line import CommandLine
 
 if TYPE_CHECKING:
     from bridge.client import Publication
-    from bridge.protocol import RosVersion
-    from bridge.results import Posterior
+    from bridge.client.protocol import RosVersion
     from casestudies.listening import Listener
     from casestudies.truths import Instance
+    from posteriors.results import Posterior
 
 LOST_DISTANCE: Final = 9.0
 """What a frame without a result counts as, in metres: the width of the area."""

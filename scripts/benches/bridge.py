@@ -334,7 +334,7 @@ def codec() -> dict[str, float]:
     """Microseconds to write and read 1024 doubles: the standard library's JSON, and CBOR as client and hub have it."""
     import numpy as np
 
-    from bridge import cbor_codec
+    from bridge.codecs import cbor_codec
 
     message = {"op": "publish", "topic": "/t", "msg": message_of(LARGE)}
     as_array = message | {"msg": {"data": np.array(message_of(LARGE)["data"])}}

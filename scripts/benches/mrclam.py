@@ -25,7 +25,7 @@ from casestudies.mrclam.model import model
 from casestudies.mrclam.player import median_distance, play
 from casestudies.mrclam.recording import RecordedFrame, area_grid, read_recording
 from scripts.processes import ROOT, Process, build, run_script
-from toolchain.address import to_address
+from toolchain.deployment.address import to_address
 from toolchain.models import Model, exact_posterior
 
 TOPIC, TYPE = "/mrclam/sightings", "mrclam_msgs/Sightings"

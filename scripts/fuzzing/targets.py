@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 import orjson
 
-from bridge import cbor_codec, fields, json_codec, png
-from bridge.arrays import with_arrays, with_lists
-from bridge.errors import BridgeError, DecodeError, EncodeError, PathError
-from bridge.events import (
+from bridge import fields
+from bridge.client.protocol import ClientCore, Delivery
+from bridge.client.protocol.calls import MAX_CALLS
+from bridge.client.protocol.events import (
     CallAnswered,
     GoalEnded,
     GoalFeedback,
@@ -28,15 +28,16 @@ from bridge.events import (
     StatusReceived,
     Unusable,
 )
-from bridge.fragments import Reassembler, split
+from bridge.client.protocol.goals import MAX_GOALS
+from bridge.client.protocol.services import MAX_REQUESTS
+from bridge.codecs import cbor_codec, json_codec, png
+from bridge.codecs.arrays import with_arrays, with_lists
+from bridge.codecs.fragments import Reassembler, split
+from bridge.codecs.serialised import MessageTypes
+from bridge.errors import BridgeError, DecodeError, EncodeError, PathError
 from bridge.hub.broker import Broker
 from bridge.hub.limits import HubLimits
-from bridge.protocol import ClientCore, Delivery
-from bridge.protocol.calls import MAX_CALLS
-from bridge.protocol.goals import MAX_GOALS
-from bridge.protocol.services import MAX_REQUESTS
 from bridge.qos import Qos
-from bridge.serialised import MessageTypes
 
 LONGEST_SENTENCE = 700
 """Characters of an error's sentence: what arrived is quoted, not repeated."""

@@ -22,9 +22,9 @@ import numpy as np
 
 from bridge import stamps
 from bridge.client import Message, Qos, Ros, State, connect
+from bridge.client.protocol import Compression
+from bridge.codecs.serialised import MessageTypes
 from bridge.errors import BridgeError, EncodeError, GoalError, NoMessageError, ServiceError
-from bridge.protocol import Compression
-from bridge.serialised import MessageTypes
 from scripts.processes import ROOT, Process
 from scripts.verifications.checks import KINDS, CheckError, Kind, Tally, expect, on_servers, serving
 

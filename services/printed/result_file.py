@@ -13,7 +13,7 @@ from typing import Any, Final, Protocol
 
 import orjson
 
-from bridge.results import Heard, Posterior
+from posteriors.results import Heard, Posterior
 from services.errors import SettingsError
 from services.printed.result_picture import Axis
 

@@ -7,7 +7,7 @@ import sys
 import orjson
 
 from services.errors import ServiceError
-from services.generations import InForce
+from services.pipeline.generations import InForce
 from services.sockets.records import Published
 from toolchain.deployment import Deployment
 

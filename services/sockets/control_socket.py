@@ -15,9 +15,10 @@ import msgspec
 
 from pcie_shim.endpoint import Endpoint, listen, remove_listener
 from pcie_shim.errors import PcieShimError
-from services.errors import ControlError, ExitCode, NotReloadedError, ReportedError, exit_code_of
-from services.logs import say
+from services.errors import ControlError, NotReloadedError, ReportedError
 from services.supervision import CONTROL_SUFFIX
+from terminal.errors import ExitCode, exit_code_of
+from terminal.logs import say
 
 ORDER_LIMIT = 1 << 14
 """Bytes of the longest order: a folder's path of 4096 characters, each escaped, fits."""

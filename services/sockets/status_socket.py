@@ -25,9 +25,9 @@ import msgspec
 from pcie_shim.endpoint import Endpoint, listen, remove_listener
 from pcie_shim.errors import PcieShimError
 from services.errors import SettingsError
-from services.logs import say
 from services.supervision import leave_private_directory
 from services.version import VERSION
+from terminal.logs import say
 
 if TYPE_CHECKING:
     # boards and pcie-app start without the bridge

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bridge.cbor_codec import TYPED_ARRAYS, decode, encode, typed_array
+from bridge.codecs.cbor_codec import TYPED_ARRAYS, decode, encode, typed_array
 from bridge.errors import DecodeError, EncodeError
 
 FORMATS = {69: "H", 70: "I", 71: "Q", 72: "b", 77: "h", 78: "i", 79: "q", 85: "f", 86: "d"}
@@ -234,7 +234,7 @@ def test_typed_arrays_of_anything():
 
 def test_numpy_is_not_imported_until_it_is_wanted():
     code = (
-        "import sys; from bridge.cbor_codec import *; decode(encode({'a': typed_array([1.5], 'f8')}));"
+        "import sys; from bridge.codecs.cbor_codec import *; decode(encode({'a': typed_array([1.5], 'f8')}));"
         "assert 'numpy' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=240)

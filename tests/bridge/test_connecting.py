@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from bridge.client import State, connect
+from bridge.client.websocket import WebSocket
 from bridge.errors import (
     AccessRefusedError,
     BridgeError,
@@ -20,7 +21,6 @@ from bridge.errors import (
     UnreachableError,
     UriError,
 )
-from bridge.websocket import WebSocket
 from tests.fake_rosbridge import FakeRosbridge
 
 

@@ -12,12 +12,12 @@ import cbor2
 import numpy as np
 import pytest
 
-from bridge import cbor_codec, png
+from bridge.client.protocol import ClientCore, Delivery
+from bridge.client.protocol.events import GoalEnded, GoalFeedback, GoalStatus, MessageReceived, Unusable
+from bridge.client.protocol.goals import MAX_GOALS
+from bridge.codecs import cbor_codec, png
+from bridge.codecs.fragments import split
 from bridge.errors import OptionError, TypeConflictError
-from bridge.events import GoalEnded, GoalFeedback, GoalStatus, MessageReceived, Unusable
-from bridge.fragments import split
-from bridge.protocol import ClientCore, Delivery
-from bridge.protocol.goals import MAX_GOALS
 from bridge.qos import Qos
 
 CBOR = Delivery(compression="cbor")

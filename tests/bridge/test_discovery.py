@@ -73,7 +73,7 @@ async def test_without_a_network_one_sentence_says_so() -> None:
 def test_importing_this_imports_no_zeroconf() -> None:
     import subprocess
 
-    code = "import sys, bridge.discovery, services.discover; sys.exit('zeroconf' in sys.modules)"
+    code = "import sys, bridge.discovery, services.commands.discover; sys.exit('zeroconf' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False, timeout=PATIENCE).returncode == 0
 
 

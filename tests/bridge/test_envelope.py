@@ -5,9 +5,9 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from bridge.envelope import LONGEST, envelope_of, topic_of
-from bridge.events import MessageReceived, Unusable
-from bridge.protocol import ClientCore
+from bridge.client.protocol import ClientCore
+from bridge.client.protocol.events import MessageReceived, Unusable
+from bridge.codecs.envelope import LONGEST, envelope_of, topic_of
 
 CANONICAL = b'{"op":"publish","topic":"/t","msg":'
 

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from bridge.codecs.fragments import MAX_FRAGMENTS, Reassembler, split
 from bridge.errors import DecodeError
-from bridge.fragments import MAX_FRAGMENTS, Reassembler, split
 
 
 def fragment(num: object, data: str, total: object, key: object = "a") -> dict[str, object]:

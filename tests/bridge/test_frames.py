@@ -15,9 +15,9 @@ from websockets.server import ServerProtocol
 from websockets.uri import parse_uri
 from websockets.utils import accept_key
 
-from bridge import frames
-from bridge.frames import UNKNOWN, UNSOUND
-from bridge.websocket import WebSocket
+from bridge.client.websocket import WebSocket
+from bridge.transport import frames
+from bridge.transport.frames import UNKNOWN, UNSOUND
 
 SIZES = [0, 1, 125, 126, 127, 65_535, 65_536]
 #: Bytes of a message at most, in what is generated here.

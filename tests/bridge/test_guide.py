@@ -15,12 +15,12 @@ from typing import Any
 import pytest
 from websockets.asyncio.client import connect as plain_connect
 
-from bridge import fragments, goals, handles, json_codec, session, websocket
-from bridge.client import connect
-from bridge.hub.door import Door
-from bridge.protocol.calls import MAX_CALLS
-from bridge.protocol.goals import MAX_GOALS
-from bridge.protocol.services import MAX_REQUESTS
+from bridge.client import connect, goals, handles, session, websocket
+from bridge.client.protocol.calls import MAX_CALLS
+from bridge.client.protocol.goals import MAX_GOALS
+from bridge.client.protocol.services import MAX_REQUESTS
+from bridge.codecs import fragments, json_codec
+from bridge.hub.access import Door
 from tests.bridge.hub.sockets import running_hub
 
 GUIDE = Path(__file__).parents[2] / "docs" / "bridge.md"

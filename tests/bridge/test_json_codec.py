@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from bridge.codecs.json_codec import MAX_DEPTH, MAX_SIZE, decode, depth, encode, find_nonfinite
 from bridge.errors import DecodeError, EncodeError
-from bridge.json_codec import MAX_DEPTH, MAX_SIZE, decode, depth, encode, find_nonfinite
 
 numbers = st.integers(-(2**63), 2**64 - 1) | st.floats()
 values = st.recursive(
@@ -293,7 +293,7 @@ def test_the_limits_of_what_leaves():
 
 def test_numpy_is_not_imported():
     modules = "bridge.client, bridge.fields, bridge.stamps"
-    code = f"import sys, {modules}; from bridge.json_codec import encode; encode({{'a': 1.0}}); print('numpy' in sys.modules)"
+    code = f"import sys, {modules}; from bridge.codecs.json_codec import encode; encode({{'a': 1.0}}); print('numpy' in sys.modules)"
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=240
     )

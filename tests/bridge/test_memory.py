@@ -8,10 +8,10 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from bridge import cbor_codec
 from bridge.client import connect
-from bridge.fragments import split
-from bridge.protocol import Compression
+from bridge.client.protocol import Compression
+from bridge.codecs import cbor_codec
+from bridge.codecs.fragments import split
 from tests.fake_rosbridge import FakeRosbridge
 
 #: Bytes that may be more in use after many rounds than after few: caches, not one object a round.

@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
+from bridge.codecs.png import decode, encode
 from bridge.errors import DecodeError
-from bridge.png import decode, encode
 
 
 def picture(pixels: bytes, size: tuple[int, int], mode: str = "RGB", **options: object) -> str:

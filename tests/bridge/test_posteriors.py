@@ -21,8 +21,8 @@ from bridge.errors import (
     OptionError,
     UnreachableError,
 )
-from bridge.posteriors import listen, posteriors
-from bridge.results import FrameReport
+from posteriors.listening import listen, posteriors
+from posteriors.results import FrameReport
 from tests.fake_rosbridge import FakeRosbridge
 
 PATIENCE = 60.0
@@ -276,7 +276,7 @@ async def test_no_server():
 
 CTRL_C = """
 import os, signal, sys
-from bridge.posteriors import listen
+from posteriors.listening import listen
 def function(posterior):
     print("got", posterior.number, flush=True)
     if "{when}" == "inside":
@@ -307,7 +307,7 @@ async def test_ctrl_c_is_an_end_like_any_other(when):
 
 
 def test_numpy_is_not_imported_before_it_is_wanted():
-    code = "import sys, bridge.posteriors; sys.exit('numpy' in sys.modules)"
+    code = "import sys, posteriors.listening; sys.exit('numpy' in sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True, timeout=PATIENCE)
 
 

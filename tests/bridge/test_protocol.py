@@ -14,6 +14,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
+from bridge.client.protocol import ClientCore
+from bridge.client.protocol.calls import MAX_CALLS
+from bridge.client.protocol.events import (
+    CallAnswered,
+    MessageReceived,
+    ServiceRequested,
+    StatusReceived,
+    Unusable,
+)
+from bridge.client.protocol.services import MAX_REQUESTS
+from bridge.codecs.json_codec import MAX_DEPTH
 from bridge.errors import (
     BridgeError,
     EncodeError,
@@ -22,11 +33,6 @@ from bridge.errors import (
     SlowPeerError,
     TypeConflictError,
 )
-from bridge.events import CallAnswered, MessageReceived, ServiceRequested, StatusReceived, Unusable
-from bridge.json_codec import MAX_DEPTH
-from bridge.protocol import ClientCore
-from bridge.protocol.calls import MAX_CALLS
-from bridge.protocol.services import MAX_REQUESTS
 
 
 def connected(**options: Any) -> ClientCore:

@@ -36,7 +36,7 @@ def frame(
 @pytest.fixture(autouse=True)
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     """The server answers no farewell, so that it need not be waited for."""
-    monkeypatch.setattr("bridge.websocket.CLOSE_TIMEOUT", 0.02)
+    monkeypatch.setattr("bridge.client.websocket.CLOSE_TIMEOUT", 0.02)
 
 
 @contextlib.asynccontextmanager

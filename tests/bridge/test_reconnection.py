@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from bridge.client import Ros, State, connect
+from bridge.client.session import FIRST_DELAY, MAX_DELAY
 from bridge.errors import DisconnectedError, StateTimeoutError
-from bridge.session import FIRST_DELAY, MAX_DELAY
 from tests.fake_rosbridge import FakeRosbridge
 
 
@@ -24,7 +24,7 @@ def delays(monkeypatch: pytest.MonkeyPatch) -> list[float]:
             waits.append(delay)
         await sleep(0.001 if delay > 0 else 0)
 
-    monkeypatch.setattr("bridge.session.asyncio.sleep", no_sleep)
+    monkeypatch.setattr("bridge.client.session.asyncio.sleep", no_sleep)
     return waits
 
 
@@ -132,7 +132,7 @@ async def test_the_waits_double_up_to_five_seconds(delays):
 
 
 async def test_a_server_that_drops_everyone_is_not_stormed(delays, monkeypatch):
-    monkeypatch.setattr("bridge.session.STEADY", 600.0)
+    monkeypatch.setattr("bridge.client.session.STEADY", 600.0)
     async with FakeRosbridge() as fake, connect(fake.uri) as ros:
         for number in range(6):
             await fake.cut()
@@ -142,7 +142,7 @@ async def test_a_server_that_drops_everyone_is_not_stormed(delays, monkeypatch):
 
 
 async def test_a_steady_connection_begins_with_the_first_wait_again(delays, monkeypatch):
-    monkeypatch.setattr("bridge.session.STEADY", 0.0)
+    monkeypatch.setattr("bridge.client.session.STEADY", 0.0)
     async with FakeRosbridge() as fake, connect(fake.uri) as ros:
         for number in range(6):
             await fake.cut()
@@ -186,7 +186,7 @@ async def test_a_server_that_takes_no_message_of_that_size_is_told():
 
 
 async def test_a_goodbye_without_hanging_up_is_not_waited_for(monkeypatch):
-    monkeypatch.setattr("bridge.websocket.CLOSE_TIMEOUT", 0.2)
+    monkeypatch.setattr("bridge.client.websocket.CLOSE_TIMEOUT", 0.2)
     async with FakeRosbridge() as fake, connect(fake.uri) as ros:
         fake.freeze()
         (client,) = fake._clients
@@ -308,7 +308,7 @@ async def test_a_callback_that_fails_breaks_nothing(caplog):
 
 
 async def test_a_peer_that_does_not_say_goodbye_is_not_waited_for(monkeypatch):
-    monkeypatch.setattr("bridge.websocket.CLOSE_TIMEOUT", 0.2)
+    monkeypatch.setattr("bridge.client.websocket.CLOSE_TIMEOUT", 0.2)
     async with FakeRosbridge() as fake:
         ros = connect(fake.uri)
         await ros.__aenter__()

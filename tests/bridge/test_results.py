@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from bridge.errors import BadResultError, LabelError
-from bridge.results import (
+from posteriors.results import (
     WAITING,
     FrameReport,
     Pairing,

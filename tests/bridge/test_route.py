@@ -20,8 +20,8 @@ from websockets.asyncio.server import ServerConnection, serve
 from websockets.http11 import Request, Response
 
 from bridge.client import State, connect
+from bridge.client.route import shown
 from bridge.errors import AccessRefusedError, BridgeError, OptionError, UnreachableError, UriError
-from bridge.route import shown
 
 TOKEN = "s3cret-token"
 PATIENCE = 60.0
@@ -448,6 +448,6 @@ async def test_socks_without_its_package(monkeypatch):
     async def missing(*_: object) -> None:
         raise ImportError  # what websockets puts there when it finds no python-socks
 
-    monkeypatch.setattr("bridge.route.connect_socks_proxy", missing)
+    monkeypatch.setattr("bridge.client.route.connect_socks_proxy", missing)
     with pytest.raises(OptionError, match="needs the package python-socks"):
         await connect("ws://robot:9090", proxy="socks5h://127.0.0.1:1").__aenter__()

@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 
+from bridge.codecs.serialised import MessageTypes
 from bridge.errors import DecodeError, DefinitionError, NameFormError
-from bridge.serialised import MessageTypes
 
 ROS1, ROS2 = get_typestore(Stores.ROS1_NOETIC), get_typestore(Stores.LATEST)
 TYPES = MessageTypes()
@@ -195,7 +195,7 @@ def test_without_rosbags_one_sentence_says_so(monkeypatch):
 
 def test_nothing_heavy_is_imported_with_the_client():
     code = (
-        "import sys, bridge.client, bridge.serialised;"
+        "import sys, bridge.client, bridge.codecs.serialised;"
         "assert not {'rosbags', 'numpy', 'zeroconf'} & set(sys.modules), sorted(sys.modules)"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=240)

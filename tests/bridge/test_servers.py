@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from bridge.client import connect
+from bridge.codecs.serialised import MessageTypes
 from bridge.errors import NoAnswerError, NoMessageError, ServiceError
-from bridge.serialised import MessageTypes
 from tests.bridge.doubles import DEPTH, Double
 
 PATIENCE = 60.0

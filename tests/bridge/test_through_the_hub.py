@@ -15,6 +15,9 @@ from websockets.asyncio.client import ClientConnection
 from websockets.asyncio.client import connect as plain_connect
 
 from bridge.client import Ros, State, connect
+from bridge.client.goals import FEEDBACK_QUEUE_SIZE
+from bridge.client.protocol.events import GoalStatus
+from bridge.codecs.serialised import MessageTypes
 from bridge.errors import (
     ConcurrentReadError,
     DecodeError,
@@ -23,10 +26,7 @@ from bridge.errors import (
     GoalError,
     NoAnswerError,
 )
-from bridge.events import GoalStatus
-from bridge.goals import FEEDBACK_QUEUE_SIZE
 from bridge.qos import Qos
-from bridge.serialised import MessageTypes
 from tests.bridge.hub.sockets import PATIENCE, running_hub
 
 SCAN = {
@@ -211,7 +211,7 @@ async def test_feedback_that_nobody_reads_is_bounded():
 
 
 def _feedback(goal: Any, n: int) -> Any:
-    from bridge.events import GoalFeedback
+    from bridge.client.protocol.events import GoalFeedback
 
     return GoalFeedback(goal._identity, {"n": n})
 

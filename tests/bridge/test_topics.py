@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bridge import handles, stamps
-from bridge.client import Message, connect
+from bridge import stamps
+from bridge.client import Message, connect, handles
 from bridge.errors import (
     ConcurrentReadError,
     DisconnectedError,
@@ -345,7 +345,7 @@ async def test_what_the_server_says_about_it_is_passed_on():
 
 
 async def test_a_topic_of_unknown_type_is_found_when_it_appears(monkeypatch):
-    monkeypatch.setattr("bridge.session.ASK_AGAIN", 0.05)
+    monkeypatch.setattr("bridge.client.session.ASK_AGAIN", 0.05)
     async with FakeRosbridge() as fake, connect(fake.uri) as ros:
         subscription = ros.subscribe("/late")
         await fake.wait_for_op("subscribe", count=2, topic="/late")
@@ -361,7 +361,7 @@ async def test_a_topic_of_unknown_type_is_found_when_it_appears(monkeypatch):
 
 
 async def test_what_was_subscribed_before_connecting_is_asked_for_too(monkeypatch):
-    monkeypatch.setattr("bridge.session.ASK_AGAIN", 0.05)
+    monkeypatch.setattr("bridge.client.session.ASK_AGAIN", 0.05)
     async with FakeRosbridge() as fake:
         ros = connect(fake.uri)
         subscription = ros.subscribe("/late")

@@ -5,8 +5,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bridge.errors import BadResultError
-from bridge.results import FrameReport, Posterior
 from casestudies.truths import Truth, Truths, read_truth
+from posteriors.results import FrameReport, Posterior
 
 
 def test_a_truth():

@@ -18,8 +18,8 @@ from machines.posterior import joint_posterior
 from machines.reference import ReferenceBM1
 from pcie_shim.programming_file import read_image
 from tests.integration.conftest import READING, build_boat, stamp_of
-from toolchain.address import to_address
 from toolchain.deployment import load_deployment
+from toolchain.deployment.address import to_address
 from toolchain.models.fusion import exact_posterior
 
 LISTENER = str(Path(__file__).with_name("roslibpy_listener.py"))

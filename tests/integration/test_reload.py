@@ -30,9 +30,9 @@ from tests.integration.conftest import (
     stamp_of,
     status_of,
 )
-from toolchain.address import to_address
 from toolchain.analysis.emulation import EmulatedBoards
 from toolchain.deployment import load_deployment
+from toolchain.deployment.address import to_address
 
 LOOP = ("master", "--loop", "--connect-timeout", "30")
 

@@ -11,16 +11,16 @@ import textwrap
 import numpy as np
 import pytest
 
-from bridge.results import read_frame_report, read_posterior
 from machines.bm1 import Start
 from machines.posterior import joint_posterior
 from machines.reference import ReferenceReplicas
 from pcie_shim.driver import FrameInput
 from pcie_shim.programming_file import read_image
+from posteriors.results import read_frame_report, read_posterior
 from tests.integration.conftest import BIN, Robot
 from tests.pcie_shim.boards import expected_of_replicas
-from toolchain.address_array import to_addresses
 from toolchain.deployment import load_deployment
+from toolchain.deployment.address_array import to_addresses
 
 LINES = 6
 MODEL = f"""

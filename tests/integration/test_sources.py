@@ -16,8 +16,8 @@ import pytest
 
 from bridge.client import connect
 from bridge.errors import BridgeError
-from bridge.posteriors import posteriors
 from bridge.stamps import header
+from posteriors.listening import posteriors
 from tests.fake_rosbridge import FakeRosbridge
 from tests.integration.conftest import BIN
 

@@ -14,7 +14,7 @@ SERVICES = {"master", "subscriber", "publisher", "pcie-app", "board0", "board1",
 
 async def ask(stage, *options):
     """`status` as a user calls it: exit code, and what it printed."""
-    asked = stage.start("python", "-m", "services.status", *options)
+    asked = stage.start("python", "-m", "services.commands.status", *options)
     return await asked.end(), asked.out + asked.err
 
 

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from services.errors import ExitCode
 from services.supervision import DIRECTORY_VARIABLE, KEPT
+from terminal.errors import ExitCode
 
 _STANDS = {
     "in a function that C code calls back": """
@@ -38,7 +38,7 @@ except Exception:
 def test_a_signal_ends_a_process_wherever_it_stands(stands):
     code = f"""
 import signal, time
-from services.command_line import ends_well, make_app, raise_on_signals
+from terminal.running import ends_well, make_app, raise_on_signals
 app = make_app("wait")
 
 @app.command()
@@ -64,7 +64,7 @@ def test_a_child_that_ends_before_it_has_anything_open_tidies_up_after_a_killed_
         killed.bind(str(left / "master.status.sock"))
     code = """
 import signal
-from services.command_line import ends_well, make_app, raise_on_signals
+from terminal.running import ends_well, make_app, raise_on_signals
 app = make_app("wait")
 
 @app.command()
@@ -86,7 +86,7 @@ app()
 
 def test_another_exception_that_is_dropped_is_told_as_ever():
     code = """
-from services.command_line import raise_on_signals
+from terminal.running import raise_on_signals
 raise_on_signals()
 class Held:
     def __del__(self):
@@ -104,8 +104,8 @@ Held()
 def test_an_output_that_takes_nothing_more_is_one_sentence(printed):
     code = f"""
 from rich.console import Console
-from services.command_line import ends_well, make_app
-from services.logs import put_json
+from terminal.running import ends_well, make_app
+from terminal.logs import put_json
 app = make_app("print")
 
 @app.command()
@@ -133,7 +133,7 @@ app()
 def test_too_few_files_that_may_be_open_are_one_sentence():
     code = """
 import resource
-from services.command_line import ends_well, make_app, run_async
+from terminal.running import ends_well, make_app, run_async
 app = make_app("wait")
 
 async def work():

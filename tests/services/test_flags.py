@@ -6,11 +6,12 @@ import sys
 import pytest
 from typer.main import get_command
 
-from toolchain.commands.usage import CommandLine
+from terminal.command_line import CommandLine
 
 MODULES = (
-    *(f"services.{name}" for name in ("master", "subscriber", "publisher", "pcie_app", "board", "loader")),
-    *(f"services.{name}" for name in ("hub", "discover", "listen", "status")),
+    *(f"services.commands.{name}" for name in ("master", "board", "loader")),
+    *(f"services.pipeline.{name}" for name in ("subscriber", "publisher", "pcie_app")),
+    *(f"services.commands.{name}" for name in ("hub", "discover", "listen", "status")),
     *(f"casestudies.boat.{name}" for name in ("simulator", "normaliser", "viewer")),
     *("casestudies.mrclam.convert", "casestudies.mrclam.player", "toolchain.command"),
 )

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from services.errors import OverflowedQueueError, VariableError
-from services.frames import QUEUE_ALL_DEPTH, TELLING, UNPAIRED_DEPTH, FrameAssembler, WaitingFrames
+from services.pipeline.frames import QUEUE_ALL_DEPTH, TELLING, UNPAIRED_DEPTH, FrameAssembler, WaitingFrames
 from toolchain.deployment import Board, Deployment, Dimension, MachineSection, Source, Variable
 
 HASH = "0" * 64

@@ -93,7 +93,7 @@ async def found(timeout):
     return {robots}
 bridge.discovery.discover = found
 sys.argv = ["discover", *{arguments!r}]
-from services.discover import main
+from services.commands.discover import main
 main()
 """
     return _run(sys.executable, "-c", code)

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from services.errors import InputLineError
-from services.publisher import result_from_line
-from services.results import Inferred
-from services.standard_input import reading_from_line
+from services.pipeline.publisher import result_from_line
+from services.pipeline.results import Inferred
+from services.pipeline.standard_input import reading_from_line
 
 BIN = Path(sys.executable).parent
 

@@ -13,9 +13,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from bridge.results import FrameReport, Posterior
+from posteriors.results import FrameReport, Posterior
+from services.commands.listen import line
 from services.errors import SettingsError
-from services.listen import line
 from services.printed import result_file
 from services.printed.result_file import open_result_file, record
 from services.printed.result_picture import ROWS, Axis, axes_of, in_colour, picture

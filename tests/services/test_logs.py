@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 import websockets
 
-from services.logs import put_json, say, say_lines
-from toolchain.commands.one_line import one_line, shown
+from terminal.logs import put_json, say, say_lines
+from terminal.one_line import one_line, shown
 
 HOSTILE = "a\nerror: all is well\r\x1b[2J\x9b31m\x07\x08\x7f\u202eend\ud800"
 HARMLESS = "a\\nerror: all is well\\r\\x1b[2J\\x9b31m\\x07\\x08\\x7f\\u202eend\\ud800"
@@ -44,7 +44,7 @@ def test_what_is_said_is_a_line(capsys):
 def test_what_is_logged_is_a_line():
     code = f"""
 import logging
-from services.logs import get_logger, log_libraries
+from terminal.logs import get_logger, log_libraries
 log_libraries(logging.WARNING, "hub: %(message)s")
 get_logger("master").warning({HOSTILE!r}, reason={HOSTILE!r}, frame=7)
 logging.getLogger("bridge").warning("a topic: %s", {HOSTILE!r})

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from bridge.client import State
-from services.publisher import ResultTopics
+from services.pipeline.publisher import ResultTopics
 from services.settings import Settings
 from services.sockets.records import BoardOutcome, FrameResult, Publish
 from tests.fake_rosbridge import FakeRosbridge
@@ -80,7 +80,7 @@ async def test_results_go_on_where_a_server_is(boat):
 
 async def test_a_server_that_takes_nothing_keeps_nobody_else_from_results(boat, monkeypatch):
     async with FakeRosbridge() as first, FakeRosbridge() as second, topics_of(boat, first, second) as topics:
-        monkeypatch.setattr("bridge.handles.Publication.ready.__defaults__", (0.2,))
+        monkeypatch.setattr("bridge.client.handles.Publication.ready.__defaults__", (0.2,))
         second.freeze()
         (frozen,) = (publication for _, publication in topics._outputs if publication.topic == "/second")
         for _ in range(10_000):  # what the two sockets hold, and then some

@@ -6,15 +6,15 @@ import numpy as np
 import orjson
 import pytest
 
-from bridge.results import read_frame_report, read_posterior
 from machines.bm1 import StopReason
 from machines.parameters import SensorMode
 from pcie_shim.errors import FrameInputError
+from posteriors.results import read_frame_report, read_posterior
 from services.errors import VariableError
-from services.frames import FrameAssembler
-from services.mini_cluster import machine_inputs
+from services.pipeline.frames import FrameAssembler
+from services.pipeline.mini_cluster import machine_inputs
+from services.pipeline.results import FrameReport, Inferred, posterior_layout, times_of
 from services.printed.result_picture import axes_of
-from services.results import FrameReport, Inferred, posterior_layout, times_of
 from services.sockets.records import BoardOutcome, FrameResult, Publish
 from toolchain.build import assemble
 from toolchain.models.model import Known, Model, PriorSelect, dimension

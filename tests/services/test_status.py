@@ -12,7 +12,8 @@ import msgspec
 import pytest
 from rich.console import Console
 
-from services import ready, status
+from services import ready
+from services.commands import status
 from services.errors import SettingsError
 from services.printed.stack_status import screen
 from services.sockets.status_socket import (
@@ -263,7 +264,7 @@ async def test_exit_codes_and_json(places):
 def subprocess_status(places, *arguments):
     environment = {"PATH": "/usr/bin:/bin", "TMPDIR": str(places)}
     return subprocess.run(
-        [sys.executable, "-m", "services.status", *arguments],
+        [sys.executable, "-m", "services.commands.status", *arguments],
         capture_output=True,
         text=True,
         env=environment,
@@ -276,7 +277,7 @@ async def test_watching_prints_a_line_every_second_until_it_is_ended(places):
     run = make_run(places, "it")
     async with served(run, master=process()):
         watching = await asyncio.create_subprocess_exec(
-            *(sys.executable, "-m", "services.status", "--watch", "--json", "--directory", str(run)),
+            *(sys.executable, "-m", "services.commands.status", "--watch", "--json", "--directory", str(run)),
             stdout=asyncio.subprocess.PIPE,
             stderr=asyncio.subprocess.PIPE,
         )

@@ -6,7 +6,7 @@ import sys
 import pytest
 
 LINES = """
-from services.logs import get_logger
+from terminal.logs import get_logger
 log = get_logger("pcie-app", {level!r})
 log.debug("computed", frame=17, cycles=512)
 log.debug("computed", frame=170, cycles=512)

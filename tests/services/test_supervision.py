@@ -14,8 +14,9 @@ from pathlib import Path
 import psutil
 import pytest
 
-from services.errors import ExitCode, ServiceError
+from services.errors import ServiceError
 from services.supervision import KEPT, RESTARTS, Child, PrivateDirectory, end_all, make_private_directory
+from terminal.errors import ExitCode
 
 PATIENCE = 50.0
 

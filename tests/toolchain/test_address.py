@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from toolchain.address import to_address
 from toolchain.deployment import Variable
+from toolchain.deployment.address import to_address
 from toolchain.errors import NotANumberError, ReadingError, ReadingMissingError, ValueOutOfRangeError
 
 NUMBERS = st.floats(allow_nan=False, allow_infinity=False) | st.integers()

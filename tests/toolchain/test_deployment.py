@@ -33,7 +33,7 @@ from toolchain.deployment import (
     load_deployment,
     write_deployment,
 )
-from toolchain.deployment_fields import MESSAGE_PATH
+from toolchain.deployment.fields import MESSAGE_PATH
 from toolchain.errors import DamagedDeploymentError, DeploymentError, DeploymentVersionError
 
 
@@ -410,7 +410,7 @@ def test_an_absent_image_is_named(with_images):
 
 
 def test_a_subscriber_needs_no_numpy():
-    code = "import sys, toolchain.deployment, toolchain.address; print('numpy' in sys.modules)"
+    code = "import sys, toolchain.deployment, toolchain.deployment.address; print('numpy' in sys.modules)"
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=240
     )

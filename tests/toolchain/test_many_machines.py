@@ -19,8 +19,6 @@ from machines.kernel import make_kernel
 from machines.parameters import RngKind, SensorMode
 from machines.posterior import posterior
 from pcie_shim.programming_file import read_image
-from toolchain.address import to_address
-from toolchain.address_array import MISSING, to_addresses
 from toolchain.analysis.accuracy import measure
 from toolchain.analysis.boards_needed import boards_needed
 from toolchain.analysis.device import DEVICES
@@ -32,6 +30,8 @@ from toolchain.build import BuildError, assemble, build_deployment
 from toolchain.checks.check import check_deployment, check_model
 from toolchain.command import app
 from toolchain.deployment import REPLICA, Deployment, Stop, Variable, load_deployment
+from toolchain.deployment.address import to_address
+from toolchain.deployment.address_array import MISSING, to_addresses
 from toolchain.errors import NotANumberError, ReadingError, ReadingMissingError, ValueOutOfRangeError
 from toolchain.models.fusion import exact_posterior
 from toolchain.models.model import Known, Model, PriorSelect, dimension

@@ -11,9 +11,9 @@ from machines.encode import decode_code
 from machines.parameters import PriorMode
 from machines.posterior import posterior
 from pcie_shim.programming_file import read_image
-from toolchain.address import to_address
 from toolchain.build import build_deployment
 from toolchain.deployment import Variable, WrittenPrior, load_deployment
+from toolchain.deployment.address import to_address
 from toolchain.errors import BuildError, DeploymentError, ModelError, ReadingError
 from toolchain.models.distribution import table, uniform
 from toolchain.models.fusion import exact_posterior, fuse

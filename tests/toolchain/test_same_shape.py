@@ -13,7 +13,7 @@ from toolchain.deployment import (
     Variable,
     WrittenPrior,
 )
-from toolchain.same_shape import differences
+from toolchain.deployment.same_shape import differences
 
 SOURCE = Source(uri="ws://a:9090", topic="/boat/sensors", type="boat_msgs/Sensors")
 D1 = Variable(name="D1", bits=7, values=101)

@@ -12,9 +12,9 @@ from bridge.errors import PathError
 from bridge.fields import parse_path
 from toolchain.command import app
 from toolchain.deployment import Variable, deployment_hash, load_deployment, write_deployment
-from toolchain.deployment_fields import MESSAGE_PATH
+from toolchain.deployment.fields import MESSAGE_PATH
+from toolchain.deployment.sources import read_sources
 from toolchain.errors import BuildError
-from toolchain.sources import read_sources
 
 MODEL = """
 import numpy as np

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from machines.encode import decode_code
-from toolchain.address import to_address
+from toolchain.deployment.address import to_address
 from toolchain.errors import BuildError, ModelError, ReadingError
 from toolchain.flag_values import key_values
 from toolchain.learning.recording import read_recording

@@ -15,10 +15,10 @@ from toolchain.board_interface import DEFAULT_INTERFACE
 from toolchain.build import build_date, build_deployment, check_options, machine_parameters
 from toolchain.commands.named_model import model_file, read_model
 from toolchain.deployment import parse_interface
+from toolchain.deployment.sources import read_sources
 from toolchain.errors import BuildError
 from toolchain.outputs.rng_table import LENGTH, read_table
 from toolchain.report import REPORT_NAME
-from toolchain.sources import read_sources
 
 if TYPE_CHECKING:
     from pathlib import Path

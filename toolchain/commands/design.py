@@ -5,8 +5,8 @@ from typing import Annotated, TypeAlias
 
 import typer
 
+from terminal.refusals import one_sentence
 from toolchain.commands import flags
-from toolchain.commands.refusals import one_sentence
 from toolchain.deployment import Stop
 from toolchain.errors import BuildError
 from toolchain.options import OnMissing

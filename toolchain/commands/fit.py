@@ -9,8 +9,8 @@ from itertools import chain
 from statistics import fmean, median
 from typing import TYPE_CHECKING, Final
 
-from toolchain.address import to_address
 from toolchain.analysis.readings import reading_columns
+from toolchain.deployment.address import to_address
 from toolchain.errors import BuildError, ModelError, ReadingError
 from toolchain.flag_values import key_values
 from toolchain.learning.fit import LEAST_READINGS, Support, fit_model, locate

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Annotated, TypeAlias
 
 import typer
 
+from terminal.command_line import CommandLine
+from terminal.refusals import one_sentence
 from toolchain.commands import flags
-from toolchain.commands.refusals import one_sentence
-from toolchain.commands.usage import CommandLine
 from toolchain.deployment import FILE_NAME, Queue, Stop
 from toolchain.options import OnMissing
 

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from toolchain.address import to_address
+from toolchain.deployment.address import to_address
 from toolchain.errors import ModelError, ReadingError
 from toolchain.learning.fit_options import FitMethod, FitOptions, FitPrior
 from toolchain.learning.fitted import Fit, FitFile, FittedRecording, FittedVariable, mean_slopes, wrapped

@@ -12,10 +12,10 @@ import numpy as np
 import tomli_w
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from toolchain.deployment.toml_file import parse_toml, read_text, validate
 from toolchain.errors import ModelError
 from toolchain.models.conditional import normal_table, wrapped_normal_table
 from toolchain.models.model import Known, Model, Normal
-from toolchain.toml_file import parse_toml, read_text, validate
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from toolchain.deployment import Dimension, Variable
-from toolchain.deployment_fields import NAME_MAX
+from toolchain.deployment.fields import NAME_MAX
 from toolchain.errors import ModelError
 
 if TYPE_CHECKING:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from math import inf
 from typing import Any, Literal
 
-from bridge import cbor_codec
+from bridge.codecs import cbor_codec
 from bridge.hub.broker import Broker
 from bridge.hub.graph import Client
 from bridge.hub.limits import HubLimits

@@ -13,7 +13,7 @@ from typing import Any, Literal
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.frames import Frame, Opcode
 
-from bridge.hub.door import Door
+from bridge.hub.access import Door
 from bridge.hub.limits import HubLimits
 from bridge.hub.server import serve_hub
 

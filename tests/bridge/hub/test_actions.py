@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from bridge.events import GoalStatus
+from bridge.client.protocol.events import GoalStatus
 from tests.bridge.hub.room import Guest, Room
 
 TYPE = "example_interfaces/action/Fibonacci"

@@ -8,7 +8,7 @@ import pytest
 from websockets.asyncio.client import connect
 from websockets.exceptions import InvalidStatus
 
-from bridge.hub.door import Door, is_loopback, read_tokens, tls_context
+from bridge.hub.access import Door, is_loopback, read_tokens, tls_context
 from bridge.hub.errors import HubError
 from tests.bridge.hub.sockets import PATIENCE, Bare, Ears, running_hub
 

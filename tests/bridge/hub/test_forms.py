@@ -10,10 +10,10 @@ from typing import Any
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
-from bridge import cbor_codec, png
-from bridge.fragments import Reassembler
+from bridge.codecs import cbor_codec, png
+from bridge.codecs.fragments import Reassembler
 from bridge.hub import topics
-from bridge.hub.forms import Message
+from bridge.hub.encodings import Message
 from tests.bridge.hub.room import WALL_CLOCK, Guest, Room
 
 ARRAY = "std_msgs/Float64MultiArray"

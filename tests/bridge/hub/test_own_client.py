@@ -6,8 +6,8 @@ from typing import Any
 import pytest
 
 from bridge.client import connect
+from bridge.client.session import State
 from bridge.errors import ServiceError
-from bridge.session import State
 from tests.bridge.hub.sockets import PATIENCE, running_hub
 
 

@@ -9,12 +9,12 @@ from websockets.asyncio.client import connect
 from websockets.exceptions import InvalidStatus
 from websockets.frames import Frame, Opcode
 
-from bridge import frames
 from bridge.hub import server
-from bridge.hub.door import Door
+from bridge.hub.access import Door
 from bridge.hub.errors import HubError
 from bridge.hub.limits import HubLimits
 from bridge.hub.server import serve_hub
+from bridge.transport import frames
 from tests.bridge.hub.sockets import PATIENCE, Bare, client, running_hub
 
 

@@ -12,7 +12,7 @@ from casestudies.mrclam.landmarks import Landmark, read_landmarks
 from casestudies.mrclam.model import model
 from casestudies.mrclam.recording import area_grid
 from machines.encode import decode_code
-from toolchain.address import to_address
+from toolchain.deployment.address import to_address
 from toolchain.errors import ModelError
 from toolchain.models.case_study import load_model
 from toolchain.models.fusion import exact_posterior, fuse

@@ -11,9 +11,9 @@ import sys
 import pytest
 
 from bridge.errors import BadResultError, BridgeError, NoResultError
-from bridge.results import Posterior
 from casestudies.mrclam.player import LOST_DISTANCE, PlayedFrame, median_distance, play
 from casestudies.mrclam.recording import SIGHTINGS_TOPIC, RecordedFrame, Sighting, area_grid
+from posteriors.results import Posterior
 from tests.casestudies.pretend_stack import PretendStack, certain
 from tests.fake_rosbridge import FakeRosbridge
 

@@ -9,13 +9,14 @@ import sys
 import pytest
 
 from pcie_shim.endpoint import Endpoint
-from services.errors import NotReloadedError, SettingsError, ShapeError, StoppedError
-from services.generations import Generations
-from services.mini_cluster import Boards
-from services.running.new_deployment import forget, keep, read_new
+from services.errors import NotReloadedError, SettingsError, ShapeError
+from services.master.new_deployment import forget, keep, read_new
+from services.pipeline.generations import Generations
+from services.pipeline.mini_cluster import Boards
 from services.settings import Settings
 from services.sockets.records import Hello, NotReloaded, Prepare, Prepared, Switch, Switched
 from services.supervision import DIRECTORY_VARIABLE, Child, PrivateDirectory
+from terminal.errors import StoppedError
 from tests.integration.conftest import build_boat
 from toolchain.deployment import load_deployment
 from toolchain.regenerate import DeploymentEdits, regenerate_deployment

@@ -7,12 +7,12 @@ import time
 import pytest
 
 from services.errors import ChildDiedError
-from services.generations import InForce
-from services.logs import get_logger
-from services.running.peers import Peer, Peers
+from services.master.peers import Peer, Peers
+from services.pipeline.generations import InForce
 from services.settings import Settings
 from services.sockets.serving import endpoint_from
 from services.supervision import Child
+from terminal.logs import get_logger
 from tests.integration.conftest import build_boat
 from toolchain.deployment import load_deployment
 

@@ -5,10 +5,10 @@ from types import SimpleNamespace
 
 import pytest
 
-from services.frames import QUEUE_ALL_DEPTH
-from services.generations import InForce
-from services.running.peers import Peer
-from services.running.reload import LOST_IN_RELOAD, Reloads, what_became_of
+from services.master.peers import Peer
+from services.master.reload import LOST_IN_RELOAD, Reloads, what_became_of
+from services.pipeline.frames import QUEUE_ALL_DEPTH
+from services.pipeline.generations import InForce
 from services.settings import Settings
 from services.sockets.control_socket import ReloadOrder
 from services.sockets.records import Prepare, Prepared, Reading, Switched

@@ -6,10 +6,10 @@ import msgspec
 import pytest
 
 from services.errors import OverflowedQueueError
-from services.frames import QUEUE_ALL_DEPTH, WaitingFrames
-from services.running.peers import Peer
-from services.running.reload import LOST_IN_RELOAD
-from services.running.run import MISSED, Master
+from services.master.peers import Peer
+from services.master.reload import LOST_IN_RELOAD
+from services.master.run import MISSED, Master
+from services.pipeline.frames import QUEUE_ALL_DEPTH, WaitingFrames
 from services.settings import Settings
 from services.sockets.control_socket import ReloadOrder
 from services.sockets.records import (

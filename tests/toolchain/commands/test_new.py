@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from toolchain.address import to_address
 from toolchain.command import app
 from toolchain.deployment import load_deployment
+from toolchain.deployment.address import to_address
 from toolchain.models.case_study import load_model
 from toolchain.models.fusion import exact_posterior
 

@@ -10,7 +10,7 @@ from typing import Annotated
 import pytest
 import typer
 
-from toolchain.commands.usage import CommandLine
+from terminal.command_line import CommandLine
 
 
 class Colour(StrEnum):
@@ -108,11 +108,9 @@ def test_no_command_is_answered_with_help(capsys):
 @pytest.mark.parametrize(
     "name",
     [
-        *(
-            f"services.{name}"
-            for name in ("master", "subscriber", "publisher", "pcie_app", "board", "loader")
-        ),
-        *(f"services.{name}" for name in ("hub", "discover", "listen", "status")),
+        *(f"services.commands.{name}" for name in ("master", "board", "loader")),
+        *(f"services.pipeline.{name}" for name in ("subscriber", "publisher", "pcie_app")),
+        *(f"services.commands.{name}" for name in ("hub", "discover", "listen", "status")),
         *(f"casestudies.boat.{name}" for name in ("simulator", "normaliser", "viewer")),
         "casestudies.mrclam.convert",
         "casestudies.mrclam.player",
@@ -131,7 +129,7 @@ def test_every_command_has_it(capsys, name):
 @pytest.mark.parametrize("arguments", [["--help"], ["paint", "shed"]])
 def test_a_full_disk_behind_the_output_is_one_sentence(arguments):
     program = (
-        "from toolchain.commands.usage import CommandLine\n"
+        "from terminal.command_line import CommandLine\n"
         "app = CommandLine()\n"
         "app.callback()(lambda: None)\n"
         "app.command('paint')(lambda wall: print('painted', wall))\n"

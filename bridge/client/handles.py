@@ -1,0 +1,452 @@
+"""What a program holds of a client: subscriptions that it reads, publications it writes, services it serves."""
+
+import asyncio
+import logging
+import time
+from collections import deque
+from collections.abc import Awaitable, Callable, Mapping
+from math import inf
+from typing import Any, Final, Self
+
+from bridge.client.protocol.events import ServiceRequested
+from bridge.client.protocol.subscription_options import Delivery
+from bridge.client.session import Message, Session, State
+from bridge.errors import (
+    BridgeError,
+    ConcurrentReadError,
+    DisconnectedError,
+    NoMessageError,
+    OptionError,
+    ServiceError,
+    SlowPeerError,
+)
+from bridge.names import absolute, same_type
+from bridge.qos import Qos
+
+#: Messages that wait in a subscription for their reader, unless it says otherwise.
+QUEUE_SIZE: Final = 64
+#: Publications of one topic that may wait for a slow server, unless it says otherwise.
+PUBLISH_QUEUE_SIZE: Final = 100
+#: Seconds that finding out why a topic is silent may take.
+EXPLAIN_TIMEOUT: Final = 0.5
+
+#: Seconds that who waits for one message stays awake, if the one before came within that time.
+_AWAKE: Final = 200e-6
+
+Handler = Callable[[dict[str, Any]], Awaitable[Mapping[str, Any] | None]]
+
+_log = logging.getLogger("bridge")
+
+
+class _Handle:
+    """Something that is closed once: by itself, by leaving its ``async with``, or with its client."""
+
+    def __init__(self, session: Session) -> None:
+        if session.state is State.CLOSED:
+            raise DisconnectedError(f"the client of {session.uri} was closed: connect() makes a new one")
+        self._session = session
+        self._closed = False
+
+    def _begin(self) -> None:
+        """Take note that the server has been told: from now on there is something to close."""
+        self._session.on_closed.add(self.end)
+        self._session.flush()
+
+    def end(self) -> None:
+        """Take note that the client was closed: nothing more comes or goes."""
+        self._closed = True
+
+    def _take_back(self) -> None:
+        """Tell the server that this is not wanted any more."""
+        raise NotImplementedError
+
+    async def close(self) -> None:
+        """Tell the server that this is not wanted any more. May be called again."""
+        if not self._closed:
+            self.end()
+            self._session.on_closed.discard(self.end)
+            self._take_back()
+            self._session.flush()
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *_exception: object) -> None:
+        await self.close()
+
+
+class Subscription(_Handle):
+    """The messages of one topic, to be read by one task: ``async for message in subscription``.
+
+    If the reader is too slow the oldest messages are dropped, and nothing else slows down. A lost connection does
+    not end the iteration, messages go on after the reconnection; closing this or the client does.
+
+    Attributes:
+        topic: what was subscribed to.
+        lost: how many messages were dropped because the queue was full.
+        blind_seconds: how long, all in all, nothing could be heard because the connection was lost; each
+            message says how long it was just before it.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        topic: str,
+        type_name: str | None,
+        *,
+        throttle_rate: int,
+        queue_length: int,
+        queue_size: int,
+        delivery: Delivery,
+    ) -> None:
+        """Subscribe (see `bridge.client.Ros.subscribe`)."""
+        super().__init__(session)
+        if queue_size < 1:
+            raise OptionError(f"queue_size of topic {topic} must be at least 1, not {queue_size}")
+        self.topic = topic
+        self.lost = 0
+        self.blind_seconds = 0.0
+        self._blind = 0.0
+        self._begun = time.monotonic()
+        self._type = type_name
+        self._size = queue_size
+        self._queue: deque[Message] = deque(maxlen=queue_size)
+        self._waiter: asyncio.Future[None] | None = None
+        self._asleep = False  # and not woken yet
+        self._answered_at_once = False
+        self._deadline = inf  # of who waits
+        self._alarm: asyncio.TimerHandle | None = None
+        self._rings = inf
+        self._number = session.core.subscriptions.subscribe(
+            topic, type_name, throttle_rate=throttle_rate, queue_length=queue_length, delivery=delivery
+        )
+        session.receivers[self._number] = self._receive
+        session.on_blind.add(self._note_blind)
+        self._begin()
+        session.ask_later()
+
+    def _receive(self, message: Message) -> None:
+        queue = self._queue
+        if self._blind:
+            message = message._replace(blind_seconds=self._blind)
+            self._blind = 0.0
+        if len(queue) == self._size:
+            self.lost += 1
+            if queue[0].blind_seconds:
+                message = self._keep_blind(message)
+        queue.append(message)
+        if self._asleep:
+            self._wake()
+
+    def _note_blind(self, seconds: float) -> None:
+        seconds = min(seconds, time.monotonic() - self._begun)
+        self._blind += seconds
+        self.blind_seconds += seconds
+
+    def _keep_blind(self, message: Message) -> Message:
+        """The message that comes next says how long it was dark before the one that is dropped now."""
+        queue = self._queue
+        heir = queue[1] if self._size > 1 else message
+        heir = heir._replace(blind_seconds=heir.blind_seconds + queue[0].blind_seconds)
+        if self._size == 1:
+            return heir
+        queue[1] = heir
+        return message
+
+    def __aiter__(self) -> Self:
+        return self
+
+    async def __anext__(self) -> Message:
+        queue = self._queue
+        while not queue:
+            if self._closed:
+                raise StopAsyncIteration
+            await self._news()
+        return queue.popleft()
+
+    async def _news(self, awake_until: float = 0.0) -> None:
+        """Wait until something has come, the subscription has ended, or the time is over (see `next`).
+
+        Args:
+            awake_until: monotonic seconds up to which the process does not fall asleep over it. Who answers at once
+                is heard sooner so: to fall asleep and be woken takes longer than an answer by way of the hub.
+        """
+        self._check_alone()
+        waiter = self._waiter = asyncio.get_running_loop().create_future()
+        try:
+            while awake_until:
+                await asyncio.sleep(0)  # the loop looks at its sockets, and other tasks have their turn
+                if self._queue or waiter.done():
+                    return
+                if time.monotonic() >= awake_until:
+                    break
+            self._asleep = True
+            await waiter
+        finally:
+            self._waiter, self._asleep = None, False
+
+    def _check_alone(self) -> None:
+        if self._waiter is not None:
+            raise ConcurrentReadError(
+                f"another task waits for messages of {self.topic} already: a second reader needs a "
+                "subscription of its own"
+            )
+
+    def _wake(self) -> None:
+        waiter, self._asleep = self._waiter, False
+        if waiter is not None and not waiter.done():
+            waiter.set_result(None)
+
+    def _set_alarm(self, now: float) -> None:
+        """See that whoever waits is woken at the deadline.
+
+        An alarm that was set before and rings earlier serves too: it is set again then. So one is set now and then, not
+        for each message: that would take longer than all the rest.
+        """
+        if self._alarm is not None:
+            if self._rings <= self._deadline:
+                return
+            self._alarm.cancel()
+        self._rings = self._deadline
+        delay = max(self._deadline - now, 0)
+        self._alarm = asyncio.get_running_loop().call_later(delay, self._ring)
+
+    def _ring(self) -> None:
+        self._alarm = None
+        now = time.monotonic()
+        if self._deadline <= now:
+            self._wake()
+        elif self._deadline != inf:
+            self._set_alarm(now)
+
+    async def next(self, timeout: float) -> Message:  # noqa: ASYNC109  # the limit is part of the error
+        """Wait for one message.
+
+        Args:
+            timeout: seconds.
+
+        Raises:
+            NoMessageError: none came in time; the sentence names topic, server and time, and what the server
+                knows about the topic if it can be asked (which takes half a second more at most).
+            DisconnectedError: subscription or client are closed.
+            ConcurrentReadError: another task waits here.
+        """
+        queue = self._queue
+        if queue:
+            return queue.popleft()
+        self._check_alone()
+        now = begun = time.monotonic()
+        self._deadline = begun + timeout
+        self._set_alarm(begun)
+        try:
+            while True:
+                if self._closed:
+                    raise DisconnectedError(f"the subscription of {self.topic} is closed")
+                if now >= self._deadline:
+                    break
+                awake_until = now + _AWAKE
+                await self._news(awake_until if self._answered_at_once else 0.0)
+                now = time.monotonic()
+                if queue:
+                    self._answered_at_once = now < awake_until
+                    return queue.popleft()
+        finally:
+            self._deadline = inf
+        why = await self._why_silent(begun)
+        raise NoMessageError(
+            f"no message of {self.topic} came from {self._session.uri} within {timeout:g} s{why}"
+        )
+
+    async def _why_silent(self, begun: float) -> str:
+        """What can be known about the topic's silence since a time, as the end of a sentence."""
+        session = self._session
+        if session.state is not State.CONNECTED:
+            return f"; the connection is {session.state}: {session.last_error}"
+        try:
+            async with asyncio.timeout(EXPLAIN_TIMEOUT):
+                known = await ask_rosapi(session, "topic_type", {"topic": self.topic}, EXPLAIN_TIMEOUT)
+                its_type = known.get("type")
+                if its_type == "":
+                    return "; the server does not know the topic"
+                if (
+                    isinstance(its_type, str)
+                    and self._type is not None
+                    and not same_type(its_type, self._type)
+                ):
+                    return f"; the server knows it as {its_type[:80]}, not as {self._type}"
+                found = await ask_rosapi(session, "publishers", {"topic": self.topic}, EXPLAIN_TIMEOUT)
+                if found.get("publishers") == []:
+                    return "; nobody publishes it"
+        except TimeoutError:  # a server without rosapi says so at once
+            return session.said_since(begun) or (
+                f"; nor did it answer a call of rosapi within {EXPLAIN_TIMEOUT:g} s: is it a rosbridge server?"
+            )
+        return session.said_since(begun)
+
+    def end(self) -> None:
+        """End the iteration, after what waits in the queue."""
+        super().end()
+        if self._alarm is not None:
+            self._alarm.cancel()
+            self._alarm = None
+        self._wake()
+
+    def _take_back(self) -> None:
+        del self._session.receivers[self._number]
+        self._session.on_blind.discard(self._note_blind)
+        self._session.core.subscriptions.unsubscribe(self._number)
+
+
+class Publication(_Handle):
+    """One advertised topic.
+
+    Attributes:
+        topic: its name.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        topic: str,
+        type_name: str,
+        *,
+        latch: bool,
+        queue_size: int,
+        qos: Qos | None,
+    ) -> None:
+        """Advertise (see `bridge.client.Ros.advertise`)."""
+        super().__init__(session)
+        if queue_size < 1:
+            raise OptionError(f"queue_size of topic {topic} must be at least 1, not {queue_size}")
+        self.topic = topic
+        self._size = queue_size
+        self._waiting = 0
+        self._publications = session.core.publications
+        self._number = self._publications.advertise(
+            topic, type_name, latch=latch, queue_size=queue_size, qos=qos
+        )
+        self._begin()
+
+    async def publish(self, msg: Mapping[str, Any], *, timeout: float = 5.0) -> None:  # noqa: ASYNC109  # as above
+        """Send one message; returns when the socket has it.
+
+        It goes out at once while the server keeps up; if not, it waits for its turn. Nothing is kept for later
+        over a lost connection: old readings are worth nothing after it.
+
+        Args:
+            msg: the ROS message; values may be NumPy arrays.
+            timeout: seconds that it may wait for a slow server.
+
+        Raises:
+            DisconnectedError: there is no connection now, or the publication or the client are closed.
+            SlowPeerError: the server did not take it in time, or as many as ``queue_size`` wait already.
+            EncodeError: it cannot be sent as JSON; a NaN or infinity is named with its place.
+        """
+        session = self._session
+        if session.must_wait():
+            if self._waiting >= self._size:
+                raise SlowPeerError(
+                    f"{session.uri} does not keep up: {self._waiting} messages of {self.topic} wait already"
+                )
+            self._waiting += 1
+            try:
+                await session.wait_turn(f"a message of {self.topic}", timeout)
+            finally:
+                self._waiting -= 1
+        session.send_now(self._written(msg))
+        if session.is_others_turn():
+            await asyncio.sleep(0)
+
+    @property
+    def must_wait(self) -> bool:
+        """Whether a message would have to wait now: for a slow server, or for a connection."""
+        session = self._session
+        return session.state is not State.CONNECTED or not session.is_open or session.must_wait()
+
+    async def ready(self, timeout: float = 5.0) -> None:  # noqa: ASYNC109  # as above
+        """Wait until the server has taken what was sent before.
+
+        Raises:
+            DisconnectedError: there is no connection now, or it was lost meanwhile.
+            SlowPeerError: the server did not take it within ``timeout`` seconds.
+        """
+        if self._session.must_wait():
+            await self._session.wait_turn(f"a message of {self.topic}", timeout)
+
+    def publish_nowait(self, msg: Mapping[str, Any]) -> None:
+        """Send one message at once or not at all: for who must not wait.
+
+        Raises:
+            SlowPeerError: the server has not taken what was sent before; nothing was sent.
+            DisconnectedError, EncodeError: as `publish`.
+        """
+        session = self._session
+        if session.must_wait():
+            raise SlowPeerError(
+                f"{session.uri} does not keep up: a message of {self.topic} would have to wait for its turn"
+            )
+        session.send_now(self._written(msg))
+
+    def _written(self, msg: Mapping[str, Any]) -> bytes:
+        if self._closed:
+            raise DisconnectedError(f"{self.topic} is not advertised any more: its publication was closed")
+        return self._publications.publish(self._number, msg)
+
+    def _take_back(self) -> None:
+        self._publications.unadvertise(self._number)
+
+
+class Service(_Handle):
+    """One service that this client serves.
+
+    Attributes:
+        name: the service's name.
+    """
+
+    def __init__(
+        self, session: Session, name: str, type_name: str, handler: Handler, handler_timeout: float
+    ) -> None:
+        """Advertise (see `bridge.client.Ros.advertise_service`)."""
+        super().__init__(session)
+        self.name = name
+        self._handler = handler
+        self._limit = handler_timeout
+        session.core.services.advertise(name, type_name)
+        session.servers[absolute(name)] = self._serve
+        self._begin()
+
+    async def _serve(self, request: ServiceRequested) -> None:
+        """Answer one request, whatever its handler does."""
+        values: Mapping[str, Any] | str
+        ok = False
+        try:
+            async with asyncio.timeout(self._limit):
+                values = await self._handler(request.args) or {}
+            ok = True
+        except ServiceError as error:
+            values = error.reason
+        except TimeoutError:
+            values = f"{self.name} did not finish within {self._limit:g} s"
+        except Exception as error:
+            _log.exception("the handler of service %s failed", self.name)
+            values = f"{self.name} failed: {type(error).__name__}"
+        answer = self._session.core.services.answer
+        try:
+            answer(request.ticket, values, ok=ok)
+        except BridgeError as error:
+            _log.error("the answer of service %s cannot be sent: %s", self.name, error)
+            answer(request.ticket, f"the answer cannot be sent: {error}", ok=False)
+        self._session.flush()
+
+    def _take_back(self) -> None:
+        del self._session.servers[absolute(self.name)]
+        self._session.core.services.unadvertise(self.name)
+
+
+async def ask_rosapi(session: Session, name: str, args: Mapping[str, Any], limit: float) -> dict[str, Any]:
+    """A rosapi service's answer; nothing where there is none: rosapi is an extra that many servers lack."""
+    try:
+        answer = await session.call(f"/rosapi/{name}", args, limit)
+    except BridgeError:
+        return {}
+    return answer if isinstance(answer, dict) else {}

@@ -1,0 +1,540 @@
+"""A connection to a rosbridge server that comes back by itself: states, sending in turn, and who gets what arrives."""
+
+import asyncio
+import logging
+import random
+import time
+from collections import deque
+from collections.abc import Callable, Coroutine, Mapping
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, fields
+from enum import StrEnum
+from typing import Any, Final, NamedTuple, Protocol
+
+from websockets.uri import WebSocketURI
+
+from bridge.client.protocol import ClientCore
+from bridge.client.protocol.events import (
+    CallAnswered,
+    Event,
+    GoalEnded,
+    GoalFeedback,
+    MessageReceived,
+    ServiceRequested,
+    StatusReceived,
+    Unusable,
+)
+from bridge.client.route import Route
+from bridge.client.websocket import CLOSE_TIMEOUT, WebSocket, open_websocket
+from bridge.errors import (
+    BridgeError,
+    DecodeError,
+    DisconnectedError,
+    NoAnswerError,
+    OptionError,
+    ServiceError,
+    SlowPeerError,
+    StateTimeoutError,
+)
+
+#: Seconds before the first attempt to reconnect, and at most before any.
+FIRST_DELAY: Final = 0.1
+MAX_DELAY: Final = 5.0
+#: Seconds that one attempt to reconnect may take.
+ATTEMPT_TIMEOUT: Final = 5.0
+#: Seconds that a connection must last for the next reconnection to begin with the first delay again.
+STEADY: Final = 5.0
+#: Seconds between two requests for a topic of unknown type that has brought nothing yet.
+ASK_AGAIN: Final = 2.0
+#: Status messages of the server that are kept.
+KEPT_STATUSES: Final = 16
+# So many messages go out in a row before other tasks get their turn.
+_IN_A_ROW: Final = 32
+
+_log = logging.getLogger("bridge")
+
+
+class State(StrEnum):
+    """Where a connection stands."""
+
+    CONNECTING = "connecting"
+    CONNECTED = "connected"
+    RECONNECTING = "reconnecting"
+    CLOSED = "closed"
+
+
+StateCallback = Callable[[State, str], None]
+Server = Callable[[ServiceRequested], Coroutine[Any, Any, None]]
+
+
+class GoalReceiver(Protocol):
+    """Who is told of a goal of an action."""
+
+    def receive(self, event: GoalFeedback | GoalEnded) -> None:
+        """Take what the server says of it."""
+
+    def fail(self, reason: str) -> None:
+        """Take note that nothing more will be heard of it."""
+
+
+class Message(NamedTuple):
+    """One message of a topic.
+
+    Attributes:
+        topic: as the server names it.
+        msg: the ROS message; shared by all subscriptions of the topic, so not to be changed.
+        received_ns: ``time.time_ns()`` at its arrival, the same for all that the socket brought at once.
+        received_monotonic_ns: ``time.monotonic_ns()`` then.
+        blind_seconds: for how long, before this message, nothing could be heard because the connection was lost;
+            0 but for the first message after a reconnection.
+    """
+
+    topic: str
+    msg: dict[str, Any]
+    received_ns: int
+    received_monotonic_ns: int
+    blind_seconds: float = 0.0
+
+    @property
+    def raw(self) -> bytes:
+        """The serialised message, of a subscription with ``cbor-raw``.
+
+        Raises:
+            DecodeError: the message has no bytes: it came another way, or the server does not know cbor-raw.
+        """
+        data = self.msg.get("bytes")
+        if type(data) is not bytes:
+            raise DecodeError(
+                f"a message of {self.topic} has no serialised bytes: was it subscribed with "
+                "compression='cbor-raw', and does the server know that?"
+            )
+        return data
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Limits:
+    """What a connection may take, in seconds and bytes (see ``bridge.client.connect``)."""
+
+    connect_timeout: float
+    max_size: int
+    ping_interval: float
+    ping_timeout: float
+
+    def __post_init__(self) -> None:
+        """Refuse what is no limit."""
+        for limit in fields(self):
+            value = getattr(self, limit.name)
+            if not value > 0:
+                raise OptionError(f"{limit.name} must be more than 0, not {value!r}")
+
+
+class Session:
+    """The one connection of a client, over all of its WebSockets.
+
+    Attributes:
+        uri: the server's, without secrets.
+        core: what is wanted of the server.
+        state: where the connection stands.
+        reconnections: how often the connection was lost and came back.
+        last_error: why the connection was lost, or why the last attempt failed.
+        unusable: how many messages arrived that no client can use.
+        statuses: what the server said of itself lately, newest last.
+        receivers: by subscription, who takes its messages.
+        on_blind: are told after a reconnection how many seconds nothing could be heard.
+        servers: by service of this client, who answers its requests.
+        goals: by identity, who is told of a goal of an action.
+        on_closed: are called once, when the connection is closed for good.
+    """
+
+    def __init__(
+        self,
+        uri: WebSocketURI,
+        shown_uri: str,
+        core: ClientCore,
+        limits: Limits,
+        on_state: StateCallback | None,
+        *,
+        route: Route,
+    ) -> None:
+        """Prepare; `open` connects."""
+        self.uri = shown_uri
+        self.core = core
+        self._wire = core.wire
+        self.state = State.CONNECTING
+        self.reconnections = 0
+        self.last_error = ""
+        self.unusable = 0
+        self.statuses: deque[StatusReceived] = deque(maxlen=KEPT_STATUSES)
+        self._status_at = 0.0
+        self._lost_at = 0.0
+        self._said = 0
+        self.receivers: dict[int, Callable[[Message], None]] = {}
+        self.on_blind: set[Callable[[float], None]] = set()
+        self.servers: dict[str, Server] = {}
+        self.goals: dict[str, GoalReceiver] = {}
+        self.on_closed: set[Callable[[], None]] = set()
+        self._parsed_uri = uri
+        self._route = route
+        self._blind_since: float | None = None
+        self._limits = limits
+        self._on_state = on_state
+        self._entered = False
+        self._websocket: WebSocket | None = None
+        self._connected_at = 0.0
+        self._delay = FIRST_DELAY
+        self._reconnecting: asyncio.Task[None] | None = None  # the last one, done or not
+        self._asking: asyncio.TimerHandle | None = None
+        self._in_a_row = 0
+        self._turn = asyncio.Lock()  # fair: who waits longer comes first
+        self._waiting = 0
+        self._serving: set[asyncio.Task[None]] = set()
+        self._calls: dict[str, asyncio.Future[CallAnswered]] = {}
+        self._state_waiters: list[tuple[State, asyncio.Future[None]]] = []
+
+    # Opening, losing, closing
+
+    async def open(self) -> None:
+        """Connect for the first time.
+
+        Raises:
+            UnreachableError: nothing answers at the URI.
+            NotRosbridgeError: something answers, but not as a WebSocket server.
+            DisconnectedError: it was opened before.
+        """
+        if self._entered:
+            raise DisconnectedError(f"this client of {self.uri} was opened before: connect() makes a new one")
+        self._entered = True
+        try:
+            await self._connect(self._limits.connect_timeout)
+        except BaseException as error:
+            await self.close(str(error))
+            raise
+
+    async def close(self, reason: str = "closed by this client") -> None:
+        """Close the connection; what was sent before still goes out. Everything that waits is ended."""
+        if self.state is State.CLOSED:
+            return
+        websocket, self._websocket = self._websocket, None
+        self.core.lost()
+        # all but the one that closes: a service's handler may
+        ending = {*self._serving, *([self._reconnecting] if self._reconnecting is not None else [])}
+        ending -= {asyncio.current_task()}
+        for task in ending:
+            task.cancel()
+        self._fail_calls(f"the client of {self.uri} was closed")
+        self._set_state(State.CLOSED, reason)
+        for end in self.on_closed:
+            end()
+        self.on_closed.clear()
+        if websocket is not None:
+            try:
+                await websocket.close()
+            finally:
+                websocket.abandon()
+        if ending:
+            await asyncio.wait(ending, timeout=CLOSE_TIMEOUT)
+
+    async def _connect(self, seconds: float) -> None:
+        websocket = await open_websocket(
+            self._parsed_uri,
+            self.uri,
+            route=self._route,
+            timeout=seconds,
+            max_size=self._limits.max_size,
+            ping_interval=self._limits.ping_interval,
+            ping_timeout=self._limits.ping_timeout,
+            on_messages=self._take,
+            on_lost=self._lost,
+        )
+        self._websocket = websocket
+        self._connected_at = websocket.loop.time()
+        if self.state is State.RECONNECTING:
+            self.reconnections += 1
+            self._tell_blind(websocket.loop.time())
+        self.core.restore()
+        self.flush()
+        self.ask_later()
+        self._set_state(State.CONNECTED, "")
+
+    def _tell_blind(self, now: float) -> None:
+        if self._blind_since is not None:
+            seconds, self._blind_since = now - self._blind_since, None
+            for tell in self.on_blind:
+                tell(seconds)
+
+    def _lost(self, websocket: WebSocket, reason: str) -> None:
+        if websocket is not self._websocket:
+            return
+        self._websocket = None
+        self._blind_since = websocket.last_heard
+        self.core.lost()
+        self.last_error = reason
+        self._lost_at = time.monotonic()
+        _log.warning("the connection to %s is lost: %s", self.uri, reason)
+        self._fail_calls(f"the connection to {self.uri} was lost ({reason})")
+        if websocket.loop.time() - self._connected_at >= STEADY:
+            self._delay = FIRST_DELAY
+        self._reconnecting = websocket.loop.create_task(self._reconnect())
+        self._set_state(State.RECONNECTING, reason)
+
+    async def _reconnect(self) -> None:
+        while True:
+            # Up to a fifth earlier, so that many clients of one server do not come back in step.
+            await asyncio.sleep(self._delay * random.uniform(0.8, 1.0))
+            self._delay = min(2 * self._delay, MAX_DELAY)
+            try:
+                await self._connect(min(self._limits.connect_timeout, ATTEMPT_TIMEOUT))
+            except BridgeError as error:
+                self.last_error = str(error)
+                _log.debug("reconnecting: %s", error)
+            except Exception as error:
+                self.last_error = f"{type(error).__name__}: {error}"
+                _log.exception("reconnecting to %s failed", self.uri)
+            else:
+                _log.info("the connection to %s is back", self.uri)
+                return
+
+    def _fail_calls(self, reason: str) -> None:
+        goals, self.goals = self.goals, {}
+        for goal in goals.values():
+            goal.fail(reason)
+        calls, self._calls = self._calls, {}
+        for call, future in calls.items():
+            if not future.done():
+                future.set_exception(DisconnectedError(f"{reason} while {call.split(':')[1]} was to answer"))
+
+    # States
+
+    def _set_state(self, state: State, reason: str) -> None:
+        self.state = state
+        waiters, self._state_waiters = self._state_waiters, []
+        for awaited, future in waiters:
+            if future.done():
+                continue
+            if awaited is state:
+                future.set_result(None)
+            elif state is State.CLOSED:
+                future.set_exception(DisconnectedError(f"the client of {self.uri} was closed"))
+            else:
+                self._state_waiters.append((awaited, future))
+        if self._on_state is not None:
+            try:
+                self._on_state(state, reason)
+            except Exception:
+                _log.exception("on_state failed")
+
+    async def wait_for_state(self, state: State, limit: float) -> None:
+        """Wait until the connection reaches a state; at once if it is there.
+
+        Raises:
+            StateTimeoutError: it did not within ``limit`` seconds.
+            DisconnectedError: it is or was closed, and will not reach it.
+        """
+        if self.state is state:
+            return
+        if self.state is State.CLOSED:
+            raise DisconnectedError(f"the client of {self.uri} was closed")
+        future: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self._state_waiters.append((state, future))
+        try:
+            async with asyncio.timeout(limit):
+                await future
+        except TimeoutError:
+            because = f" ({self.last_error})" if self.last_error else ""
+            raise StateTimeoutError(
+                f"the connection to {self.uri} was not {state} within {limit:g} s, it is {self.state}{because}"
+            ) from None
+        finally:
+            self._state_waiters = [waiter for waiter in self._state_waiters if waiter[1] is not future]
+
+    # Sending
+
+    @property
+    def is_open(self) -> bool:
+        """Whether there is a connection that takes messages."""
+        return self._websocket is not None and self._websocket.is_open
+
+    def must_wait(self) -> bool:
+        """Whether what is to be sent has to wait for its turn.
+
+        Raises:
+            DisconnectedError: there is no connection.
+        """
+        websocket = self._websocket
+        if websocket is None or not websocket.is_open:
+            websocket = self._open_websocket()
+        return websocket.paused or self._waiting > 0
+
+    def _open_websocket(self) -> WebSocket:
+        websocket = self._websocket
+        if websocket is None or not websocket.is_open:
+            raise DisconnectedError(f"there is no connection to {self.uri} now: {self._why_none()}")
+        return websocket
+
+    def _why_none(self) -> str:
+        if self.state is State.CLOSED:
+            return "this client was closed"
+        if self.state is State.CONNECTING:
+            return "`async with` opens it"
+        return self.last_error or "the server is closing it"
+
+    def send_now(self, data: bytes) -> None:
+        """Hand a message to the socket.
+
+        Raises:
+            DisconnectedError: there is no connection.
+        """
+        websocket = self._websocket
+        if self._wire.fragment_size is not None:
+            self._send_pieces(self._open_websocket(), data)
+        elif websocket is None or not websocket.send_now(data):
+            self._open_websocket()  # which says why there is none
+
+    def is_others_turn(self) -> bool:
+        """Whether so many messages were sent in a row that other tasks are to get their turn. Ask after each."""
+        self._in_a_row += 1
+        if self._in_a_row < _IN_A_ROW:
+            return False
+        self._in_a_row = 0
+        return True
+
+    def together(self) -> AbstractContextManager[None]:
+        """Have what is sent inside leave in one piece (see `bridge.client.Ros.together`)."""
+        websocket = self._websocket
+        return nullcontext() if websocket is None else websocket.together()
+
+    async def wait_turn(self, what: str, limit: float) -> None:
+        """Wait until the server has taken what waits before.
+
+        Args:
+            what: is named in the errors.
+            limit: seconds to wait at most.
+
+        Raises:
+            SlowPeerError: the turn did not come in time.
+            DisconnectedError: the connection was lost.
+        """
+        self._waiting += 1
+        try:
+            async with asyncio.timeout(limit), self._turn:
+                while (websocket := self._open_websocket()).paused:
+                    await _drain(websocket)
+        except TimeoutError:
+            raise SlowPeerError(f"{self.uri} did not take {what} within {limit:g} s") from None
+        finally:
+            self._waiting -= 1
+
+    def flush(self) -> None:
+        """Send what the core wants to be sent: small, seldom and in order, so it never waits."""
+        data = self.core.data_to_send()
+        websocket = self._websocket
+        if websocket is not None and websocket.is_open:
+            for message in data:
+                self._send_pieces(websocket, message)
+
+    def _send_pieces(self, websocket: WebSocket, data: bytes) -> None:
+        for piece in self._wire.pieces(data):
+            websocket.send_now(piece)
+
+    def ask_later(self) -> None:
+        """Ask again in a while for topics of unknown type, as long as they bring nothing."""
+        if self._asking is None and self._websocket is not None:
+            self._asking = self._websocket.loop.call_later(ASK_AGAIN, self._ask_again)
+
+    def _ask_again(self) -> None:
+        self._asking = None
+        if self.core.subscriptions.ask_again():
+            self.flush()
+            self.ask_later()
+
+    async def call(self, service: str, args: Mapping[str, Any], limit: float) -> Any:
+        """Call a service and wait for its answer.
+
+        Raises:
+            ServiceError: it answered that it failed.
+            NoAnswerError: it did not answer within ``limit`` seconds.
+            SlowPeerError: the server did not even take the call.
+            DisconnectedError: there is no connection, or it was lost meanwhile.
+            EncodeError: the arguments cannot be sent as JSON.
+        """
+        if self.must_wait():
+            await self.wait_turn(f"a call of {service}", limit)
+        begun = time.monotonic()
+        call = self.core.calls.send(service, args)
+        future = self._calls[call] = asyncio.get_running_loop().create_future()
+        self.flush()
+        try:
+            async with asyncio.timeout(limit):
+                answer = await future
+        except TimeoutError:
+            raise NoAnswerError(
+                f"service {service} at {self.uri} did not answer within {limit:g} s{self.said_since(begun)}"
+            ) from None
+        finally:
+            self._calls.pop(call, None)
+            self.core.calls.forget(call)
+        if not answer.ok:
+            raise ServiceError(answer.values, f"{service} at {self.uri}")
+        return answer.values
+
+    def said_since(self, since: float) -> str:
+        """What the server said last, or how it was lost, if after ``since`` (``time.monotonic()``): the end of a sentence."""
+        if self._lost_at > since:
+            return f"; meanwhile the connection was lost: {self.last_error}"
+        return f"; the server said: {self.statuses[-1].text[:200]}" if self._status_at > since else ""
+
+    # Receiving
+
+    def _take(self, messages: list[bytes]) -> None:
+        received_ns, received_monotonic_ns = time.time_ns(), time.monotonic_ns()
+        now = received_monotonic_ns * 1e-9
+        receive, receivers = self.core.receive, self.receivers
+        for data in messages:
+            event = receive(data, now)
+            if type(event) is MessageReceived:
+                topic, msg, subscriptions = event
+                # What a named tuple's own constructor does takes three times as long.
+                message = tuple.__new__(Message, (topic, msg, received_ns, received_monotonic_ns, 0.0))
+                for number in subscriptions:
+                    receivers[number](message)
+            else:
+                self._take_other(event)
+
+    def _take_other(self, event: Event | None) -> None:
+        match event:
+            case CallAnswered():
+                future = self._calls.pop(event.call, None)
+                if future is not None and not future.done():
+                    future.set_result(event)
+            case ServiceRequested():
+                task = asyncio.get_running_loop().create_task(self.servers[event.service](event))
+                self._serving.add(task)
+                task.add_done_callback(self._serving.discard)
+            case GoalFeedback() | GoalEnded():
+                ended = isinstance(event, GoalEnded)
+                goal = self.goals.pop(event.goal, None) if ended else self.goals.get(event.goal)
+                if goal is not None:
+                    goal.receive(event)
+            case StatusReceived():
+                self.statuses.append(event)
+                self._status_at = time.monotonic()
+                self._said += 1
+                if self._said <= KEPT_STATUSES or self._said & (self._said - 1) == 0:
+                    level = logging.WARNING if event.level in {"error", "warning"} else logging.INFO
+                    _log.log(level, "%s says (%.20s): %.500s", self.uri, event.level, event.text)
+            case Unusable():
+                self.unusable += 1
+                # The 1st, 2nd, 4th, 8th ...: a server that goes mad does not fill the log (as with statuses).
+                if self.unusable & (self.unusable - 1) == 0:
+                    _log.warning("%s, %d so far: %s", self.uri, self.unusable, event.reason)
+            case _:
+                self.flush()  # a request may have been refused on the spot
+
+
+async def _drain(websocket: WebSocket) -> None:
+    """Wait for room in the socket's buffer; a loss shows in the WebSocket's state, whatever the error."""
+    try:
+        await websocket.drain()
+    except Exception:
+        if websocket.is_open:
+            raise

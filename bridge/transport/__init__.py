@@ -1,0 +1,1 @@
+"""WebSocket frames in and out."""

@@ -1,0 +1,42 @@
+"""The loader: programs a board over its own port, without a restart of the host (thesis 3.4, SofLoader)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pcie_shim.loader import program
+from services.commands import flags as options
+from services.settings import load_settings
+from services.sockets.serving import endpoint_from
+from services.supervision import end_with_parent
+from terminal.logs import say
+from terminal.running import ends_well, make_app
+
+app = make_app(
+    "Program a board with an image that `toolchain build` wrote.\n\n"
+    "`loader build/boat/boards/board0.bm unix:/tmp/b/board0.sock`\n\n"
+    "It refuses while pcie-app holds the board."
+)
+
+
+@app.command(help=app.info.help)
+@ends_well
+def loader(
+    image: Annotated[Path, typer.Argument(help="Programming file (boards/*.bm of a deployment).")],
+    endpoint: Annotated[str, typer.Argument(help="The board's endpoint.", metavar="ENDPOINT")],
+    peer_timeout: options.PeerTimeout = None,
+) -> int:
+    """Program a board with an image that `toolchain build` wrote."""
+    end_with_parent()
+    settings = load_settings(peer_timeout=peer_timeout)
+    image_hash = program(endpoint_from(endpoint, "ENDPOINT"), image, timeout=settings.peer_timeout)
+    say(f"{endpoint} holds image {image_hash[:16]} now")
+    return 0
+
+
+def main() -> None:
+    """Entry point of the command `loader`."""
+    app()

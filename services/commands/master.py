@@ -1,0 +1,164 @@
+"""The command `master`, which runs the stack, and `master reload`, which speaks to one that runs."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Concatenate, ParamSpec
+
+import orjson
+import typer
+
+from services.commands import flags as options
+from services.errors import SettingsError
+from services.master.run import run_master
+from services.settings import endpoint_in, load_settings
+from services.sockets.control_socket import ReloadOrder, control_socket, give_order
+from services.sockets.serving import deployment_for
+from services.supervision import end_with_parent
+from terminal.errors import ExitCode
+from terminal.one_line import one_line
+from terminal.running import ends_well, make_app, run_async
+
+RELOAD_TIME = 600.0
+"""Seconds that `master reload` waits for its answer."""
+
+app = make_app(
+    "Move readings to the boards and posteriors back to the robot.\n\n"
+    "`master --once -d build/boat --uri ws://robot:9090` computes one frame; `master --loop` goes on until Ctrl-C.\n\n"
+    "`master reload -d build/boat2` has a running one take another deployment of the same shape.\n\n"
+    "It starts what is not running (subscriber, publisher, pcie-app, emulated boards) and ends it again. "
+    "Exit codes: 0 done, 2 usage or deployment, 3 rosbridge, 4 a variable, 5 a board, 6 a process, 130, 143."
+)
+
+
+Parameters = ParamSpec("Parameters")
+
+
+def _unless_another(
+    command: Callable[Concatenate[typer.Context, Parameters], int],
+) -> Callable[..., None]:
+    """Run a command that has commands of its own, where none of those was given."""
+    run = ends_well(command)
+
+    @functools.wraps(command)
+    def unless(context: typer.Context, *args: Parameters.args, **kwargs: Parameters.kwargs) -> None:
+        if context.invoked_subcommand is None:
+            run(context, *args, **kwargs)
+
+    return unless
+
+
+@app.callback(help=app.info.help, invoke_without_command=True)
+@_unless_another
+def master(
+    context: typer.Context,
+    once: Annotated[bool, typer.Option("--once", help="Compute the first complete frame, then end.")] = False,
+    loop: Annotated[bool, typer.Option("--loop", help="Go on until Ctrl-C, or --count.")] = False,
+    count: options.Count = None,
+    deployment: options.Deployment = None,
+    uri: options.Uri = None,
+    connect: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder with subscriber.sock, publisher.sock and pcie-app.sock of services that already run."
+        ),
+    ] = None,
+    boards: options.Boards = None,
+    queue: options.Queue = None,
+    stop: options.Stop = None,
+    ros_version: options.RosVersion = None,
+    connect_timeout: options.ConnectTimeout = None,
+    first_data_timeout: options.FirstDataTimeout = None,
+    peer_timeout: options.PeerTimeout = None,
+    board_timeout: options.BoardTimeout = None,
+    stop_timeout: options.StopTimeout = None,
+    fused: Annotated[
+        bool | None,
+        typer.Option(
+            "--fused",
+            help="Run subscriber, publisher and pcie-app inside this process: fewer hops, nothing else differs.",
+        ),
+    ] = None,
+    log_level: options.LogLevel = None,
+    json: Annotated[bool, typer.Option("--json", help="Print one JSON object per result.")] = False,
+    print_config: Annotated[
+        bool, typer.Option("--print-config", help="Print all settings as they are in force, and end.")
+    ] = False,
+) -> int:
+    """Move readings to the boards and posteriors back to the robot."""
+    del context  # it says whether there is something to do here at all
+    end_with_parent()
+    connected = {}
+    if connect is not None:
+        if not connect.is_dir():
+            msg = f"--connect {connect} is no folder; name the one with the sockets of the services that run already"
+            raise SettingsError(msg)
+        for name in ("subscriber", "publisher", "pcie-app"):
+            connected[name.replace("-", "_")] = str(endpoint_in(connect, name))
+    settings = load_settings(
+        deployment=deployment,
+        uri=uri,
+        boards=boards,
+        queue=queue,
+        stop=stop,
+        ros_version=ros_version,
+        connect_timeout=connect_timeout,
+        first_data_timeout=first_data_timeout,
+        peer_timeout=peer_timeout,
+        board_timeout=board_timeout,
+        stop_timeout=stop_timeout,
+        fused=fused,
+        log_level=log_level,
+        **connected,
+    )
+    if print_config:
+        print(orjson.dumps(settings.model_dump(mode="json"), option=orjson.OPT_INDENT_2).decode())
+        return ExitCode.DONE
+    if once == loop:
+        msg = "choose one of --once and --loop"
+        raise SettingsError(msg)
+    if once and count is not None:
+        msg = "--count belongs to --loop; --once computes one frame"
+        raise SettingsError(msg)
+    loaded = deployment_for(settings)
+    return run_async(run_master(settings, loaded, once=once, count=count, json=json))
+
+
+@app.command("reload")
+@ends_well
+def reload_(
+    deployment: options.Deployment = None,
+    directory: Annotated[
+        Path | None,
+        typer.Option(
+            "--directory",
+            help="Folder of the master's control socket: BM_CONTROL_DIRECTORY, or BM_RUN_DIRECTORY, of its own.",
+            metavar="DIR",
+        ),
+    ] = None,
+) -> int:
+    """Have a running `master --loop` take another deployment of the same shape, or the same folder as it is now.
+
+    `toolchain regenerate memories build/boat --model casestudies/boat`, then `master reload -d build/boat`: readings and results go on. If
+    it can't be taken, the run goes on with what it has, and the sentence says why. Exit codes: 0 done, 2 another shape
+    or damaged, 5 a board, 6 not now.
+    """
+    end_with_parent()
+    settings = load_settings(deployment=deployment)
+    folder = "" if settings.deployment is None else str(settings.deployment.absolute())
+
+    async def order() -> int:
+        from services.commands.status import find_run
+
+        run = directory or settings.control_directory or settings.run_directory or await find_run()
+        print(one_line(await give_order(control_socket(run), ReloadOrder(folder), timeout=RELOAD_TIME)))
+        return ExitCode.DONE
+
+    return run_async(order())
+
+
+def main() -> None:
+    """Entry point of the command `master`."""
+    app()

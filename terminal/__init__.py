@@ -1,0 +1,1 @@
+"""What every command line shares: start, flags, logs, errors and exit codes, end."""

@@ -1,0 +1,43 @@
+"""The deployment: everything that follows from the model and that the services read."""
+
+from toolchain.deployment.deployment_file import (
+    FILE_NAME,
+    REPLICA,
+    Board,
+    Deployment,
+    DeploymentFile,
+    Dimension,
+    MachineSection,
+    Output,
+    Queue,
+    Source,
+    Stop,
+    Variable,
+    WrittenPrior,
+    deployment_hash,
+    deployment_text,
+    load_deployment,
+    parse_interface,
+    write_deployment,
+)
+
+__all__ = [
+    "FILE_NAME",
+    "REPLICA",
+    "Board",
+    "Deployment",
+    "DeploymentFile",
+    "Dimension",
+    "MachineSection",
+    "Output",
+    "Queue",
+    "Source",
+    "Stop",
+    "Variable",
+    "WrittenPrior",
+    "deployment_hash",
+    "deployment_text",
+    "load_deployment",
+    "parse_interface",
+    "write_deployment",
+]
