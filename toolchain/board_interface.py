@@ -67,8 +67,9 @@ def board_interface(
             message += f", or --partitions {-(-model.lines // given[1])}"
         raise BuildError(message)
     if given[0] > room[0] or given[1] > room[1]:
-        message = f"the interface {given[0]}x{given[1]} is larger than the register map's {room[0]}x{room[1]}"
-        raise BuildError(message)
+        raise BuildError(
+            f"the interface {given[0]}x{given[1]} is larger than the register map's {room[0]}x{room[1]}"
+        )
     return given, ", as asked for"
 
 
@@ -97,19 +98,18 @@ def _interface_of_many(
     ]
     instead = f": use {' or '.join(ways)}" if ways else ""
     if inputs > room[0] or results > room[1]:
-        message = f"{needed}, but the register map has room for {room[0]} and {room[1]}{instead}"
-        raise BuildError(message)
+        raise BuildError(f"{needed}, but the register map has room for {room[0]} and {room[1]}{instead}")
     if given is None:
         larger = (max(inputs, DEFAULT_INTERFACE[0]), max(results, DEFAULT_INTERFACE[1]))
         default = f"{DEFAULT_INTERFACE[0]}x{DEFAULT_INTERFACE[1]}"
         return larger, "" if larger == DEFAULT_INTERFACE else f", larger than the default {default}: {needed}"
     if given[0] > room[0] or given[1] > room[1]:
-        message = f"the interface {given[0]}x{given[1]} is larger than the register map's {room[0]}x{room[1]}"
-        raise BuildError(message)
+        raise BuildError(
+            f"the interface {given[0]}x{given[1]} is larger than the register map's {room[0]}x{room[1]}"
+        )
     if inputs > given[0] or results > given[1]:
-        message = (
+        raise BuildError(
             f"the model is larger than the interface {given[0]}x{given[1]}: {needed}; use --interface "
             f"{max(inputs, given[0])}x{max(results, given[1])} or leave it out"
         )
-        raise BuildError(message)
     return given, ", as asked for"

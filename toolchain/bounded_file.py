@@ -26,9 +26,7 @@ def read_bounded(path: Path, most: int, error: type[ToolchainError], larger: str
         with path.open("rb") as file:
             data = file.read(most + 1)
     except OSError as reason:
-        message = f"{path} can't be read: {reason.strerror or reason}"
-        raise error(message) from None
+        raise error(f"{path} can't be read: {reason.strerror or reason}") from None
     if len(data) > most:
-        message = f"{path} has more than {most} bytes: {larger}"
-        raise error(message)
+        raise error(f"{path} has more than {most} bytes: {larger}")
     return data

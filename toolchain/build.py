@@ -56,19 +56,16 @@ _FLAGS: Final = {"tolerance_s": "--tolerance", "path": "--prior-path"}
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Built:
-    """A deployment, what its boards are programmed with, and what there is to say about it.
-
-    Attributes:
-        deployment: What `deployment.toml` says.
-        images: One per board.
-        quantised: The codes before they were split over boards, and what was lost.
-        report: What `report.txt` says.
-    """
+    """A deployment, what its boards are programmed with, and what there is to say about it."""
 
     deployment: Deployment
+    """What `deployment.toml` says."""
     images: tuple[Image, ...]
+    """One per board."""
     quantised: Quantised
+    """The codes before they were split over boards, and what was lost."""
     report: str
+    """What `report.txt` says."""
 
 
 def build_deployment(model: Model, directory: Path, options: BuildOptions, *, remark: str = "") -> Built:
@@ -166,8 +163,7 @@ def build_date(model_file: Path) -> str:
         seconds = int(model_file.stat().st_mtime) if epoch is None else int(epoch)
         return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(seconds))
     except (ValueError, OverflowError, OSError):
-        message = f"SOURCE_DATE_EPOCH is {epoch!r}, expected a number of seconds since 1970"
-        raise BuildError(message) from None
+        raise BuildError(f"SOURCE_DATE_EPOCH is {epoch!r}, expected a number of seconds since 1970") from None
 
 
 def model_hash(model: Model, quantised: Quantised, parameters: BM1Parameters) -> str:
@@ -320,14 +316,12 @@ def check_options(options: BuildOptions) -> None:
     except ValidationError as reason:
         raise refused_option(reason) from None
     if options.sensor_mode is not SensorMode.COLUMN and options.scaling is Scale.ADDRESS:
-        message = (
+        raise BuildError(
             f"--scale address does not go with --sensor-mode {options.sensor_mode}: lines look at different addresses in a "
             "frame, so the factors of addresses would not cancel; use --scale column or none"
         )
-        raise BuildError(message)
     if not 1 <= options.replicas <= REPLICAS_MAX:
-        message = f"--replicas is {options.replicas}, expected 1 to {REPLICAS_MAX}"
-        raise BuildError(message)
+        raise BuildError(f"--replicas is {options.replicas}, expected 1 to {REPLICAS_MAX}")
 
 
 def _check_seeds(board: BM1Parameters) -> None:
@@ -343,14 +337,12 @@ def _check_prior(model: Model, options: BuildOptions) -> None:
     if options.prior_mode is PriorMode.TABLE:
         if _written_prior(options) is not None:
             flag = "--prior-path" if options.sources is None else f"{options.sources.path}"
-            message = f"{flag} says where a written prior comes from: add --prior-mode written"
-            raise BuildError(message)
+            raise BuildError(f"{flag} says where a written prior comes from: add --prior-mode written")
     elif model.prior_select is not None:
-        message = (
+        raise BuildError(
             f"the prior is selected by {model.prior_select.name}, so it can't be written too: leave "
             "--prior-mode written out, or the selection"
         )
-        raise BuildError(message)
 
 
 def refused_option(reason: ValidationError) -> BuildError:

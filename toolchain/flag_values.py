@@ -21,11 +21,9 @@ def key_values(settings: Iterable[str], flag: str = "--set", example: str = "wid
         key, equals, value = setting.partition("=")
         key = key.strip()
         if not equals or not key:
-            message = f"{flag} {setting}: expected KEY=VALUE, such as {flag} {example}"
-            raise BuildError(message)
+            raise BuildError(f"{flag} {setting}: expected KEY=VALUE, such as {flag} {example}")
         if key in found:
-            message = f"{flag} {key} is given twice"
-            raise BuildError(message)
+            raise BuildError(f"{flag} {key} is given twice")
         found[key] = value
     return found
 
@@ -38,6 +36,5 @@ def names_in(flag: str, text: str) -> list[str]:
     """
     names = [name.strip() for name in text.split(",")] if text else []
     if not all(names):
-        message = f"{flag} {text}: expected names with a comma between them, such as {flag} A,B"
-        raise BuildError(message)
+        raise BuildError(f"{flag} {text}: expected names with a comma between them, such as {flag} A,B")
     return names

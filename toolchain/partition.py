@@ -25,8 +25,9 @@ def partition_lines(lines: int, count: int) -> tuple[Block, ...]:
         BuildError: Fewer than 1 board, or more boards than lines.
     """
     if not 1 <= count <= lines:
-        message = f"{lines} lines can't be split over {count} boards: expected 1 to {lines} partitions"
-        raise BuildError(message)
+        raise BuildError(
+            f"{lines} lines can't be split over {count} boards: expected 1 to {lines} partitions"
+        )
     shorter, longer = divmod(lines, count)
     sizes = [shorter + (board < longer) for board in range(count)]
     return tuple(Block(sum(sizes[:board]), size) for board, size in enumerate(sizes))

@@ -32,25 +32,23 @@ _ROUNDING: Final = 1e-12
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ColumnLoss:
-    """What quantising took from one column.
-
-    Attributes:
-        name: The known variable's name, or `prior`.
-        bits: Address bits.
-        values: Served addresses.
-        mass: Share of P(S, K) that lies in cells whose code became 0: how often a reading meets such a cell
-            on the true line.
-        kl_bits: Divergence of the column's own posterior from the exact one, KL(Q(S | k) || P(S | k)) in bits,
-            the expectation over k; all lines read the same k. (The other way round it would be infinite wherever a tail became 0.)
-        dead_values: Served addresses that are possible, but have code 0 on every line.
-    """
+    """What quantising took from one column."""
 
     name: str
+    """The known variable's name, or `prior`."""
     bits: int
+    """Address bits."""
     values: int
+    """Served addresses."""
     mass: float
+    """Share of P(S, K) that lies in cells whose code became 0: how often a reading meets such a cell on the
+    true line."""
     kl_bits: float
+    """Divergence of the column's own posterior from the exact one, KL(Q(S | k) || P(S | k)) in bits, the
+    expectation over k; all lines read the same k. (The other way round it would be infinite wherever a
+    tail became 0.)"""
     dead_values: int
+    """Served addresses that are possible, but have code 0 on every line."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -64,23 +62,20 @@ class VanishedFloor:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Quantised:
-    """A model's codes for all lines, before they are split over boards.
-
-    Attributes:
-        prior: uint16[rows, lines]: one row, or one for each address that selects a prior; then the top one is the
-            prior without a selection, and unserved ones hold 0.
-        tables: uint16[2**bits, lines] per known variable; addresses beyond the served ones hold 0, the top one,
-            a missing reading's, all ones. None where cells are given codes.
-        losses: The prior's and one per known variable.
-        floors: Outlier floors that are too low for the codes.
-        warnings: What a user should know, a sentence each.
-    """
+    """A model's codes for all lines, before they are split over boards."""
 
     prior: NDArray[np.uint16]
+    """uint16[rows, lines]: one row, or one for each address that selects a prior; then the top one is the
+    prior without a selection, and unserved ones hold 0."""
     tables: tuple[NDArray[np.uint16], ...]
+    """uint16[2**bits, lines] per known variable; addresses beyond the served ones hold 0, the top one, a
+    missing reading's, all ones. None where cells are given codes."""
     losses: tuple[ColumnLoss, ...]
+    """The prior's and one per known variable."""
     floors: tuple[VanishedFloor, ...]
+    """Outlier floors that are too low for the codes."""
     warnings: tuple[str, ...]
+    """What a user should know, a sentence each."""
 
 
 def quantise(
@@ -155,20 +150,16 @@ def written_codes(likelihoods: NDArray[np.float64], *, prob_bits: int, scale: Sc
         ReadingError: One is no probability, or all of a row are 0.
     """
     if not np.isfinite(likelihoods).all():
-        message = "a likelihood is not finite"
-        raise ReadingError(message)
+        raise ReadingError("a likelihood is not finite")
     if (least := float(likelihoods.min())) < 0:
-        message = f"{least:g} is no probability"
-        raise ReadingError(message)
+        raise ReadingError(f"{least:g} is no probability")
     largest = likelihoods.max(axis=-1, keepdims=True)
     if scale is Scale.NONE:
         if float(largest.max()) > 1:
-            message = f"{float(largest.max()):g} is no probability, expected 0 to 1 (scale = none)"
-            raise ReadingError(message)
+            raise ReadingError(f"{float(largest.max()):g} is no probability, expected 0 to 1 (scale = none)")
         return encode_probability(likelihoods, prob_bits)
     if not (largest > 0).all():
-        message = "all lines have 0, so that none is possible"
-        raise ReadingError(message)
+        raise ReadingError("all lines have 0, so that none is possible")
     return encode_probability(likelihoods / largest, prob_bits)
 
 
@@ -188,8 +179,7 @@ def written_prior(prior: ArrayLike, *, lines: int, prob_bits: int, replicas: int
     try:
         numbers = np.asarray(prior, dtype=np.float64)
     except (TypeError, ValueError):
-        message = "the prior to write is not an array of numbers"
-        raise ReadingError(message) from None
+        raise ReadingError("the prior to write is not an array of numbers") from None
     if replicas > 1 and numbers.size == replicas * lines:
         numbers = numbers.reshape(replicas, lines)
     elif numbers.shape != (lines,):
@@ -199,8 +189,9 @@ def written_prior(prior: ArrayLike, *, lines: int, prob_bits: int, replicas: int
         raise ReadingError(message + (f", or for each of {replicas} replicas" if replicas > 1 else ""))
     largest = numbers.max(axis=-1, keepdims=True)
     if not np.all(np.isfinite(numbers)) or np.any(numbers < 0) or not np.all(largest > 0):
-        message = "the prior to write is no distribution: it holds a negative, infinite or NaN number, or only zeros"
-        raise ReadingError(message)
+        raise ReadingError(
+            "the prior to write is no distribution: it holds a negative, infinite or NaN number, or only zeros"
+        )
     codes = encode_probability(numbers / largest, prob_bits)
     return codes if replicas == 1 else np.broadcast_to(codes, (replicas, lines)).copy()
 

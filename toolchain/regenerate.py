@@ -57,33 +57,30 @@ _MACHINE_KEYS: Final = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DeploymentEdits:
-    """What to change in `deployment.toml`; None leaves it as it is.
-
-    Attributes:
-        uri: The rosbridge server with the readings.
-        topic: The topic with the readings.
-        type: That topic's type.
-        output: The topic for the posteriors.
-        order: All sensors' names in the order in which the columns are to read them.
-        paths: By name, where in the message a variable is.
-        target_count: The count that stops a machine.
-        max_cycles: The cycles after which it stops anyway.
-        stop: Whether boards stop together.
-        queue: What happens to frames that come too fast.
-        tolerance_s: Within what time readings from several topics belong together, seconds.
-    """
+    """What to change in `deployment.toml`; None leaves it as it is."""
 
     uri: str | None = None
+    """The rosbridge server with the readings."""
     topic: str | None = None
+    """The topic with the readings."""
     type: str | None = None
+    """That topic's type."""
     output: str | None = None
+    """The topic for the posteriors."""
     order: tuple[str, ...] | None = None
+    """All sensors' names in the order in which the columns are to read them."""
     paths: tuple[tuple[str, str], ...] = ()
+    """By name, where in the message a variable is."""
     target_count: int | None = None
+    """The count that stops a machine."""
     max_cycles: int | None = None
+    """The cycles after which it stops anyway."""
     stop: Stop | None = None
+    """Whether boards stop together."""
     queue: Queue | None = None
+    """What happens to frames that come too fast."""
     tolerance_s: float | None = None
+    """Within what time readings from several topics belong together, seconds."""
 
 
 def regenerate_memories(directory: Path, model: Model | None = None, *, build_date: str = "") -> Changes:
@@ -177,11 +174,10 @@ def check_agreement(deployment: Deployment, images: Sequence[Image]) -> None:
         }
         for key, value in found.items():
             if value != said[key]:
-                message = (
+                raise DeploymentError(
                     f"{deployment.path} says {key} = {said[key]}, but {board.image} was built with {value}: set it back, "
                     "or build again with 'toolchain build'"
                 )
-                raise DeploymentError(message)
 
 
 def _options(deployment: Deployment, image: Image) -> BuildOptions:
@@ -219,14 +215,12 @@ def _with_widths(model: Model, deployment: Deployment) -> Model:
     built_kinds = {variable.name: variable.kind for variable in deployment.variables}
     for what, new, old in (("searches", sizes, built_sizes), ("knows", sorted(kinds), sorted(built_kinds))):
         if new != old:
-            message = (
+            raise BuildError(
                 f"the model {what} {_listed(new)}, but the deployment {_listed(old)}: this is another machine, so "
                 "build it again with 'toolchain build'"
             )
-            raise BuildError(message)
     if kinds != built_kinds:
-        message = "another variable selects the prior now: build it again with 'toolchain build'"
-        raise BuildError(message)
+        raise BuildError("another variable selects the prior now: build it again with 'toolchain build'")
     bits = {variable.name: variable.bits for variable in deployment.variables}
     select = model.prior_select
     if deployment.machine.sensor_mode is SensorMode.THRESHOLD:  # no memory is that wide: there is none
@@ -238,8 +232,9 @@ def _with_widths(model: Model, deployment: Deployment) -> Model:
             prior_select=None if select is None else replace(select, bits=bits[select.name]),
         )
     except ModelError as reason:
-        message = f"{reason}: its memory is that wide; build it again with 'toolchain build'"
-        raise BuildError(message) from None
+        raise BuildError(
+            f"{reason}: its memory is that wide; build it again with 'toolchain build'"
+        ) from None
 
 
 def _listed(values: Sequence[object]) -> str:
@@ -297,11 +292,10 @@ def _edited(deployment: Deployment, edits: DeploymentEdits) -> Deployment:
     targets = {"uri": edits.uri, "topic": edits.topic, "type": edits.type}
     targets = {key: value for key, value in targets.items() if value is not None}
     if targets and len(deployment.sources) > 1:
-        message = (
+        raise BuildError(
             f"--{next(iter(targets))}: this deployment has {len(deployment.sources)} sources; edit [[source]] in "
             f"{deployment.path}, then say 'toolchain regenerate deployment' without it"
         )
-        raise BuildError(message)
     outputs = deployment.outputs
     if edits.output is not None:
         outputs = (type(outputs[0])(**dict(outputs[0]) | {"topic": edits.output}), *outputs[1:])
@@ -339,11 +333,10 @@ def _in_order(variables: tuple[Variable, ...], order: tuple[str, ...] | None) ->
     columns = [place for place, variable in enumerate(variables) if variable.kind == "sensor"]
     by_name = {variables[place].name: variables[place] for place in columns}
     if sorted(order) != sorted(by_name):
-        message = (
+        raise BuildError(
             f"--order {','.join(order)}: expected each of {', '.join(by_name) or 'no sensors'} once, in the order of "
             "the columns"
         )
-        raise BuildError(message)
     changed = list(variables)
     for place, name in zip(columns, order, strict=True):
         reading = by_name[name]
@@ -358,8 +351,7 @@ def _with_paths(variables: tuple[Variable, ...], paths: tuple[tuple[str, str], .
     for name, path in said.items():
         if name not in {variable.name for variable in variables}:
             names = ", ".join(variable.name for variable in variables)
-            message = f"--path {name}={path}: there is no such variable; there are {names or 'none'}"
-            raise BuildError(message)
+            raise BuildError(f"--path {name}={path}: there is no such variable; there are {names or 'none'}")
     return tuple(
         type(variable)(**dict(variable) | {"path": said.get(variable.name, variable.path)})
         for variable in variables

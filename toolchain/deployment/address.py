@@ -43,8 +43,7 @@ def to_address(variable: Variable, value: object) -> int | None:
     if not isinstance(value, int | float):  # bool is an int: False is 0, True is 1
         if isinstance(value, list | tuple) and not value:
             return _missing(variable, "is an empty array")
-        message = f"variable {variable.name}: {_shown(value)} is {_kind(value)}, not a number"
-        raise NotANumberError(message)
+        raise NotANumberError(f"variable {variable.name}: {_shown(value)} is {_kind(value)}, not a number")
     if value != value:  # noqa: PLR0124 - NaN; math.isnan fails on integers beyond a double
         return _missing(variable, "is NaN")
 
@@ -62,8 +61,9 @@ def to_address(variable: Variable, value: object) -> int | None:
 
 def _missing(variable: Variable, what: str) -> int | None:
     if variable.on_missing == "error":
-        message = f"variable {variable.name} {what}, and this deployment needs it (on_missing = error)"
-        raise ReadingMissingError(message)
+        raise ReadingMissingError(
+            f"variable {variable.name} {what}, and this deployment needs it (on_missing = error)"
+        )
     return None
 
 
@@ -76,11 +76,10 @@ def _unserved(variable: Variable, value: float, beyond_top: bool | None) -> int 
     last = variable.offset + (variable.values - 1) * variable.step
     low, high = sorted((variable.offset, last))
     around = f", around a period of {variable.period} steps" if variable.period else ""
-    message = (
+    raise ValueOutOfRangeError(
         f"variable {variable.name}: {_shown(value)} is out of range, expected {low:g} to {high:g} "
         f"in steps of {abs(variable.step):g}{around}"
     )
-    raise ValueOutOfRangeError(message)
 
 
 def _shown(value: object) -> str:

@@ -83,19 +83,18 @@ def _numbers(variable: Variable, value: object, shape: tuple[int, ...]) -> NDArr
         return None
     if not isinstance(given, list | np.ndarray) or (isinstance(given, list) and _holds_text(given)):
         what = "an array with strings" if isinstance(given, list) else f"of type {type(value).__name__}"
-        message = f"variable {variable.name} is {what}, expected an array of {_length(shape)} numbers"
-        raise NotANumberError(message)
+        raise NotANumberError(
+            f"variable {variable.name} is {what}, expected an array of {_length(shape)} numbers"
+        )
     try:
         numbers = np.asarray(given, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
-        message = f"variable {variable.name} is no array of {_length(shape)} numbers"
-        raise NotANumberError(message) from None
+        raise NotANumberError(f"variable {variable.name} is no array of {_length(shape)} numbers") from None
     if numbers.size == 0:
         return None
     if numbers.shape != shape and numbers.shape != (math.prod(shape),):
         found = " x ".join(map(str, numbers.shape)) or "one"
-        message = f"variable {variable.name} has {found} values, expected {_length(shape)}"
-        raise ReadingError(message)
+        raise ReadingError(f"variable {variable.name} has {found} values, expected {_length(shape)}")
     return numbers.reshape(shape)
 
 
@@ -144,8 +143,7 @@ def _codes(
             given = np.where(absent[there], 0.0, rows[there])
             codes[there] = written_codes(given, prob_bits=prob_bits, scale=scale)
     except ReadingError as error:
-        message = f"variable {variable.name}: {error}"
-        raise ReadingError(message) from None
+        raise ReadingError(f"variable {variable.name}: {error}") from None
     codes[absent] = MISSING
     return codes.reshape(numbers.shape)
 
@@ -156,8 +154,7 @@ def _check_missing(variable: Variable, addresses: NDArray[np.int64]) -> None:
     partly = missing.any(axis=-1) & ~missing.all(axis=-1)
     if partly.any():
         where = f" of replica {int(np.flatnonzero(partly)[0])}" if addresses.ndim == 2 else ""
-        message = (
+        raise ReadingMissingError(
             f"variable {variable.name} is missing on some lines{where} and not on others; a reading is missing on all "
             "lines or on none"
         )
-        raise ReadingMissingError(message)

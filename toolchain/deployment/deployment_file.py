@@ -122,11 +122,10 @@ class Variable(_Section):
     def _addresses_fit(self) -> Self:
         if self.values > 2**self.bits - 1:
             bits = "1 bit holds" if self.bits == 1 else f"{self.bits} bits hold"
-            message = (
+            raise ValueError(
                 f"{self.name} serves {self.values} values, but {bits} {2**self.bits - 1} "
                 "beside the address of a missing reading"
             )
-            raise ValueError(message)
         states_fit(self.name, self.states, self.values)
         return self
 
@@ -241,8 +240,7 @@ class Board(_Section):
     def _inside(cls, image: str) -> str:
         path = PurePosixPath(image)
         if path.is_absolute() or ".." in path.parts or not path.name:
-            message = f"{image!r} must be a path inside the deployment's folder"
-            raise ValueError(message)
+            raise ValueError(f"{image!r} must be a path inside the deployment's folder")
         return image
 
 
@@ -282,52 +280,49 @@ class DeploymentFile(_Section):
         names_differ("output", [output.topic for output in self.outputs])
         for variable in self.variables:
             if variable.source >= len(self.sources):
-                message = (
+                raise ValueError(
                     f"variable {variable.name} reads source {variable.source}, but the last one is "
                     f"{len(self.sources) - 1}"
                 )
-                raise ValueError(message)
         self._prior_agrees()
         cells = math.prod(dimension.size for dimension in self.searched)
         if cells != self.machine.lines:
-            message = (
+            raise ValueError(
                 f"the searched variables have {cells} cells, but the machine has {self.machine.lines} lines"
             )
-            raise ValueError(message)
         if self.machine.replicas > 1 and REPLICA in [dimension.label for dimension in self.searched]:
-            message = f"a searched variable is called {REPLICA!r}, which is what the dimension of replicas is called"
-            raise ValueError(message)
+            raise ValueError(
+                f"a searched variable is called {REPLICA!r}, which is what the dimension of replicas is called"
+            )
         offset = 0
         for index, board in enumerate(self.boards):
             if board.line_offset != offset:
-                message = f"board {index} starts at line {board.line_offset}, expected {offset}"
-                raise ValueError(message)
+                raise ValueError(f"board {index} starts at line {board.line_offset}, expected {offset}")
             offset += board.lines
         if offset != self.machine.lines:
-            message = f"the boards have {offset} lines together, but the machine has {self.machine.lines}"
-            raise ValueError(message)
+            raise ValueError(
+                f"the boards have {offset} lines together, but the machine has {self.machine.lines}"
+            )
         return self
 
     def _prior_agrees(self) -> None:
         selects = [variable for variable in self.variables if variable.kind == "prior_select"]
         if len(selects) > 1:
-            message = f"{selects[0].name} and {selects[1].name} both select the prior; one can"
-            raise ValueError(message)
+            raise ValueError(f"{selects[0].name} and {selects[1].name} both select the prior; one can")
         bits = selects[0].bits if selects else 0
         if bits != self.machine.prior_bits:
             who = f"{selects[0].name} selects it with {bits}" if selects else "no variable selects it"
-            message = f"the prior has {self.machine.prior_bits} address bits (prior_bits), but {who}"
-            raise ValueError(message)
+            raise ValueError(f"the prior has {self.machine.prior_bits} address bits (prior_bits), but {who}")
         if self.prior is None:
             return
         if self.machine.prior_mode is not PriorMode.WRITTEN:
-            message = (
+            raise ValueError(
                 "[prior] says where a written prior comes from, but the machine's is a table (prior_mode)"
             )
-            raise ValueError(message)
         if self.prior.source >= len(self.sources):
-            message = f"the prior comes from source {self.prior.source}, but the last one is {len(self.sources) - 1}"
-            raise ValueError(message)
+            raise ValueError(
+                f"the prior comes from source {self.prior.source}, but the last one is {len(self.sources) - 1}"
+            )
 
 
 class Deployment(DeploymentFile):
@@ -400,8 +395,7 @@ def parse_interface(text: str) -> tuple[int, int]:
     """
     match = _INTERFACE.fullmatch(text)
     if not match:
-        message = f"{text!r} is no interface; expected inputs x results, such as '20x1200'"
-        raise ValueError(message)
+        raise ValueError(f"{text!r} is no interface; expected inputs x results, such as '20x1200'")
     return int(match[1]), int(match[2])
 
 
@@ -437,29 +431,29 @@ def load_deployment(directory: Path, *, images: bool = True, edited: bool = Fals
     directory = Path(directory)
     path = directory / FILE_NAME
     if directory.is_file():
-        message = f"{directory} is a file; give the folder that 'toolchain build' wrote, here perhaps {directory.parent}"
-        raise DeploymentError(message)
+        raise DeploymentError(
+            f"{directory} is a file; give the folder that 'toolchain build' wrote, here perhaps {directory.parent}"
+        )
     if not path.is_file():
-        message = f"{directory} holds no deployment: {path} is not there; make one with 'toolchain build'"
-        raise DeploymentError(message)
+        raise DeploymentError(
+            f"{directory} holds no deployment: {path} is not there; make one with 'toolchain build'"
+        )
     text = read_text(path, DeploymentError)
     tables = parse_toml(text, path, DeploymentError)
     version = tables.get("format")
     if version != FORMAT or isinstance(version, bool):
         found = "has no key 'format'" if version is None else f"is of format {version!r}"
-        message = (
+        raise DeploymentVersionError(
             f"{path} {found}, and this version reads format {FORMAT}: build it again with 'toolchain build'"
         )
-        raise DeploymentVersionError(message)
     file = validate(DeploymentFile, tables, text, path, DeploymentError)
     computed = deployment_hash(file)
     if computed != file.hash and not edited:
-        message = (
+        raise DamagedDeploymentError(
             f"{path} is not as it was built: its hash is {computed[:16]}, "
             f"it says {file.hash[:16] or 'nothing'}; only URIs, endpoints and compression may be edited: "
             "build it again with 'toolchain build', or keep the edit with 'toolchain regenerate deployment'"
         )
-        raise DamagedDeploymentError(message)
     deployment = Deployment(**dict(file), directory=directory)
     if images:
         _check_images(deployment)
@@ -482,8 +476,7 @@ def write_deployment(directory: Path, deployment: DeploymentFile) -> Deployment:
     except OSError as reason:
         with suppress(OSError):
             partial.unlink(missing_ok=True)
-        message = f"{written.path} can't be written: {reason.strerror or reason}"
-        raise DeploymentError(message) from None
+        raise DeploymentError(f"{written.path} can't be written: {reason.strerror or reason}") from None
     return written
 
 
@@ -510,10 +503,9 @@ def _check_images(deployment: Deployment) -> None:
     for index, board in enumerate(deployment.boards):
         path = deployment.image_path(index)
         if not path.is_file():
-            message = (
+            raise DamagedDeploymentError(
                 f"{path}, the image of board {index}, is not there: build it again with 'toolchain build'"
             )
-            raise DamagedDeploymentError(message)
         try:
             image = read_image(path)
         except DamagedImageError as reason:
@@ -521,8 +513,7 @@ def _check_images(deployment: Deployment) -> None:
         except PcieShimError as reason:
             raise DeploymentError(str(reason)) from reason
         if image.image_hash != board.image_hash:
-            message = (
+            raise DamagedDeploymentError(
                 f"{path} is another board's or another build's image: its hash is {image.image_hash[:16]}, "
                 f"{deployment.path} says {board.image_hash[:16]}"
             )
-            raise DamagedDeploymentError(message)

@@ -28,57 +28,51 @@ def websocket_uri(uri: str) -> str:
     except ValueError:  # a port beyond 65535, half an IPv6 address
         is_whole = False
     if not is_whole or not re.fullmatch(r"wss?://[^\s/?#]+\S*", uri):
-        message = f"{uri!r} is no WebSocket URI; expected one like 'ws://robot:9090'"
-        raise ValueError(message)
+        raise ValueError(f"{uri!r} is no WebSocket URI; expected one like 'ws://robot:9090'")
     return uri
 
 
 def _topic(topic: str) -> str:
     if not _TOPIC.fullmatch(topic):
-        message = f"{topic!r} is no topic name; expected one like '/boat/sensors'"
-        raise ValueError(message)
+        raise ValueError(f"{topic!r} is no topic name; expected one like '/boat/sensors'")
     if not topic.startswith("/"):
-        message = (
+        raise ValueError(
             f"{topic!r} has no slash at its beginning; write '/{topic}', which means the same on every server"
         )
-        raise ValueError(message)
     return topic
 
 
 def _message_type(name: str) -> str:
     if not _TYPE.fullmatch(name):
-        message = (
+        raise ValueError(
             f"{name!r} is no message type; expected one like 'std_msgs/Float64' or 'std_msgs/msg/Float64'"
         )
-        raise ValueError(message)
     return name
 
 
 def _not_zero(step: float) -> float:
     if step == 0:
-        message = "a step of 0 would give every value the same address"
-        raise ValueError(message)
+        raise ValueError("a step of 0 would give every value the same address")
     return step
 
 
 def _sha256(text: str) -> str:
     if not re.fullmatch(r"[0-9a-f]{64}", text):
-        message = f"{text!r} is no SHA-256 hash; expected 64 hexadecimal digits"
-        raise ValueError(message)
+        raise ValueError(f"{text!r} is no SHA-256 hash; expected 64 hexadecimal digits")
     return text
 
 
 def _message_path(path: str) -> str:
     if not MESSAGE_PATH.fullmatch(path):
-        message = f"{path!r} is no place in a message; expected one like 'pose.position.x', 'ranges[3]' or a field's name"
-        raise ValueError(message)
+        raise ValueError(
+            f"{path!r} is no place in a message; expected one like 'pose.position.x', 'ranges[3]' or a field's name"
+        )
     return path
 
 
 def _printable(name: str) -> str:
     if not name.isprintable():
-        message = f"{name!r} has a character that can't be printed"
-        raise ValueError(message)
+        raise ValueError(f"{name!r} has a character that can't be printed")
     return name
 
 
@@ -108,8 +102,7 @@ def states_fit(name: str, states: tuple[str, ...], size: int) -> None:
         ValueError: Says whose, and how many.
     """
     if states and len(states) != size:
-        message = f"{name} has {size} values, but {len(states)} states are named"
-        raise ValueError(message)
+        raise ValueError(f"{name} has {size} values, but {len(states)} states are named")
 
 
 def names_differ(kind: str, names: list[str]) -> None:
@@ -120,5 +113,4 @@ def names_differ(kind: str, names: list[str]) -> None:
     """
     twice = [name for name, count in Counter(names).items() if count > 1]
     if twice:
-        message = f"[[{kind}]] has {twice[0]!r} twice; every name must be its own"
-        raise ValueError(message)
+        raise ValueError(f"[[{kind}]] has {twice[0]!r} twice; every name must be its own")

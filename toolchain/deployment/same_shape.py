@@ -31,17 +31,14 @@ _TABLES: Final = {"sources", "variables", "searched", "machine", "boards", "outp
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """A field that would have to stay.
-
-    Attributes:
-        field: Its place in `deployment.toml`.
-        before: Its value in the deployment that is in force.
-        after: Its value in the new one.
-    """
+    """A field that would have to stay."""
 
     field: str
+    """Its place in `deployment.toml`."""
     before: str
+    """Its value in the deployment that is in force."""
     after: str
+    """Its value in the new one."""
 
     def __str__(self) -> str:
         return f"{self.field} is {self.before} in the run and {self.after} in the new one"

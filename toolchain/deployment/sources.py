@@ -22,25 +22,22 @@ MOST_SOURCES: Final = 256
 
 
 class SourceTable(BaseModel):
-    """`[[source]]` of a sources file.
-
-    Attributes:
-        uri: The rosbridge server; None for that of `--uri`.
-        topic: The topic.
-        type: Its messages' type.
-        compression: How the server is asked to send them: `cbor` pays where they have long arrays.
-        variables: By name, where in the message each variable is; None for all that no other source has.
-        prior: Where in the message a written prior is, or None.
-    """
+    """`[[source]]` of a sources file."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
     uri: WebSocketUri | None = None
+    """The rosbridge server; None for that of `--uri`."""
     topic: Topic
+    """The topic."""
     type: MessageType
+    """Its messages' type."""
     compression: Literal["none", "cbor"] = "none"
+    """How the server is asked to send them: `cbor` pays where they have long arrays."""
     variables: dict[Name, MessagePath] | None = None
+    """By name, where in the message each variable is; None for all that no other source has."""
     prior: MessagePath | None = None
+    """Where in the message a written prior is, or None."""
 
 
 class SourcesTables(BaseModel):
@@ -53,17 +50,14 @@ class SourcesTables(BaseModel):
 
 @dataclass(frozen=True, slots=True)
 class SourcesFile:
-    """A sources file that was read.
-
-    Attributes:
-        path: Where it is.
-        text: What stands in it.
-        tables: What it says; every source has a URI.
-    """
+    """A sources file that was read."""
 
     path: Path
+    """Where it is."""
     text: str
+    """What stands in it."""
     tables: tuple[SourceTable, ...]
+    """What it says; every source has a URI."""
 
     @property
     def sources(self) -> tuple[Source, ...]:
@@ -108,11 +102,10 @@ class SourcesFile:
         rest = next((at for at, table in enumerate(self.tables) if table.variables is None), None)
         left = [name for name in names if name not in places]
         if left and rest is None:
-            message = (
+            raise BuildError(
                 f"{self.path}: no source has {', '.join(left)}; add them to a source's variables, or leave "
                 "'variables' out of one, which then has all that no other has"
             )
-            raise BuildError(message)
         if not left and rest is not None and self.tables[rest].prior is None:
             raise self._refused(rest, "the other sources have all variables; nothing is left for this one")
         return tuple(
@@ -146,11 +139,17 @@ class SourcesFile:
                 raise self._refused(at, "nothing is read from it: it has neither variables nor a prior")
             first = seen.setdefault((table.uri, table.topic), at)
             if first != at:
-                why = f"source {first + 1} is the same topic of the same server: put their variables together"
-                raise self._refused(at, why, "topic")
+                raise self._refused(
+                    at,
+                    f"source {first + 1} is the same topic of the same server: put their variables together",
+                    "topic",
+                )
         if len(rests) > 1:
-            why = f"source {rests[0] + 1} has no 'variables' either; only one can have all that no other has"
-            raise self._refused(rests[1], why, "topic")
+            raise self._refused(
+                rests[1],
+                f"source {rests[0] + 1} has no 'variables' either; only one can have all that no other has",
+                "topic",
+            )
         if len(priors) > 1:
             raise self._refused(priors[1], f"source {priors[0] + 1} has the prior already", "prior")
 

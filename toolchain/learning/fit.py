@@ -44,38 +44,32 @@ _TO_SIGMA: Final = 1.4826
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Truth:
-    """Where the truth lay in each row that a model can learn from.
-
-    Attributes:
-        rows: int64[n], the recording's rows that have a true value of every searched dimension, inside the grid.
-        lines: int64[n], the line of each.
-        within: float64[dimensions, n], how far from the cell's centre, in cells: -0.5 to 0.5.
-        outside: How many other rows there are.
-    """
+    """Where the truth lay in each row that a model can learn from."""
 
     rows: NDArray[np.int64]
+    """int64[n], the recording's rows that have a true value of every searched dimension, inside the grid."""
     lines: NDArray[np.int64]
+    """int64[n], the line of each."""
     within: NDArray[np.float64]
+    """float64[dimensions, n], how far from the cell's centre, in cells: -0.5 to 0.5."""
     outside: int
+    """How many other rows there are."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Support:
-    """How much data a table rests on.
-
-    Attributes:
-        name: The variable.
-        readings: Its readings, in rows with a truth.
-        cells: Lines of the machine that have at least one of them.
-        median: Of the readings in such a line.
-        refused: Readings that are no values of the variable.
-    """
+    """How much data a table rests on."""
 
     name: str
+    """The variable."""
     readings: int
+    """Its readings, in rows with a truth."""
     cells: int
+    """Lines of the machine that have at least one of them."""
     median: float
+    """Of the readings in such a line."""
     refused: int
+    """Readings that are no values of the variable."""
 
 
 def locate(model: Model, columns: Mapping[str, Sequence[object]], rows: int) -> Truth:
@@ -126,8 +120,9 @@ def fit_model(
         ModelError: No row has a truth, or a variable that can't be learnt in this way.
     """
     if not len(truth.rows):
-        message = "no row has a true value inside the searched dimensions: is --truth right, and in the model's unit?"
-        raise ModelError(message)
+        raise ModelError(
+            "no row has a true value inside the searched dimensions: is --truth right, and in the model's unit?"
+        )
     known = {each.name: each for each in model.known}
     if options.method is FitMethod.NORMALS:
         supports, variables = _normals(
@@ -297,10 +292,9 @@ def _pools(names: Sequence[str], patterns: Sequence[str]) -> list[list[str]]:
     for pattern in patterns:
         pool = [name for name in left if fnmatchcase(name, pattern)]
         if not pool:
-            message = (
+            raise ModelError(
                 f"--pool {pattern} is none of the variables that are fitted; they are {', '.join(names[:20])}"
             )
-            raise ModelError(message)
         pools.append(pool)
         left = [name for name in left if name not in pool]
     return pools + [[name] for name in left]

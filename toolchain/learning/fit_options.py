@@ -26,26 +26,23 @@ class FitPrior(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FitOptions:
-    """What a fit is told beside the model and the recordings.
-
-    Attributes:
-        truth: `LABEL=COLUMN` of each searched dimension.
-        readings: `NAME=COLUMN` of known variables; one `*` in both stands for the same text.
-        method: What is learnt.
-        pool: Patterns of variables that share sigma and bias; each keeps its own outliers' share.
-        bias: Whether a constant error is fitted.
-        floor: What an outlier gets at least, relative to the peak.
-        pseudo_count: Readings that the Dirichlet prior of a cell is worth.
-        prior: What that prior looks like.
-        tolerance_s: Seconds between a reading in a bag and the truth that belongs to it.
-    """
+    """What a fit is told beside the model and the recordings."""
 
     truth: tuple[str, ...]
+    """`LABEL=COLUMN` of each searched dimension."""
     readings: tuple[str, ...] = ()
+    """`NAME=COLUMN` of known variables; one `*` in both stands for the same text."""
     method: FitMethod = FitMethod.NORMALS
+    """What is learnt."""
     pool: tuple[str, ...] = ()
+    """Patterns of variables that share sigma and bias; each keeps its own outliers' share."""
     bias: bool = False
+    """Whether a constant error is fitted."""
     floor: float = 0.005
+    """What an outlier gets at least, relative to the peak."""
     pseudo_count: float = 1.0
+    """Readings that the Dirichlet prior of a cell is worth."""
     prior: FitPrior = FitPrior.MODEL
+    """What that prior looks like."""
     tolerance_s: float = 0.1
+    """Seconds between a reading in a bag and the truth that belongs to it."""

@@ -71,15 +71,12 @@ class FitFile(_Section):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Fit:
-    """What was learnt.
-
-    Attributes:
-        file: Method, recordings and the variables' numbers.
-        tables: With the method `counts`, P(K | S) of each variable, float64[values, lines].
-    """
+    """What was learnt."""
 
     file: FitFile
+    """Method, recordings and the variables' numbers."""
     tables: Mapping[str, NDArray[np.float64]]
+    """With the method `counts`, P(K | S) of each variable, float64[values, lines]."""
 
 
 def with_fit(model: Model, path: Path | None) -> Model:
@@ -104,19 +101,19 @@ def apply_fit(model: Model, fit: Fit, where: str = "the fit") -> Model:
     known = {each.name: each for each in model.known}
     for variable in fit.file.variables:
         if variable.name not in known:
-            message = f"{where} is of a model with {variable.name}; {model.name} has {', '.join(known) or 'no known variables'}"
-            raise ModelError(message)
+            raise ModelError(
+                f"{where} is of a model with {variable.name}; {model.name} has {', '.join(known) or 'no known variables'}"
+            )
         before = known[variable.name]
         if fit.file.method == "normals":
             known[variable.name] = _with_normal(model, before, variable, fit.file.floor, where)
         else:
             table = fit.tables[variable.name]
             if table.shape != before.table.shape:
-                message = (
+                raise ModelError(
                     f"{where}: the table of {variable.name} has shape {table.shape}, the model's {before.table.shape}; "
                     "fit again with this model"
                 )
-                raise ModelError(message)
             known[variable.name] = replace(before, table=table, floor=0.0, normal=None)
     return replace(model, known=tuple(known.values()))
 
@@ -138,8 +135,9 @@ def mean_slopes(model: Model, known: Known) -> NDArray[np.float64]:
         ModelError: The variable has no mean: its table is not one of normals.
     """
     if known.normal is None:
-        message = f"{known.name} is not normal around a mean that the model says; fit it with --method counts"
-        raise ModelError(message)
+        raise ModelError(
+            f"{known.name} is not normal around a mean that the model says; fit it with --method counts"
+        )
     sizes = tuple(dimension.size for dimension in model.searched)
     mean = known.normal.mean.reshape(sizes)
     turn = None if known.period is None else known.period * abs(known.step)
@@ -165,8 +163,7 @@ def wrapped(away: NDArray[np.float64], turn: float) -> NDArray[np.float64]:
 
 def _with_normal(model: Model, known: Known, fitted: FittedVariable, floor: float, where: str) -> Known:
     if not fitted.sigma > 0:
-        message = f"{where}: sigma of {known.name} is {fitted.sigma:g}, expected a positive number"
-        raise ModelError(message)
+        raise ModelError(f"{where}: sigma of {known.name} is {fitted.sigma:g}, expected a positive number")
     spread = cell_spread(model, known)
     if known.normal is None:  # cell_spread has refused it
         raise AssertionError
@@ -190,8 +187,7 @@ def write_fit(path: Path, fit: Fit) -> None:
     content: dict[str, Any] = fit.file.model_dump(mode="json", exclude_defaults=False)
     suffix = ".toml" if fit.file.method == "normals" else ".npz"
     if path.suffix != suffix:
-        message = f"{path}: the method {fit.file.method} writes a file that ends in {suffix}"
-        raise ModelError(message)
+        raise ModelError(f"{path}: the method {fit.file.method} writes a file that ends in {suffix}")
     partial = path.with_name(path.name + ".part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -205,8 +201,7 @@ def write_fit(path: Path, fit: Fit) -> None:
             _write_tables(partial, content, fit.tables)
         partial.replace(path)
     except OSError as reason:
-        message = f"{path} can't be written: {reason.strerror or reason}"
-        raise ModelError(message) from None
+        raise ModelError(f"{path} can't be written: {reason.strerror or reason}") from None
 
 
 def read_fit(path: Path) -> Fit:
@@ -221,8 +216,7 @@ def read_fit(path: Path) -> Fit:
     tables = parse_toml(text, path, ModelError)
     file = validate(FitFile, tables, text, path, ModelError)
     if file.method != "normals":
-        message = f"{path} says method = {file.method!r}, whose tables `toolchain fit` writes as .npz"
-        raise ModelError(message)
+        raise ModelError(f"{path} says method = {file.method!r}, whose tables `toolchain fit` writes as .npz")
     return Fit(file=file, tables={})
 
 
@@ -243,8 +237,7 @@ def _read_tables(path: Path) -> Fit:
     try:
         with zipfile.ZipFile(path) as archive:
             if sum(entry.file_size for entry in archive.infolist()) > MAX_BYTES:
-                message = f"{path} is larger than {MAX_BYTES} bytes, unpacked; the most that is read"
-                raise ModelError(message)
+                raise ModelError(f"{path} is larger than {MAX_BYTES} bytes, unpacked; the most that is read")
             content = json.loads(_member(archive, _META, MAX_TABLE_BYTES))
             content = {
                 {"recordings": "recording", "variables": "variable"}.get(key, key): value
@@ -257,8 +250,7 @@ def _read_tables(path: Path) -> Fit:
                 for number, variable in enumerate(counted)
             }
     except OSError as reason:
-        message = f"{path} can't be read: {reason.strerror or reason}"
-        raise ModelError(message) from None
+        raise ModelError(f"{path} can't be read: {reason.strerror or reason}") from None
     except (
         zipfile.BadZipFile,
         KeyError,
@@ -270,11 +262,11 @@ def _read_tables(path: Path) -> Fit:
         NotImplementedError,
         RuntimeError,
     ) as reason:
-        message = f"{path} is no file of counted tables that `toolchain fit` wrote, or is damaged: {type(reason).__name__}"
-        raise ModelError(message) from None
+        raise ModelError(
+            f"{path} is no file of counted tables that `toolchain fit` wrote, or is damaged: {type(reason).__name__}"
+        ) from None
     if file.method != "counts":
-        message = f"{path} holds {file.method}, which `toolchain fit` writes as .toml"
-        raise ModelError(message)
+        raise ModelError(f"{path} holds {file.method}, which `toolchain fit` writes as .toml")
     return Fit(file=file, tables=tables)
 
 

@@ -28,17 +28,14 @@ _STEP: Final = re.compile(r"(\w+)((?:\[\d{1,9}\])*)")
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """Columns of a recording.
-
-    Attributes:
-        path: Where it came from.
-        rows: How many rows it has.
-        columns: By name, one value a row: a number, a word, or None where there is nothing.
-    """
+    """Columns of a recording."""
 
     path: Path
+    """Where it came from."""
     rows: int
+    """How many rows it has."""
     columns: dict[str, list[object]]
+    """By name, one value a row: a number, a word, or None where there is nothing."""
 
 
 def read_recording(path: Path, columns: Sequence[str], *, tolerance_s: float = 0.1) -> Recording:
@@ -53,8 +50,7 @@ def read_recording(path: Path, columns: Sequence[str], *, tolerance_s: float = 0
         ModelError: Not there, damaged, without a column (lists those there are), or longer than `MAX_ROWS`.
     """
     if not path.exists():
-        message = f"the recording {path} is not there"
-        raise ModelError(message)
+        raise ModelError(f"the recording {path} is not there")
     if path.suffix.lower() == ".csv":
         return _read_csv(path, columns)
     return _read_bag(path, columns, round(tolerance_s * 1e9))
@@ -72,24 +68,23 @@ def _read_csv(path: Path, columns: Sequence[str]) -> Recording:
                 if not line:
                     continue
                 if len(line) != len(heading):
-                    message = f"{path}, line {lines.line_num}: {len(line)} values, but the heading has {len(heading)}"
-                    raise ModelError(message)
+                    raise ModelError(
+                        f"{path}, line {lines.line_num}: {len(line)} values, but the heading has {len(heading)}"
+                    )
                 rows += 1
                 _check_rows(path, rows)
                 for column, place in places.items():
                     found[column].append(_cell(line[place]))
             if not rows:
-                message = f"{path} has a heading and no rows"
-                raise ModelError(message)
+                raise ModelError(f"{path} has a heading and no rows")
     except OSError as reason:
-        message = f"{path} can't be read: {reason.strerror or reason}"
-        raise ModelError(message) from None
+        raise ModelError(f"{path} can't be read: {reason.strerror or reason}") from None
     except UnicodeDecodeError:
-        message = f"{path} is no CSV file: it is not UTF-8 text, at the line after {lines.line_num} or later"
-        raise ModelError(message) from None
+        raise ModelError(
+            f"{path} is no CSV file: it is not UTF-8 text, at the line after {lines.line_num} or later"
+        ) from None
     except csv.Error as reason:
-        message = f"{path} is no CSV file: {reason}"
-        raise ModelError(message) from None
+        raise ModelError(f"{path} is no CSV file: {reason}") from None
     return Recording(path, rows, found)
 
 
@@ -97,22 +92,19 @@ def _lines(path: Path, file: TextIO) -> Iterator[str]:
     """The lines of a file, which may be one without an end."""
     while line := file.readline(_LONGEST_LINE + 1):
         if len(line) > _LONGEST_LINE:
-            message = f"{path} is no CSV file: a line has more than {_LONGEST_LINE} characters"
-            raise ModelError(message)
+            raise ModelError(f"{path} is no CSV file: a line has more than {_LONGEST_LINE} characters")
         yield line
 
 
 def _check_rows(path: Path, rows: int) -> None:
     if rows > MAX_ROWS:
-        message = f"{path} has more than {MAX_ROWS} rows or messages, the most that is read"
-        raise ModelError(message)
+        raise ModelError(f"{path} has more than {MAX_ROWS} rows or messages, the most that is read")
 
 
 def _check_topics(path: Path, topics: Sequence[str], there: set[str]) -> None:
     for topic in topics:
         if topic not in there:
-            message = f"{path} has no topic {topic!r}; it has {_listed(sorted(there))}"
-            raise ModelError(message)
+            raise ModelError(f"{path} has no topic {topic!r}; it has {_listed(sorted(there))}")
 
 
 def _place(path: Path, heading: Sequence[str], column: str) -> int:
@@ -150,10 +142,9 @@ def _read_bag(path: Path, columns: Sequence[str], tolerance_ns: int) -> Recordin
     for column in columns:
         topic, colon, _ = column.partition(":")
         if not colon:
-            message = (
+            raise ModelError(
                 f"the column {column!r} of {path}: in a bag a column is TOPIC:PATH, such as /scan:ranges[3]"
             )
-            raise ModelError(message)
         topics.setdefault(topic, []).append(column)
     times: dict[str, list[int]] = {topic: [] for topic in topics}
     values: dict[str, list[object]] = {column: [] for column in columns}
@@ -175,8 +166,9 @@ def _messages(path: Path, topics: tuple[str, ...]) -> Iterator[tuple[str, int, A
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
-        message = f"{path} is no CSV file, and bags are read by rosbags: pip install rosbags"
-        raise ModelError(message) from None
+        raise ModelError(
+            f"{path} is no CSV file, and bags are read by rosbags: pip install rosbags"
+        ) from None
     count = 0
     try:
         with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as reader:
@@ -190,8 +182,9 @@ def _messages(path: Path, topics: tuple[str, ...]) -> Iterator[tuple[str, int, A
         raise
     except Exception as reason:  # rosbags reads many formats, and each fails in its own way
         text = " ".join(str(reason).split())[:200]
-        message = f"{path} can't be read as a bag, after {count} messages: {text or type(reason).__name__}"
-        raise ModelError(message) from None
+        raise ModelError(
+            f"{path} can't be read as a bag, after {count} messages: {text or type(reason).__name__}"
+        ) from None
 
 
 def _field(message: Any, path: str) -> object:
@@ -200,11 +193,9 @@ def _field(message: Any, path: str) -> object:
     for step in path.split("."):
         match = _STEP.fullmatch(step)
         if match is None:
-            text = f"{path!r} is no path; expected one such as pose.position.x or ranges[3]"
-            raise ModelError(text)
+            raise ModelError(f"{path!r} is no path; expected one such as pose.position.x or ranges[3]")
         if match[1].startswith("_") or match[1] not in getattr(value, "__dataclass_fields__", {}):
-            text = f"the message has no field {match[1]!r} of {path!r}"
-            raise ModelError(text)
+            raise ModelError(f"the message has no field {match[1]!r} of {path!r}")
         value = getattr(value, match[1])
         for index in re.findall(r"\d+", match[2]):
             if not hasattr(value, "__len__") or int(index) >= len(value):

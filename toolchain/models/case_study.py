@@ -41,11 +41,10 @@ def load_model(case: Path, settings: Mapping[str, str]) -> Model:
     path = model_path(case)
     if not path.is_file():
         what = f"has no {FILE_NAME}" if Path(case).is_dir() else "is no folder"
-        message = (
+        raise ModelError(
             f"{case} {what}; expected a case study's folder with a {FILE_NAME} that defines model(), or a network's "
             "file: .bif, .xmlbif, .uai or .net"
         )
-        raise ModelError(message)
     with _importing_from(path.parent.resolve()):
         function = _model_function(path)
         arguments = _arguments(path, function, settings)
@@ -53,11 +52,10 @@ def load_model(case: Path, settings: Mapping[str, str]) -> Model:
     if isinstance(model, Question):
         return model.model()
     if not isinstance(model, Model):
-        message = (
+        raise ModelError(
             f"{path}: model() returned {type(model).__name__}, expected a toolchain.models.Model or a "
             "toolchain.models.Question"
         )
-        raise ModelError(message)
     return model
 
 
@@ -80,8 +78,7 @@ def _importing_from(folder: Path) -> Iterator[None]:
 def _model_function(path: Path) -> Callable[..., object]:
     spec = importlib.util.spec_from_file_location("rosbayes_case_study_model", path)
     if spec is None or spec.loader is None:
-        message = f"{path} can't be loaded as a Python module"
-        raise ModelError(message)
+        raise ModelError(f"{path} can't be loaded as a Python module")
     module: ModuleType = importlib.util.module_from_spec(spec)
     loader = spec.loader
     sys.modules[spec.name] = module  # dataclasses and get_type_hints look their module up
@@ -91,8 +88,9 @@ def _model_function(path: Path) -> Callable[..., object]:
         del sys.modules[spec.name]
     function = getattr(module, "model", None)
     if not callable(function):
-        message = f"{path} defines no model(); expected a function that returns a toolchain.models.Model"
-        raise ModelError(message)
+        raise ModelError(
+            f"{path} defines no model(); expected a function that returns a toolchain.models.Model"
+        )
     return function  # type: ignore[no-any-return]  # what a user's module holds has no type
 
 
@@ -106,15 +104,13 @@ def _guarded(path: Path, what: str, call: Callable[[], object]) -> object:
     except ModelError as error:
         frames = traceback.extract_tb(error.__traceback__)
         if Path(frames[-1].filename).is_relative_to(_TOOLCHAIN) and (line := _line(path, frames)):
-            message = f"{path}, line {line}: {error}"
-            raise ModelError(message) from None
+            raise ModelError(f"{path}, line {line}: {error}") from None
         raise
     except ToolchainError:
         raise
     except SyntaxError as error:
         place = f", line {error.lineno}" if error.lineno else ""  # a file that is no text has none
-        message = f"{error.filename or path}{place}: {error.msg}"
-        raise ModelError(message) from None
+        raise ModelError(f"{error.filename or path}{place}: {error.msg}") from None
     except SystemExit as error:
         frames = traceback.extract_tb(error.__traceback__)
         if Path(frames[-1].filename).is_relative_to(
@@ -124,15 +120,13 @@ def _guarded(path: Path, what: str, call: Callable[[], object]) -> object:
         line = _line(path, frames)
         where = f"{path}, line {line}" if line else str(path)
         said = "" if error.code is None else f" with {error.code!r}"
-        message = f"{where}: {what} ended the program{said}; expected a model"
-        raise ModelError(message) from None
+        raise ModelError(f"{where}: {what} ended the program{said}; expected a model") from None
     except Exception as error:
         line = _line(path, traceback.extract_tb(error.__traceback__))
         where = f"{path}, line {line}" if line else str(path)
         text = " ".join(str(error).split())
         raised = f"{type(error).__name__}: {text}" if text else type(error).__name__
-        message = f"{where}: {what} raised {raised}"
-        raise ModelError(message) from error
+        raise ModelError(f"{where}: {what} raised {raised}") from error
 
 
 def _line(path: Path, frames: traceback.StackSummary) -> int | None:
@@ -160,8 +154,7 @@ def _arguments(path: Path, function: Callable[..., object], settings: Mapping[st
         arguments[key] = _value(key, text, hints.get(key, fallback))
     for key, parameter in parameters.items():
         if parameter.default is inspect.Parameter.empty and key not in arguments:
-            message = f"{path}: the model needs {key}: add --set {key}=VALUE"
-            raise ModelError(message)
+            raise ModelError(f"{path}: the model needs {key}: add --set {key}=VALUE")
     return arguments
 
 
@@ -189,12 +182,11 @@ def _value(key: str, text: str, wanted: Any) -> object:
         try:
             return wanted(text)
         except ValueError:
-            message = f"--set {key}={text}: expected {'an integer' if wanted is int else 'a number'}"
-            raise ModelError(message) from None
+            raise ModelError(
+                f"--set {key}={text}: expected {'an integer' if wanted is int else 'a number'}"
+            ) from None
     else:
-        message = f"--set {key}={text}: the model's {key} can't be given on the command line"
-        raise ModelError(message)
+        raise ModelError(f"--set {key}={text}: the model's {key} can't be given on the command line")
     if text not in choices:
-        message = f"--set {key}={text}: expected one of {', '.join(choices)}"
-        raise ModelError(message)
+        raise ModelError(f"--set {key}={text}: expected one of {', '.join(choices)}")
     return choices[text]

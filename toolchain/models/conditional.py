@@ -169,24 +169,24 @@ def _checked(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     mean = np.asarray(shape.mean, dtype=np.float64)
     if mean.ndim != 1 or not np.all(np.isfinite(mean)):
-        message = f"variable {name!r}: its mean must be one finite number for every line"
-        raise ModelError(message)
+        raise ModelError(f"variable {name!r}: its mean must be one finite number for every line")
     spread = np.asarray(shape.sigma, dtype=np.float64)
     if spread.shape not in {(), mean.shape}:
-        message = f"variable {name!r}: sigma has shape {spread.shape}, expected one number or {mean.shape}"
-        raise ModelError(message)
+        raise ModelError(
+            f"variable {name!r}: sigma has shape {spread.shape}, expected one number or {mean.shape}"
+        )
     if not (np.all(spread > 0) and np.all(np.isfinite(spread))):
-        message = f"variable {name!r}: sigma must be positive on every line"
-        raise ModelError(message)
+        raise ModelError(f"variable {name!r}: sigma must be positive on every line")
     if values < 1 or not step > 0 or not math.isfinite(step):
-        message = f"variable {name!r}: {values} bins of width {step:g}; both must be positive"
-        raise ModelError(message)
+        raise ModelError(f"variable {name!r}: {values} bins of width {step:g}; both must be positive")
     if not 0 <= shape.floor < math.inf:
-        message = f"variable {name!r}: a floor of {shape.floor:g}, expected a share of the peak from 0"
-        raise ModelError(message)
+        raise ModelError(
+            f"variable {name!r}: a floor of {shape.floor:g}, expected a share of the peak from 0"
+        )
     if not 0 <= shape.outliers <= 1:
-        message = f"variable {name!r}: {shape.outliers:g} of its readings are outliers, expected 0 to 1"
-        raise ModelError(message)
+        raise ModelError(
+            f"variable {name!r}: {shape.outliers:g} of its readings are outliers, expected 0 to 1"
+        )
     return mean, np.broadcast_to(spread, mean.shape)
 
 

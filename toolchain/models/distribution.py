@@ -33,20 +33,17 @@ _SUM_TOLERANCE: Final = 1e-6
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Distribution:
-    """P(symbol | given) as a table.
-
-    Attributes:
-        symbol: The symbol that it is a distribution of.
-        given: What it depends on.
-        table: float64[symbol's size, size of each given], summing to 1 over the first axis.
-        normal: What it was made of, where it is one of normals; its arrays run over the given symbols' values,
-            the last fastest.
-    """
+    """P(symbol | given) as a table."""
 
     symbol: Symbol
+    """The symbol that it is a distribution of."""
     given: tuple[Symbol, ...]
+    """What it depends on."""
     table: NDArray[np.float64]
+    """float64[symbol's size, size of each given], summing to 1 over the first axis."""
     normal: Normal | None = None
+    """What it was made of, where it is one of normals; its arrays run over the given symbols' values, the
+    last fastest."""
 
     @property
     def scope(self) -> tuple[Symbol, ...]:
@@ -64,15 +61,12 @@ class Distribution:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Potential:
-    """A function of some symbols that is a factor of the joint distribution and no distribution by itself.
-
-    Attributes:
-        scope: The symbols of its table's axes.
-        table: float64[size of each symbol], from 0.
-    """
+    """A function of some symbols that is a factor of the joint distribution and no distribution by itself."""
 
     scope: tuple[Symbol, ...]
+    """The symbols of its table's axes."""
     table: NDArray[np.float64]
+    """float64[size of each symbol], from 0."""
 
     def __repr__(self) -> str:
         return f"Potential({', '.join(each.name for each in self.scope)}, {_sizes(self.table)})"
@@ -97,22 +91,21 @@ def table(symbol: Symbol, values: ArrayLike, *, given: Sequence[Symbol] = ()) ->
     numbers = np.array(values, dtype=np.float64)
     shape = tuple(each.size for each in scope)
     if numbers.shape != shape:
-        message = f"{_title(symbol, given)} has shape {numbers.shape}, expected {shape}"
-        raise ModelError(message)
+        raise ModelError(f"{_title(symbol, given)} has shape {numbers.shape}, expected {shape}")
     if not np.all(np.isfinite(numbers)) or np.any(numbers < 0):
-        message = f"{_title(symbol, given)} holds a number that is no probability: negative, infinite or NaN"
-        raise ModelError(message)
+        raise ModelError(
+            f"{_title(symbol, given)} holds a number that is no probability: negative, infinite or NaN"
+        )
     sums = numbers.sum(axis=0)
     wrong = np.argwhere(np.abs(sums - 1) > _SUM_TOLERANCE)
     if len(wrong):
         place = tuple(wrong[0])
         where = ", ".join(f"{each.name} = {_shown(each, at)}" for each, at in zip(given, place, strict=True))
-        message = (
+        raise ModelError(
             f"{_title(symbol, given)} sums to {float(sums[place]):.9g}"
             + (f" for {where}" if where else "")
             + "; a distribution sums to 1"
         )
-        raise ModelError(message)
     numbers.flags.writeable = False
     return Distribution(symbol=symbol, given=given, table=numbers)
 
@@ -148,8 +141,7 @@ def conditional_normal(
     scope = _scope(symbol, given)
     title = _title(symbol, given)
     if symbol.type.labels:
-        message = f"{title}: a normal is over numbers, and {symbol.name} has named values"
-        raise ModelError(message)
+        raise ModelError(f"{title}: a normal is over numbers, and {symbol.name} has named values")
     shape = Normal(
         mean=_evaluated(title, "mean", mean, given),
         sigma=_evaluated(title, "sigma", sigma, given),
@@ -179,8 +171,7 @@ def function(symbol: Symbol, given: Sequence[Symbol], value: Formula) -> Distrib
     title = _title(symbol, given)
     numbers = _evaluated(title, "the function", value, given)
     if not np.all(np.isfinite(numbers)):
-        message = f"{title}: the function gives {numbers[~np.isfinite(numbers)][0]}"
-        raise ModelError(message)
+        raise ModelError(f"{title}: the function gives {numbers[~np.isfinite(numbers)][0]}")
     place = np.floor((numbers - symbol.type.offset) / symbol.type.step + 0.5)
     if symbol.type.wraps:
         place %= symbol.size
@@ -189,11 +180,10 @@ def function(symbol: Symbol, given: Sequence[Symbol], value: Formula) -> Distrib
     outside = (place < 0) | (place >= symbol.size)
     if np.any(outside):
         last = symbol.type.offset + (symbol.size - 1) * symbol.type.step
-        message = (
+        raise ModelError(
             f"{title}: the function gives {numbers[outside][0]:g}, but {symbol.name} is {symbol.type.offset:g} to "
             f"{last:g}; widen its type, or give it on_range = clamp"
         )
-        raise ModelError(message)
     flat = (np.arange(symbol.size)[:, np.newaxis] == place).astype(np.float64)
     flat.flags.writeable = False
     return Distribution(symbol=symbol, given=given, table=flat.reshape(tuple(each.size for each in scope)))
@@ -213,11 +203,11 @@ def potential(symbols: Sequence[Symbol], values: ArrayLike) -> Potential:
     numbers = np.array(values, dtype=np.float64)
     names = ", ".join(each.name for each in scope)
     if numbers.shape != tuple(each.size for each in scope):
-        message = f"the potential of {names} has shape {numbers.shape}, expected {tuple(each.size for each in scope)}"
-        raise ModelError(message)
+        raise ModelError(
+            f"the potential of {names} has shape {numbers.shape}, expected {tuple(each.size for each in scope)}"
+        )
     if not np.all(np.isfinite(numbers)) or np.any(numbers < 0):
-        message = f"the potential of {names} holds a number that is negative, infinite or NaN"
-        raise ModelError(message)
+        raise ModelError(f"the potential of {names} holds a number that is negative, infinite or NaN")
     numbers.flags.writeable = False
     return Potential(scope=scope, table=numbers)
 
@@ -225,12 +215,12 @@ def potential(symbols: Sequence[Symbol], values: ArrayLike) -> Potential:
 def _scope(symbol: Symbol, given: tuple[Symbol, ...]) -> tuple[Symbol, ...]:
     scope = (symbol, *given)
     if len({each.name for each in scope}) < len(scope):
-        message = f"{_title(symbol, given)} names a symbol twice"
-        raise ModelError(message)
+        raise ModelError(f"{_title(symbol, given)} names a symbol twice")
     entries = math.prod(each.size for each in scope)
     if entries > MAX_ENTRIES:
-        message = f"{_title(symbol, given)} would be a table of {entries} entries; the most is {MAX_ENTRIES}"
-        raise ModelError(message)
+        raise ModelError(
+            f"{_title(symbol, given)} would be a table of {entries} entries; the most is {MAX_ENTRIES}"
+        )
     return scope
 
 
@@ -242,8 +232,7 @@ def _evaluated(title: str, what: str, formula: Formula, given: tuple[Symbol, ...
     try:
         numbers = np.broadcast_to(np.asarray(values, dtype=np.float64), sizes)
     except (TypeError, ValueError):
-        message = f"{title}: {what} has shape {np.shape(values)}, expected {sizes}"
-        raise ModelError(message) from None
+        raise ModelError(f"{title}: {what} has shape {np.shape(values)}, expected {sizes}") from None
     return numbers.ravel().copy()
 
 

@@ -114,8 +114,7 @@ def _check_size(scope: Sequence[str], sizes: Mapping[str, int], what: str) -> No
         names = ", ".join(scope[:_NAMED]) + (
             f" and {len(scope) - _NAMED} more" if len(scope) > _NAMED else ""
         )
-        message = (
+        raise ModelError(
             f"{what} needs a table of {entries} entries over {names}; the most is {MAX_ENTRIES}: search or know fewer "
             "variables, or ones that are nearer to each other"
         )
-        raise ModelError(message)

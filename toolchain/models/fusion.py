@@ -35,8 +35,9 @@ def exact_posterior(
             impossible on every line.
     """
     if len(addresses) != len(model.known):
-        message = f"{len(addresses)} readings for the {len(model.known)} known variables of {model.name!r}"
-        raise ModelError(message)
+        raise ModelError(
+            f"{len(addresses)} readings for the {len(model.known)} known variables of {model.name!r}"
+        )
     factors = []
     for known, address in zip(model.known, addresses, strict=True):
         if address is None:
@@ -45,15 +46,13 @@ def exact_posterior(
             factors.append(known.table[address, np.arange(model.lines)])
             continue
         if not 0 <= address < known.values:
-            message = f"variable {known.name}: address {address} is not one of its {known.values}"
-            raise ModelError(message)
+            raise ModelError(f"variable {known.name}: address {address} is not one of its {known.values}")
         factors.append(known.table[address])
     if prior_address is None:
         return fuse(model.prior_distribution, factors)
     rows = None if model.prior_select is None else model.prior_select.table
     if rows is None or not 0 <= prior_address < len(rows):
-        message = f"model {model.name!r} has no prior of address {prior_address}"
-        raise ModelError(message)
+        raise ModelError(f"model {model.name!r} has no prior of address {prior_address}")
     return fuse(rows[prior_address], factors)
 
 
@@ -71,8 +70,7 @@ def fuse(prior: NDArray[np.float64], likelihoods: Iterable[NDArray[np.float64]])
             logarithm = logarithm + np.log(likelihood)
     largest = logarithm.max()
     if largest == -np.inf:
-        message = "these readings are impossible on every line: there is no posterior"
-        raise ModelError(message)
+        raise ModelError("these readings are impossible on every line: there is no posterior")
     weights = np.exp(logarithm - largest)
     posterior: NDArray[np.float64] = weights / weights.sum()
     return posterior

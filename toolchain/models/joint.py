@@ -35,15 +35,12 @@ _LISTED: Final = 20
 
 @dataclass(frozen=True, eq=False)
 class JointDistribution:
-    """A product of factors: a Bayesian network, or with potentials a Markov network.
-
-    Attributes:
-        name: What a deployment of it is called.
-        factors: The distributions P(A | B, C) and potentials; every symbol that is given has a factor too.
-    """
+    """A product of factors: a Bayesian network, or with potentials a Markov network."""
 
     name: str
+    """What a deployment of it is called."""
     factors: tuple[Factor, ...]
+    """The distributions P(A | B, C) and potentials; every symbol that is given has a factor too."""
     symbols: tuple[Symbol, ...] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -57,27 +54,23 @@ class JointDistribution:
         for factor in self.factors:
             for symbol in factor.scope:
                 if symbols.setdefault(symbol.name, symbol) != symbol:
-                    message = f"{self.name}: there are two different symbols {symbol.name!r}"
-                    raise ModelError(message)
+                    raise ModelError(f"{self.name}: there are two different symbols {symbol.name!r}")
         children: dict[str, tuple[str, ...]] = {}
         bare = set(symbols)
         for factor in self.factors:
             if isinstance(factor, Distribution):
                 if factor.symbol.name in children:
-                    message = f"{self.name}: {factor.symbol.name} has two distributions"
-                    raise ModelError(message)
+                    raise ModelError(f"{self.name}: {factor.symbol.name} has two distributions")
                 children[factor.symbol.name] = tuple(each.name for each in factor.given)
                 bare.discard(factor.symbol.name)
             else:
                 bare.difference_update(each.name for each in factor.scope)
         if bare:
-            message = (
+            raise ModelError(
                 f"{self.name}: {min(bare)} has no distribution; give it one, such as uniform({min(bare)})"
             )
-            raise ModelError(message)
         if circle := _circle(children):
-            message = f"{self.name}: {' -> '.join(circle)} is a circle; a joint distribution has none"
-            raise ModelError(message)
+            raise ModelError(f"{self.name}: {' -> '.join(circle)} is a circle; a joint distribution has none")
         object.__setattr__(self, "symbols", tuple(symbols.values()))
 
     def symbol(self, name: Named) -> Symbol:
@@ -92,8 +85,7 @@ class JointDistribution:
                 return symbol
         names = [symbol.name for symbol in self.symbols]
         more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
-        message = f"{self.name} has no variable {wanted!r}; it has {', '.join(names[:_LISTED])}{more}"
-        raise ModelError(message)
+        raise ModelError(f"{self.name} has no variable {wanted!r}; it has {', '.join(names[:_LISTED])}{more}")
 
     def ask(
         self,
@@ -127,31 +119,28 @@ class JointDistribution:
         names = [each.name for each in (*question.searched, *question.observed)] + list(fixed)
         for name in names:
             if names.count(name) > 1:
-                message = f"{self.name}: {name} is in the question twice; it can be searched, known or given"
-                raise ModelError(message)
+                raise ModelError(
+                    f"{self.name}: {name} is in the question twice; it can be searched, known or given"
+                )
         if not question.searched:
-            message = f"{self.name}: the question searches nothing"
-            raise ModelError(message)
+            raise ModelError(f"{self.name}: the question searches nothing")
         return question
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Question:
-    """P(searched | known) of a joint distribution; `JointDistribution.ask` makes it.
-
-    Attributes:
-        joint: The joint distribution.
-        searched: What is searched, the slowest dimension first.
-        known: What is known, in the columns' order.
-        given: What is known for ever: each name's value.
-        prior_select: What selects the prior, or None.
-    """
+    """P(searched | known) of a joint distribution; `JointDistribution.ask` makes it."""
 
     joint: JointDistribution
+    """The joint distribution."""
     searched: tuple[Symbol, ...]
+    """What is searched, the slowest dimension first."""
     known: tuple[Symbol, ...]
+    """What is known, in the columns' order."""
     given: Mapping[str, int]
+    """What is known for ever: each name's value."""
     prior_select: Symbol | None
+    """What selects the prior, or None."""
 
     def __repr__(self) -> str:
         known = [*(each.name for each in self.observed), *(f"{name}={at}" for name, at in self.given.items())]
@@ -180,11 +169,10 @@ class Question:
         lines = math.prod(symbol.size for symbol in self.searched)
         widest = max((symbol.size for symbol in self.observed), default=1)
         if lines * widest > MAX_ENTRIES:
-            message = (
+            raise ModelError(
                 f"{self.joint.name}: {lines} lines with {widest} values each are a table of {lines * widest} entries; the "
                 f"most is {MAX_ENTRIES}: search fewer variables"
             )
-            raise ModelError(message)
         links = Links(terms, factors, {*searched, *self.given})
         if links.joined(observed):
             raise self._refusal(active, observed)
@@ -263,8 +251,7 @@ class Question:
         for total in sums.values():
             prior = _scaled(prior * total)
         if not prior.sum() > 0:
-            message = f"{self.joint.name}: what is given is impossible, so there is nothing to search"
-            raise ModelError(message)
+            raise ModelError(f"{self.joint.name}: what is given is impossible, so there is nothing to search")
         prior /= prior.sum()
         select = None
         if self.prior_select is not None:

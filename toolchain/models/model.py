@@ -31,53 +31,47 @@ _SUM_TOLERANCE: Final = 1e-6
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Normal:
-    """What a table of normals was made of; learning replaces the parts that recordings tell (`toolchain fit`).
-
-    Attributes:
-        mean: float64[lines], in the reading's unit.
-        sigma: Standard deviation, one or float64[lines], in the reading's unit.
-        floor: What an outlier's bin gets everywhere, relative to the bin likelihood's peak.
-        outliers: Share of readings that have nothing to do with S.
-    """
+    """What a table of normals was made of; learning replaces the parts that recordings tell (`toolchain fit`)."""
 
     mean: NDArray[np.float64]
+    """float64[lines], in the reading's unit."""
     sigma: ArrayLike
+    """Standard deviation, one or float64[lines], in the reading's unit."""
     floor: float = 0.0
+    """What an outlier's bin gets everywhere, relative to the bin likelihood's peak."""
     outliers: float = 0.0
+    """Share of readings that have nothing to do with S."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Known:
-    """A known variable K: its conditional distribution, and how a reading becomes an address of it.
-
-    Attributes:
-        name: The variable's name: the field in the message, unless `path` says where it is.
-        table: P(K | S), float64[values, lines]; row k is address k, and every line's column sums to 1.
-        bits: Address bits of its column; 0 takes as few as hold all values and the missing reading's address.
-        offset: The reading that is address 0, in the variable's unit.
-        step: From one address to the next, in the variable's unit.
-        period: After how many addresses the readings begin again (a turn of a bearing), or None.
-        on_range: What a reading out of range is: an error, the nearest end, or a missing reading.
-        on_missing: Whether a reading may be missing.
-        path: Where in the message it is; empty to search the message for the name.
-        floor: The least probability of an outlier that the table was made with, relative to the peak of the
-            likelihood; 0 for none. Quantising says when codes are too coarse to hold it.
-        states: Its values' names, or none; a reading may be a name.
-        normal: What the table was made of, where it is one of normals.
-    """
+    """A known variable K: its conditional distribution, and how a reading becomes an address of it."""
 
     name: str
+    """The variable's name: the field in the message, unless `path` says where it is."""
     table: NDArray[np.float64] = field(repr=False)
+    """P(K | S), float64[values, lines]; row k is address k, and every line's column sums to 1."""
     bits: int = 0
+    """Address bits of its column; 0 takes as few as hold all values and the missing reading's address."""
     offset: float = 0.0
+    """The reading that is address 0, in the variable's unit."""
     step: float = 1.0
+    """From one address to the next, in the variable's unit."""
     period: int | None = None
+    """After how many addresses the readings begin again (a turn of a bearing), or None."""
     on_range: Literal["error", "clamp", "missing"] = "error"
+    """What a reading out of range is: an error, the nearest end, or a missing reading."""
     on_missing: Literal["error", "missing"] = "error"
+    """Whether a reading may be missing."""
     path: str = ""
+    """Where in the message it is; empty to search the message for the name."""
     floor: float = 0.0
+    """The least probability of an outlier that the table was made with, relative to the peak of the
+    likelihood; 0 for none. Quantising says when codes are too coarse to hold it."""
     states: tuple[str, ...] = ()
+    """Its values' names, or none; a reading may be a name."""
     normal: Normal | None = field(default=None, repr=False)
+    """What the table was made of, where it is one of normals."""
 
     def __post_init__(self) -> None:
         """Check the table by itself.
@@ -106,32 +100,29 @@ class Known:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PriorSelect:
-    """A known variable A that selects the prior: P(S | A), one row of the prior's table for each value (thesis 2.1.2).
-
-    Attributes:
-        name: The variable's name: the field in the message, unless `path` says where it is.
-        table: P(S | A), float64[values, lines]; row a is address a, and every row sums to 1.
-        bits: Address bits of the prior's table; 0 takes as few as hold all values and the top row, which is the
-            prior without a selection.
-        offset: The reading that is address 0, in the variable's unit.
-        step: From one address to the next, in the variable's unit.
-        period: After how many addresses the readings begin again, or None.
-        on_range: What a reading out of range is: an error, the nearest end, or a missing reading.
-        on_missing: Whether a reading may be missing.
-        path: Where in the message it is; empty to search the message for the name.
-        states: Its values' names, or none; a reading may be a name.
-    """
+    """A known variable A that selects the prior: P(S | A), one row of the prior's table for each value (thesis 2.1.2)."""
 
     name: str
+    """The variable's name: the field in the message, unless `path` says where it is."""
     table: NDArray[np.float64] = field(repr=False)
+    """P(S | A), float64[values, lines]; row a is address a, and every row sums to 1."""
     bits: int = 0
+    """Address bits of the prior's table; 0 takes as few as hold all values and the top row, which is the
+    prior without a selection."""
     offset: float = 0.0
+    """The reading that is address 0, in the variable's unit."""
     step: float = 1.0
+    """From one address to the next, in the variable's unit."""
     period: int | None = None
+    """After how many addresses the readings begin again, or None."""
     on_range: Literal["error", "clamp", "missing"] = "error"
+    """What a reading out of range is: an error, the nearest end, or a missing reading."""
     on_missing: Literal["error", "missing"] = "error"
+    """Whether a reading may be missing."""
     path: str = ""
+    """Where in the message it is; empty to search the message for the name."""
     states: tuple[str, ...] = ()
+    """Its values' names, or none; a reading may be a name."""
 
     def __post_init__(self) -> None:
         """Check the table by itself.
@@ -161,22 +152,19 @@ class PriorSelect:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Model:
-    """A naive Bayesian fusion: what a BM1 computes.
-
-    Attributes:
-        name: What the deployment is called.
-        searched: The searched variable's dimensions, the slowest first; line = y * width + x for (y, x).
-        known: The known variables in the order of the machine's columns 1..N.
-        prior: P(S), float64[lines] summing to 1; None for a uniform one, or with a `prior_select` for the mean of
-            its rows.
-        prior_select: What selects the prior; then `prior` is the one without a selection.
-    """
+    """A naive Bayesian fusion: what a BM1 computes."""
 
     name: str
+    """What the deployment is called."""
     searched: tuple[Dimension, ...]
+    """The searched variable's dimensions, the slowest first; line = y * width + x for (y, x)."""
     known: tuple[Known, ...]
+    """The known variables in the order of the machine's columns 1..N."""
     prior: NDArray[np.float64] | None = None
+    """P(S), float64[lines] summing to 1; None for a uniform one, or with a `prior_select` for the mean of
+    its rows."""
     prior_select: PriorSelect | None = None
+    """What selects the prior; then `prior` is the one without a selection."""
 
     def __post_init__(self) -> None:
         """Check that the parts belong together.
@@ -186,34 +174,34 @@ class Model:
         """
         name = self.name if isinstance(self.name, str) else ""  # a user's file is not type-checked
         if not (0 < len(name) <= NAME_MAX and name.isprintable()):
-            message = f"the model's name is {str(self.name)[:NAME_MAX]!r}, expected 1 to {NAME_MAX} characters that can be printed"
-            raise ModelError(message)
+            raise ModelError(
+                f"the model's name is {str(self.name)[:NAME_MAX]!r}, expected 1 to {NAME_MAX} characters that can be printed"
+            )
         if not self.searched:
-            message = f"model {self.name!r} searches nothing: it needs at least one searched dimension"
-            raise ModelError(message)
+            raise ModelError(
+                f"model {self.name!r} searches nothing: it needs at least one searched dimension"
+            )
         if self.lines > MAX_LINES:
             sizes = " x ".join(str(each.size) for each in self.searched)
-            message = f"model {self.name!r} searches {sizes} = {self.lines} values; the most is {MAX_LINES}"
-            raise ModelError(message)
+            raise ModelError(
+                f"model {self.name!r} searches {sizes} = {self.lines} values; the most is {MAX_LINES}"
+            )
         for kind, names in (
             ("known variable", [known.name for known in self._all_known()]),
             ("searched dimension", [dimension.label for dimension in self.searched]),
         ):
             twice = [name for name, count in Counter(names).items() if count > 1]
             if twice:
-                message = f"model {self.name!r} has the {kind} {twice[0]!r} twice"
-                raise ModelError(message)
+                raise ModelError(f"model {self.name!r} has the {kind} {twice[0]!r} twice")
         for known in self.known:
             if known.table.shape[1] != self.lines:
-                message = (
+                raise ModelError(
                     f"P({known.name} | S) has {known.table.shape[1]} lines, but the searched dimensions "
                     f"({' x '.join(str(d.size) for d in self.searched)}) have {self.lines} cells"
                 )
-                raise ModelError(message)
         prior = self._default_prior() if self.prior is None else np.array(self.prior, float)
         if prior.shape != (self.lines,):
-            message = f"the prior P(S) has shape {prior.shape}, expected ({self.lines},)"
-            raise ModelError(message)
+            raise ModelError(f"the prior P(S) has shape {prior.shape}, expected ({self.lines},)")
         _check_distribution("the prior P(S)", prior)
         if self.prior_select is not None:
             self._default_prior()  # checks that its rows have this model's lines
@@ -237,11 +225,10 @@ class Model:
             return np.full(self.lines, 1 / self.lines)
         rows = self.prior_select.table
         if rows.shape[1] != self.lines:
-            message = (
+            raise ModelError(
                 f"P(S | {self.prior_select.name}) has {rows.shape[1]} lines, but the searched dimensions have "
                 f"{self.lines} cells"
             )
-            raise ModelError(message)
         mean: NDArray[np.float64] = rows.mean(axis=0)
         return mean
 
@@ -276,8 +263,7 @@ def dimension(
     try:
         return Dimension(label=label, size=size, offset=offset, step=step, states=states)
     except ValidationError as reason:
-        message = f"searched dimension {label!r}: {_first(reason)}"
-        raise ModelError(message) from None
+        raise ModelError(f"searched dimension {label!r}: {_first(reason)}") from None
 
 
 def interval(label: str, low: float, high: float, *, cells: int) -> Dimension:
@@ -287,8 +273,7 @@ def interval(label: str, low: float, high: float, *, cells: int) -> Dimension:
         ModelError: No cells, or no interval.
     """
     if cells < 1 or not low < high:
-        message = f"searched dimension {label!r}: [{low:g}, {high:g}] can't be cut into {cells} cells"
-        raise ModelError(message)
+        raise ModelError(f"searched dimension {label!r}: [{low:g}, {high:g}] can't be cut into {cells} cells")
     step = (high - low) / cells
     return dimension(label, size=cells, offset=low + step / 2, step=step)
 
@@ -315,19 +300,18 @@ def _variable(known: Known | PriorSelect, kind: Literal["sensor", "prior_select"
             states=known.states,
         )
     except ValidationError as reason:
-        message = f"variable {known.name!r}: {_first(reason)}"
-        raise ModelError(message) from None
+        raise ModelError(f"variable {known.name!r}: {_first(reason)}") from None
 
 
 def _keep_table(variable: Known | PriorSelect, what: str) -> None:
     """Keep a variable's table as a copy that nobody can write to, and as many address bits as hold it where none are said."""
     table = np.array(variable.table, dtype=np.float64)
     if table.ndim != 2 or 0 in table.shape:
-        message = f"{what} has shape {table.shape}, expected (values, lines)"
-        raise ModelError(message)
+        raise ModelError(f"{what} has shape {table.shape}, expected (values, lines)")
     if len(table) > MAX_VALUES:
-        message = f"{what} has {len(table)} values; a column serves at most {MAX_VALUES}: use a larger step"
-        raise ModelError(message)
+        raise ModelError(
+            f"{what} has {len(table)} values; a column serves at most {MAX_VALUES}: use a larger step"
+        )
     table.flags.writeable = False
     object.__setattr__(variable, "table", table)
     object.__setattr__(variable, "bits", variable.bits or len(table).bit_length())
@@ -335,15 +319,13 @@ def _keep_table(variable: Known | PriorSelect, what: str) -> None:
 
 def _check_distribution(what: str, table: NDArray[np.float64]) -> None:
     if not np.all(np.isfinite(table)) or np.any(table < 0):
-        message = f"{what} holds a number that is no probability: negative, infinite or NaN"
-        raise ModelError(message)
+        raise ModelError(f"{what} holds a number that is no probability: negative, infinite or NaN")
     sums = np.atleast_1d(table.sum(axis=0))
     wrong = np.abs(sums - 1) > _SUM_TOLERANCE
     if np.any(wrong):
         line = int(np.argmax(wrong))
         where = f" over its values on line {line}" if table.ndim == 2 else ""
-        message = f"{what} sums to {sums[line]:.9g}{where}; a distribution sums to 1"
-        raise ModelError(message)
+        raise ModelError(f"{what} sums to {sums[line]:.9g}{where}; a distribution sums to 1")
 
 
 def _first(reason: ValidationError) -> str:

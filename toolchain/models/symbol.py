@@ -40,11 +40,9 @@ class IntegerType:
             ModelError: `high` is below `low`, or one is no whole number.
         """
         if not (_is_whole(self.low) and _is_whole(self.high)):
-            message = f"an integer type from {self.low!r} to {self.high!r}: expected whole numbers"
-            raise ModelError(message)
+            raise ModelError(f"an integer type from {self.low!r} to {self.high!r}: expected whole numbers")
         if self.high < self.low:
-            message = f"an integer type from {self.low} to {self.high} has no values"
-            raise ModelError(message)
+            raise ModelError(f"an integer type from {self.low} to {self.high} has no values")
 
     @property
     def size(self) -> int:
@@ -86,11 +84,11 @@ class IntervalType:
             ModelError: No intervals or no whole number of them, or `high` is not above `low`.
         """
         if not _is_whole(self.intervals):
-            message = f"[{self.low:g}, {self.high:g}] can't be cut into {self.intervals!r} intervals: expected a whole number"
-            raise ModelError(message)
+            raise ModelError(
+                f"[{self.low:g}, {self.high:g}] can't be cut into {self.intervals!r} intervals: expected a whole number"
+            )
         if self.intervals < 1 or not (math.isfinite(self.low) and self.low < self.high < math.inf):
-            message = f"[{self.low:g}, {self.high:g}] can't be cut into {self.intervals} intervals"
-            raise ModelError(message)
+            raise ModelError(f"[{self.low:g}, {self.high:g}] can't be cut into {self.intervals} intervals")
 
     @property
     def size(self) -> int:
@@ -130,8 +128,9 @@ class LabelType:
             ModelError: None, an empty one, or one twice.
         """
         if not labels or not all(labels) or len(set(labels)) < len(labels):
-            message = f"a label type needs names that differ, not {', '.join(map(repr, labels)) or 'none'}"
-            raise ModelError(message)
+            raise ModelError(
+                f"a label type needs names that differ, not {', '.join(map(repr, labels)) or 'none'}"
+            )
         object.__setattr__(self, "labels", labels)
 
     @property
@@ -171,23 +170,20 @@ Type: TypeAlias = IntegerType | IntervalType | LabelType
 
 @dataclass(frozen=True, slots=True)
 class Symbol:
-    """A variable: its name, its type, and where its readings come from when a question knows it.
-
-    Attributes:
-        name: Its name; also the field in the message, unless `path` says where it is.
-        type: Which values it has.
-        path: Where in the message it is; empty to search the message for the name.
-        bits: Address bits of its column; 0 takes as few as will do.
-        on_range: What a reading that is none of its values is: an error, the nearest end, or a missing reading.
-        on_missing: Whether a reading may be missing.
-    """
+    """A variable: its name, its type, and where its readings come from when a question knows it."""
 
     name: str
+    """Its name; also the field in the message, unless `path` says where it is."""
     type: Type
+    """Which values it has."""
     path: str = ""
+    """Where in the message it is; empty to search the message for the name."""
     bits: int = 0
+    """Address bits of its column; 0 takes as few as will do."""
     on_range: Literal["error", "clamp", "missing"] = "error"
+    """What a reading that is none of its values is: an error, the nearest end, or a missing reading."""
     on_missing: Literal["error", "missing"] = "error"
+    """Whether a reading may be missing."""
 
     def __post_init__(self) -> None:
         """Refuse a symbol without a name.
@@ -196,8 +192,7 @@ class Symbol:
             ModelError: The name is empty.
         """
         if not self.name:
-            message = "a symbol needs a name"
-            raise ModelError(message)
+            raise ModelError("a symbol needs a name")
 
     @property
     def size(self) -> int:
@@ -229,5 +224,4 @@ class Symbol:
                 return at
         last = self.type.offset + (self.size - 1) * self.type.step
         expected = ", ".join(self.type.labels[:20]) or f"{self.type.offset:g} to {last:g}"
-        message = f"{self.name} is never {label!r}; expected {expected}"
-        raise ModelError(message)
+        raise ModelError(f"{self.name} is never {label!r}; expected {expected}")

@@ -48,8 +48,7 @@ def read_network(path: Path, *, on_missing: Literal["error", "missing"] = "error
     except NetworkFileError:
         raise
     except ModelError as reason:
-        message = f"{path}: {reason}"
-        raise NetworkFileError(message) from None
+        raise NetworkFileError(f"{path}: {reason}") from None
 
 
 def _reader(path: Path) -> Callable[[bytes, NetworkBuilder], None]:
@@ -63,8 +62,7 @@ def _reader(path: Path) -> Callable[[bytes, NetworkBuilder], None]:
         case ".net":
             from toolchain.networks.net import read_net as reader
         case _:
-            message = (
+            raise NetworkFileError(
                 f"{path} is no network that is known here; expected a name that ends in {', '.join(SUFFIXES)}"
             )
-            raise NetworkFileError(message)
     return reader

@@ -190,11 +190,9 @@ class NetworkBuilder:
             ModelError: No variables, one without a table, or a circle of parents.
         """
         if not self._symbols:
-            message = "the file has no variables"
-            raise ModelError(message)
+            raise ModelError("the file has no variables")
         used = {symbol.name for symbol in chain.from_iterable(factor.scope for factor in self._factors)}
         for name in self._symbols:
             if name not in used:
-                message = f"{name} has no table"
-                raise ModelError(message)
+                raise ModelError(f"{name} has no table")
         return JointDistribution(self._name or self.path.stem, tuple(self._factors))

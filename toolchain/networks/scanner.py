@@ -38,8 +38,7 @@ class Scanner:
             text = data.decode("utf-8-sig")
         except UnicodeDecodeError as reason:
             line = data.count(b"\n", 0, reason.start) + 1
-            message = f"{path}, line {line}: not UTF-8 text"
-            raise NetworkFileError(message) from None
+            raise NetworkFileError(f"{path}, line {line}: not UTF-8 text") from None
         self._text = text
         self._start = self._end = 0
         if comments:

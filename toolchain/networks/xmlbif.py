@@ -51,8 +51,9 @@ class _Reader:
         try:
             self._parser.Parse(data, True)
         except expat.ExpatError as reason:
-            message = f"{self._builder.path}, line {reason.lineno}: {expat.ErrorString(reason.code)}"
-            raise NetworkFileError(message) from None
+            raise NetworkFileError(
+                f"{self._builder.path}, line {reason.lineno}: {expat.ErrorString(reason.code)}"
+            ) from None
         except (LookupError, ValueError):
             raise self._here.error("its encoding is not known") from None
         for fields, line in self._definitions:

@@ -33,21 +33,18 @@ _ROWS_AT_ONCE: Final = 64
 
 @dataclass(frozen=True, slots=True)
 class Memory:
-    """A memory of a board, or one that all boards have alike.
-
-    Attributes:
-        name: Its file's name.
-        width: Bits of a word.
-        depth: How many words.
-        words: Returns every word, from address 0.
-        comments: What it is, a line each.
-    """
+    """A memory of a board, or one that all boards have alike."""
 
     name: str
+    """Its file's name."""
     width: int
+    """Bits of a word."""
     depth: int
+    """How many words."""
     words: Callable[[], Iterable[int]]
+    """Returns every word, from address 0."""
     comments: tuple[str, ...]
+    """What it is, a line each."""
 
     def lines(self) -> Iterator[str]:
         """Yield the MIF, in canonical form."""

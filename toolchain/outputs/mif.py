@@ -38,15 +38,12 @@ _TOKEN: Final = re.compile(
 
 @dataclass(frozen=True, slots=True)
 class Mif:
-    """A memory's contents.
-
-    Attributes:
-        width: Bits of a word.
-        words: Every word, from address 0; what a file leaves out is 0, as in Quartus.
-    """
+    """A memory's contents."""
 
     width: int
+    """Bits of a word."""
     words: tuple[int, ...]
+    """Every word, from address 0; what a file leaves out is 0, as in Quartus."""
 
     def __post_init__(self) -> None:
         """Refuse words that no memory of this width holds.
@@ -55,12 +52,10 @@ class Mif:
             MifError: The memory has no words or no width, or a word has more bits.
         """
         if not self.words or self.width < 1:
-            message = f"a memory of {len(self.words)} words of {self.width} bits holds nothing"
-            raise MifError(message)
+            raise MifError(f"a memory of {len(self.words)} words of {self.width} bits holds nothing")
         for address, word in enumerate(self.words):
             if word < 0 or word.bit_length() > self.width:
-                message = f"the word at address {address} doesn't fit {self.width} bits"
-                raise MifError(message)
+                raise MifError(f"the word at address {address} doesn't fit {self.width} bits")
 
 
 def mif_lines(width: int, depth: int, words: Iterable[int], comments: Iterable[str] = ()) -> Iterator[str]:
@@ -261,8 +256,7 @@ class _Reader:
         self._fail(f"expected {expected}, found {found}")
 
     def _fail(self, what: str) -> NoReturn:
-        message = f"{self._name}, line {self._line}: {what}"
-        raise MifError(message)
+        raise MifError(f"{self._name}, line {self._line}: {what}")
 
 
 def _short(word: str) -> str:

@@ -40,15 +40,12 @@ class Change(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class OutputFiles:
-    """A part of a deployment: all its files, and how to know one that is left from an earlier build.
-
-    Attributes:
-        contents: By path from the deployment's folder, what to write, in pieces.
-        own: Paths that are this part's: those of them that are not in `contents` are removed.
-    """
+    """A part of a deployment: all its files, and how to know one that is left from an earlier build."""
 
     contents: dict[str, Callable[[], Iterable[bytes]]]
+    """By path from the deployment's folder, what to write, in pieces."""
     own: re.Pattern[str]
+    """Paths that are this part's: those of them that are not in `contents` are removed."""
 
 
 _MEMORIES: Final = re.compile(

@@ -46,8 +46,7 @@ def read_table(path: Path) -> NDArray[np.uint32]:
     """
     mif = read_mif(path)
     if mif.width > 32:
-        message = (
+        raise BuildError(
             f"{path} has words of {mif.width} bits; expected random numbers of at most 32, the codes' or more"
         )
-        raise BuildError(message)
     return np.array(mif.words, dtype=np.uint32)
