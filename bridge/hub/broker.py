@@ -24,16 +24,16 @@ import orjson
 from bridge.codecs.fragments import Reassembler
 from bridge.codecs.json_codec import could_be_deeper, decode, depth
 from bridge.errors import BridgeError
-from bridge.hub.actions import Actions
-from bridge.hub.calls import Calls
-from bridge.hub.definitions import Definitions, RosVersion
-from bridge.hub.delivery import Delivery
+from bridge.hub.delivery.definitions import Definitions, RosVersion
+from bridge.hub.delivery.dispatcher import Delivery
+from bridge.hub.delivery.outbox import Outbox
 from bridge.hub.graph import Client, Graph
+from bridge.hub.handlers.actions import Actions
+from bridge.hub.handlers.calls import Calls
+from bridge.hub.handlers.rosapi import NODE, ROSOUT, Rosapi
+from bridge.hub.handlers.topics import Topics
 from bridge.hub.limits import HubLimits
 from bridge.hub.operations import Operation, RefusedError, is_round, text
-from bridge.hub.outbox import Outbox
-from bridge.hub.rosapi import NODE, ROSOUT, Rosapi
-from bridge.hub.topics import Topics
 from bridge.stamps import stamp
 
 log = logging.getLogger(__name__)

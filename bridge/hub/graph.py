@@ -8,9 +8,9 @@ the same topic, and gets its messages under the name that it used.
 from dataclasses import dataclass, field
 
 from bridge.codecs.fragments import Reassembler
-from bridge.hub.encodings import Compression
+from bridge.hub.delivery.encodings import Compression
+from bridge.hub.delivery.outbox import Lane, Outbox
 from bridge.hub.operations import OperationId
-from bridge.hub.outbox import Lane, Outbox
 from bridge.names import same_type
 
 

@@ -25,11 +25,11 @@ from websockets.server import ServerProtocol
 
 from bridge.hub.access import Door, choose_subprotocol
 from bridge.hub.broker import Broker
-from bridge.hub.definitions import RosVersion
+from bridge.hub.delivery.definitions import RosVersion
+from bridge.hub.delivery.outbox import Outbox
 from bridge.hub.errors import HubError
 from bridge.hub.graph import Client, Graph
 from bridge.hub.limits import HubLimits
-from bridge.hub.outbox import Outbox
 from bridge.transport.frames import UNKNOWN, UNSOUND, frame_end, only_message, unmasked, whole_messages
 
 log = logging.getLogger(__name__)

@@ -11,7 +11,7 @@ from typing import Any
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from tests.bridge.hub.room import Guest, Room
+from tests.bridge.hub.broker_harness import Guest, Room
 
 _NAMES = ["/t", "t", "/u", "/u", "/v", "v", "/w", "", "a b"]
 _TYPES = ["a/B", "a/msg/B", "a/B", "a/B", "a/C", "nonsense"]

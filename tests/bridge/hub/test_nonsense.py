@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.bridge.hub.room import Room
+from tests.bridge.hub.broker_harness import Room
 
 NONSENSE = [
     b"",

@@ -12,9 +12,9 @@ from rosbags.typesys import Stores, get_typestore
 
 from bridge.codecs import cbor_codec, png
 from bridge.codecs.fragments import Reassembler
-from bridge.hub import topics
-from bridge.hub.encodings import Message
-from tests.bridge.hub.room import WALL_CLOCK, Guest, Room
+from bridge.hub.delivery.encodings import Message
+from bridge.hub.handlers import topics
+from tests.bridge.hub.broker_harness import WALL_CLOCK, Guest, Room
 
 ARRAY = "std_msgs/Float64MultiArray"
 

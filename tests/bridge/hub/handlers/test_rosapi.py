@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.bridge.hub.room import WALL_CLOCK, Guest, Room
+from tests.bridge.hub.broker_harness import WALL_CLOCK, Guest, Room
 
 
 @pytest.fixture
@@ -83,7 +83,7 @@ def test_every_service_that_is_listed_can_be_called(guest: Guest) -> None:
 
 
 def test_every_service_is_documented(guest: Guest) -> None:
-    documentation = (Path(__file__).parents[3] / "docs" / "hub.md").read_text()
+    documentation = (Path(__file__).parents[4] / "docs" / "hub.md").read_text()
     for service in guest.rosapi("node_details", node="/rosapi")["services"]:
         assert f"`{service.removeprefix('/rosapi/')}`" in documentation
 

@@ -9,7 +9,7 @@ from typing import Any, Final, Literal
 import orjson
 
 from bridge.codecs.png import encode as picture
-from bridge.hub.definitions import Definitions
+from bridge.hub.delivery.definitions import Definitions
 from bridge.hub.operations import RefusedError
 
 Compression = Literal["none", "png", "cbor", "cbor-raw"]

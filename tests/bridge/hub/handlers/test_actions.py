@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from bridge.client.protocol.events import GoalStatus
-from tests.bridge.hub.room import Guest, Room
+from tests.bridge.hub.broker_harness import Guest, Room
 
 TYPE = "example_interfaces/action/Fibonacci"
 

@@ -2,7 +2,7 @@ import json
 
 import pytest
 
-from tests.bridge.hub.room import Room
+from tests.bridge.hub.broker_harness import Room
 
 
 def test_a_message_reaches_all_who_subscribed_and_nobody_else() -> None:

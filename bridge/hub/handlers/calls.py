@@ -10,9 +10,10 @@ from typing import Any
 import orjson
 
 from bridge.errors import BridgeError
-from bridge.hub.delivery import Delivery, fragment_size_of
-from bridge.hub.encodings import compression_of
+from bridge.hub.delivery.dispatcher import Delivery, fragment_size_of
+from bridge.hub.delivery.encodings import compression_of
 from bridge.hub.graph import Client, Graph, Service
+from bridge.hub.handlers.rosapi import PREFIX, Rosapi, RosapiError
 from bridge.hub.limits import HubLimits
 from bridge.hub.operations import (
     Operation,
@@ -24,7 +25,6 @@ from bridge.hub.operations import (
     operation_id,
     text,
 )
-from bridge.hub.rosapi import PREFIX, Rosapi, RosapiError
 from bridge.names import absolute, split_type
 
 log = logging.getLogger(__name__)

@@ -5,10 +5,10 @@ from typing import Final
 
 import orjson
 
-from bridge.hub.encodings import as_png
+from bridge.hub.delivery.encodings import as_png
+from bridge.hub.delivery.outbox import Lane
 from bridge.hub.graph import Client
 from bridge.hub.limits import HubLimits
-from bridge.hub.outbox import Lane
 
 #: Characters of a fragment at least: smaller ones would be little but their own frames.
 SMALLEST_FRAGMENT: Final = 16

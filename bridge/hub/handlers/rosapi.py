@@ -16,7 +16,7 @@ import orjson
 
 from bridge.codecs.json_codec import depth
 from bridge.errors import BridgeError
-from bridge.hub.definitions import Definitions
+from bridge.hub.delivery.definitions import Definitions
 from bridge.hub.graph import Graph
 from bridge.hub.limits import HubLimits
 from bridge.hub.operations import RefusedError

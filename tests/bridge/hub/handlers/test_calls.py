@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from tests.bridge.hub.room import Guest, Room
+from tests.bridge.hub.broker_harness import Guest, Room
 
 
 def _serve(guest: Guest, service: str = "/add", type_name: str = "a/Add") -> None:

@@ -9,10 +9,11 @@ import orjson
 from bridge.codecs.envelope import BRACE, envelope_of, topic_of
 from bridge.codecs.json_codec import could_be_deeper
 from bridge.errors import BridgeError
-from bridge.hub.definitions import Definitions
-from bridge.hub.delivery import Delivery, fragment_size_of
-from bridge.hub.encodings import AROUND, COMPRESSIONS, Message, compression_of, json_prefix
+from bridge.hub.delivery.definitions import Definitions
+from bridge.hub.delivery.dispatcher import Delivery, fragment_size_of
+from bridge.hub.delivery.encodings import AROUND, COMPRESSIONS, Message, compression_of, json_prefix
 from bridge.hub.graph import Advertisement, Client, Graph, Subscription, Topic, Wish
+from bridge.hub.handlers.rosapi import ROSOUT, rosout_type
 from bridge.hub.limits import HubLimits
 from bridge.hub.operations import (
     Operation,
@@ -26,7 +27,6 @@ from bridge.hub.operations import (
     quality,
     text,
 )
-from bridge.hub.rosapi import ROSOUT, rosout_type
 from bridge.names import absolute, same_type, split_type
 
 #: Keys of an operation whose envelope can be known again: op, topic and msg.

@@ -8,9 +8,10 @@ import orjson
 
 from bridge.client.protocol.events import GoalStatus
 from bridge.errors import BridgeError
-from bridge.hub.calls import Asker, asker_of, note_takeover
-from bridge.hub.delivery import Delivery
+from bridge.hub.delivery.dispatcher import Delivery
+from bridge.hub.delivery.outbox import Lane
 from bridge.hub.graph import Action, Client, Graph
+from bridge.hub.handlers.calls import Asker, asker_of, note_takeover
 from bridge.hub.limits import HubLimits
 from bridge.hub.operations import (
     Operation,
@@ -20,7 +21,6 @@ from bridge.hub.operations import (
     optional_text,
     text,
 )
-from bridge.hub.outbox import Lane
 from bridge.names import absolute, ros2_type, same_type
 
 #: The service of ROS 2 that cancels all goals of an action, as roslibjs calls it.

@@ -1,0 +1,1 @@
+"""Outgoing messages: their encodings, and the bounded queue of each client."""

@@ -1,0 +1,1 @@
+"""Operations of clients, one module for each kind."""
