@@ -12,8 +12,9 @@ from pathlib import Path
 
 from bridge.errors import BridgeError
 from casestudies.errors import CaseStudyError
-from services.errors import ServiceError
-from services.supervision import ask_for_end_with_parent, own_command
+from services.errors import StackError
+from services.supervision.child import own_command
+from services.supervision.parent import ask_for_end_with_parent
 from terminal.errors import ExitCode, StoppedError
 from terminal.running import run_async
 from toolchain.errors import ToolchainError
@@ -71,7 +72,7 @@ class Process:
         """Wait for a line that matches.
 
         Raises:
-            ServiceError: the process ended before it printed one.
+            StackError: the process ended before it printed one.
         """
         seen = 0
         while True:
@@ -84,10 +85,10 @@ class Process:
             self._news.clear()
             await self._news.wait()
 
-    def failure(self, code: int) -> ServiceError:
+    def failure(self, code: int) -> StackError:
         """Its end as an error, in its own last words."""
         said = self._lines[-1].removeprefix("error: ") if self._lines else "it said nothing"
-        error = ServiceError(f"{self.name}: {said} (all that it said is in {self._log})")
+        error = StackError(f"{self.name}: {said} (all that it said is in {self._log})")
         error.exit_code = code if code > 0 else ExitCode.CHILD
         return error
 
@@ -102,7 +103,7 @@ class Process:
         """Wait for its end.
 
         Raises:
-            ServiceError: it did not exit 0.
+            StackError: it did not exit 0.
         """
         if code := await self.wait():
             raise self.failure(code)
@@ -127,7 +128,7 @@ async def build(case_study: str, deployment: Path, uri: str, topic: str, type_: 
     """Build a case study's deployment for four boards; the report goes to DEPLOYMENT.log.
 
     Raises:
-        ServiceError: the toolchain refuses.
+        StackError: the toolchain refuses.
     """
     toolchain = Process("toolchain", deployment.with_name(deployment.name + ".log"))
     await toolchain.start(
@@ -149,14 +150,14 @@ def run_script(work: Callable[[], Awaitable[int]], limit: float) -> int:
             return await asyncio.wait_for(work(), limit)
         except TimeoutError:
             msg = f"this did not end within {limit:.0f} s"
-            raise ServiceError(msg) from None
+            raise StackError(msg) from None
 
     try:
         return run_async(limited())
     except StoppedError as stopped:
         print(stopped, file=sys.stderr)
         return stopped.exit_code
-    except (ServiceError, BridgeError, CaseStudyError, ToolchainError) as error:
+    except (StackError, BridgeError, CaseStudyError, ToolchainError) as error:
         print(f"error: {error}", file=sys.stderr)
         return error.exit_code
     except OSError as error:

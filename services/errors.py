@@ -5,7 +5,7 @@ from __future__ import annotations
 from terminal.errors import ExitCode
 
 
-class ServiceError(Exception):
+class StackError(Exception):
     """Root of the services' errors; its text is one sentence for the user.
 
     Attributes:
@@ -15,85 +15,85 @@ class ServiceError(Exception):
     exit_code: int = ExitCode.USAGE
 
 
-class SettingsError(ServiceError):
+class SettingsError(StackError):
     """A flag, an environment variable or a value in the configuration is wrong."""
 
 
-class InputLineError(ServiceError):
+class InputLineError(StackError):
     """A line on standard input is not what the command reads."""
 
 
-class LocalSocketError(ServiceError):
+class LocalSocketError(StackError):
     """A local socket can't be made, or what came over it is no message of ours."""
 
     exit_code = ExitCode.CHILD
 
 
-class OtherPeerError(ServiceError):
+class OtherPeerError(StackError):
     """The process at the other end of a local socket is not the one that belongs there."""
 
 
-class NoDataError(ServiceError):
+class NoDataError(StackError):
     """No reading came within the time that the first one may take."""
 
     exit_code = ExitCode.ROSBRIDGE
 
 
-class RosbridgeLostError(ServiceError):
+class RosbridgeLostError(StackError):
     """The rosbridge server went away in a run that does not wait for it."""
 
     exit_code = ExitCode.ROSBRIDGE
 
 
-class VariableError(ServiceError):
+class VariableError(StackError):
     """A variable is missing in a message, or its value can't be used."""
 
     exit_code = ExitCode.VARIABLE
 
 
-class BoardFailedError(ServiceError):
+class BoardFailedError(StackError):
     """A board failed, or failed too often."""
 
     exit_code = ExitCode.BOARD
 
 
-class ChildDiedError(ServiceError):
+class ChildDiedError(StackError):
     """A process that the master started ended when it should not have, or too often."""
 
     exit_code = ExitCode.CHILD
 
 
-class OverflowedQueueError(ServiceError):
+class OverflowedQueueError(StackError):
     """With `queue = all`, frames came in faster than they could be computed."""
 
     exit_code = ExitCode.CHILD
 
 
-class NotPreparedError(ServiceError):
+class NotPreparedError(StackError):
     """A service was asked to switch to a deployment that it does not have, or could not have."""
 
 
-class ShapeError(ServiceError):
+class ShapeError(StackError):
     """A deployment can't take the place of the one in force: boards or topics were made for another."""
 
 
-class NotReloadedError(ServiceError):
+class NotReloadedError(StackError):
     """A reload that could not be finished now; the run goes on with the deployment that it had."""
 
     exit_code = ExitCode.CHILD
 
 
-class ControlError(ServiceError):
+class ControlError(StackError):
     """What came over a control socket is no order, or the answer is none."""
 
 
-class OutdatedError(ServiceError):
+class OutdatedError(StackError):
     """A master asks for what a service's folder holds by now, and the service has what was there before."""
 
     exit_code = ExitCode.CHILD
 
 
-class ReportedError(ServiceError):
+class ReportedError(StackError):
     """A failure that another process put into words; it keeps that process's exit code."""
 
     def __init__(self, exit_code: int, sentence: str) -> None:

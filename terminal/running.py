@@ -16,7 +16,7 @@ import typer
 import uvloop
 
 from services.errors import ReportedError
-from services.supervision import PARENT_VARIABLE, leave_private_directory
+from services.supervision.parent import PARENT_VARIABLE, leave_private_directory
 from terminal.command_line import UNWRITABLE, CommandLine, drop_output, output_unwritable
 from terminal.errors import ExitCode, StoppedError, exit_code_of
 from terminal.logs import log_by_lines, say, say_lines

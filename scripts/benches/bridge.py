@@ -27,7 +27,7 @@ from rich.table import Table
 
 from scripts.other_clients.installation import install_roslib, install_roslibpy
 from scripts.processes import ROOT, Process, run_script
-from services.errors import ServiceError
+from services.errors import StackError
 
 Result = TypeVar("Result")
 
@@ -106,14 +106,14 @@ async def soon(awaited: Awaitable[Result], what: str) -> Result:
     """Wait for it, with an end to patience.
 
     Raises:
-        ServiceError: it did not come.
+        StackError: it did not come.
     """
     try:
         async with asyncio.timeout(PATIENCE):
             return await awaited
     except TimeoutError:
         msg = f"{what} did not come within {PATIENCE:.0f} s"
-        raise ServiceError(msg) from None
+        raise StackError(msg) from None
 
 
 def frame(operation: dict[str, Any]) -> bytes:
@@ -220,7 +220,7 @@ class Child:
             line = await soon(self._process.stdout.readline(), f"an answer of {self.kind.name}")
             if not line:
                 msg = f"{self.kind.name} ended in the middle of a measurement"
-                raise ServiceError(msg)
+                raise StackError(msg)
             try:
                 return json.loads(line)
             except ValueError:

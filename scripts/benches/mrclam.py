@@ -104,7 +104,7 @@ async def fit(arguments: argparse.Namespace) -> Fitted:
     """Take the tables that were learnt, or learn them from robot 3 where the file is not there yet.
 
     Raises:
-        ServiceError: the toolchain refuses.
+        StackError: the toolchain refuses.
     """
     landmarks = arguments.data / "landmarks.csv"
     if not arguments.fit.exists():

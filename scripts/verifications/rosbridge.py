@@ -38,7 +38,7 @@ from scripts.verifications.checks import (
     on_servers,
     serving,
 )
-from services.errors import ServiceError
+from services.errors import StackError
 
 OUT = ROOT / "out" / "verify"
 LIMIT = 300.0
@@ -509,7 +509,7 @@ async def run_checks(stand: Stand, tally: Tally) -> None:
                     await stand.start_server()
                 await check(stand, form)
                 details = "\n".join(f"    {note}" for note in stand.notes)
-            except (CheckError, ServiceError, ConnectionClosed) as error:
+            except (CheckError, StackError, ConnectionClosed) as error:
                 why, details = str(error), stand.tails()
                 await stand.stop_server()  # the next check gets a new one
             tally.tell(f"{stand.kind.name}: {name}", started, why, details)
@@ -522,7 +522,7 @@ def only_one() -> Iterator[None]:
     """Hold what no second verification in this folder may hold: they would overwrite each other's deployments.
 
     Raises:
-        ServiceError: another one runs.
+        StackError: another one runs.
     """
     OUT.parent.mkdir(exist_ok=True)
     with OUT.with_suffix(".lock").open("w") as lock:
@@ -530,7 +530,7 @@ def only_one() -> Iterator[None]:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             msg = f"another scripts/verify runs, and writes to {OUT}: wait for its end"
-            raise ServiceError(msg) from None
+            raise StackError(msg) from None
         yield
 
 

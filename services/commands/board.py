@@ -23,14 +23,9 @@ from services.errors import BoardFailedError, SettingsError
 from services.settings import endpoint_in, load_settings
 from services.sockets.serving import endpoint_from
 from services.sockets.status_socket import BoardStatus, ProcessStatus, status_thread
-from services.supervision import (
-    PARENT_VARIABLE,
-    RESTARTS,
-    RESTARTS_WITHIN,
-    end_with_parent,
-    how_it_ended,
-    remove_dead_sockets,
-)
+from services.supervision.child import RESTARTS, RESTARTS_WITHIN, how_it_ended
+from services.supervision.parent import PARENT_VARIABLE, end_with_parent
+from services.supervision.private_directory import remove_stale_sockets
 from terminal.errors import exit_code_of
 from terminal.logs import say
 from terminal.running import ends_well, make_app, raise_on_signals, stopped_by
@@ -226,7 +221,7 @@ class BoardProcesses:
         for at in range(len(self._endpoints)):
             self._forget(self._endpoints[at])
         if self._run_directory is not None:
-            remove_dead_sockets(self._run_directory)
+            remove_stale_sockets(self._run_directory)
 
     def _forget(self, endpoint: Endpoint) -> None:
         # a board that was killed could not take its sockets away

@@ -11,7 +11,7 @@ from pcie_shim.loader import program
 from services.commands import flags as options
 from services.settings import load_settings
 from services.sockets.serving import endpoint_from
-from services.supervision import end_with_parent
+from services.supervision.parent import end_with_parent
 from terminal.logs import say
 from terminal.running import ends_well, make_app
 

@@ -16,7 +16,7 @@ from services.master.run import run_master
 from services.settings import endpoint_in, load_settings
 from services.sockets.control_socket import ReloadOrder, control_socket, give_order
 from services.sockets.serving import deployment_for
-from services.supervision import end_with_parent
+from services.supervision.parent import end_with_parent
 from terminal.errors import ExitCode
 from terminal.one_line import one_line
 from terminal.running import ends_well, make_app, run_async

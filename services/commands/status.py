@@ -16,7 +16,7 @@ from services.errors import SettingsError
 from services.printed.stack_status import SilentProcess, StackStatus, plain, screen
 from services.settings import load_settings
 from services.sockets.status_socket import STATUS_LIMIT, SUFFIX, ProcessStatus
-from services.supervision import PRIVATE
+from services.supervision.private_directory import DIRECTORY_PREFIX
 from terminal.errors import ExitCode
 from terminal.running import ends_well, make_app, run_async
 
@@ -37,7 +37,9 @@ def run_directories() -> list[Path]:
     places = {Path(tempfile.gettempdir())}
     if runtime := os.environ.get("XDG_RUNTIME_DIR"):
         places.add(Path(runtime))
-    return sorted(path for place in places for path in place.glob(f"{PRIVATE}*") if _is_own_directory(path))
+    return sorted(
+        path for place in places for path in place.glob(f"{DIRECTORY_PREFIX}*") if _is_own_directory(path)
+    )
 
 
 def _is_own_directory(path: Path) -> bool:

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from services.errors import NotReloadedError, SettingsError, ShapeError
-from services.supervision import KEPT
+from services.supervision.private_directory import COPY_PREFIX
 from toolchain.deployment import Deployment, load_deployment
 from toolchain.deployment.same_shape import differences
 
@@ -62,7 +62,7 @@ def keep(deployment: Deployment, directory: Path, generation: int) -> Path:
         NotReloadedError: It can't be copied, or was changed meanwhile.
         ToolchainError: The copy is none.
     """
-    kept = directory / f"{KEPT}{generation}"
+    kept = directory / f"{COPY_PREFIX}{generation}"
     shutil.rmtree(kept, ignore_errors=True)
     for source in (deployment.path, *(deployment.image_path(at) for at in range(len(deployment.boards)))):
         copy = kept / source.relative_to(deployment.directory)
@@ -99,4 +99,4 @@ def _check_readable(source: Path) -> None:
 
 def forget(directory: Path, generation: int) -> None:
     """Take a copy away that no child reads any more."""
-    shutil.rmtree(directory / f"{KEPT}{generation}", ignore_errors=True)
+    shutil.rmtree(directory / f"{COPY_PREFIX}{generation}", ignore_errors=True)

@@ -19,8 +19,8 @@ from services.errors import (
     NotReloadedError,
     OtherPeerError,
     ReportedError,
-    ServiceError,
     SettingsError,
+    StackError,
 )
 from services.pipeline.generations import InForce
 from services.settings import Settings, endpoint_in
@@ -28,14 +28,8 @@ from services.sockets.local_socket import RecordProtocol, check_hello, open_conn
 from services.sockets.records import AnyRecord, Hello, NotReloaded, Prepared, Switched, Trouble
 from services.sockets.serving import board_endpoints, endpoint_from
 from services.sockets.status_socket import PeerStatus
-from services.supervision import (
-    RESTARTS,
-    RESTARTS_WITHIN,
-    Child,
-    PrivateDirectory,
-    end_all,
-    own_command,
-)
+from services.supervision.child import RESTARTS, RESTARTS_WITHIN, Child, end_all, own_command
+from services.supervision.private_directory import PrivateDirectory
 from terminal.errors import ExitCode
 from terminal.logs import say
 
@@ -261,14 +255,14 @@ class Peers:
         """Seconds more that boards may take to listen. Whether one of the run's own has died is seen without it."""
         return 0.0 if self._boards is None else COMPILING_TIME
 
-    def start(self) -> None:
+    async def start(self) -> None:
         """Start what does not run, connect to all, and bring back what is lost from then on."""
         if self._boards is not None:
-            self._boards.start()
+            await self._boards.start()
             self._tasks.append(asyncio.ensure_future(self._keep_boards(self._boards)))
         for peer in self:
             if peer.child is not None:
-                peer.child.start()
+                await peer.child.start()
         if self._settings.fused:
             self._inside = self._start_inside()
         else:
@@ -338,14 +332,14 @@ class Peers:
         while True:
             await boards.ended()
             failure = boards.failure()
-            if boards.exit_code() == ExitCode.BOARD:
+            if boards.exit_code == ExitCode.BOARD:
                 self._moving.fail(failure)
                 return
             if self._once or not boards.may_restart():
                 self._moving.fail(BoardFailedError(str(failure)))
                 return
             self._log.warning(f"{failure}; restarting it")
-            boards.start()
+            await boards.start()
 
     async def _keep(self, peer: Peer) -> None:
         try:
@@ -357,8 +351,6 @@ class Peers:
                 first = False
                 closing = asyncio.ensure_future(peer.closed.wait())
                 while not closing.done():
-                    if peer.child is not None:
-                        peer.child.relay()
                     self._check_stuck(peer)
                     await asyncio.wait([closing], timeout=0.05)
                 peer.protocol, peer.ready = None, False
@@ -410,10 +402,9 @@ class Peers:
         peer.closed.clear()
         while True:
             child = peer.child
-            if child is not None:
-                child.relay()
-                if child.exit_code() is not None:
-                    raise child.failure()
+            if child is not None and not child.is_running:
+                await child.ended()
+                raise child.failure()
             if peer.endpoint is None:
                 return
             try:
@@ -440,7 +431,7 @@ class Peers:
 
     async def _again(self, peer: Peer) -> None:
         """After a lost connection: bring the process back, or say why the run is over."""
-        if isinstance(peer.reason, ServiceError):
+        if isinstance(peer.reason, StackError):
             raise peer.reason
         child = peer.child
         if child is None:
@@ -453,8 +444,9 @@ class Peers:
             return
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(child.ended(), self._settings.stop_timeout)
-        if child.exit_code() is None:
+        if child.is_running:
             child.kill()
+            await child.ended()
         failure = child.failure()
         if self._once or getattr(failure, "exit_code", ExitCode.CHILD) != ExitCode.CHILD:
             raise failure
@@ -462,7 +454,7 @@ class Peers:
             msg = f"{failure}; it was restarted {RESTARTS} times within {RESTARTS_WITHIN:.0f} s before"
             raise ChildDiedError(msg)
         self._log.warning(f"{failure}; restarting it")
-        child.start()
+        await child.start()
 
     # --- greetings -----------------------------------------------------------------------------
 

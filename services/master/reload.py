@@ -13,7 +13,7 @@ from typing import Any, Protocol
 
 from structlog.typing import FilteringBoundLogger
 
-from services.errors import NotReloadedError, ReportedError, ServiceError, SettingsError
+from services.errors import NotReloadedError, ReportedError, SettingsError, StackError
 from services.master.new_deployment import forget, keep, read_new
 from services.master.peers import ANSWER_TIME, Peer, Peers
 from services.pipeline.frames import WaitingFrames
@@ -89,14 +89,14 @@ class Reloads:
             return
         try:
             self._coming.put(waits)
-        except ServiceError:  # the boards are no slow part while they are programmed
+        except StackError:  # the boards are no slow part while they are programmed
             self._moving.lose(LOST_IN_RELOAD, 1)
 
     async def order(self, order: ReloadOrder) -> str:
         """Reload; gives a sentence about it.
 
         Raises:
-            ServiceError, ToolchainError: why the run goes on with the deployment that it had.
+            StackError, ToolchainError: why the run goes on with the deployment that it had.
         """
         if self._one_at_a_time.locked():
             msg = "another reload is under way; try again when it is done"
@@ -158,7 +158,7 @@ class Reloads:
             if peer.generation != number and peer.protocol is not None:
                 try:
                     await self._ask(peer, Switch(number), limit)
-                except ServiceError as error:
+                except StackError as error:
                     self._peers.renew(peer, f"{error}; ending it")
         lost_meanwhile = self._moving.lost_for(LOST_IN_RELOAD) - lost_before - lost
         milliseconds = (time.monotonic() - started) * 1000
@@ -228,7 +228,7 @@ class Reloads:
                 try:
                     limit = ANSWER_TIME + len(in_force.deployment.boards) * _PROGRAM_TIME
                     await self._ask(peer, Switch(in_force.generation), limit)
-                except ServiceError as error:
+                except StackError as error:
                     self._peers.renew(peer, f"{error}; ending it")
         self._moving.go_on()
 

@@ -14,7 +14,7 @@ from services.errors import (
     NoDataError,
     ReportedError,
     RosbridgeLostError,
-    ServiceError,
+    StackError,
     VariableError,
 )
 from services.master.peers import ANSWER_TIME, ROLE, Awaited, Peer, Peers
@@ -41,7 +41,7 @@ from services.sockets.records import (
     Unusable,
 )
 from services.sockets.status_socket import FrameCounts, ProcessStatus, reasons, seconds_since, status_served
-from services.supervision import RESTARTS, RESTARTS_WITHIN
+from services.supervision.child import RESTARTS, RESTARTS_WITHIN
 from terminal.errors import ExitCode
 from terminal.logs import get_logger, say
 from toolchain.deployment import Deployment
@@ -95,7 +95,7 @@ class Master:
         """Start what is not running, move frames until the run is over, and end what was started.
 
         Raises:
-            ServiceError: what ended the run, with its exit code.
+            StackError: what ended the run, with its exit code.
         """
         settings, peers = self._settings, self._peers
         sockets = contextlib.AsyncExitStack()
@@ -106,7 +106,7 @@ class Master:
             if not self._once:
                 control = settings.control_directory or run_directory
                 await sockets.enter_async_context(control_served(control, self._reloads.order))
-            peers.start()
+            await peers.start()
             if sys.stderr.isatty() and not self._once:
                 self._tasks.append(asyncio.ensure_future(self._show_progress()))
             await self._end
@@ -310,7 +310,7 @@ class Master:
             return
         try:
             self._readings.put(waits)
-        except ServiceError as error:
+        except StackError as error:
             if self._held or self._catching_up:  # a reload was the slow part, not the boards
                 self.lose(LOST_IN_RELOAD, 1)
             else:

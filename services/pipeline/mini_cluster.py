@@ -25,7 +25,7 @@ from pcie_shim.errors import (
 )
 from pcie_shim.loader import program
 from pcie_shim.programming_file import Image, read_image
-from services.errors import ServiceError
+from services.errors import StackError
 from services.pipeline.generations import Generations
 from services.settings import Settings
 from services.sockets.records import (
@@ -129,7 +129,7 @@ class Boards:
             except PcieShimError:
                 self._put_back(cluster)
                 raise
-        except (PcieShimError, ServiceError) as error:
+        except (PcieShimError, StackError) as error:
             return NotReloaded(record.generation, exit_code_of(error), str(error))
         answer = self.generations.switch(record)
         self._use()

@@ -45,7 +45,7 @@ from services.sockets.status_socket import (
     seconds_since,
     status_thread,
 )
-from services.supervision import end_with_parent
+from services.supervision.parent import end_with_parent
 from terminal.errors import ExitCode, exit_code_of
 from terminal.logs import get_logger
 from terminal.running import ends_well, make_app, raise_on_signals

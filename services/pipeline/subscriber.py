@@ -44,7 +44,7 @@ from services.sockets.status_socket import (
     status_served,
     why_not_connected,
 )
-from services.supervision import end_with_parent
+from services.supervision.parent import end_with_parent
 from terminal.errors import exit_code_of
 from terminal.logs import get_logger, say
 from terminal.running import ends_well, make_app, run_async

@@ -6,7 +6,7 @@ import sys
 
 import orjson
 
-from services.errors import ServiceError
+from services.errors import StackError
 from services.pipeline.generations import InForce
 from services.sockets.records import Published
 from toolchain.deployment import Deployment
@@ -17,7 +17,7 @@ def print_json(record: Published, in_force: InForce) -> None:
 
     Raises:
         BrokenPipeError: whoever read it has what it wanted.
-        ServiceError: standard output can't be written.
+        StackError: standard output can't be written.
     """
     line = orjson.dumps(
         {
@@ -37,7 +37,7 @@ def print_json(record: Published, in_force: InForce) -> None:
         raise
     except OSError as error:
         msg = f"standard output can't be written: {error.strerror or error}"
-        raise ServiceError(msg) from error
+        raise StackError(msg) from error
 
 
 def print_sentence(record: Published, in_force: InForce) -> None:

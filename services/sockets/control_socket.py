@@ -16,7 +16,7 @@ import msgspec
 from pcie_shim.endpoint import Endpoint, listen, remove_listener
 from pcie_shim.errors import PcieShimError
 from services.errors import ControlError, NotReloadedError, ReportedError
-from services.supervision import CONTROL_SUFFIX
+from services.supervision.private_directory import CONTROL_SUFFIX
 from terminal.errors import ExitCode, exit_code_of
 from terminal.logs import say
 

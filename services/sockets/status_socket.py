@@ -25,7 +25,7 @@ import msgspec
 from pcie_shim.endpoint import Endpoint, listen, remove_listener
 from pcie_shim.errors import PcieShimError
 from services.errors import SettingsError
-from services.supervision import leave_private_directory
+from services.supervision.parent import leave_private_directory
 from services.version import VERSION
 from terminal.logs import say
 

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from services.supervision import DIRECTORY_VARIABLE, KEPT
+from services.supervision.parent import DIRECTORY_VARIABLE
+from services.supervision.private_directory import COPY_PREFIX
 from terminal.errors import ExitCode
 
 _STANDS = {
@@ -59,7 +60,7 @@ app()
 def test_a_child_that_ends_before_it_has_anything_open_tidies_up_after_a_killed_master():
     # a socket's path has 107 bytes at most: pytest's own folders may be too deep
     left = Path(tempfile.mkdtemp(dir="/tmp"))
-    (left / f"{KEPT}1").mkdir()
+    (left / f"{COPY_PREFIX}1").mkdir()
     with socket.socket(socket.AF_UNIX) as killed:
         killed.bind(str(left / "master.status.sock"))
     code = """

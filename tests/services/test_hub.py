@@ -13,7 +13,7 @@ from bridge.discovery import UnknownRobotError
 from services import settings
 from services.errors import SettingsError
 from services.settings import load_settings
-from services.supervision import own_command
+from services.supervision.child import own_command
 
 PATIENCE = 60
 EVERYWHERE = "0.0.0.0"  # noqa: S104  # the hub is to refuse it, or to want tokens

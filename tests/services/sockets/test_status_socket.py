@@ -21,7 +21,7 @@ from services.sockets.status_socket import (
     status_served,
     status_thread,
 )
-from services.supervision import remove_dead_sockets
+from services.supervision.private_directory import remove_stale_sockets
 
 
 def counts(completed, lost=None):
@@ -118,7 +118,7 @@ def test_dead_sockets_are_removed_and_live_ones_stay(tmp_path):
         dead.bind(str(tmp_path / "master.status.sock"))
     (tmp_path / "board0.sock").touch()
     with status_thread(tmp_path, "board0", tell):
-        remove_dead_sockets(tmp_path)
+        remove_stale_sockets(tmp_path)
         assert sorted(path.name for path in tmp_path.iterdir()) == ["board0.sock", "board0.status.sock"]
 
 

@@ -11,7 +11,7 @@ from services.master.peers import Peer, Peers
 from services.pipeline.generations import InForce
 from services.settings import Settings
 from services.sockets.serving import endpoint_from
-from services.supervision import Child
+from services.supervision.child import Child
 from terminal.logs import get_logger
 from tests.integration.conftest import build_boat
 from toolchain.deployment import load_deployment
@@ -53,7 +53,7 @@ async def test_a_process_of_its_own_may_start_slowly(tmp_path, own):
     )
     place = tmp_path / "late.sock"
     child = Child("subscriber", [sys.executable, "-c", LATE, str(place)])
-    child.start()
+    await child.start()
     peer = Peer("subscriber", endpoint_from(f"unix:{place}", "here"), child if own else None)
     keeping = asyncio.ensure_future(peers._keep(peer))
     try:
@@ -70,4 +70,5 @@ async def test_a_process_of_its_own_may_start_slowly(tmp_path, own):
         if peer.protocol is not None:
             peer.protocol.close()
         child.kill()
+        await child.ended()
         child.close()

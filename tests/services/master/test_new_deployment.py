@@ -15,7 +15,8 @@ from services.pipeline.generations import Generations
 from services.pipeline.mini_cluster import Boards
 from services.settings import Settings
 from services.sockets.records import Hello, NotReloaded, Prepare, Prepared, Switch, Switched
-from services.supervision import DIRECTORY_VARIABLE, Child, PrivateDirectory
+from services.supervision.parent import DIRECTORY_VARIABLE
+from services.supervision.private_directory import PrivateDirectory
 from terminal.errors import StoppedError
 from tests.integration.conftest import build_boat
 from toolchain.deployment import load_deployment
@@ -152,21 +153,8 @@ def test_a_damaged_image_is_for_those_who_read_images(boat):
     assert refused.exit_code == 2
 
 
-def test_a_child_is_started_with_another_value_later(tmp_path):
-    out = tmp_path / "out"
-    command = [sys.executable, "-c", f"import sys; open({str(out)!r}, 'w').write(' '.join(sys.argv[1:]))"]
-    child = Child("tester", [*command, "--deployment", "a", "--log-level", "info"])
-    child.give("--deployment", "b")
-    child.give("--reprogram")
-    child.give("--reprogram")
-    child.start()
-    child._process.wait(20)
-    assert out.read_text() == "--deployment b --log-level info --reprogram"
-    child.close()
-
-
 def leave(directory):
-    code = "from services.supervision import leave_private_directory; leave_private_directory()"
+    code = "from services.supervision.parent import leave_private_directory; leave_private_directory()"
     subprocess.run(
         [sys.executable, "-c", code],
         env=os.environ | {DIRECTORY_VARIABLE: str(directory)},

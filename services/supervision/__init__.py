@@ -1,0 +1,1 @@
+"""Processes of a run: started together, watched, and ended together, however the run ends."""

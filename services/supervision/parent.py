@@ -1,0 +1,79 @@
+"""The end of a child: with its parent, however that ends, and without leaving files behind."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import os
+import shutil
+import signal
+import time
+from pathlib import Path
+
+from services.supervision.private_directory import COPY_PREFIX, has_master, remove_stale_sockets
+from terminal.errors import ExitCode
+
+PARENT_VARIABLE = "ROSBAYES_PARENT"
+"""Environment variable with the process number of the parent; `Child` sets it."""
+
+DIRECTORY_VARIABLE = "ROSBAYES_DIRECTORY"
+"""Environment variable with the run's private directory, which the last process to end removes."""
+
+_PR_SET_PDEATHSIG = 1
+_DYING_TIME = 5.0
+"""Seconds to wait for the last threads of a killed parent."""
+
+
+def ask_for_end_with_parent() -> None:
+    """Have the kernel send this process SIGTERM when its parent ends; an exec does not undo it."""
+    ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
+
+
+def end_with_parent() -> None:
+    """In a child: have the kernel send SIGTERM when the parent ends, even by SIGKILL.
+
+    Do nothing in a process that has no parent of ours.
+    """
+    parent = os.environ.get(PARENT_VARIABLE)
+    if parent is None or not parent.isdigit():
+        return
+    # until the command installs its own handlers
+    signal.signal(signal.SIGTERM, _end_early)
+    ask_for_end_with_parent()
+    # the parent may have ended before the kernel was asked
+    if os.getppid() != int(parent):
+        _end_early(signal.SIGTERM, None)
+
+
+def _end_early(_number: int, _frame: object) -> None:
+    leave_private_directory()
+    os._exit(ExitCode.TERMINATED)
+
+
+def leave_private_directory() -> None:
+    """In a child that ends: remove the run's private directory if its master is gone, or if it is empty.
+
+    Every child does so, and the last one finds no sockets of others. Do nothing in a process that has no parent of ours.
+    """
+    name = os.environ.get(DIRECTORY_VARIABLE)
+    if not name:
+        return
+    directory = Path(name)
+    deadline = time.monotonic() + _DYING_TIME
+    while _is_dying(os.environ.get(PARENT_VARIABLE, "")) and time.monotonic() < deadline:
+        time.sleep(0.001)
+    remove_stale_sockets(directory)
+    if not has_master(directory):
+        for copy in directory.glob(f"{COPY_PREFIX}*"):
+            shutil.rmtree(copy, ignore_errors=True)
+    with contextlib.suppress(OSError):
+        directory.rmdir()
+
+
+def _is_dying(process: str) -> bool:
+    """Return whether a killed process still has threads: until they end it keeps its locks and sockets."""
+    try:
+        zombie = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+        return zombie and len(list(Path(f"/proc/{process}/task").iterdir())) > 1
+    except OSError:
+        return False

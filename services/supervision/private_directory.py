@@ -1,0 +1,139 @@
+"""The private directory of a run: the sockets of its processes, and copies of its deployments."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import re
+import shutil
+import socket
+import stat
+import tempfile
+from pathlib import Path
+
+from services.errors import StackError
+
+STATUS_SUFFIX = ".status.sock"
+CONTROL_SUFFIX = ".control.sock"
+
+DIRECTORY_PREFIX = "rosbayes-"
+COPY_PREFIX = "deployment-"
+"""Start of the names of the folders that hold copies of deployments (`services.master.new_deployment`)."""
+
+_DIRECTORY_NAME = re.compile(DIRECTORY_PREFIX + "[a-z0-9_]{8}")
+_COPY_NAME = re.compile(COPY_PREFIX + "[0-9]+")
+_MOST_ORPHANS = 100
+
+
+class PrivateDirectory:
+    """A directory that only this user can enter, and that stays locked as long as its master lives.
+
+    The kernel releases the lock when the master ends, even by SIGKILL, so that other processes recognise an orphan.
+    """
+
+    def __init__(self) -> None:
+        """Make and lock a directory, after removing those that killed masters left.
+
+        Raises:
+            StackError: There is no place for it.
+        """
+        remove_orphans()
+        while True:
+            self.path = make_private_directory()
+            # until it is locked, another master that starts may take it for an orphan
+            with contextlib.suppress(FileNotFoundError):
+                self._lock = os.open(self.path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+                fcntl.flock(self._lock, fcntl.LOCK_EX)
+                if os.fstat(self._lock).st_nlink:
+                    return
+                os.close(self._lock)
+
+    def remove(self) -> None:
+        """Remove the directory and everything in it."""
+        shutil.rmtree(self.path, ignore_errors=True)
+        os.close(self._lock)
+
+
+def _parent() -> Path:
+    """Return the folder in which this user's runs have their private directories."""
+    runtime = os.environ.get("XDG_RUNTIME_DIR", "")
+    # its specification has relative paths ignored; a long one leaves no room for the names of sockets
+    usable = Path(runtime).is_absolute() and len(os.fsencode(runtime)) < 40
+    return Path(runtime if usable and os.access(f"{runtime}/.", os.W_OK | os.X_OK) else tempfile.gettempdir())
+
+
+def make_private_directory() -> Path:
+    """Make a directory that only this user can enter (0700).
+
+    Raises:
+        StackError: There is no place for it.
+    """
+    try:
+        return Path(tempfile.mkdtemp(prefix=DIRECTORY_PREFIX, dir=_parent()))
+    except OSError as error:
+        raise StackError(
+            f"can't make a private directory for the local sockets: {error.strerror or error}; set TMPDIR to a writable folder"
+        ) from error
+
+
+def remove_orphans() -> None:
+    """Remove private directories orphaned by killed masters.
+
+    An orphan has the right name, belongs to this user alone, is locked by no master, and holds nothing but sockets and
+    copies of deployments. Links are not followed.
+    """
+    with contextlib.suppress(OSError):
+        found = [each for each in _parent().iterdir() if _DIRECTORY_NAME.fullmatch(each.name)]
+        for directory in found[:_MOST_ORPHANS]:
+            with contextlib.suppress(OSError):
+                _remove_if_orphaned(directory)
+
+
+def _remove_if_orphaned(directory: Path) -> None:
+    handle = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+    try:
+        found = os.fstat(handle)
+        if found.st_uid != os.geteuid() or stat.S_IMODE(found.st_mode) != 0o700:
+            return
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        with os.scandir(handle) as entries:
+            modes = {each.name: each.stat(follow_symlinks=False).st_mode for each in entries}
+        copies = {name for name, mode in modes.items() if stat.S_ISDIR(mode) and _COPY_NAME.fullmatch(name)}
+        sockets = {name for name, mode in modes.items() if stat.S_ISSOCK(mode)}
+        if copies | sockets != set(modes):
+            return
+        for name in sockets:
+            os.unlink(name, dir_fd=handle)
+        for name in copies:
+            shutil.rmtree(name, dir_fd=handle)
+        directory.rmdir()
+    finally:
+        os.close(handle)
+
+
+def has_master(directory: Path) -> bool:
+    """Return whether the master of a private directory lives, or the directory is gone."""
+    try:
+        handle = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    except OSError:
+        return True
+    try:
+        fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except OSError:
+        return True
+    else:
+        return False
+    finally:
+        os.close(handle)
+
+
+def remove_stale_sockets(directory: Path) -> None:
+    """Remove the status and control sockets of killed processes."""
+    for path in (*directory.glob(f"*{STATUS_SUFFIX}"), *directory.glob(f"*{CONTROL_SUFFIX}")):
+        with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX) as probe:
+            probe.settimeout(0.2)
+            try:
+                probe.connect(str(path))
+            except ConnectionRefusedError:
+                path.unlink()

@@ -1,0 +1,143 @@
+"""Children: their errors kept, their other lines passed on, their ends noticed."""
+
+import asyncio
+import os
+import signal
+import sys
+import time
+
+import pytest
+import uvloop
+
+from services.errors import ReportedError, StackError
+from services.supervision.child import RESTARTS, Child, end_all
+from terminal.errors import ExitCode
+
+PATIENCE = 50.0
+
+
+@pytest.fixture(params=[asyncio.new_event_loop, uvloop.new_event_loop], ids=["asyncio", "uvloop"])
+def run(request):
+    """Run a coroutine on each of the event loops that a parent may have."""
+
+    def run(coroutine):
+        with asyncio.Runner(loop_factory=request.param) as runner:
+            return runner.run(asyncio.wait_for(coroutine, PATIENCE))
+
+    return run
+
+
+def child(code: str) -> Child:
+    return Child("tester", [sys.executable, "-c", code])
+
+
+async def failure_of(code: str, number: int = 0) -> ReportedError:
+    one = child(code)
+    await one.start()
+    if number:
+        os.kill(one.pid, number)
+    await one.ended()
+    assert not one.is_running
+    one.close()
+    return one.failure()
+
+
+@pytest.mark.parametrize(
+    ("code", "number", "exit_code", "sentence"),
+    [
+        (
+            "print('starting\\nerror: no luck', file=sys.stderr); sys.exit(3)",
+            0,
+            ExitCode.ROSBRIDGE,
+            "no luck",
+        ),
+        (
+            "sys.stderr.write('starting\\nerror: half a line'); sys.exit(4)",
+            0,
+            ExitCode.VARIABLE,
+            "half a line",
+        ),
+        ("print('starting', file=sys.stderr)", 0, ExitCode.CHILD, "tester ended by itself with exit code 0"),
+        ("time.sleep(60)", signal.SIGKILL, ExitCode.CHILD, "tester was killed by SIGKILL"),
+        ("time.sleep(60)", signal.SIGRTMIN + 1, ExitCode.CHILD, "tester was killed by signal 35"),
+    ],
+    ids=["error", "no line end", "silent", "killed", "nameless signal"],
+)
+def test_an_end_is_an_error_with_the_childs_own_sentence_and_code(
+    run, capsys, code, number, exit_code, sentence
+):
+    failure = run(failure_of(f"import sys, time; {code}", number))
+    assert (str(failure), failure.exit_code) == (sentence, exit_code)
+    assert capsys.readouterr().err == ("starting\n" if "starting" in code else "")
+
+
+def test_a_line_is_passed_on_while_the_child_runs(run, capsys):
+    async def until_said():
+        one = child("import sys, time; print('ready', file=sys.stderr, flush=True); time.sleep(60)")
+        await one.start()
+        while capsys.readouterr().err != "ready\n":
+            await asyncio.sleep(0.01)
+        assert await end_all([one], PATIENCE) == []
+
+    run(until_said())
+
+
+def test_an_end_is_noticed_though_a_grandchild_holds_standard_error(run):
+    grandchild = "import subprocess; subprocess.Popen(['sleep', '60'])"
+    assert (
+        run(failure_of(f"import os; {grandchild}; os.write(2, b'error: gone\\n'); os._exit(5)")).exit_code
+        == 5
+    )
+
+
+@pytest.mark.parametrize(("ignores", "killed"), [(True, ["tester"]), (False, [])])
+def test_a_stubborn_child_is_killed_and_named(run, tmp_path, ignores, killed):
+    up = tmp_path / "up"
+
+    async def end():
+        one = child(
+            f"import signal, time; signal.signal(signal.SIGTERM, signal.{'SIG_IGN' if ignores else 'SIG_DFL'});"
+            f"open({str(up)!r}, 'w').close(); time.sleep(60)"
+        )
+        await one.start()
+        while not up.exists():
+            await asyncio.sleep(0.02)
+        began = time.monotonic()
+        assert await end_all([child(""), one], 0.2 if ignores else PATIENCE) == killed
+        assert one.exit_code == (-signal.SIGKILL if ignores else -signal.SIGTERM)
+        assert time.monotonic() - began < PATIENCE / 2
+
+    run(end())
+
+
+def test_restarts_are_bounded(monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr("services.supervision.child.time.monotonic", lambda: now[0])
+    one = child("")
+    assert [one.may_restart() for _ in range(RESTARTS + 1)] == [True] * RESTARTS + [False]
+    now[0] += 60.1
+    assert one.may_restart()
+    assert one.restarts == RESTARTS + 2
+
+
+def test_a_command_that_is_not_there(run):
+    with pytest.raises(StackError) as refused:
+        run(Child("tester", ["/nonexistent/command"]).start())
+    assert refused.value.exit_code == ExitCode.USAGE
+
+
+def test_a_later_start_has_other_flags(run, tmp_path):
+    out = tmp_path / "out"
+    command = [sys.executable, "-c", f"import sys; open({str(out)!r}, 'w').write(' '.join(sys.argv[1:]))"]
+
+    async def start_twice():
+        one = Child("tester", [*command, "--deployment", "a", "--log-level", "info"])
+        for flags in ((), (("--deployment", "b"), ("--reprogram",), ("--reprogram",))):
+            for flag in flags:
+                one.give(*flag)
+            await one.start()
+            await one.ended()
+        one.close()
+
+    run(start_twice())
+    assert out.read_text() == "--deployment b --log-level info --reprogram"

@@ -1,0 +1,87 @@
+"""Children of a killed master: they end, and the last one removes the private directory."""
+
+import contextlib
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import psutil
+
+PATIENCE = 50.0
+
+
+def test_a_child_ends_when_its_parent_is_killed(tmp_path):
+    child_code = (
+        "import time; from services.supervision.parent import end_with_parent; end_with_parent();"
+        f"open({str(tmp_path / 'up')!r}, 'w').close(); time.sleep(60)"
+    )
+    parent_code = f"""
+import asyncio, sys, time
+from services.supervision.child import Child
+
+async def main():
+    one = Child("tester", [sys.executable, "-c", {child_code!r}])
+    await one.start()
+    print(one.pid, flush=True)
+    await asyncio.sleep(60)
+
+asyncio.run(main())
+"""
+    parent = subprocess.Popen([sys.executable, "-c", parent_code], stdout=subprocess.PIPE, text=True)
+    pid = int(parent.stdout.readline())
+    deadline = time.monotonic() + PATIENCE
+    while not (tmp_path / "up").exists():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    parent.kill()
+    parent.wait(PATIENCE)
+    while psutil.pid_exists(pid) and psutil.Process(pid).status() != psutil.STATUS_ZOMBIE:
+        assert time.monotonic() < deadline, "the child outlived its parent"
+        time.sleep(0.02)
+
+
+KILLED_IN_PART = """
+import ctypes, os, platform, socket, subprocess, sys, threading, time
+from services.supervision.parent import DIRECTORY_VARIABLE, PARENT_VARIABLE
+from services.supervision.private_directory import COPY_PREFIX, PrivateDirectory
+directory = PrivateDirectory().path
+(directory / f"{COPY_PREFIX}3").mkdir()
+listener = socket.socket(socket.AF_UNIX)
+listener.bind(str(directory / "master.status.sock"))
+listener.listen()
+variables = {PARENT_VARIABLE: str(os.getpid()), DIRECTORY_VARIABLE: str(directory)}
+code = "import time; from services.supervision.parent import end_with_parent; end_with_parent(); print(flush=True); time.sleep(100)"
+child = subprocess.Popen([sys.executable, "-c", code], env=os.environ | variables, stdout=subprocess.PIPE)
+child.stdout.readline()
+print(child.pid, directory, flush=True)
+threading.Thread(target=lambda: (time.sleep(1), os._exit(0))).start()
+exit_of_this_thread = {"x86_64": 60, "aarch64": 93}[platform.machine()]
+ctypes.CDLL(None).syscall(exit_of_this_thread, 0)
+"""
+
+
+def test_a_parent_of_which_a_thread_still_dies_is_waited_for():
+    # a socket's path has 107 bytes at most: pytest's own folders may be too deep
+    with tempfile.TemporaryDirectory(dir="/tmp") as place:
+        _leave_when_the_last_thread_is_dead(Path(place))
+
+
+def _leave_when_the_last_thread_is_dead(place: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", KILLED_IN_PART],
+        env=os.environ | {"TMPDIR": str(place), "XDG_RUNTIME_DIR": ""},
+        stdout=subprocess.PIPE,
+        text=True,
+        timeout=PATIENCE,
+        check=True,
+    )
+    child_pid = int(done.stdout.split()[0])
+    deadline = time.monotonic() + PATIENCE
+    with contextlib.suppress(psutil.NoSuchProcess):
+        while psutil.Process(child_pid).status() != psutil.STATUS_ZOMBIE:
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+    assert list(place.iterdir()) == []
