@@ -162,11 +162,6 @@ class Greeting:
     image_hash: str
     token: bytes
 
-    @property
-    def is_blank(self) -> bool:
-        """Whether no image is loaded."""
-        return not self.image_hash.strip("0")
-
 
 def encode_greeting(greeting: Greeting) -> bytes:
     """The greeting's frame."""

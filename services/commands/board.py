@@ -14,10 +14,10 @@ from typing import Annotated, NoReturn
 
 import typer
 
-from pcie_shim.board import StopSignal, serve_board
-from pcie_shim.emulated_board import EmulatedBoard
+from pcie_shim.board.emulated_board import EmulatedBoard
+from pcie_shim.board.misbehaviour import Misbehaviour
+from pcie_shim.board.server import StopSignal, serve_board
 from pcie_shim.endpoint import Endpoint
-from pcie_shim.misbehaviour import Misbehaviour
 from services.commands import flags as options
 from services.errors import BoardFailedError, SettingsError
 from services.settings import endpoint_in, load_settings

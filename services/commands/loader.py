@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from pcie_shim.loader import program
+from pcie_shim.host.loader import program
 from services.commands import flags as options
 from services.settings import load_settings
 from services.sockets.serving import endpoint_from

@@ -10,7 +10,6 @@ import numpy as np
 import numpy.typing as npt
 
 from machines.parameters import SensorMode
-from pcie_shim.driver import PROGRAMMING_S, FrameInput, FrameOutput, MiniCluster
 from pcie_shim.endpoint import Endpoint
 from pcie_shim.errors import (
     BoardError,
@@ -23,7 +22,9 @@ from pcie_shim.errors import (
     ImageError,
     PcieShimError,
 )
-from pcie_shim.loader import program
+from pcie_shim.host.frame import FrameInput, FrameOutput
+from pcie_shim.host.loader import program
+from pcie_shim.host.mini_cluster import PROGRAMMING_S, MiniCluster
 from pcie_shim.programming_file import Image, read_image
 from services.errors import StackError
 from services.pipeline.generations import Generations

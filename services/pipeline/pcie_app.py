@@ -14,12 +14,12 @@ from typing import Annotated
 
 import typer
 
-from pcie_shim.driver import FrameOutput
 from pcie_shim.endpoint import Endpoint, listen, remove_listener
 from pcie_shim.errors import (
     BoardError,
     PcieShimError,
 )
+from pcie_shim.host.frame import FrameOutput
 from services.commands import flags as options
 from services.errors import LocalSocketError, OtherPeerError, SettingsError
 from services.pipeline.mini_cluster import TICK, Boards, frame_failed, result_record

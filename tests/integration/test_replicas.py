@@ -14,7 +14,7 @@ import pytest
 from machines.bm1 import Start
 from machines.posterior import joint_posterior
 from machines.reference import ReferenceReplicas
-from pcie_shim.driver import FrameInput
+from pcie_shim.host.frame import FrameInput
 from pcie_shim.programming_file import read_image
 from posteriors.results import read_frame_report, read_posterior
 from tests.integration.conftest import BIN, Robot

@@ -15,9 +15,9 @@ import numpy as np
 from machines.bm1 import BM1Machine, Start, StopReason
 from machines.kernel import make_kernel
 from machines.parameters import BM1Parameters, RngKind, SensorMode
-from pcie_shim.board import StopSignal, serve_board
-from pcie_shim.driver import FrameInput
-from pcie_shim.misbehaviour import Misbehaviour
+from pcie_shim.board.misbehaviour import Misbehaviour
+from pcie_shim.board.server import StopSignal, serve_board
+from pcie_shim.host.frame import FrameInput
 from pcie_shim.programming_file import Image, Partition, interface_words
 
 _FORK = multiprocessing.get_context("fork")

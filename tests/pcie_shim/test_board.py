@@ -12,9 +12,9 @@ import pytest
 
 from machines.bm1 import Start, StopReason
 from machines.kernel import make_kernel
-from pcie_shim import board as board_module
 from pcie_shim import framing
 from pcie_shim import register_map as rm
+from pcie_shim.board import server as board_module
 from pcie_shim.endpoint import connect, listen, parse_endpoint
 from pcie_shim.errors import (
     AccessError,
@@ -25,8 +25,8 @@ from pcie_shim.errors import (
     SequenceError,
     StaleHandleError,
 )
-from pcie_shim.link import SocketLink
-from pcie_shim.loader import program
+from pcie_shim.host.loader import program
+from pcie_shim.host.socket_link import SocketLink
 from pcie_shim.programming_file import image_bytes
 from pcie_shim.register_map import BoardState, ErrorCode
 from tests.pcie_shim.boards import BoardProcess, image, machine, never_stopping, tcp_endpoint, words
@@ -78,9 +78,7 @@ def test_a_frame_over_a_link(start_board: StartBoard, kind: str) -> None:
         assert bytes(done.results) == kernel.counts.tobytes() == link.read_block(rm.RESULTS, 8)
         assert done.compute_ns == struct.unpack("<Q", link.read_block(rm.COMPUTE_NS, 2))[0] > 0
         # posted: both frames in one send, nothing acknowledged but by the interrupt
-        link.post(
-            link.posted_write(rm.RUN_UNTIL, struct.pack("<Q", 0)) + link.posted_write(rm.RESUME, words(2))
-        )
+        link.post([(rm.RUN_UNTIL, struct.pack("<Q", 0)), (rm.RESUME, words(2))])
         done = link.wait_done(2, timeout=PATIENCE)
         kernel.resume(0)
         assert (done.reason, done.cycles) == (kernel.reason, kernel.cycles)
@@ -116,7 +114,7 @@ def test_a_refused_access_leaves_the_link_usable(start_board: StartBoard) -> Non
 
 def test_a_refused_posted_write_is_heard_of(start_board: StartBoard) -> None:
     with open_link(start_board()) as link:
-        link.post(link.posted_write(rm.RESULTS, words(1)))
+        link.post([(rm.RESULTS, words(1))])
         with refused(ErrorCode.BLANK):
             link.wait_done(1, timeout=PATIENCE)
 
@@ -277,7 +275,7 @@ def test_a_killed_boards_place_is_taken_by_the_next(start_board: StartBoard) -> 
     board = start_board()
     board.kill()
     with open_link(start_board(board.endpoint)) as link:
-        assert link.greeting.is_blank
+        assert not any(bytes.fromhex(link.greeting.image_hash))
 
 
 def test_a_taken_place_is_refused_and_left_alone(start_board: StartBoard) -> None:
@@ -312,7 +310,7 @@ def test_a_blank_board_is_programmed_and_programmed_again(start_board: StartBoar
     board = start_board()
     first, second = image(MACHINE), image(machine(2, lines=3))
     with open_link(board) as link:
-        assert link.greeting.is_blank
+        assert not any(bytes.fromhex(link.greeting.image_hash))
     assert program(board.endpoint, first) == first.image_hash
     assert program(board.endpoint, image_bytes(second)) == second.image_hash
     with open_link(board) as link:

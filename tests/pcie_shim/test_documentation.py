@@ -3,7 +3,7 @@ import inspect
 from pathlib import Path
 
 from pcie_shim import errors, framing
-from pcie_shim.misbehaviour import MisbehaviourKind
+from pcie_shim.board.misbehaviour import MisbehaviourKind
 
 TEXT = (Path(__file__).parents[2] / "docs" / "boards.md").read_text()
 

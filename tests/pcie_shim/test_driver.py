@@ -16,9 +16,8 @@ from hypothesis import strategies as st
 from machines.bm1 import StopReason
 from machines.parameters import PriorMode
 from pcie_shim import register_map as rm
-from pcie_shim.driven_board import BoardResult
-from pcie_shim.driver import FrameInput, FrameOutput, MiniCluster
-from pcie_shim.emulated_board import EmulatedBoard
+from pcie_shim.board.emulated_board import EmulatedBoard
+from pcie_shim.board.misbehaviour import Misbehaviour, MisbehaviourKind, UnknownMisbehaviourError
 from pcie_shim.errors import (
     BoardGoneError,
     BoardHeldError,
@@ -33,8 +32,9 @@ from pcie_shim.errors import (
     ImageMismatchError,
     PcieShimError,
 )
-from pcie_shim.loader import program
-from pcie_shim.misbehaviour import Misbehaviour, MisbehaviourKind, UnknownMisbehaviourError
+from pcie_shim.host.frame import FrameInput, FrameOutput
+from pcie_shim.host.loader import program
+from pcie_shim.host.mini_cluster import MiniCluster
 from tests.pcie_shim.boards import (
     BoardProcess,
     expected,
@@ -133,7 +133,6 @@ def test_times_say_where_a_frame_went(cluster: MiniCluster) -> None:
     assert output.register_writes_ns > 0
     assert output.reads_ns > 0
     assert 0 < output.boards_compute_ns < output.compute_ns + output.register_writes_ns
-    assert max(board.compute_ns for board in output.boards) <= output.boards_compute_ns
     assert output.slices >= 1
 
 
@@ -202,10 +201,13 @@ def test_what_did_not_change_is_not_written(
     written: list[int] = []
     with MiniCluster.open(endpoints_of(boards), parts) as cluster:
         link = cluster._boards[0].link
-        good = link.posted_write
-        monkeypatch.setattr(
-            link, "posted_write", lambda address, words: written.append(address) or good(address, words)
-        )
+        good = link.post
+
+        def post(writes: list[tuple[int, bytes]]) -> None:
+            written.extend(address for address, _ in writes)
+            good(writes)
+
+        monkeypatch.setattr(link, "post", post)
         for changed, first in (
             ({}, rm.TARGET_COUNT),
             ({}, rm.RUN_UNTIL),
@@ -538,9 +540,3 @@ def test_misbehaviours_are_parsed() -> None:
         with pytest.raises(UnknownMisbehaviourError, match="use KIND") as caught:
             Misbehaviour.parse(text)
         assert caught.value.exit_code == 2
-
-
-def test_a_result_is_plain_data() -> None:
-    result = BoardResult(words=bytes(4), cycles=0, reason=StopReason.NONE, compute_ns=0)
-    with pytest.raises(AttributeError):
-        result.cycles = 1

@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 from machines.bm1 import BM1Kernel, Start, StopReason
 from machines.kernel import make_kernel
 from machines.parameters import CYCLES_MAX, PriorMode, RngKind, RngReset
-from pcie_shim import emulated_board
 from pcie_shim import register_map as rm
+from pcie_shim.board import emulated_board
+from pcie_shim.board.emulated_board import EmulatedBoard, RefusedError
 from pcie_shim.doorbell import following
-from pcie_shim.emulated_board import EmulatedBoard, RefusedError
 from pcie_shim.programming_file import image_bytes
 from pcie_shim.register_map import BoardState, ErrorCode
 from tests.pcie_shim.boards import image, machine, never_stopping, words

@@ -117,7 +117,7 @@ def test_greeting_error_and_begin_come_back() -> None:
     )
     (frame,) = _frames(framing.encode_greeting(greeting))
     assert framing.decode_greeting(frame) == greeting
-    assert greeting.is_blank
+    assert not any(bytes.fromhex(greeting.image_hash))
     (frame,) = _frames(framing.encode_error(9, 0x100, 5, "beschäftigt"))
     assert (frame.sequence, frame.address, *framing.decode_error(frame)) == (9, 0x100, 5, "beschäftigt")
     begin = ProgramBegin(size=5, sha256=b"s" * 32, token=b"t" * 8)

@@ -4,7 +4,6 @@ from pathlib import Path
 
 import pytest
 
-from pcie_shim import loader
 from pcie_shim import register_map as rm
 from pcie_shim.errors import (
     DamagedImageError,
@@ -13,8 +12,9 @@ from pcie_shim.errors import (
     ImageMismatchError,
     UnreachableError,
 )
-from pcie_shim.link import SocketLink
-from pcie_shim.loader import program
+from pcie_shim.host import loader
+from pcie_shim.host.loader import program
+from pcie_shim.host.socket_link import SocketLink
 from pcie_shim.programming_file import image_bytes, write_image
 from tests.pcie_shim.boards import BoardProcess, image, machine
 

@@ -13,9 +13,10 @@ from hypothesis import strategies as st
 from machines.bm1 import StopReason
 from machines.parameters import PriorMode, SensorMode
 from pcie_shim import register_map as rm
-from pcie_shim.driver import FrameInput, FrameOutput, MiniCluster
-from pcie_shim.emulated_board import EmulatedBoard, RefusedError
+from pcie_shim.board.emulated_board import EmulatedBoard, RefusedError
 from pcie_shim.errors import BoardMismatchError, FrameInputError, ImageError
+from pcie_shim.host.frame import FrameInput, FrameOutput
+from pcie_shim.host.mini_cluster import MiniCluster
 from pcie_shim.programming_file import Image, image_bytes, image_from_bytes
 from pcie_shim.register_map import BoardState, ErrorCode
 from tests.pcie_shim.boards import (
@@ -176,8 +177,8 @@ def test_each_replica_stops_with_its_own_parts() -> None:
 def test_a_frame_that_does_not_fit_is_refused(name: str, change: dict, sentence: str) -> None:
     parts = CASES[name]
     case = Case(parts, MiniCluster.__new__(MiniCluster))
-    from pcie_shim.driven_board import DrivenBoard
     from pcie_shim.endpoint import parse_endpoint
+    from pcie_shim.host.driven_board import DrivenBoard
 
     boards = [DrivenBoard(at, parse_endpoint("unix:/tmp/x.sock"), part) for at, part in enumerate(parts)]
     case.cluster.__init__(boards, timeout=1, slack=1)
@@ -287,7 +288,7 @@ def test_a_board_of_other_capabilities_is_refused(
         other = dataclasses.replace(part, machine=dataclasses.replace(part.machine, parameters=parameters))
         known = part.image_hash
         monkeypatch.setattr(Image, "image_hash", property(lambda _: known))
-        monkeypatch.setattr("pcie_shim.driven_board.interface_words", lambda _: (inputs, 18))
+        monkeypatch.setattr("pcie_shim.host.driven_board.interface_words", lambda _: (inputs, 18))
         with pytest.raises(BoardMismatchError, match=sentence):
             MiniCluster.open([board.endpoint], [other])
         assert board.stop() == 0

@@ -5,7 +5,6 @@ from __future__ import annotations
 import select
 import struct
 import time
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -38,8 +37,10 @@ from pcie_shim.errors import (
     StaleHandleError,
     UnreachableError,
 )
-from pcie_shim.link import ALL_ONES, Done, SocketLink
-from pcie_shim.loader import program
+from pcie_shim.host.frame import BoardResult
+from pcie_shim.host.link import ALL_ONES
+from pcie_shim.host.loader import program
+from pcie_shim.host.socket_link import SocketLink
 from pcie_shim.programming_file import interface_words, is_plain
 from pcie_shim.register_map import BoardState
 
@@ -47,6 +48,7 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from pcie_shim.endpoint import Endpoint
+    from pcie_shim.host.link import Done, Link, RegisterWrite
     from pcie_shim.programming_file import Image
 
 _ASSUMED_SPEED: Final = 1e4  # cycles per second of a board that does not say its own
@@ -57,34 +59,6 @@ _REASONS: Final = frozenset(StopReason) - {StopReason.NONE}
 _PRIOR_AT: Final = rm.PRIOR_SELECT - rm.TARGET_COUNT
 _REPLICA: Final = np.dtype([("reason", "<u4"), ("zero", "<u4"), ("cycles", "<u8")])  # of OUTCOMES
 _CAPABILITIES: Final = range(rm.CAP_MACHINE, rm.CAP_INTERFACE + 4, 4)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class BoardResult:
-    """What one board computed.
-
-    Attributes:
-        words: One count per line of the board, 32 bits each, little-endian, as they came; replica after replica.
-        cycles: Cycles that its machine ran; of replicas the one that ran longest.
-        reason: Why it stopped; IMPOSSIBLE boards ran nothing and have no weight. Of replicas what ``joint_reason``
-            makes of theirs, or SLICE where all of them were stopped by other boards'.
-        compute_ns: Time that its machine took, in nanoseconds, as the board measured it.
-        replica_cycles: Cycles of each replica; empty where the board holds one machine.
-        replica_reasons: Why each replica stopped; empty likewise.
-    """
-
-    words: bytes
-    cycles: int
-    reason: StopReason
-    compute_ns: int
-    replica_cycles: tuple[int, ...] = ()
-    replica_reasons: tuple[StopReason, ...] = ()
-
-    @property
-    def counts(self) -> npt.NDArray[np.uint32]:
-        """uint32[lines of the board], with replicas uint32[replicas, lines of the board]; a copy."""
-        counts = np.frombuffer(self.words, "<u4").astype(np.uint32)
-        return counts.reshape(len(self.replica_cycles), -1) if self.replica_cycles else counts
 
 
 class DrivenBoard:
@@ -102,7 +76,7 @@ class DrivenBoard:
         self.result_bytes = self.counts_bytes + (
             self.replicas * _REPLICA.itemsize if self.replicas > 1 else 0
         )
-        self.link: SocketLink | None = None
+        self.link: Link | None = None
         self.broken = "it was not opened"
         self.speed = _ASSUMED_SPEED
         self._forget()
@@ -116,7 +90,6 @@ class DrivenBoard:
         self.number = 0
         self.waiting = False
         self.done: Done | None = None
-        self.compute_ns = 0
         self.readable = select.poll()
 
     # ---- opening --------------------------------------------------------------------------------------
@@ -131,8 +104,8 @@ class DrivenBoard:
         self._forget()
         link = self._identified(timeout, connect_timeout)
         try:
-            if link.greeting.is_blank:
-                program(self.endpoint, self.image, timeout=programming_timeout, token=link.greeting.token)
+            if not any(link.read_block(rm.IMAGE_HASH, rm.IMAGE_HASH_WORDS)):
+                program(self.endpoint, self.image, timeout=programming_timeout, token=link.token)
                 link.close("the board was programmed")
                 link = self._identified(timeout, connect_timeout)
             self._check_image(link)
@@ -146,7 +119,7 @@ class DrivenBoard:
         self.link = link
         self.readable.register(link.fileno(), select.POLLIN)
 
-    def _identified(self, timeout: float, connect_timeout: float) -> SocketLink:
+    def _identified(self, timeout: float, connect_timeout: float) -> Link:
         """A link to what is certainly a board with this register map."""
         link = SocketLink.open(self.endpoint, timeout=timeout, connect_timeout=connect_timeout)
         try:
@@ -156,7 +129,7 @@ class DrivenBoard:
             raise
         return link
 
-    def _check_identity(self, link: SocketLink) -> None:
+    def _check_identity(self, link: Link) -> None:
         identity = link.read32(rm.ID)
         pattern = time.monotonic_ns() & ALL_ONES
         link.write32(rm.LIVENESS, pattern)
@@ -173,7 +146,7 @@ class DrivenBoard:
                 f"{rm.MAP_SHA256}: use a board and a host of the same version"
             )
 
-    def _check_image(self, link: SocketLink) -> None:
+    def _check_image(self, link: Link) -> None:
         found = link.read_block(rm.IMAGE_HASH, rm.IMAGE_HASH_WORDS).hex()
         if found != self.image.image_hash:
             raise ImageMismatchError(
@@ -182,7 +155,7 @@ class DrivenBoard:
                 "programmed when it is opened)"
             )
 
-    def _check_capabilities(self, link: SocketLink) -> None:
+    def _check_capabilities(self, link: Link) -> None:
         """What the host is going to write and read must be there, whatever the hash of the image says."""
         parameters = self.image.machine.parameters
         words = struct.iter_unpack("<I", link.read_block(_CAPABILITIES.start, len(_CAPABILITIES)))
@@ -228,12 +201,12 @@ class DrivenBoard:
         """Post a new frame: what changed of the settings, the sensors, the doorbell (figure 3.3)."""
         assert self.link is not None  # noqa: S101 - MiniCluster.run has checked
         self.waiting = True  # from here on, whatever interrupts the frame must interrupt the board
-        frames = self.link.posted_write(self.inputs_at, sensors) if sensors else b""
+        writes: list[RegisterWrite] = [(self.inputs_at, sensors)] if sensors else []
         if selects != self.selects:
-            frames += self.link.posted_write(rm.PRIOR_SELECTS, selects)
+            writes.append((rm.PRIOR_SELECTS, selects))
             self.selects = selects
         if prior is not None and (self.prior is None or not np.array_equal(prior, self.prior)):
-            frames += self.link.posted_write(rm.PRIOR_CODES, prior.astype("<u4").tobytes())
+            writes.append((rm.PRIOR_CODES, prior.astype("<u4").tobytes()))
             self.prior = prior.copy()
         # Settings, slice and doorbell lie side by side: one burst from the first one that changed.
         known = self.settings
@@ -246,22 +219,21 @@ class DrivenBoard:
         else:
             at = _PRIOR_AT
         self.settings = settings
-        self.compute_ns = 0
-        self._ring(frames, rm.TARGET_COUNT + at, settings[at:], _START, end)
+        self._ring(writes, rm.TARGET_COUNT + at, settings[at:], _START, end)
 
     def resume(self, end: int, halted: bytes = b"") -> None:
         """Post the next slice of the frame; ``halted`` are the words of HALT, where they change anything."""
         assert self.link is not None  # noqa: S101 - MiniCluster.collect has checked
-        frames = self.link.posted_write(rm.HALT, halted) if halted else b""
-        self._ring(frames, rm.RUN_UNTIL, b"", _RESUME, end, 0)
+        self._ring([(rm.HALT, halted)] if halted else [], rm.RUN_UNTIL, b"", _RESUME, end, 0)
 
-    def _ring(self, frames: bytes, address: int, before: bytes, layout: struct.Struct, *words: int) -> None:
+    def _ring(
+        self, writes: list[RegisterWrite], address: int, before: bytes, layout: struct.Struct, *words: int
+    ) -> None:
         assert self.link is not None  # noqa: S101 - MiniCluster.run has checked
         self.number = following(self.number)
         self.waiting = True
         self.done = None
-        burst = before + layout.pack(*words, self.number)
-        self.link.post(frames + self.link.posted_write(address, burst))
+        self.link.post([*writes, (address, before + layout.pack(*words, self.number))])
 
     def receive(self) -> bool:
         """Take what has come, after a poll; True once the board has said done."""
@@ -291,7 +263,6 @@ class DrivenBoard:
             self.outcomes = outcomes.copy()
         self.waiting = False
         self.done = done
-        self.compute_ns += done.compute_ns
         return True
 
     @property
@@ -309,7 +280,6 @@ class DrivenBoard:
                 words=bytes(self.done.results[: self.counts_bytes]),
                 cycles=self.done.cycles,
                 reason=joint if joint is not StopReason.NONE else StopReason.SLICE,
-                compute_ns=self.compute_ns,
                 replica_cycles=tuple(self.outcomes["cycles"].tolist()),
                 replica_reasons=reasons,
             )
@@ -317,7 +287,6 @@ class DrivenBoard:
             words=bytes(self.done.results),
             cycles=self.done.cycles,
             reason=StopReason(self.done.reason),
-            compute_ns=self.compute_ns,
         )
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 from pcie_shim import framing, register_map
 from pcie_shim.endpoint import parse_endpoint
 from pcie_shim.errors import AccessError, ImageMismatchError
-from pcie_shim.link import SocketLink
+from pcie_shim.host.socket_link import SocketLink
 from pcie_shim.programming_file import Image, image_bytes, image_from_bytes, read_bytes
 from pcie_shim.register_map import ErrorCode
 
@@ -54,7 +54,7 @@ def program(
         for offset in range(0, len(content), PART_BYTES):
             part = content[offset : offset + PART_BYTES]
             padded = part + bytes(-len(part) % 4)
-            link.post(link.posted(framing.PROGRAM, offset, padded))
+            link.post_part(offset, padded)
         _request(link, framing.END, len(content), b"")
         identity = link.read32(register_map.ID)
         found = link.read_block(register_map.IMAGE_HASH, register_map.IMAGE_HASH_WORDS).hex()

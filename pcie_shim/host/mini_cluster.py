@@ -10,14 +10,12 @@ from __future__ import annotations
 import select
 import struct
 import time
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, Literal, NoReturn, Self
+from typing import TYPE_CHECKING, Final, NoReturn, Self
 
 import numpy as np
 
 from machines.bm1 import StopReason, first_slice
 from machines.parameters import CYCLES_MAX, PriorMode, SensorMode
-from pcie_shim.driven_board import BoardResult, DrivenBoard, board_error
 from pcie_shim.endpoint import parse_endpoint
 from pcie_shim.errors import (
     AccessError,
@@ -28,7 +26,9 @@ from pcie_shim.errors import (
     PcieShimError,
     StaleHandleError,
 )
-from pcie_shim.link import LONGEST_POLL_S
+from pcie_shim.host.driven_board import DrivenBoard, board_error
+from pcie_shim.host.frame import FrameInput, FrameOutput
+from pcie_shim.host.link import LONGEST_POLL_S
 from pcie_shim.programming_file import is_plain
 
 if TYPE_CHECKING:
@@ -49,54 +49,6 @@ PROGRAMMING_S: Final = 30.0
 """Seconds for each step of programming a blank board, at least."""
 
 _SETTINGS: Final = struct.Struct("<IQII")  # TARGET_COUNT, MAX_CYCLES, BANK, PRIOR_SELECT
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FrameInput:
-    """One frame's readings and settings.
-
-    Attributes:
-        addresses: One table address per sensor column, in the model's order; None is a missing reading. For cells with
-            inputs of their own, and for replicas: an array of integers of the whole machine's ``input_shape``,
-            addresses or codes, with -1 in all lines of a missing reading.
-        prior_address: Row of the prior's table (prior select); with replicas one for all, or a tuple of one each.
-        prior_codes: uint16[total lines], a written prior; with replicas the same for all, or uint16[replicas, total
-            lines]; None: the image's own.
-        target_count: Count that stops the machines (thesis figure 3.3: number of target samples).
-        max_cycles: Most cycles, whatever the counts.
-        bank: Set of seeds from which the RNGs restart.
-        stop: ``slices``: all boards stop in the slice in which the first one overflows; ``own``: each for itself.
-    """
-
-    addresses: tuple[int | None, ...] | npt.NDArray[np.integer]
-    prior_address: int | tuple[int, ...] = 0
-    prior_codes: npt.NDArray[np.uint16] | None = None
-    target_count: int
-    max_cycles: int
-    bank: int = 0
-    stop: Literal["slices", "own"] = "slices"
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FrameOutput:
-    """A frame's results, and where its time went (thesis figure 4.5), in nanoseconds.
-
-    Attributes:
-        boards: One result per board, in the order of the partition.
-        register_writes_ns: Posting settings, sensors, starts and resumes.
-        compute_ns: Waiting for the boards, their computing and the link's way included.
-        reads_ns: Taking the results out of what came.
-        boards_compute_ns: The boards' own computing: the slowest board of each slice, summed. What
-            ``compute_ns`` has above it is transport, and boards that had to share a core.
-        slices: Number of rounds of starting or resuming and waiting.
-    """
-
-    boards: tuple[BoardResult, ...]
-    register_writes_ns: int
-    compute_ns: int
-    reads_ns: int
-    boards_compute_ns: int
-    slices: int
 
 
 class _Course:

@@ -18,10 +18,10 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, Final
 
 from pcie_shim import framing, register_map
-from pcie_shim.emulated_board import EmulatedBoard, RefusedError
+from pcie_shim.board.emulated_board import EmulatedBoard, RefusedError
+from pcie_shim.board.misbehaviour import Misbehaviour, MisbehaviourKind
 from pcie_shim.endpoint import Endpoint, listen, no_delay, parse_endpoint, remove_listener
 from pcie_shim.errors import FramingError
-from pcie_shim.misbehaviour import Misbehaviour, MisbehaviourKind
 from pcie_shim.programming_file import MAX_IMAGE_BYTES
 from pcie_shim.register_map import ErrorCode
 

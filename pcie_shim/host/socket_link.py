@@ -1,9 +1,4 @@
-"""The host's end of a link to one board: registers over a blocking socket (AF_UNIX or TCP).
-
-A board is known only through this interface: ``read32``, ``write32``, ``read_block``, ``write_block``,
-``wait_done`` and ``close``; a host with many boards posts with ``post`` and collects with
-``take_done``. What cannot be trusted closes the link: nothing is guessed.
-"""
+"""The link over a blocking socket (AF_UNIX or TCP): frames with sequence numbers and CRCs."""
 
 from __future__ import annotations
 
@@ -12,7 +7,7 @@ import socket
 import struct
 import time
 from contextlib import suppress
-from typing import TYPE_CHECKING, Final, NamedTuple, NoReturn, Self
+from typing import TYPE_CHECKING, Final, NoReturn, Self
 
 from pcie_shim import framing, register_map
 from pcie_shim.endpoint import Endpoint, connect
@@ -30,18 +25,15 @@ from pcie_shim.errors import (
     ShortReadError,
     StaleHandleError,
 )
+from pcie_shim.host.link import ALL_ONES, LONGEST_POLL_S, Done, Link
 from pcie_shim.register_map import ErrorCode
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
     from types import TracebackType
 
     from pcie_shim.framing import Frame, Octets
-
-ALL_ONES: Final = 0xFFFFFFFF
-"""What a bus reads where no device answers."""
-
-LONGEST_POLL_S: Final = 3600.0
-"""Longest single wait: poll takes milliseconds in 31 bits."""
+    from pcie_shim.host.link import RegisterWrite
 
 _WORD: Final = struct.Struct("<I")
 _DONE: Final = struct.Struct("<IIQQ")  # the registers DONE, STATUS, CYCLES and COMPUTE_NS
@@ -49,36 +41,7 @@ _DONE_WORDS: Final = _DONE.size // 4
 _CLOSING_CODES: Final = (ErrorCode.STALE, ErrorCode.HELD, ErrorCode.BAD_FRAME)
 
 
-class Done(NamedTuple):
-    """What a board says when its machine has stopped.
-
-    Attributes:
-        number: The number of the start or resume that has stopped.
-        status: The STATUS register.
-        cycles: Cycles run in this frame.
-        compute_ns: Time the machine took since that start or resume, in nanoseconds.
-        results: One 32-bit count per line, of replicas one after the other, and then their OUTCOMES; as bytes, valid
-            until the link receives again.
-    """
-
-    number: int
-    status: int
-    cycles: int
-    compute_ns: int
-    results: memoryview
-
-    @property
-    def state(self) -> int:
-        """STATUS.STATE."""
-        return self.status & register_map.STATUS_STATE_MASK
-
-    @property
-    def reason(self) -> int:
-        """STATUS.STOP_REASON."""
-        return (self.status & register_map.STATUS_STOP_REASON_MASK) >> register_map.STATUS_STOP_REASON_SHIFT
-
-
-class SocketLink:
+class SocketLink(Link):
     """One open link; closes itself, and says why, once the stream cannot be trusted.
 
     Attributes:
@@ -105,6 +68,7 @@ class SocketLink:
             if frame.operation == framing.ERROR:
                 self._refused(frame)
             self.greeting = framing.decode_greeting(frame)
+            self.token = self.greeting.token
         except LinkError as error:
             self._give_up(error)
 
@@ -240,21 +204,23 @@ class SocketLink:
 
     # ---- for a host that drives many boards -----------------------------------------------------------
 
-    def posted_write(self, address: int, words: Octets) -> bytes:
-        """The frame of a posted write, to be handed to :meth:`post` before any other request is made."""
-        return self.posted(framing.WRITE, address, words)
-
-    def posted(self, operation: int, address: int, words: Octets) -> bytes:
-        """The frame of any posted operation, as :meth:`posted_write`."""
-        self._sequence = (self._sequence + 1) & ALL_ONES
-        return framing.encode(operation, framing.POSTED, self._sequence, address, len(words) // 4, words)
-
-    def post(self, frames: bytes) -> None:
-        """Send frames without waiting; a refusal comes where the next answer or interrupt is taken.
+    def post(self, writes: Iterable[RegisterWrite]) -> None:
+        """Send posted writes; a refusal is raised where the next answer or interrupt is taken.
 
         Raises:
             LinkError: The link broke; it is closed.
         """
+        self._send(b"".join(self._posted(framing.WRITE, address, words) for address, words in writes))
+
+    def post_part(self, offset: int, part: Octets) -> None:
+        """Send a part of a programming file, which begins at this offset, without waiting; errors as `post`."""
+        self._send(self._posted(framing.PROGRAM, offset, part))
+
+    def _posted(self, operation: int, address: int, words: Octets) -> bytes:
+        self._sequence = (self._sequence + 1) & ALL_ONES
+        return framing.encode(operation, framing.POSTED, self._sequence, address, len(words) // 4, words)
+
+    def _send(self, frames: bytes) -> None:
         self._check_open()
         try:
             self._socket.sendall(frames)
@@ -303,7 +269,7 @@ class SocketLink:
             LinkError: The link broke; it is closed.
         """
         self._sequence = sequence = (self._sequence + 1) & ALL_ONES
-        self.post(framing.encode(operation, flags, sequence, address, count, payload))
+        self._send(framing.encode(operation, flags, sequence, address, count, payload))
         deadline = time.monotonic() + self.timeout
         while True:
             try:

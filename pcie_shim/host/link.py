@@ -1,0 +1,97 @@
+"""The interface of a link to one board: its registers, and its answer when the machine has stopped."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final, NamedTuple, Protocol, TypeAlias
+
+from pcie_shim import register_map
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from pcie_shim.endpoint import Endpoint
+    from pcie_shim.errors import LinkTimeoutError
+    from pcie_shim.framing import Octets
+
+ALL_ONES: Final = 0xFFFFFFFF
+"""What a bus reads where no device answers."""
+
+LONGEST_POLL_S: Final = 3600.0
+"""Longest single wait: poll takes milliseconds in 31 bits."""
+
+RegisterWrite: TypeAlias = "tuple[int, Octets]"
+"""An address of the register map, in bytes, and the little-endian words to write from there on."""
+
+
+class Done(NamedTuple):
+    """A board's answer when its machine has stopped.
+
+    Attributes:
+        number: The number of the start or resume that has stopped.
+        status: The STATUS register.
+        cycles: Cycles run in this frame.
+        compute_ns: Time the machine took since that start or resume, in nanoseconds.
+        results: One 32-bit count per line, replica after replica, and then the OUTCOMES of several replicas; as
+            bytes, valid until the link receives again.
+    """
+
+    number: int
+    status: int
+    cycles: int
+    compute_ns: int
+    results: memoryview
+
+    @property
+    def state(self) -> int:
+        """STATUS.STATE."""
+        return self.status & register_map.STATUS_STATE_MASK
+
+    @property
+    def reason(self) -> int:
+        """STATUS.STOP_REASON."""
+        return (self.status & register_map.STATUS_STOP_REASON_MASK) >> register_map.STATUS_STOP_REASON_SHIFT
+
+
+class Link(Protocol):
+    """One open link to a board, whatever carries it; it closes itself once what it carries cannot be trusted.
+
+    A host with one board reads, writes and waits. A host with many boards posts to each of them, polls
+    their descriptors and takes what has come. Every method raises `LinkError`: `AccessError` where the
+    board refused (the link stays open), any other one where the link broke (it is closed).
+    """
+
+    endpoint: Endpoint
+    """Where the board listens."""
+
+    token: bytes
+    """Proof, for the board's programming port, that its owner holds this link."""
+
+    def read32(self, address: int) -> int:
+        """Read one register."""
+
+    def write32(self, address: int, value: int) -> None:
+        """Write one register and wait until the board has taken it."""
+
+    def read_block(self, address: int, count: int) -> bytes:
+        """Read `count` words from `address` on, as little-endian bytes."""
+
+    def write_block(self, address: int, words: Octets) -> None:
+        """Write little-endian words from `address` on and wait until the board has taken them."""
+
+    def wait_done(self, number: int, *, timeout: float) -> Done:
+        """Wait until the board has stopped after start or resume `number`; needs CONTROL.INTERRUPT_ENABLE."""
+
+    def post(self, writes: Iterable[RegisterWrite]) -> None:
+        """Write without waiting; a refusal is raised where the next answer is taken."""
+
+    def receive_done(self) -> Done | None:
+        """Receive once, after a poll of `fileno()`; return the board's answer if it is complete."""
+
+    def fileno(self) -> int:
+        """Return a descriptor that is readable when something has come."""
+
+    def late(self, timeout: float, what: str) -> LinkTimeoutError:
+        """Return the error that the board did not `what` within `timeout` seconds."""
+
+    def close(self, reason: str = "it was closed") -> None:
+        """End the link; later calls raise `LinkClosedError` with this reason."""
