@@ -30,7 +30,7 @@ from tests.integration.conftest import (
     stamp_of,
     status_of,
 )
-from toolchain.analysis.emulation import EmulatedBoards
+from toolchain.analysis.accuracy.emulation import EmulatedBoards
 from toolchain.deployment import load_deployment
 from toolchain.deployment.address import to_address
 

@@ -13,7 +13,7 @@ MODULES = (
     *(f"services.pipeline.{name}" for name in ("subscriber", "publisher", "pcie_app")),
     *(f"services.commands.{name}" for name in ("hub", "discover", "listen", "status")),
     *(f"casestudies.boat.{name}" for name in ("simulator", "normaliser", "viewer")),
-    *("casestudies.mrclam.convert", "casestudies.mrclam.player", "toolchain.command"),
+    *("casestudies.mrclam.convert", "casestudies.mrclam.player", "toolchain.commands.main"),
 )
 
 

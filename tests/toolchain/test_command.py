@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from pcie_shim.programming_file import read_image
-from toolchain.command import app
+from toolchain.commands.main import app
 from toolchain.deployment import load_deployment
 from toolchain.outputs.mif import read_mif
 
@@ -303,7 +303,7 @@ def test_the_installed_command_has_help_with_an_example():
 
 
 def test_help_loads_no_numpy():
-    code = "import sys, toolchain.command; print('numpy' in sys.modules)"
+    code = "import sys, toolchain.commands.main; print('numpy' in sys.modules)"
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=240
     )

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from toolchain import checks
 from toolchain.build import assemble
-from toolchain.command import app
+from toolchain.commands.main import app
 from toolchain.deployment import DeploymentFile
 from toolchain.errors import ModelError
 from toolchain.models.case_study import load_model

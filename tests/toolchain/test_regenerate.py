@@ -6,7 +6,7 @@ import pytest
 from typer.testing import CliRunner
 
 from pcie_shim.programming_file import read_image
-from toolchain.command import app
+from toolchain.commands.main import app
 from toolchain.deployment import load_deployment
 from toolchain.errors import DamagedDeploymentError
 

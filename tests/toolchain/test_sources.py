@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from bridge.errors import PathError
 from bridge.fields import parse_path
-from toolchain.command import app
+from toolchain.commands.main import app
 from toolchain.deployment import Variable, deployment_hash, load_deployment, write_deployment
 from toolchain.deployment.fields import MESSAGE_PATH
 from toolchain.deployment.sources import read_sources
@@ -196,18 +196,11 @@ def test_no_file(tmp_path):
         read_sources(tmp_path / "sources.toml", None)
 
 
-@pytest.mark.parametrize(
-    ("flags", "said"),
-    [
-        (("--topic", "/t"), "--topic /t: the file of --sources says that"),
-        (("--type", "a/B"), "--type a/B: the file of --sources says that"),
-        (("--prior-path", "p"), "--prior-path p: the file of --sources says that"),
-    ],
-)
-def test_flags_that_say_the_same(tmp_path, written, flags, said):
+@pytest.mark.parametrize("flags", [("--topic", "/t"), ("--type", "a/B"), ("--prior-path", "p")])
+def test_flags_that_say_the_same(tmp_path, written, flags):
     result = build(tmp_path, "--sources", str(written(FILE)), *flags)
     assert result.exit_code == 2
-    assert said in result.stderr
+    assert result.stderr.startswith(f"error: {' '.join(flags)}: ")
 
 
 @given(st.text(st.sampled_from("ab_3[].x-"), max_size=12) | st.from_regex(MESSAGE_PATH, fullmatch=True))

@@ -1,68 +1,53 @@
-"""What `toolchain check` does: tells the findings about a model or a deployment, a line each."""
-
-from __future__ import annotations
+"""The `toolchain check` command: the findings about a model or a deployment, one on each line."""
 
 import json as json_text
 from collections import Counter
-from typing import TYPE_CHECKING, Final, TypedDict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from toolchain.checks.check import check_deployment, check_model, refusal
-from toolchain.checks.finding import Finding, Severity
-from toolchain.commands.build import on_device, read_options
-from toolchain.commands.named_model import read_model
-from toolchain.deployment import FILE_NAME
+from toolchain.commands.flags import BuildFlags
 from toolchain.errors import BuildError, ToolchainError
-from toolchain.models import case_study
-from toolchain.networks import is_network
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-
-    from toolchain.commands.named_model import NetworkQuestion, Unread
-    from toolchain.options import BuildOptions
+    from toolchain.checks.finding import Finding
 
 
-class Target(TypedDict):
-    """Where readings come from: a check says nothing of it, but a build must know."""
+def check(
+    context: typer.Context,
+    path: Annotated[
+        Path,
+        typer.Argument(
+            help="Folder that holds model.py, a network's file, or a deployment's folder.",
+            metavar="MODEL|DIR",
+        ),
+    ],
+    flags: BuildFlags,
+    json: Annotated[bool, typer.Option("--json", help="One JSON object a line.")] = False,
+) -> None:
+    """Say what is wrong before anything runs: of a model as it would be built, or of a deployment.
 
-    uri: str
-    topic: str
-    type: str
-
-
-UNTOLD_TARGET: Final[Target] = {
-    "uri": "ws://127.0.0.1:9090",
-    "topic": "/readings",
-    "type": "std_msgs/Float64MultiArray",
-}
-
-
-def run_check(
-    path: Path,
-    question: NetworkQuestion,
-    options: BuildOptions,
-    unread: Unread,
-    said: Sequence[str],
-    *,
-    json: bool,
-) -> int:
-    """Tell the findings on stdout, and return the command's exit code: 2 if there is an error, else 0.
-
-    Args:
-        path: A model or a deployment.
-        question: To a network.
-        options: What a model would be built with.
-        unread: What of them is as the user wrote it.
-        said: Names of the flags that were given; a deployment takes none.
-        json: Whether findings are JSON objects.
-
-    Raises:
-        BuildError: There is neither a model nor a deployment, or flags that mean nothing to it.
+    For example `toolchain check casestudies/boat --partitions 4`, or `toolchain check build/boat`. Exit code 2 if there
+    is an error among the findings, else 0.
     """
-    findings = _findings(path, question, options, unread, said)
+    from toolchain.checks.check import check_deployment
+    from toolchain.checks.finding import Severity
+    from toolchain.deployment import FILE_NAME
+    from toolchain.models import case_study
+    from toolchain.networks import is_network
+
+    if is_network(path) or case_study.model_path(path).is_file():
+        findings = _of_model(path, flags)
+    elif not (path / FILE_NAME).is_file():
+        raise BuildError(
+            f"{path} holds neither a model ({case_study.FILE_NAME}) nor a deployment ({FILE_NAME}), and is not a "
+            "network's file"
+        )
+    else:
+        for flag in _model_flags(context):
+            raise BuildError(f"{flag} is for a model; {path} is a deployment, which was built with its own")
+        findings = check_deployment(path)
     for finding in findings:
         typer.echo(json_text.dumps(finding.as_dict()) if json else finding.sentence)
     counts = Counter(finding.severity for finding in findings)
@@ -71,27 +56,31 @@ def run_check(
             f"{counts[severity]} {severity}{'' if counts[severity] == 1 else 's'}" for severity in Severity
         )
         typer.echo(f"{path}: {summary}", err=True)
-    return ToolchainError.exit_code if counts[Severity.ERROR] else 0
+    raise typer.Exit(ToolchainError.exit_code if counts[Severity.ERROR] else 0)
 
 
-def _findings(
-    path: Path, question: NetworkQuestion, options: BuildOptions, unread: Unread, said: Sequence[str]
-) -> list[Finding]:
-    if not is_network(path) and not case_study.model_path(path).is_file():
-        if not (path / FILE_NAME).is_file():
-            message = (
-                f"{path} holds neither a model ({case_study.FILE_NAME}) nor a deployment ({FILE_NAME}), and is no "
-                "network's file"
-            )
-            raise BuildError(message)
-        if said:
-            message = f"--{said[0].replace('_', '-')} is for a model; {path} is a deployment, which was built with its own"
-            raise BuildError(message)
-        return check_deployment(path)
+def _model_flags(context: typer.Context) -> list[str]:
+    """Return the flags on the command line that belong to a model."""
+    given = []
+    for each in context.command.params:
+        source = context.get_parameter_source(each.name or "")
+        if source is not None and source.name == "COMMANDLINE" and each.name not in {"path", "json"}:
+            given.append(max(each.opts, key=len))
+    return given
+
+
+def _of_model(path: Path, flags: BuildFlags) -> "list[Finding]":
+    from toolchain.checks.check import check_model, refusal
+    from toolchain.commands.request import build_options, fit_to_device, read_model, read_named
+
+    # a check needs no target, but a build's options have one
+    options = build_options(
+        flags, uri="ws://127.0.0.1:9090", topic="/readings", message_type="std_msgs/Float64MultiArray"
+    )
     try:
-        options = read_options(options, unread)
-        model = read_model(path, question, unread)
-        options, why = on_device(options, model, unread.device)
+        options = read_named(options, flags)
+        model = read_model(path, flags, flags.bits)
+        options, why = fit_to_device(options, model, flags.device)
     except ToolchainError as reason:
         return [refusal(reason, "the model")]
     if why:

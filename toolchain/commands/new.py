@@ -1,51 +1,45 @@
-"""What `toolchain new` does: a model of one's own, from a template that runs."""
-
-from __future__ import annotations
+"""The `toolchain new` command: a model to start from, made of a template that runs."""
 
 import re
 import shlex
 from importlib.resources import files
-from typing import TYPE_CHECKING, Final
+from pathlib import Path
+from typing import Annotated, Final
+
+import typer
 
 from toolchain.errors import BuildError
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 _FILES: Final = ("model.py", "robot.py")
 
 
-def new_model(folder: Path) -> str:
-    """Write the template into a folder, and return what to do next.
+def new(
+    name: Annotated[Path, typer.Argument(help="The folder to make; its last part names the model.")],
+) -> None:
+    """Start a model from a template that runs: a robot in a corridor.
 
-    Args:
-        folder: It is made; its last part names the model, its topic and nothing else.
-
-    Raises:
-        BuildError: A name that no topic can have, files that are there already, or a folder that can't be written.
+    For example `toolchain new mymodel`; it prints how to go on.
     """
-    name = folder.name
-    if not re.fullmatch(r"[A-Za-z]\w{0,60}", name, re.ASCII):
-        message = f"{name or str(folder)!r} names no model: expected a letter, then letters, digits and _"
-        raise BuildError(message)
-    for file in _FILES:
-        if (folder / file).exists():
-            message = f"{folder / file} is there already; choose another name"
-            raise BuildError(message)
-    if not folder.parent.is_dir():
-        message = (
-            f"{folder.parent} is no folder, so {name} can't be made in it: make it first, or correct the path"
+    model = name.name
+    if not re.fullmatch(r"[A-Za-z]\w{0,60}", model, re.ASCII):
+        raise BuildError(
+            f"{model or str(name)!r} is not a model's name: expected a letter, then letters, digits and _"
         )
-        raise BuildError(message)
+    for file in _FILES:
+        if (name / file).exists():
+            raise BuildError(f"{name / file} is there already; choose another name")
+    if not name.parent.is_dir():
+        raise BuildError(
+            f"{name.parent} is not a folder, so {model} can't be made in it; make it first, or correct the path"
+        )
     try:
-        folder.mkdir(exist_ok=True)
+        name.mkdir(exist_ok=True)
         for file in _FILES:
             text = files("toolchain.commands").joinpath("template", file + ".txt").read_text(encoding="utf-8")
-            (folder / file).write_text(text.replace("NAME", name), encoding="utf-8")
+            (name / file).write_text(text.replace("NAME", model), encoding="utf-8")
     except OSError as reason:
-        message = f"{folder} can't be written: {reason.strerror or reason}"
-        raise BuildError(message) from None
-    return _next_steps(folder)
+        raise BuildError(f"{name} can't be written: {reason.strerror or reason}") from None
+    typer.echo(_next_steps(name), nl=False)
 
 
 def _next_steps(folder: Path) -> str:

@@ -1,4 +1,4 @@
-"""The `toolchain regenerate` commands (thesis 3.4): flags, and what became of each file."""
+"""The `toolchain regenerate` commands (thesis 3.4): one part of a deployment is written again."""
 
 import difflib
 from collections.abc import Sequence
@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING, Annotated, TypeAlias
 import typer
 
 from terminal.command_line import CommandLine
-from terminal.refusals import one_sentence
-from toolchain.commands import flags
+from toolchain.commands.flags import ModelFlags, TargetCount
+from toolchain.commands.registration import add_commands
 from toolchain.deployment import FILE_NAME, Queue, Stop
-from toolchain.options import OnMissing
 
 if TYPE_CHECKING:
     from toolchain.regenerate import Changes
@@ -28,9 +27,9 @@ def regenerate() -> None:
     """Redo one part of a deployment, leave the rest as it is, and say what changed."""
 
 
-@app.command()
 def memories(
     directory: Directory,
+    flags: ModelFlags,
     model: Annotated[
         Path | None,
         typer.Option(
@@ -38,54 +37,43 @@ def memories(
             metavar="MODEL",
         ),
     ] = None,
-    settings: flags.Settings = None,
-    searched: flags.Searched = "",
-    known: flags.KnownNames = "",
-    given: flags.Given = None,
-    prior_select: flags.PriorSelectName = "",
-    on_missing: flags.OnMissingFlag = OnMissing.ERROR,
 ) -> None:
     """The parameters and memory files; with --model also the boards' images, for a model with new numbers.
 
     For example `toolchain regenerate memories build/boat --model casestudies/boat`. Topics, endpoints and everything
     else in deployment.toml that says nothing of the tables stays as it is.
     """
-    with one_sentence():
-        from toolchain.build import build_date
-        from toolchain.commands.named_model import NetworkQuestion, Unread, model_file, read_model
-        from toolchain.errors import BuildError
-        from toolchain.regenerate import regenerate_memories
+    from toolchain.build import build_date
+    from toolchain.commands.request import model_file, read_model
+    from toolchain.errors import BuildError
+    from toolchain.regenerate import regenerate_memories
 
-        question = NetworkQuestion.of_flags(searched, known, given, prior_select, on_missing)
-        if model is None:
-            if settings or question.flags:
-                message = f"{'--set' if settings else question.flags[0]} belongs to a model: add --model"
-                raise BuildError(message)
-            changes = regenerate_memories(directory)
-            _tell(changes)
-        else:
-            read = read_model(model, question, Unread(settings=tuple(settings or ())))
-            before = _lines(directory)
-            changes = regenerate_memories(directory, read, build_date=build_date(model_file(model)))
-            _tell(changes, before, _lines(directory))
+    if model is not None:
+        read = read_model(model, flags)
+        before = _lines(directory)
+        changes = regenerate_memories(directory, read, build_date=build_date(model_file(model)))
+        _print_changes(changes, before, _lines(directory))
+    elif flags.settings or flags.question:
+        raise BuildError(
+            f"{'--set' if flags.settings else flags.question[0]} belongs to a model: add --model"
+        )
+    else:
+        _print_changes(regenerate_memories(directory))
 
 
-@app.command()
 def project(directory: Directory) -> None:
     """The Quartus project.
 
     For example `toolchain regenerate project build/boat`.
     """
-    with one_sentence():
-        from toolchain.regenerate import regenerate_project
+    from toolchain.regenerate import regenerate_project
 
-        changes = regenerate_project(directory)
-    _tell(changes)
+    changes = regenerate_project(directory)
+    _print_changes(changes)
     if not changes:
         typer.echo("rng = ideal exists emulated only, so there is no project", err=True)
 
 
-@app.command()
 def deployment(
     directory: Directory,
     uri: Annotated[str | None, typer.Option(help="rosbridge server with the readings.")] = None,
@@ -102,7 +90,7 @@ def deployment(
         list[str] | None,
         typer.Option(help="Where in the message a variable is; repeat for more.", metavar="NAME=PATH"),
     ] = None,
-    target_count: flags.TargetCount = None,
+    target_count: TargetCount = None,
     max_cycles: Annotated[int | None, typer.Option(help="Cycles after which a machine stops anyway.")] = None,
     stop: Annotated[
         Stop | None,
@@ -120,39 +108,41 @@ def deployment(
     For example `toolchain regenerate deployment build/boat --order D2,D1,D3,B1,B2,B3` where the first two readings were
     mixed up. No image, memory or board is touched. What is left out stays as it is.
     """
-    with one_sentence():
-        from toolchain.flag_values import key_values, names_in
-        from toolchain.regenerate import DeploymentEdits, regenerate_deployment
+    from toolchain.flag_values import key_values, names_in
+    from toolchain.regenerate import DeploymentEdits, regenerate_deployment
 
-        edits = DeploymentEdits(
-            uri=uri,
-            topic=topic,
-            type=message_type,
-            output=output,
-            order=None if order is None else tuple(names_in("--order", order)),
-            paths=tuple(key_values(path or (), "--path", "range=data[0]").items()),
-            target_count=target_count,
-            max_cycles=max_cycles,
-            stop=stop,
-            queue=queue,
-            tolerance_s=tolerance,
-        )
-        before = _lines(directory)
-        changes = regenerate_deployment(directory, edits)
-    _tell(changes, before, _lines(directory))
+    edits = DeploymentEdits(
+        uri=uri,
+        topic=topic,
+        type=message_type,
+        output=output,
+        order=None if order is None else tuple(names_in("--order", order)),
+        paths=tuple(key_values(path or (), "--path", "range=data[0]").items()),
+        target_count=target_count,
+        max_cycles=max_cycles,
+        stop=stop,
+        queue=queue,
+        tolerance_s=tolerance,
+    )
+    before = _lines(directory)
+    changes = regenerate_deployment(directory, edits)
+    _print_changes(changes, before, _lines(directory))
 
 
 def _lines(directory: Path) -> list[str]:
-    """Return `deployment.toml` as it stands; nothing where it isn't there, which is refused elsewhere."""
+    """Return the lines of `deployment.toml`; none where it is missing, which is refused elsewhere."""
     file = directory / FILE_NAME
     return file.read_text(encoding="utf-8", errors="replace").splitlines() if file.is_file() else []
 
 
-def _tell(changes: "Changes", before: Sequence[str] = (), after: Sequence[str] = ()) -> None:
-    """Say what became of each file, and which lines of `deployment.toml` did."""
+def _print_changes(changes: "Changes", before: Sequence[str] = (), after: Sequence[str] = ()) -> None:
+    """Print each file's change, and the changed lines of `deployment.toml`."""
     for name, change in changes:
         typer.echo(f"{change:9}  {name}")
         if name == FILE_NAME:
             for line in difflib.unified_diff(before, after, lineterm="", n=0):
                 if not line.startswith(("---", "+++", "@@")):
                     typer.echo(f"           {line}")
+
+
+add_commands(app, memories, project, deployment)

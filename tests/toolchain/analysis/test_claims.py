@@ -7,10 +7,18 @@ import pytest
 
 from machines.bm1 import Start, addressed_codes
 from machines.reference import ReferenceBM1
-from toolchain.analysis import claims
-from toolchain.analysis.claims import KINDS, Faults, FaultyMachine, beacons, frames_of, machine_of, run_claims
-from toolchain.analysis.pictures import draw_claims
-from toolchain.analysis.readings import sample_readings
+from toolchain.analysis.accuracy.readings import sample_readings
+from toolchain.analysis.exploration import claims
+from toolchain.analysis.exploration.claims import (
+    KINDS,
+    Faults,
+    FaultyMachine,
+    beacons,
+    frames_of,
+    machine_of,
+    run_claims,
+)
+from toolchain.analysis.exploration.pictures import draw_claims
 from toolchain.models.fusion import exact_posterior
 
 
@@ -70,8 +78,9 @@ def test_the_claims(monkeypatch, tmp_path):
     monkeypatch.setattr(claims, "TARGETS", (31, 255))
     monkeypatch.setattr(claims, "RATES", (0.0, 0.01))
     monkeypatch.setattr(claims, "_FAULT_CYCLES", 1024)
+    monkeypatch.setattr(claims, "FAULT_FRAMES", 6)
     told = []
-    found = run_claims(frames=60, fault_frames=6, seed=2, advance=told.append)
+    found = run_claims(frames=60, seed=2, advance=told.append)
     assert len(told) == claims.experiments() == 3 + 3 + 2 + 5 * 2
     by_lines = [course.median for course in found.lines]
     assert max(by_lines) < 1.6 * min(by_lines)  # while the number of lines grows 16 times

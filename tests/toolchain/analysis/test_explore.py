@@ -16,11 +16,11 @@ from typer.testing import CliRunner
 
 from machines.parameters import RngKind, SensorMode
 from tests.toolchain.corridor import corridor
-from toolchain.analysis.device import DEVICES
-from toolchain.analysis.explore import Frames, Sweep, explore, run_task, tasks
-from toolchain.analysis.pictures import check_pictures_possible
-from toolchain.analysis.sweep_results import Point, Results, pareto
-from toolchain.command import app
+from toolchain.analysis.exploration.pictures import check_pictures_possible
+from toolchain.analysis.exploration.results import Point, Results, pareto
+from toolchain.analysis.exploration.sweep import Frames, Sweep, run_sweep, run_task, tasks
+from toolchain.analysis.resources.device import DEVICES
+from toolchain.commands.main import app
 from toolchain.deployment import Stop
 from toolchain.errors import BuildError
 from toolchain.models.model import Known, Model, dimension
@@ -168,11 +168,11 @@ def test_a_sweep_goes_on_where_it_stopped(tmp_path):
 
     first = Results(tmp_path / "r.jsonl")
     with pytest.raises(KeyboardInterrupt):
-        explore(found, first.points, measure_two, first.append, lambda _: None)
+        run_sweep(found, first.points, measure_two, first.append, lambda _: None)
     again = Results(tmp_path / "r.jsonl")
     assert list(again.points) == measured
     more = []
-    explore(
+    run_sweep(
         found,
         again.points,
         lambda task: more.append(task.key) or run_task(model, task, readings, D8, 1),
@@ -394,7 +394,7 @@ def test_nothing_to_explore():
 
 def test_ctrl_c_keeps_what_is_done(case):
     results = case.parent / "r.jsonl"
-    command = [sys.executable, "-c", "from toolchain.command import main; main()", "explore", str(case)]
+    command = [sys.executable, "-c", "from toolchain.commands.main import main; main()", "explore", str(case)]
     command += [
         "-o",
         str(results),
@@ -435,6 +435,6 @@ def test_ctrl_c_keeps_what_is_done(case):
 
 
 def test_a_file_of_results_that_does_not_end_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr("toolchain.analysis.sweep_results.MAX_FILE_BYTES", 1000)
+    monkeypatch.setattr("toolchain.analysis.exploration.results.MAX_FILE_BYTES", 1000)
     with pytest.raises(BuildError, match="more than 1000 bytes"):
         Results(Path("/dev/zero"))

@@ -5,11 +5,11 @@ from dataclasses import replace
 import pytest
 
 from machines.parameters import BM1Parameters, PriorMode, RngKind, RngReset, SensorMode
-from toolchain.analysis.boards_needed import boards_needed, with_lines
-from toolchain.analysis.device import DEVICES, device_named
-from toolchain.analysis.logic import logic_of
-from toolchain.analysis.resources import Pcie, estimate
-from toolchain.analysis.table_memories import Tables
+from toolchain.analysis.resources.boards_needed import boards_needed, with_lines
+from toolchain.analysis.resources.device import DEVICES, device_named
+from toolchain.analysis.resources.estimate import Pcie, estimate
+from toolchain.analysis.resources.logic import logic_of
+from toolchain.analysis.resources.table_memories import Tables
 from toolchain.errors import BuildError
 
 D8 = DEVICES["proce-v-d8"]

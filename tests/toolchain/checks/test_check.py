@@ -16,7 +16,7 @@ from machines.reference import ReferenceBM1
 from toolchain.build import assemble, build_deployment
 from toolchain.checks.check import check_deployment, check_model, line_name, reading
 from toolchain.checks.finding import Severity
-from toolchain.command import app
+from toolchain.commands.main import app
 from toolchain.errors import ModelError
 from toolchain.models.conditional import normal, wrapped_normal
 from toolchain.models.model import Known, Model, PriorSelect, cell_centres, dimension, interval

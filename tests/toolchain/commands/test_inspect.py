@@ -5,10 +5,10 @@ import json
 import pytest
 from typer.testing import CliRunner
 
+from toolchain.analysis.inspection.inspection import machines_of
+from toolchain.analysis.inspection.report import _unit
 from toolchain.build import build_deployment
-from toolchain.command import app
-from toolchain.commands.inspect import machines_of
-from toolchain.commands.inspection_report import _unit
+from toolchain.commands.main import app
 from toolchain.deployment import load_deployment
 
 MODEL = """

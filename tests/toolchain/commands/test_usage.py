@@ -114,7 +114,7 @@ def test_no_command_is_answered_with_help(capsys):
         *(f"casestudies.boat.{name}" for name in ("simulator", "normaliser", "viewer")),
         "casestudies.mrclam.convert",
         "casestudies.mrclam.player",
-        "toolchain.command",
+        "toolchain.commands.main",
     ],
 )
 def test_every_command_has_it(capsys, name):

@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from toolchain.command import app
+from toolchain.commands.main import app
 from toolchain.errors import ModelError
 from toolchain.learning.fit import LEAST_READINGS, fit_model, locate, mixture
 from toolchain.learning.fit_options import FitMethod, FitOptions, FitPrior

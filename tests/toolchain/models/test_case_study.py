@@ -127,7 +127,7 @@ def test_mistakes_in_the_file(case, text, sentence):
 
 def test_a_signal_ends_the_command_in_the_middle_of_a_model(case):
     folder = case("import os, signal, time\nos.kill(os.getpid(), signal.SIGTERM)\ntime.sleep(60)")
-    code = "from toolchain.command import main; main()"
+    code = "from toolchain.commands.main import main; main()"
     target = ["--uri", "ws://robot:9090", "--topic", "/t", "--type", "a/B"]
     ended = subprocess.run(
         [sys.executable, "-c", code, "build", str(folder), "-o", str(folder / "built"), *target],

@@ -17,8 +17,8 @@ from machines.bm1 import BM1Machine
 from machines.encode import decode_code
 from machines.parameters import BM1Parameters
 from machines.rng import random_numbers
-from toolchain.analysis.emulation import EmulatedBoards
-from toolchain.analysis.readings import sample_readings
+from toolchain.analysis.accuracy.emulation import EmulatedBoards
+from toolchain.analysis.accuracy.readings import sample_readings
 from toolchain.deployment import Stop
 from toolchain.models.conditional import normal
 from toolchain.models.fusion import exact_posterior
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from toolchain.analysis.readings import Readings
+    from toolchain.analysis.accuracy.readings import Readings
 
 _Word = TypeVar("_Word", np.uint16, np.uint32)
 
@@ -47,6 +47,8 @@ SENSORS: Final = (1, 2, 3, 4, 6, 8, 10, 12)
 TARGETS: Final = (15, 31, 63, 127, 255, 511, 1023, 2047, 4095)
 RATES: Final = (0.0, 1e-5, 1e-4, 1e-3, 1e-2, 0.03, 0.1)
 MAX_CYCLES: Final = 2**20
+FAULT_FRAMES: Final = 100
+"""Frames at each rate of flipped bits, at most: they run cycle by cycle."""
 
 _MIDDLE_SENSORS: Final = 4
 _MIDDLE_GRID: Final = 16
@@ -123,17 +125,15 @@ def machine_of(model: Model, counter_bits: int = 12) -> BM1Machine:
     return BM1Machine(parameters, quantised.prior, quantised.tables)
 
 
-def run_claims(
-    *, frames: int, fault_frames: int, seed: int, advance: Callable[[str], None] = lambda _: None
-) -> Claims:
+def run_claims(*, frames: int, seed: int, advance: Callable[[str], None] = lambda _: None) -> Claims:
     """Run all experiments.
 
     Args:
-        frames: Frames of each size.
-        fault_frames: Frames of each rate of flipped bits.
+        frames: Frames of each size, and of each rate of flipped bits, there at most `FAULT_FRAMES`.
         seed: Of readings and flips.
-        advance: Told of every experiment before it begins.
+        advance: Called with each experiment's name before it begins.
     """
+    fault_frames = min(frames, FAULT_FRAMES)
     lines, sensors, targets = [], [], []
     for grid in GRIDS:
         advance(f"{grid * grid} lines")

@@ -15,8 +15,8 @@ import numpy as np
 from machines.bm1 import Start, addressed_codes
 from machines.encode import decode_code
 from machines.parameters import RngReset
-from toolchain.analysis.emulation import inputs_of_boards
-from toolchain.analysis.intervals import Interval, bootstrap, bootstrap_rows, share_of_frames
+from toolchain.analysis.accuracy.emulation import inputs_of_boards
+from toolchain.analysis.accuracy.intervals import Interval, bootstrap, bootstrap_rows, share_of_frames
 from toolchain.errors import BuildError, ModelError
 from toolchain.models.fusion import exact_posterior, fuse
 
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from machines.bm1 import BM1Machine
-    from toolchain.analysis.emulation import EmulatedBoards, Inputs
-    from toolchain.analysis.readings import Readings
+    from toolchain.analysis.accuracy.emulation import EmulatedBoards, Inputs
+    from toolchain.analysis.accuracy.readings import Readings
     from toolchain.models.model import Model
 
 EXPECTED_COUNT: Final = 5.0

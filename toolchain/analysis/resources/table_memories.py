@@ -11,7 +11,7 @@ from toolchain.outputs.rng_table import LENGTH
 
 if TYPE_CHECKING:
     from machines.parameters import BM1Parameters
-    from toolchain.analysis.device import Device
+    from toolchain.analysis.resources.device import Device
 
 MLAB_ALMS: Final = 10
 """ALMs that a memory LAB is made of."""

@@ -10,14 +10,14 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import TYPE_CHECKING, Final
 
-from toolchain.analysis.logic import Logic, logic_of
-from toolchain.analysis.table_memories import MLAB_ALMS, MLAB_SHARE, Memories, Tables, place_tables
+from toolchain.analysis.resources.logic import Logic, logic_of
+from toolchain.analysis.resources.table_memories import MLAB_ALMS, MLAB_SHARE, Memories, Tables, place_tables
 from toolchain.errors import BuildError
 from toolchain.outputs.rng_table import LENGTH
 
 if TYPE_CHECKING:
     from machines.parameters import BM1Parameters
-    from toolchain.analysis.device import Device
+    from toolchain.analysis.resources.device import Device
 
 SOFT_PCIE_ELEMENTS: Final = (8_000, 30_000)
 """Logic elements that a PCIe controller made of logic takes, by its configuration (thesis 2.3)."""

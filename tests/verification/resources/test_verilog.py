@@ -13,7 +13,7 @@ from machines.bm1 import BM1Machine
 from machines.parameters import BM1Parameters, PriorMode, RngKind, RngReset, SensorMode
 from pcie_shim.programming_file import interface_words
 from tests.toolchain.corridor import corridor, machine_of
-from toolchain.analysis.rtl import OUTCOME_WORDS, PRIOR_ADDRESSES, Places, verilog
+from tests.verification.resources.verilog import OUTCOME_WORDS, PRIOR_ADDRESSES, Places, verilog
 from toolchain.errors import BuildError
 
 

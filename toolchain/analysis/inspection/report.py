@@ -1,4 +1,4 @@
-"""What `toolchain inspect` prints of what it found: sentences and tables, or one JSON object."""
+"""Reports of an inspection: sentences and tables, or one JSON object."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ import math
 from dataclasses import asdict
 from typing import TYPE_CHECKING
 
-from toolchain.analysis.energy import ASSUMPTIONS
-from toolchain.analysis.resources import Pcie
+from toolchain.analysis.resources.energy import ASSUMPTIONS
+from toolchain.analysis.resources.estimate import Pcie
 from toolchain.report import loss_heading, many_sentence
 
 if TYPE_CHECKING:
-    from toolchain.analysis.accuracy import Difference
-    from toolchain.analysis.intervals import Interval
-    from toolchain.commands.inspect import Inspection
+    from toolchain.analysis.accuracy.intervals import Interval
+    from toolchain.analysis.accuracy.measurement import Difference
+    from toolchain.analysis.inspection.inspection import Inspection
 
 
 def report(found: Inspection) -> str:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from machines.parameters import SensorMode
 from pcie_shim.programming_file import interface_room
-from toolchain.analysis.resources import Pcie, estimate
+from toolchain.analysis.resources.estimate import Pcie, estimate
 from toolchain.errors import BuildError
 from toolchain.outputs.rng_table import LENGTH
 from toolchain.partition import partition_lines
@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from machines.parameters import BM1Parameters
-    from toolchain.analysis.device import Device
-    from toolchain.analysis.resources import Estimate
+    from toolchain.analysis.resources.device import Device
+    from toolchain.analysis.resources.estimate import Estimate
 
 
 def boards_needed(

@@ -274,7 +274,7 @@ def _input(parameters: BM1Parameters, replica: int, column: int, line: int) -> s
 
 
 def _generators(parameters: BM1Parameters) -> Iterator[str]:
-    assert parameters.rng.lfsr_bits is not None  # noqa: S101 - verilog() has refused all else
+    assert parameters.rng.lfsr_bits is not None
     top = parameters.rng.lfsr_bits - 1
     bank_bits = _bank_bits(parameters)
     count = parameters.columns * (1 if parameters.shared else parameters.lines)

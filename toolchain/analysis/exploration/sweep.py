@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Final
 from machines.bm1 import BM1Machine
 from machines.errors import MachineError
 from machines.parameters import RngKind, SensorMode
-from toolchain.analysis.accuracy import measure
-from toolchain.analysis.boards_needed import with_lines
-from toolchain.analysis.emulation import EmulatedBoards, one_replica, split
-from toolchain.analysis.readings import check_frames, readings_of_lines, sample_readings
-from toolchain.analysis.resources import Pcie, estimate
-from toolchain.analysis.sweep_results import Point
+from toolchain.analysis.accuracy.emulation import EmulatedBoards, one_replica, split
+from toolchain.analysis.accuracy.measurement import measure
+from toolchain.analysis.accuracy.readings import check_frames, readings_of_lines, sample_readings
+from toolchain.analysis.exploration.results import Point
+from toolchain.analysis.resources.boards_needed import with_lines
+from toolchain.analysis.resources.estimate import Pcie, estimate
 from toolchain.board_interface import DEFAULT_INTERFACE, board_interface
 from toolchain.build import check_options, machine_parameters
 from toolchain.errors import BuildError
@@ -29,8 +29,8 @@ from toolchain.quantise import quantise
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
-    from toolchain.analysis.device import Device
-    from toolchain.analysis.readings import Readings
+    from toolchain.analysis.accuracy.readings import Readings
+    from toolchain.analysis.resources.device import Device
     from toolchain.deployment import Stop
     from toolchain.models.model import Model
 
@@ -293,7 +293,7 @@ def with_resources(model: Model, task: Task, point: Point, device: Device) -> Po
     return point.model_copy(update=update)
 
 
-def explore(
+def run_sweep(
     found: Sequence[Task],
     kept: dict[str, Point],
     measured: Callable[[Task], Point],

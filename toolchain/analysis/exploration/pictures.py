@@ -11,8 +11,8 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from toolchain.analysis.claims import Claims
-    from toolchain.analysis.sweep_results import Point
+    from toolchain.analysis.exploration.claims import Claims
+    from toolchain.analysis.exploration.results import Point
 
 _DPI: Final = 75
 _COLOURS: Final = ("#4477aa", "#ee6677", "#228833", "#ccbb44", "#66ccee", "#aa3377", "#bbbbbb")

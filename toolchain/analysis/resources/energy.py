@@ -13,15 +13,15 @@ import numpy as np
 
 from machines.bm1 import Start, addressed_codes
 from machines.encode import decode_code
-from toolchain.analysis.emulation import one_replica
-from toolchain.analysis.logic import logic_of
+from toolchain.analysis.accuracy.emulation import one_replica
+from toolchain.analysis.resources.logic import logic_of
 from toolchain.outputs.rng_table import table_length
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from machines.bm1 import BM1Machine
-    from toolchain.analysis.readings import Readings
+    from toolchain.analysis.accuracy.readings import Readings
 
 CORE_VOLTAGE: Final = 0.9
 """Volts, of a Stratix V."""

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from machines.bm1 import BM1Machine
-    from toolchain.analysis.emulation import Inputs
+    from toolchain.analysis.accuracy.emulation import Inputs
     from toolchain.deployment import Dimension, Variable
     from toolchain.options import Scale
 
@@ -93,6 +93,16 @@ def check_frames(frames: int) -> None:
     if not 1 <= frames <= MOST_FRAMES:
         message = f"--frames is {frames}, expected 1 to {MOST_FRAMES}"
         raise BuildError(message)
+
+
+def check_columns(recording: Path | None, columns: Sequence[str] | None) -> None:
+    """Refuse columns of a recording where there is none.
+
+    Raises:
+        BuildError: Columns without a recording.
+    """
+    if recording is None and columns:
+        raise BuildError(f"--reading {columns[0]} is a column of a recording; add --readings FILE")
 
 
 def sample_readings(model: Model, frames: int, *, seed: int, source: str = "") -> Readings:

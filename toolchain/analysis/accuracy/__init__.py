@@ -1,0 +1,1 @@
+"""Exact and statistical measurement of a machine's posteriors on readings."""

@@ -1,0 +1,1 @@
+"""Inspection of a deployment: machine, loss, accuracy, resources and energy."""

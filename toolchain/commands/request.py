@@ -1,0 +1,180 @@
+"""The model and the build options that a command line asks for."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from machines.errors import MachineError
+from machines.parameters import ADDRESS_BITS_MAX, RngKind
+from toolchain.analysis.resources.boards_needed import boards_needed
+from toolchain.analysis.resources.device import device_named
+from toolchain.board_interface import DEFAULT_INTERFACE
+from toolchain.build import machine_parameters
+from toolchain.deployment import parse_interface
+from toolchain.errors import BuildError
+from toolchain.flag_values import key_values, names_in
+from toolchain.models.case_study import load_model, model_path
+from toolchain.networks import is_network, read_network
+from toolchain.options import BuildOptions
+from toolchain.outputs.rng_table import LENGTH, read_table
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+    from pathlib import Path
+
+    from toolchain.commands.flags import BuildFlags, ModelFlags
+    from toolchain.models.model import Model
+
+
+def model_file(path: Path) -> Path:
+    """Return the file that a model is read from: the network's own, or the folder's `model.py`."""
+    return path if is_network(path) else model_path(path)
+
+
+def read_model(path: Path, flags: ModelFlags, bits: Iterable[str] | None = None) -> Model:
+    """Return the model at a path.
+
+    Args:
+        path: A folder with `model.py`, or a network's file.
+        flags: Its parameters, or the question to the network.
+        bits: `NAME=BITS`, the address bits of some columns.
+
+    Raises:
+        ModelError: The model has a mistake, or a column can't be so wide.
+        BuildError: Flags that don't fit the model.
+    """
+    settings = key_values(flags.settings or ())
+    model = (_network_model if is_network(path) else _case_model)(path, flags, settings)
+    return _with_bits(model, key_values(bits or (), "--bits", "range=8"))
+
+
+def build_options(flags: BuildFlags, *, uri: str, topic: str, message_type: str) -> BuildOptions:
+    """Return the options of a build, but for the files that flags name.
+
+    Args:
+        flags: The machine's flags.
+        uri: The rosbridge server with the readings.
+        topic: Their topic.
+        message_type: That topic's type.
+    """
+    return BuildOptions(
+        uri=uri,
+        topic=topic,
+        type=message_type,
+        partitions=flags.partitions,
+        scale=flags.scale,
+        prob_bits=flags.prob_bits,
+        prior_mode=flags.prior_mode,
+        counter_bits=flags.counter_bits,
+        target_count=flags.target_count,
+        max_cycles=flags.max_cycles,
+        stop=flags.stop,
+        rng=flags.rng,
+        rng_banks=flags.rng_banks,
+        rng_reset=flags.rng_reset,
+        shared=flags.shared,
+        steps_per_clock=flags.steps_per_clock,
+        sensor_mode=flags.sensor_mode,
+        replicas=flags.replicas,
+    )
+
+
+def read_named(options: BuildOptions, flags: BuildFlags) -> BuildOptions:
+    """Return the options with the interface and the table of random numbers that flags name.
+
+    Raises:
+        BuildError: Not an interface, or random numbers for generators that play none.
+        MifError: The file of random numbers can't be read.
+    """
+    if flags.interface is not None:
+        try:
+            options = replace(options, interface=parse_interface(flags.interface))
+        except ValueError as reason:
+            raise BuildError(f"--interface: {reason}") from None
+    if flags.rng_table is not None:
+        if options.rng is not RngKind.TABLE:
+            raise BuildError(f"--rng-table is what --rng table plays, but this is --rng {options.rng}")
+        options = replace(options, rng_table=read_table(flags.rng_table))
+    return options
+
+
+def fit_to_device(options: BuildOptions, model: Model, name: str | None) -> tuple[BuildOptions, str]:
+    """Return the options with as many boards as the lines need on a device, and the reason as a sentence.
+
+    More boards than needed are kept where more were asked for.
+
+    Raises:
+        BuildError: Not a device, not a machine, or a machine of which not even one line fits.
+    """
+    if name is None:
+        return options, ""
+    device = device_named(name)
+    try:
+        parameters = machine_parameters(model, options)
+    except MachineError as reason:
+        raise BuildError(str(reason)) from None
+    count, why = boards_needed(
+        parameters,
+        device,
+        interface=options.interface or DEFAULT_INTERFACE,
+        table_length=LENGTH if options.rng_table is None else options.rng_table.size,
+    )
+    if options.partitions > count:
+        why += f" --partitions {options.partitions} asks for more."
+    return replace(options, partitions=max(count, options.partitions)), why
+
+
+def _with_bits(model: Model, bits: dict[str, str]) -> Model:
+    names = [variable.name for variable in model.variables]
+    widths: dict[str, int] = {}
+    for name, text in bits.items():
+        if name not in names:
+            raise BuildError(
+                f"--bits {name}={text}: the model has no such variable; it has {', '.join(names) or 'none'}"
+            )
+        if not re.fullmatch(r"\d{1,3}", text, re.ASCII) or not 1 <= int(text) <= ADDRESS_BITS_MAX:
+            raise BuildError(f"--bits {name}={text}: expected 1 to {ADDRESS_BITS_MAX} bits")
+        widths[name] = int(text)
+    select = model.prior_select
+    return replace(
+        model,
+        known=tuple(replace(known, bits=widths.get(known.name, known.bits)) for known in model.known),
+        prior_select=None if select is None else replace(select, bits=widths.get(select.name, select.bits)),
+    )
+
+
+def _network_model(path: Path, flags: ModelFlags, settings: dict[str, str]) -> Model:
+    """Return the model that answers the question to a network's file.
+
+    Raises:
+        ModelError: Not a network, or a question that no BM1 computes.
+        BuildError: No question, or one that can't be read.
+    """
+    if settings:
+        raise BuildError(
+            f"--set {next(iter(settings))}: a network's file has no parameters; --given NAME=STATE fixes a variable"
+        )
+    if not flags.searched:
+        raise BuildError(
+            f"{path} is a network: say what is searched and known, such as --searched A --known B,C"
+        )
+    return (
+        read_network(path, on_missing=flags.on_missing.value)
+        .ask(
+            names_in("--searched", flags.searched),
+            names_in("--known", flags.known),
+            given=key_values(flags.given or (), "--given", "smoke=yes"),
+            prior_select=flags.prior_select or None,
+        )
+        .model()
+    )
+
+
+def _case_model(path: Path, flags: ModelFlags, settings: dict[str, str]) -> Model:
+    if flags.question:
+        raise BuildError(
+            f"{flags.question[0]} asks a network's file, but {path} is not one; model.py asks its own question"
+        )
+    return load_model(path, settings)
