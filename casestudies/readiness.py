@@ -1,29 +1,23 @@
-"""Whether a process of a case study does its work, told to whoever asks: a container's health check, or `status`.
+"""Readiness of a case study's process: whether it did its work lately, shown on its status socket."""
 
-Where BM_RUN_DIRECTORY names a folder, `NAME.status.sock` there answers each connection with one JSON object and closes
-it, as the services' own do: `python -m services.ready boat-viewer` understands it.
-"""
-
-import asyncio
 import contextlib
 import json
 import os
 import time
 from collections.abc import AsyncIterator
-from pathlib import Path
 from typing import Final
 
-from casestudies.running import say
+from terminal.health import health_served
 
 RECENT_S: Final = 10.0
 """Seconds after which the last piece of work is too long ago."""
 
 
 class Readiness:
-    """When a process last did what it is there for."""
+    """When a process last did its work."""
 
     def __init__(self, work: str) -> None:
-        """Nothing is done yet; `work` names it in the past tense: "a reading was published"."""
+        """Begin with nothing done; `work` names the work in the past tense: "a reading was published"."""
         self._work = work
         self._last: float | None = None
         self._done = 0
@@ -33,8 +27,8 @@ class Readiness:
         self._last = time.monotonic()
         self._done += 1
 
-    def tell(self) -> tuple[bool, str]:
-        """Whether it is ready, and a sentence that says why."""
+    def state(self) -> tuple[bool, str]:
+        """Return whether the process is ready, and why."""
         if self._last is None:
             return False, f"not once yet: {self._work}"
         age = time.monotonic() - self._last
@@ -42,44 +36,15 @@ class Readiness:
 
 
 @contextlib.asynccontextmanager
-async def readiness_told(name: str, readiness: Readiness) -> AsyncIterator[None]:
-    """Answer while the context lasts; nothing happens without a run directory.
-
-    A folder that refuses the socket is a warning: a process's work does not end by that.
-    """
-    directory = os.environ.get("BM_RUN_DIRECTORY", "")
-    if not directory:
-        yield
-        return
-    path = Path(directory) / f"{name}.status.sock"
+async def readiness_served(name: str, readiness: Readiness) -> AsyncIterator[None]:
+    """Show the readiness in the folder that BM_RUN_DIRECTORY names, if any, while the context lasts."""
     started = time.monotonic()
 
-    def answer(_: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        ready, why = readiness.tell()
-        told = {
-            "ready": ready,
-            "why": why,
-            "name": name,
-            "pid": os.getpid(),
-            "uptime_s": round(time.monotonic() - started, 3),
-        }
-        writer.write(json.dumps(told).encode())
-        writer.close()
+    def answer() -> bytes:
+        ready, why = readiness.state()
+        uptime = round(time.monotonic() - started, 3)
+        status = {"ready": ready, "why": why, "name": name, "pid": os.getpid(), "uptime_s": uptime}
+        return json.dumps(status).encode()
 
-    server = None
-    before = os.umask(0o177)  # the socket is its owner's alone
-    try:
-        with contextlib.suppress(FileNotFoundError):
-            path.unlink()  # of a process that was killed
-        server = await asyncio.start_unix_server(answer, path)
-    except OSError as error:
-        say(f"{name}: warning: its status can't be shown at {path}: {error.strerror or error}")
-    finally:
-        os.umask(before)
-    try:
+    async with health_served(os.environ.get("BM_RUN_DIRECTORY") or None, name, answer):
         yield
-    finally:
-        if server is not None:
-            server.close()
-            with contextlib.suppress(OSError):
-                path.unlink()

@@ -52,11 +52,11 @@ async def serve(uri: str, *, raw_topic: str, sensors_topic: str, array: bool) ->
     from bridge.client import connect
     from casestudies.boat.lossy import LossyPublication
     from casestudies.connection import told
-    from casestudies.readiness import Readiness, readiness_told
+    from casestudies.readiness import Readiness, readiness_served
 
     said: set[str] = set()
     readiness = Readiness("a reading was normalised")
-    async with readiness_told("boat-normaliser", readiness), connect(uri, on_state=told(uri)) as ros:
+    async with readiness_served("boat-normaliser", readiness), connect(uri, on_state=told(uri)) as ros:
         sensors = LossyPublication(await ros.advertise(sensors_topic, ARRAY_TYPE if array else SENSORS_TYPE))
         raw = ros.subscribe(raw_topic, ARRAY_TYPE if array else RAW_TYPE)
         async for message in raw:

@@ -114,10 +114,10 @@ async def simulate(
     from bridge.stamps import header
     from casestudies.boat.lossy import LossyPublication
     from casestudies.connection import told
-    from casestudies.readiness import Readiness, readiness_told
+    from casestudies.readiness import Readiness, readiness_served
 
     readiness = Readiness("a reading was published")
-    async with readiness_told("boat-simulator", readiness), connect(uri, on_state=told(uri)) as ros:
+    async with readiness_served("boat-simulator", readiness), connect(uri, on_state=told(uri)) as ros:
         ros_version = await ros.detect_ros_version()
         poses = LossyPublication(await ros.advertise(TRUE_POSE_TOPIC, TRUE_POSE_TYPE))
         readings = LossyPublication(await ros.advertise(topic, ARRAY_TYPE if array else RAW_TYPE))

@@ -143,11 +143,11 @@ class Viewer:
         from bridge.client import connect
         from casestudies.connection import told
         from casestudies.listening import listen
-        from casestudies.readiness import Readiness, readiness_told
+        from casestudies.readiness import Readiness, readiness_served
 
         readiness = Readiness("a result was shown")
         async with (
-            readiness_told("boat-viewer", readiness),
+            readiness_served("boat-viewer", readiness),
             connect(uri, on_state=told(uri)) as ros,
             listen(ros, truth_topic=truth_topic, truth_tolerance_s=truth_tolerance_s) as listener,
         ):

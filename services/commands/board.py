@@ -22,7 +22,7 @@ from services.commands import flags as options
 from services.errors import BoardFailedError, SettingsError
 from services.settings import endpoint_in, load_settings
 from services.sockets.serving import endpoint_from
-from services.sockets.status_socket import BoardStatus, ProcessStatus, status_thread
+from services.sockets.status import BoardStatus, ProcessStatus, status_thread
 from services.supervision.child import RESTARTS, RESTARTS_WITHIN, how_it_ended
 from services.supervision.parent import PARENT_VARIABLE, end_with_parent
 from services.supervision.private_directory import remove_stale_sockets

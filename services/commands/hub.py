@@ -17,7 +17,7 @@ from bridge.hub.limits import HubLimits
 from bridge.hub.server import serve_hub
 from services.errors import SettingsError
 from services.settings import load_settings
-from services.sockets.status_socket import HubStatus, ProcessStatus, status_served
+from services.sockets.status import HubStatus, ProcessStatus, status_served
 from services.supervision.parent import end_with_parent
 from terminal.logs import log_libraries, say
 from terminal.one_line import shown

@@ -6,6 +6,7 @@ import asyncio
 import os
 import sys
 import tempfile
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Annotated
 
@@ -15,9 +16,10 @@ import typer
 from services.errors import SettingsError
 from services.printed.stack_status import SilentProcess, StackStatus, plain, screen
 from services.settings import load_settings
-from services.sockets.status_socket import STATUS_LIMIT, SUFFIX, ProcessStatus
+from services.sockets.status import ProcessStatus, read_process_status
 from services.supervision.private_directory import DIRECTORY_PREFIX
 from terminal.errors import ExitCode
+from terminal.health import SUFFIX, NoHealthError
 from terminal.running import ends_well, make_app, run_async
 
 ANSWER_TIME = 1.0
@@ -26,10 +28,6 @@ ANSWER_TIME = 1.0
 WATCH_EVERY = 1.0
 _PLAIN_WIDTH = 140
 _ORDER = ("hub", "master", "subscriber", "publisher", "pcie-app")
-
-
-class _SilentError(Exception):
-    """A process did not answer; the text says why."""
 
 
 def run_directories() -> list[Path]:
@@ -54,40 +52,12 @@ def _status_sockets(directory: Path) -> list[Path]:
     return list(directory.glob(f"*{SUFFIX}"))
 
 
-async def _answer(path: Path) -> ProcessStatus:
-    try:
-        reader, writer = await asyncio.open_unix_connection(path)
-        try:
-            data = bytearray()
-            while part := await reader.read(65536):
-                data += part
-                if len(data) > STATUS_LIMIT:
-                    msg = f"what answers at {path} says more than {STATUS_LIMIT} bytes: it is no process of rosbayes"
-                    raise _SilentError(msg)
-        finally:
-            writer.close()
-    except ConnectionRefusedError as error:
-        msg = f"nobody listens at {path}: it was killed, and has not been started again yet"
-        raise _SilentError(msg) from error
-    except OSError as error:
-        msg = f"it can't be asked at {path} ({error.strerror or error})"
-        raise _SilentError(msg) from error
-    try:
-        return msgspec.json.decode(data, type=ProcessStatus)
-    except (msgspec.MsgspecError, RecursionError) as error:
-        msg = f"what answers at {path} is no process of rosbayes, or one of another version ({error})"
-        raise _SilentError(msg) from error
-
-
-async def _ask(path: Path) -> ProcessStatus | SilentProcess:
+def _ask(path: Path) -> ProcessStatus | SilentProcess:
     name = path.name.removesuffix(SUFFIX)
     try:
-        async with asyncio.timeout(ANSWER_TIME):
-            return msgspec.structs.replace(await _answer(path), name=name)
-    except _SilentError as silent:
-        return SilentProcess(name, str(silent))
-    except TimeoutError:
-        return SilentProcess(name, f"it does not answer at {path} within {ANSWER_TIME:g} s: it is stuck")
+        return msgspec.structs.replace(read_process_status(str(path), ANSWER_TIME), name=name)
+    except NoHealthError as error:
+        return SilentProcess(name, f"it {error}")
 
 
 def _place(name: str) -> tuple[int, int, str]:
@@ -100,7 +70,10 @@ def _place(name: str) -> tuple[int, int, str]:
 
 async def ask_stack(directory: Path) -> StackStatus:
     """What the processes in a run directory say of themselves, asked in parallel, within about a second."""
-    answers = await asyncio.gather(*(_ask(path) for path in _status_sockets(directory)))
+    paths = _status_sockets(directory)
+    loop = asyncio.get_running_loop()
+    with ThreadPoolExecutor(max(1, len(paths))) as pool:
+        answers = await asyncio.gather(*(loop.run_in_executor(pool, _ask, path) for path in paths))
     processes = [each for each in answers if isinstance(each, ProcessStatus)]
     silent = [each for each in answers if isinstance(each, SilentProcess)]
     heard = {each.name for each in answers}

@@ -24,7 +24,7 @@ from services.pipeline.subscriber import Subscriber
 from services.settings import Settings
 from services.sockets.records import AnyRecord, Frame, Notice, Prepare, Ready, Record, Switch, Trouble
 from services.sockets.serving import Link, MakeLink, board_endpoints
-from services.sockets.status_socket import status_served
+from services.sockets.status import status_served
 from terminal.errors import exit_code_of
 from toolchain.deployment import Deployment
 

@@ -27,7 +27,7 @@ from services.settings import Settings, endpoint_in
 from services.sockets.local_socket import RecordProtocol, check_hello, open_connection, own_hello
 from services.sockets.records import AnyRecord, Hello, NotReloaded, Prepared, Switched, Trouble
 from services.sockets.serving import board_endpoints, endpoint_from
-from services.sockets.status_socket import PeerStatus
+from services.sockets.status import PeerStatus
 from services.supervision.child import RESTARTS, RESTARTS_WITHIN, Child, end_all, own_command
 from services.supervision.private_directory import PrivateDirectory
 from terminal.errors import ExitCode

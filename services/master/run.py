@@ -40,7 +40,7 @@ from services.sockets.records import (
     Switched,
     Unusable,
 )
-from services.sockets.status_socket import FrameCounts, ProcessStatus, reasons, seconds_since, status_served
+from services.sockets.status import FrameCounts, ProcessStatus, reasons, seconds_since, status_served
 from services.supervision.child import RESTARTS, RESTARTS_WITHIN
 from terminal.errors import ExitCode
 from terminal.logs import get_logger, say

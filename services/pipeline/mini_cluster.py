@@ -39,7 +39,7 @@ from services.sockets.records import (
     Switch,
     Switched,
 )
-from services.sockets.status_socket import BoardStatus
+from services.sockets.status import BoardStatus
 from terminal.errors import exit_code_of
 from toolchain.deployment import Deployment
 

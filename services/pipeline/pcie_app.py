@@ -38,7 +38,7 @@ from services.sockets.records import (
     Trouble,
 )
 from services.sockets.serving import board_endpoints, deployment_for, endpoint_from, outdated
-from services.sockets.status_socket import (
+from services.sockets.status import (
     FrameCounts,
     ProcessStatus,
     reasons,

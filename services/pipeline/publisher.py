@@ -46,7 +46,7 @@ from services.sockets.records import (
     Trouble,
 )
 from services.sockets.serving import MakeLink, deployment_for, endpoint_from, listening
-from services.sockets.status_socket import (
+from services.sockets.status import (
     FrameCounts,
     ProcessStatus,
     connections,

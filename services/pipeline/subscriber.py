@@ -35,7 +35,7 @@ from services.sockets.records import (
     Unusable,
 )
 from services.sockets.serving import MakeLink, deployment_for, endpoint_from, listening
-from services.sockets.status_socket import (
+from services.sockets.status import (
     FrameCounts,
     ProcessStatus,
     connections,

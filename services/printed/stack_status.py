@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from services.sockets.status_socket import BoardStatus, FrameCounts, ProcessStatus
+from services.sockets.status import BoardStatus, FrameCounts, ProcessStatus
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -13,8 +13,8 @@ import tempfile
 from pathlib import Path
 
 from services.errors import StackError
+from terminal.health import SUFFIX
 
-STATUS_SUFFIX = ".status.sock"
 CONTROL_SUFFIX = ".control.sock"
 
 DIRECTORY_PREFIX = "rosbayes-"
@@ -130,7 +130,7 @@ def has_master(directory: Path) -> bool:
 
 def remove_stale_sockets(directory: Path) -> None:
     """Remove the status and control sockets of killed processes."""
-    for path in (*directory.glob(f"*{STATUS_SUFFIX}"), *directory.glob(f"*{CONTROL_SUFFIX}")):
+    for path in (*directory.glob(f"*{SUFFIX}"), *directory.glob(f"*{CONTROL_SUFFIX}")):
         with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX) as probe:
             probe.settimeout(0.2)
             try:

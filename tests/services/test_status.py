@@ -6,17 +6,17 @@ import io
 import socket
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import msgspec
 import pytest
 from rich.console import Console
 
-from services import ready
 from services.commands import status
 from services.errors import SettingsError
 from services.printed.stack_status import screen
-from services.sockets.status_socket import (
+from services.sockets.status import (
     BoardStatus,
     ConnectionStatus,
     FrameCounts,
@@ -89,74 +89,25 @@ async def test_a_killed_process_is_named(tmp_path):
 
 
 async def test_those_who_do_not_answer_are_waited_for_together(tmp_path, monkeypatch):
-    stuck = []
-    for name in ("subscriber", "publisher", "pcie-app", "board0"):
-        each = socket.socket(socket.AF_UNIX)
-        each.bind(str(tmp_path / f"{name}.status.sock"))
-        each.listen()
-        stuck.append(each)
-    answer, asked_now, most = status._answer, 0, 0
+    together = threading.Barrier(5)
+    ask = status._ask
 
-    async def counting(path):
-        nonlocal asked_now, most
-        asked_now += 1
-        most = max(most, asked_now)
-        try:
-            return await answer(path)
-        finally:
-            asked_now -= 1
+    def ask_together(path):
+        together.wait(30)  # all of them are asked before the first has answered
+        return ask(path)
 
-    monkeypatch.setattr(status, "_answer", counting)
+    monkeypatch.setattr(status, "_ask", ask_together)
     monkeypatch.setattr(status, "ANSWER_TIME", 3.0)
-    async with served(tmp_path, master=process()):
-        stack = await status.ask_stack(tmp_path)
-    assert most == 5
+    silent = ("subscriber", "publisher", "pcie-app", "board0")
+    with contextlib.ExitStack() as sockets:
+        for name in silent:
+            stuck = sockets.enter_context(socket.socket(socket.AF_UNIX))
+            stuck.bind(str(tmp_path / f"{name}.status.sock"))
+            stuck.listen()
+        async with served(tmp_path, master=process()):
+            stack = await status.ask_stack(tmp_path)
     assert [each.name for each in stack.processes] == ["master"]
-    assert [each.name for each in stack.silent] == ["subscriber", "publisher", "pcie-app", "board0"]
-    assert all("does not answer" in each.why for each in stack.silent)
-    for each in stuck:
-        each.close()
-
-
-@pytest.mark.parametrize(
-    "said",
-    [
-        b"",
-        b"hello",
-        b"{}",
-        b'{"ready": 1, "why": "x"}',
-        b"[" * 100_000,
-        b'{"ready":true,"why":3}',
-        b"\xff\xfe",
-    ],
-)
-async def test_nonsense_is_told_as_such(tmp_path, said):
-    async def answer(_reader, writer):
-        writer.write(said)
-        writer.close()
-
-    server = await asyncio.start_unix_server(answer, tmp_path / "hub.status.sock")
-    async with server:
-        stack = await status.ask_stack(tmp_path)
-        assert not stack.ready
-        assert "is no process of rosbayes" in stack.silent[0].why
-        heard, why = await asyncio.to_thread(ready.ask, str(tmp_path), "hub", 20)
-    assert not heard or b'"ready":true' in said  # the health check reads no more than it needs
-    assert why
-
-
-async def test_an_endless_answer_is_not_read_to_its_end(tmp_path):
-    async def answer(_reader, writer):
-        with contextlib.suppress(ConnectionError):
-            while True:
-                writer.write(b"x" * 65536)
-                await writer.drain()
-
-    server = await asyncio.start_unix_server(answer, tmp_path / "hub.status.sock")
-    async with server:
-        stack = await status.ask_stack(tmp_path)
-        assert stack.silent
-        assert not (await asyncio.to_thread(ready.ask, str(tmp_path), "hub", 20))[0]
+    assert tuple(each.name for each in stack.silent) == silent
 
 
 async def test_a_peer_that_the_master_waits_for_is_named_even_without_a_socket(tmp_path):
@@ -289,59 +240,6 @@ async def test_watching_prints_a_line_every_second_until_it_is_ended(places):
         watching.terminate()
         assert await asyncio.wait_for(watching.wait(), 120) == 143
         assert b"Traceback" not in await watching.stderr.read()
-
-
-# --- the health check --------------------------------------------------------------------------
-
-
-async def test_the_health_check_is_the_process_own_word(tmp_path):
-    async with served(
-        tmp_path,
-        subscriber=process(why="connected"),
-        master=process(is_ready=False, why="no result for 12 s"),
-    ):
-        assert await asyncio.to_thread(ready.ask, str(tmp_path), "subscriber", 30) == (
-            True,
-            "subscriber: connected",
-        )
-        assert await asyncio.to_thread(ready.ask, str(tmp_path), "master", 30) == (
-            False,
-            "master: no result for 12 s",
-        )
-
-
-def test_the_health_check_of_nobody(tmp_path, capsys, monkeypatch):
-    monkeypatch.setenv("BM_RUN_DIRECTORY", str(tmp_path))
-    assert ready.main(["hub"]) == 1
-    assert "hub is not running, or shows no status at" in capsys.readouterr().out
-    with socket.socket(socket.AF_UNIX) as stuck:
-        stuck.bind(str(tmp_path / "hub.status.sock"))
-        stuck.listen()
-        assert ready.ask(str(tmp_path), "hub", 0.1) == (
-            False,
-            f"hub does not answer at {tmp_path}/hub.status.sock within 0.1 s",
-        )
-
-
-@pytest.mark.parametrize("arguments", [[], ["a", "b"], ["../x"], ["--what"]])
-def test_the_health_check_is_never_green_by_mistake(arguments, capsys, monkeypatch, tmp_path):
-    monkeypatch.setenv("BM_RUN_DIRECTORY", str(tmp_path))
-    assert ready.main(arguments) == 1
-    assert "usage:" in capsys.readouterr().out
-
-
-def test_the_health_check_without_a_directory(capsys, monkeypatch):
-    monkeypatch.delenv("BM_RUN_DIRECTORY", raising=False)
-    assert ready.main(["hub"]) == 1
-    assert "BM_RUN_DIRECTORY" in capsys.readouterr().out
-
-
-def test_the_health_check_starts_fast():
-    code = "import sys, services.ready; print(sorted(set(sys.modules) & {'msgspec','asyncio','typer','structlog','orjson','pydantic'}))"
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=240
-    )
-    assert done.stdout.strip() == "[]"
 
 
 def test_a_run_that_ends_while_runs_are_looked_for_is_none(tmp_path, monkeypatch):

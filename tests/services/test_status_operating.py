@@ -11,7 +11,7 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs/operating.md").read_text()
-PACKAGES = ("services", "bridge", "pcie_shim")
+PACKAGES = ("services", "bridge", "pcie_shim", "terminal")
 
 
 def literals(*packages):

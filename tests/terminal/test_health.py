@@ -1,0 +1,205 @@
+"""The status socket: one JSON object per connection, for its user alone, whatever asks and whatever answers.
+
+is_ready, read_status ──▶ NAME.status.sock ◀── health_served (a loop), health_thread (a blocking process)
+"""
+
+import asyncio
+import contextlib
+import json
+import socket
+import stat
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+from services import ready
+from terminal.health import (
+    ANSWER_LIMIT,
+    NoHealthError,
+    Silence,
+    health_served,
+    health_thread,
+    is_ready,
+    read_status,
+    status_socket,
+)
+
+PATIENCE = 60.0
+
+
+class Server:
+    """A process's health, served from a thread or from the loop of one."""
+
+    def __init__(self, kind):
+        self.kind = kind
+        self.samples = 0
+
+    @contextlib.contextmanager
+    def serving(self, directory, status, name="board0"):
+        def answer():
+            return json.dumps(status).encode()
+
+        if self.kind == "thread":
+            with health_thread(directory, name, answer, self.sample):
+                yield
+            return
+        loop = asyncio.new_event_loop()
+        begun, over = threading.Event(), asyncio.Event()
+
+        async def serve():
+            async with health_served(directory, name, answer, self.sample):
+                begun.set()
+                await over.wait()
+
+        thread = threading.Thread(target=loop.run_until_complete, args=(serve(),))
+        thread.start()
+        assert begun.wait(PATIENCE)
+        try:
+            yield
+        finally:
+            loop.call_soon_threadsafe(over.set)
+            thread.join(PATIENCE)
+            loop.close()
+
+    def sample(self):
+        self.samples += 1
+
+
+@pytest.fixture(params=["thread", "loop"])
+def server(request):
+    return Server(request.param)
+
+
+def status(*, is_ready=True, why="programmed"):
+    return {"ready": is_ready, "why": why}
+
+
+def test_every_connection_gets_one_object(server, tmp_path):
+    path = status_socket(tmp_path, "board0")
+    with server.serving(tmp_path, status()):
+        assert is_ready(path, PATIENCE) == (True, "programmed")
+        assert json.loads(read_status(path, PATIENCE)) == status()
+        assert stat.S_IMODE(Path(path).stat().st_mode) == 0o600
+        assert server.samples
+    assert not list(tmp_path.iterdir())
+
+
+def test_connections_that_do_not_read_keep_nobody_from_asking(server, tmp_path):
+    path = status_socket(tmp_path, "board0")
+    with server.serving(tmp_path, status()), contextlib.ExitStack() as stack:
+        for _ in range(20):
+            stack.enter_context(socket.socket(socket.AF_UNIX)).connect(path)
+        assert is_ready(path, PATIENCE)[0]
+
+
+def test_a_second_process_of_a_name_warns_and_leaves_it_to_the_first(server, tmp_path, capsys):
+    path = status_socket(tmp_path, "board0")
+    with server.serving(tmp_path, status(why="first")):
+        with server.serving(tmp_path, status(why="second")):
+            assert is_ready(path, PATIENCE)[1] == "first"
+        assert is_ready(path, PATIENCE)[1] == "first"
+    assert capsys.readouterr().err.count("warning") == 1
+
+
+def test_the_socket_of_a_killed_process_is_replaced(server, tmp_path):
+    path = status_socket(tmp_path, "board0")
+    with socket.socket(socket.AF_UNIX) as dead:
+        dead.bind(path)
+    with server.serving(tmp_path, status()):
+        assert is_ready(path, PATIENCE)[0]
+
+
+def test_nothing_is_served_without_a_directory(server, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with server.serving(None, status()):
+        assert not list(tmp_path.iterdir())
+
+
+def test_the_thread_takes_no_signals(tmp_path):
+    with Server("thread").serving(tmp_path, status()):
+        thread = [each for each in threading.enumerate() if each.name == "status"][-1]  # others may end yet
+        lines = Path(f"/proc/self/task/{thread.native_id}/status").read_text().splitlines()
+        blocked = next(line.split()[1] for line in lines if line.startswith("SigBlk"))
+    assert int(blocked, 16) & (1 << 14)  # SIGTERM is 15
+
+
+@contextlib.contextmanager
+def answering(path, data):
+    """A process that answers one connection with some bytes; with None it does not answer."""
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(path)
+        listener.listen()
+
+        def answer():
+            connection, _ = listener.accept()
+            with connection, contextlib.suppress(OSError):
+                connection.sendall(data)
+
+        thread = threading.Thread(target=answer)
+        if data is not None:
+            thread.start()
+        yield
+        if data is not None:
+            thread.join(PATIENCE)
+
+
+@pytest.mark.parametrize(
+    "data",
+    [b"", b"hello", b"{}", b"[" * 100_000, b'{"ready":true}', b"\xff\xfe", b" " * (ANSWER_LIMIT + 2), b"7"],
+    ids=["nothing", "text", "no fields", "deep", "no reason", "no text", "endless", "number"],
+)
+def test_an_answer_that_is_not_a_status_is_not_ready(tmp_path, data):
+    path = status_socket(tmp_path, "hub")
+    with answering(path, data), pytest.raises(NoHealthError) as silent:
+        is_ready(path, PATIENCE)
+    assert silent.value.reason is Silence.NOT_OURS
+
+
+def test_only_true_is_ready(tmp_path):
+    path = status_socket(tmp_path, "hub")
+    with answering(path, b'{"ready": 1, "why": "x"}'):
+        assert is_ready(path, PATIENCE) == (False, "x")
+
+
+def test_silence_has_a_reason(tmp_path):
+    path = status_socket(tmp_path, "hub")
+
+    def reason(timeout):
+        with pytest.raises(NoHealthError) as silent:
+            read_status(path, timeout)
+        return silent.value.reason
+
+    assert reason(PATIENCE) is Silence.NO_SOCKET
+    with answering(path, None):
+        assert reason(0.1) is Silence.TIMEOUT
+    assert reason(PATIENCE) is Silence.NO_LISTENER
+
+
+# --- python -m services.ready ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("said", "code"), [(status(), 0), (status(is_ready=False, why="no result for 12 s"), 1)]
+)
+@pytest.mark.parametrize("flag", [["--directory", "{}"], ["--directory={}"], []])
+def test_the_exit_code_is_the_health(tmp_path, capsys, monkeypatch, said, code, flag):
+    monkeypatch.setenv("BM_RUN_DIRECTORY", "" if flag else str(tmp_path))
+    with Server("thread").serving(tmp_path, said, "master"):
+        assert ready.main([*(part.format(tmp_path) for part in flag), "master"]) == code
+    assert capsys.readouterr().out == f"master: {said['why']}\n"
+
+
+@pytest.mark.parametrize("arguments", [["hub"], [], ["a", "b"], ["../x"], ["--what"]])
+@pytest.mark.parametrize("directory", [True, False])
+def test_the_health_check_is_never_green_by_mistake(arguments, directory, monkeypatch, tmp_path):
+    monkeypatch.setenv("BM_RUN_DIRECTORY", str(tmp_path) if directory else "")
+    assert ready.main(arguments) == 1
+
+
+def test_the_health_check_imports_nothing_slow():
+    slow = "{'msgspec','asyncio','typer','structlog','orjson','pydantic'}"
+    code = f"import sys, services.ready; sys.exit(bool(set(sys.modules) & {slow}))"
+    assert subprocess.run([sys.executable, "-c", code], check=False, timeout=240).returncode == 0
