@@ -1,11 +1,9 @@
 """Replicas, and readings for each line: arrays become addresses by the one rule, and a build of each kind is what it says."""
 
 import base64
-import json
 import math
 import re
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -41,7 +39,6 @@ from toolchain.quantise import quantise, written_prior
 OPTIONS = BuildOptions(uri="ws://robot:9090", topic="/costs", type="stereo/Costs")
 CELL = replace(OPTIONS, sensor_mode=SensorMode.CELL)
 THRESHOLD = replace(OPTIONS, sensor_mode=SensorMode.THRESHOLD)
-DOCS = Path(__file__).parents[2] / "docs"
 
 
 def model(lines=6, *, select=False, **known):
@@ -401,34 +398,3 @@ def test_a_frame_of_replicas_is_measured_as_a_board_runs_it(mode):
     assert measured.cycles.median.value == np.median(lengths)
     with pytest.raises(BuildError, match="a frame of 20 replicas takes 20 readings, and there are 12"):
         measure(boards, readings, of, replicas=20)
-
-
-@pytest.mark.parametrize("mode", ["cell", "threshold"])
-def test_inspect_explains_such_a_deployment(tmp_path, mode):
-    page = (DOCS / "toolchain.md").read_text()
-    (example,) = re.findall(r"```python\n(# disparity/model\.py.*?)```", page, re.DOTALL)
-    (tmp_path / "disparity").mkdir()
-    (tmp_path / "disparity/model.py").write_text(example)
-    runner = CliRunner()
-    flags = ["--uri", "ws://localhost:9090", "--topic", "/costs", "--type", "stereo/Costs"]
-    flags += ["--sensor-mode", mode, "--replicas", "3"]
-    out = tmp_path / "out"
-    built = runner.invoke(app, ["build", str(tmp_path / "disparity"), "-o", str(out), *flags])
-    assert built.exit_code == 0, built.output
-    looked = runner.invoke(app, ["inspect", str(out), "--frames", "5"])
-    if mode == "threshold":
-        assert looked.exit_code == 2
-        assert "--model" in looked.stderr
-    else:
-        assert looked.exit_code == 0, looked.output
-        assert "Each board holds 3 of these machines around the same generators" in looked.stdout
-        assert "5 frames of readings for 3 replicas, drawn from" in looked.stdout
-        assert "A frame is 3 posteriors and ends with the last of them" in looked.stdout
-    named = runner.invoke(
-        app, ["inspect", str(out), "--frames", "5", "--model", str(tmp_path / "disparity"), "--json"]
-    )
-    assert named.exit_code == 0, named.output
-    # lines that all read the same would have nothing to be wrong about
-    assert 0.001 < json.loads(named.stdout)["accuracy"]["machine"]["total_variation"]["value"] < 0.1
-    recorded = runner.invoke(app, ["inspect", str(out), "--readings", str(tmp_path / "r.csv")])
-    assert recorded.exit_code == 2

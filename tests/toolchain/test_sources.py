@@ -1,8 +1,5 @@
 """A sources file: which variable comes from which topic, and every mistake in it as a sentence with its line."""
 
-import re
-from pathlib import Path
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -217,19 +214,3 @@ def test_many_sources_are_too_many(written):
     table = '[[source]]\nuri = "ws://one:9090"\ntopic = "/t{}"\ntype = "a/B"\nvariables = {{ near = "x" }}\n'
     with pytest.raises(BuildError, match="at most 256 items"):
         read_sources(written("".join(map(table.format, range(257)))), None)
-
-
-def test_the_example_of_the_documentation(written):
-    page = (Path(__file__).parents[2] / "docs" / "deployment.md").read_text()
-    (example,) = re.findall(r"^```toml\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
-    file = read_sources(written(example), "ws://robot:9090")
-    names = ("ahead", "colour", "left", "near", "turn")
-    placed = file.place(tuple(Variable(name=name, bits=3, values=4) for name in names))
-    assert [(each.source, each.path) for each in placed] == [
-        (1, "ranges[0]"),
-        (3, "data[2]"),
-        (1, "ranges[90]"),
-        (0, "range"),
-        (2, "angular_velocity.z"),
-    ]
-    assert file.sources[1].uri == "ws://lidar-computer:9090"

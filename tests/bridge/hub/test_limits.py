@@ -1,5 +1,4 @@
 import dataclasses
-from pathlib import Path
 
 import pytest
 
@@ -23,9 +22,3 @@ def test_limits_that_contradict_each_other_are_refused() -> None:
 
 def test_the_default_message_is_a_mebibyte() -> None:
     assert HubLimits().message_bytes == 1 << 20
-
-
-def test_every_limit_is_documented() -> None:
-    documentation = (Path(__file__).parents[3] / "docs" / "hub.md").read_text()
-    for field in dataclasses.fields(HubLimits):
-        assert f"`{field.name}`" in documentation

@@ -1,6 +1,5 @@
 """Mistakes in a command line: one sentence that says what, where, what was expected, and where to read on."""
 
-import importlib
 import subprocess
 import sys
 from enum import StrEnum
@@ -103,27 +102,6 @@ def test_no_command_is_answered_with_help(capsys):
     assert code == 2
     assert "paint" in out + err
     assert "error" not in out + err
-
-
-@pytest.mark.parametrize(
-    "name",
-    [
-        *(f"services.commands.{name}" for name in ("master", "board", "loader")),
-        *(f"services.pipeline.{name}" for name in ("subscriber", "publisher", "pcie_app")),
-        *(f"services.commands.{name}" for name in ("hub", "discover", "listen", "status")),
-        *(f"casestudies.boat.{name}" for name in ("simulator", "normaliser", "viewer")),
-        "casestudies.mrclam.convert",
-        "casestudies.mrclam.player",
-        "toolchain.commands.main",
-    ],
-)
-def test_every_command_has_it(capsys, name):
-    app = importlib.import_module(name).app
-    assert isinstance(app, CommandLine)
-    with pytest.raises(SystemExit) as ended:
-        app(["--qqq"])
-    assert ended.value.code == 2
-    assert capsys.readouterr().err == "error: painter has no --qqq; painter --help says more\n"
 
 
 @pytest.mark.parametrize("arguments", [["--help"], ["paint", "shed"]])

@@ -1,5 +1,6 @@
 """The pages of documentation say what the code does: every key, every option, and an example that runs."""
 
+import json
 import re
 import shlex
 from pathlib import Path
@@ -13,7 +14,8 @@ from typer.testing import CliRunner
 from toolchain import checks
 from toolchain.build import assemble
 from toolchain.commands.main import app
-from toolchain.deployment import DeploymentFile
+from toolchain.deployment import DeploymentFile, Variable
+from toolchain.deployment.sources import read_sources
 from toolchain.errors import ModelError
 from toolchain.models.case_study import load_model
 from toolchain.models.model import Known, Model, dimension
@@ -153,3 +155,51 @@ def test_every_option_of_regenerate(part):
     command = typer.main.get_command(app).commands["regenerate"].commands[part]
     for name in {name for each in command.params for name in each.opts if name.startswith("-")} - question:
         assert name in section
+
+
+def test_the_sources_of_the_deployment_page(tmp_path):
+    page = (DOCS / "deployment.md").read_text()
+    (example,) = re.findall(r"^```toml\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    (tmp_path / "sources.toml").write_text(example)
+    file = read_sources(tmp_path / "sources.toml", "ws://robot:9090")
+    names = ("ahead", "colour", "left", "near", "turn")
+    placed = file.place(tuple(Variable(name=name, bits=3, values=4) for name in names))
+    assert [(each.source, each.path) for each in placed] == [
+        (1, "ranges[0]"),
+        (3, "data[2]"),
+        (1, "ranges[90]"),
+        (0, "range"),
+        (2, "angular_velocity.z"),
+    ]
+    assert file.sources[1].uri == "ws://lidar-computer:9090"
+
+
+@pytest.mark.parametrize("mode", ["cell", "threshold"])
+def test_inspect_explains_such_a_deployment(tmp_path, mode):
+    page = (DOCS / "toolchain.md").read_text()
+    (example,) = re.findall(r"```python\n(# disparity/model\.py.*?)```", page, re.DOTALL)
+    (tmp_path / "disparity").mkdir()
+    (tmp_path / "disparity/model.py").write_text(example)
+    runner = CliRunner()
+    flags = ["--uri", "ws://localhost:9090", "--topic", "/costs", "--type", "stereo/Costs"]
+    flags += ["--sensor-mode", mode, "--replicas", "3"]
+    out = tmp_path / "out"
+    built = runner.invoke(app, ["build", str(tmp_path / "disparity"), "-o", str(out), *flags])
+    assert built.exit_code == 0, built.output
+    looked = runner.invoke(app, ["inspect", str(out), "--frames", "5"])
+    if mode == "threshold":
+        assert looked.exit_code == 2
+        assert "--model" in looked.stderr
+    else:
+        assert looked.exit_code == 0, looked.output
+        assert "Each board holds 3 of these machines around the same generators" in looked.stdout
+        assert "5 frames of readings for 3 replicas, drawn from" in looked.stdout
+        assert "A frame is 3 posteriors and ends with the last of them" in looked.stdout
+    named = runner.invoke(
+        app, ["inspect", str(out), "--frames", "5", "--model", str(tmp_path / "disparity"), "--json"]
+    )
+    assert named.exit_code == 0, named.output
+    # lines that all read the same would have nothing to be wrong about
+    assert 0.001 < json.loads(named.stdout)["accuracy"]["machine"]["total_variation"]["value"] < 0.1
+    recorded = runner.invoke(app, ["inspect", str(out), "--readings", str(tmp_path / "r.csv")])
+    assert recorded.exit_code == 2

@@ -108,7 +108,6 @@ PLAYED: dict[str, tuple[Company | None, str]] = {
 ELSEWHERE = {"Actions (ROS 2)", "TLS, tokens, proxies"}
 
 
-@pytest.mark.asyncio(loop_factories=["asyncio"])
 @pytest.mark.parametrize("heading", PLAYED)
 async def test_an_example_runs(heading):
     company, printed = PLAYED[heading]
@@ -116,7 +115,6 @@ async def test_an_example_runs(heading):
         assert printed in await run(EXAMPLES[heading], f"ws://127.0.0.1:{port}", company)
 
 
-@pytest.mark.asyncio(loop_factories=["asyncio"])
 async def test_what_is_published_is_heard():
     async with running_hub(ros_version=2) as port, connect(f"ws://127.0.0.1:{port}") as ros:
         poses = ros.subscribe("/pose", "geometry_msgs/PointStamped")
@@ -126,7 +124,6 @@ async def test_what_is_published_is_heard():
         assert heard == [0.1 * step for step in range(10)]
 
 
-@pytest.mark.asyncio(loop_factories=["asyncio"])
 @pytest.mark.parametrize("served", [True, False])
 async def test_the_goal_of_the_guide(served):
     async with running_hub(ros_version=2) as port:
@@ -145,7 +142,6 @@ async def test_the_goal_of_the_guide(served):
         assert "SUCCEEDED {'sequence': [0, 1, 1]}" in out
 
 
-@pytest.mark.asyncio(loop_factories=["asyncio"])
 async def test_the_door_of_the_guide(tmp_path):
     certificate, key = tmp_path / "ca.pem", tmp_path / "key.pem"
     subprocess.run(
