@@ -1,6 +1,11 @@
-"""What the toolchain refuses, each as one sentence for the user."""
+"""Errors of the toolchain, each one sentence for the user."""
 
-from typing import ClassVar
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 
 class ToolchainError(Exception):
@@ -8,29 +13,51 @@ class ToolchainError(Exception):
 
     exit_code: ClassVar[int] = 2
 
+    def __init__(
+        self,
+        sentence: str,
+        *,
+        path: Path | str = "",
+        line: int | None = None,
+        place: tuple[str | int, ...] = (),
+    ) -> None:
+        """Put the place before the sentence.
+
+        Args:
+            sentence: What is wrong, what was expected, what to do.
+            path: The file in which the mistake is, where there is one.
+            line: Its line, from 1, where it is known.
+            place: The key of a configuration file, as `("variable", 2, "bits")`; only for callers.
+        """
+        where = f"{path}" + ("" if line is None else f", line {line}")
+        super().__init__(f"{where}: {sentence}" if where else sentence)
+        self.path = path
+        self.line = line
+        self.place = place
+
 
 class ModelError(ToolchainError):
-    """A model that is not a BM1's: wrong shapes, names, probabilities or parameters."""
+    """A model is not one that a BM1 computes: wrong shapes, names, probabilities or parameters."""
 
 
 class NetworkFileError(ModelError):
-    """A network's file that can't be read: damaged, hostile, or of another kind; says the file and the line."""
+    """A network's file can't be read: damaged, hostile, or of another kind; names the file and the line."""
 
 
 class MifError(ToolchainError):
-    """A memory's file that can't be read: no MIF, or words that don't fit; says the file and the line."""
+    """A memory's file can't be read: not a MIF, or words that don't fit; names the file and the line."""
 
 
 class BuildError(ToolchainError):
-    """A build that cannot be done: options that don't fit, or a folder that can't be written."""
+    """A build cannot be done: options don't fit each other, or a folder can't be written."""
 
 
 class DeploymentError(ToolchainError):
-    """A deployment that is not there, not readable, or not consistent."""
+    """A deployment is absent, not readable, or not consistent."""
 
 
 class DeploymentVersionError(DeploymentError):
-    """A deployment in a format that this version doesn't read."""
+    """A deployment has a format that this version doesn't read."""
 
 
 class DamagedDeploymentError(DeploymentError):
@@ -38,18 +65,18 @@ class DamagedDeploymentError(DeploymentError):
 
 
 class ReadingError(ToolchainError):
-    """A reading that cannot become an address of its column."""
+    """A reading cannot become an address of its column."""
 
     exit_code: ClassVar[int] = 4
 
 
 class NotANumberError(ReadingError):
-    """A reading that is no number: a string, an object, a non-empty array."""
+    """A reading is not a number: a string, an object, a non-empty array."""
 
 
 class ValueOutOfRangeError(ReadingError):
-    """A number whose address the column does not serve (`on_range = error`)."""
+    """A number's address is not one that the column serves (`on_range = error`)."""
 
 
 class ReadingMissingError(ReadingError):
-    """No reading where there must be one (`on_missing = error`)."""
+    """A reading is missing where it must not be (`on_missing = error`)."""

@@ -28,13 +28,13 @@ import numpy as np
 from machines.bm1 import BM1Machine
 from machines.parameters import BM1Parameters, RngKind
 from machines.posterior import posterior
+from toolchain.building.quantise import quantise
 from toolchain.errors import ModelError
 from toolchain.models.distribution import Distribution
 from toolchain.models.fusion import exact_posterior
 from toolchain.models.joint import JointDistribution
 from toolchain.models.model import Model
 from toolchain.networks import read_network
-from toolchain.quantise import quantise
 
 INDEPENDENT = Path(__file__).with_name("independent_networks.py")
 LOCK = Path(__file__).with_name("independent-networks.lock")

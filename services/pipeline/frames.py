@@ -114,7 +114,7 @@ class _PriorReader:
         self._machine = machine
 
     def read(self, message: dict[str, Any]) -> bytes:
-        from toolchain.quantise import written_prior
+        from toolchain.deployment.written_codes import written_prior
 
         present, value = self._field.value(message)
         if not present or value is None:

@@ -12,14 +12,14 @@ from pydantic import BaseModel
 from typer.testing import CliRunner
 
 from toolchain import checks
-from toolchain.build import assemble
+from toolchain.building.build import assemble
+from toolchain.building.options import BuildOptions
 from toolchain.commands.main import app
 from toolchain.deployment import DeploymentFile, Variable
 from toolchain.deployment.sources import read_sources
 from toolchain.errors import ModelError
 from toolchain.models.case_study import load_model
 from toolchain.models.model import Known, Model, dimension
-from toolchain.options import BuildOptions
 from toolchain.outputs.vhdl_parameters import parameters_vhd
 
 DOCS = Path(__file__).parents[2] / "docs"

@@ -16,9 +16,9 @@ from services.pipeline.mini_cluster import machine_inputs
 from services.pipeline.results import FrameReport, Inferred, posterior_layout, times_of
 from services.printed.result_picture import axes_of
 from services.sockets.records import BoardOutcome, FrameResult, Publish
-from toolchain.build import assemble
+from toolchain.building.build import assemble
+from toolchain.building.options import BuildOptions
 from toolchain.models.model import Known, Model, PriorSelect, dimension
-from toolchain.options import BuildOptions
 
 
 def deployment(*, written=False, **changes):

@@ -4,9 +4,9 @@ import numpy as np
 
 from machines.bm1 import BM1Machine
 from machines.parameters import BM1Parameters
+from toolchain.building.quantise import quantise
 from toolchain.models.conditional import normal
 from toolchain.models.model import Known, Model, PriorSelect, cell_centres, interval
-from toolchain.quantise import quantise
 
 
 def corridor(cells=12, *, sigma=1.0, select=False, missing=False):

@@ -195,7 +195,7 @@ def test_any_other_edit_is_found(folder, old, new):
 
 def test_a_missing_hash_is_a_damaged_one(folder):
     edit(folder, "hash = ", "# hash = ")
-    assert "it says nothing" in refused(folder, DamagedDeploymentError)
+    assert "but it names none" in refused(folder, DamagedDeploymentError)
 
 
 @pytest.mark.parametrize(
@@ -309,7 +309,7 @@ def test_parts_that_disagree(folder, old, new, sentence):
 
 
 def test_no_deployment(tmp_path):
-    with pytest.raises(DeploymentError, match="holds no deployment: .*deployment.toml is not there"):
+    with pytest.raises(DeploymentError, match="holds no deployment: .*deployment.toml does not exist"):
         load_deployment(tmp_path / "nowhere")
 
 
@@ -405,7 +405,7 @@ def test_a_swapped_image_is_named_with_both_hashes(with_images):
 
 def test_an_absent_image_is_named(with_images):
     (with_images / "boards" / "board1.bm").unlink()
-    with pytest.raises(DamagedDeploymentError, match=r"board1\.bm, the image of board 1, is not there"):
+    with pytest.raises(DamagedDeploymentError, match=r"board1\.bm, the image of board 1, does not exist"):
         load_deployment(with_images)
 
 

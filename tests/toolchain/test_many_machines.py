@@ -24,17 +24,18 @@ from toolchain.analysis.resources.boards_needed import boards_needed
 from toolchain.analysis.resources.device import DEVICES
 from toolchain.analysis.resources.estimate import estimate
 from toolchain.analysis.resources.logic import logic_of
-from toolchain.build import BuildError, assemble, build_deployment
+from toolchain.building.build import BuildError, assemble, build_deployment
+from toolchain.building.options import BuildOptions
+from toolchain.building.quantise import quantise
 from toolchain.checks.check import check_deployment, check_model
 from toolchain.commands.main import app
-from toolchain.deployment import REPLICA, Deployment, Stop, Variable, load_deployment
+from toolchain.deployment import REPLICA, Deployment, Scale, Stop, Variable, load_deployment
 from toolchain.deployment.address import to_address
 from toolchain.deployment.address_array import MISSING, to_addresses
+from toolchain.deployment.written_codes import written_prior
 from toolchain.errors import NotANumberError, ReadingError, ReadingMissingError, ValueOutOfRangeError
 from toolchain.models.fusion import exact_posterior
 from toolchain.models.model import Known, Model, PriorSelect, dimension
-from toolchain.options import BuildOptions, Scale
-from toolchain.quantise import quantise, written_prior
 
 OPTIONS = BuildOptions(uri="ws://robot:9090", topic="/costs", type="stereo/Costs")
 CELL = replace(OPTIONS, sensor_mode=SensorMode.CELL)
@@ -254,7 +255,7 @@ def test_columns_are_normalised_as_a_whole():
         ),
         (
             replace(CELL, replicas=3, interface=(35, 18)),
-            "a board needs 36 inputs and 18 results (2 known variables and 6 lines on a board, 3 times); use --interface 36x18",
+            "a board needs 36 inputs and 18 results (2 known variables and 6 lines on it, 3 times); use --interface 36x18",
         ),
         (
             replace(OPTIONS, replicas=3, interface=(9000, 18)),
@@ -270,7 +271,7 @@ def test_what_is_impossible_is_one_sentence(options, sentence):
 
 def test_more_than_the_register_map_holds_is_refused_with_a_way_out():
     with pytest.raises(
-        BuildError, match=r"room for 8192 and 4096: use more --partitions or fewer --replicas"
+        BuildError, match=r"room for 8192 and 4096: use --partitions 2 or more, or fewer --replicas"
     ):
         assemble(model(40), replace(CELL, replicas=200))
     assemble(model(40), replace(CELL, replicas=200, partitions=2))

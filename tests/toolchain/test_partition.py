@@ -4,8 +4,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from toolchain.building.partition import Block, partition_lines
 from toolchain.errors import BuildError
-from toolchain.partition import Block, partition_lines
 
 
 @given(st.data())

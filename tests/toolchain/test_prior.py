@@ -11,17 +11,18 @@ from machines.encode import decode_code
 from machines.parameters import PriorMode
 from machines.posterior import posterior
 from pcie_shim.programming_file import read_image
-from toolchain.build import build_deployment
-from toolchain.deployment import Variable, WrittenPrior, load_deployment
+from toolchain.building.build import build_deployment
+from toolchain.building.options import BuildOptions
+from toolchain.building.quantise import quantise
+from toolchain.deployment import Scale, Variable, WrittenPrior, load_deployment
 from toolchain.deployment.address import to_address
+from toolchain.deployment.written_codes import written_prior
 from toolchain.errors import BuildError, DeploymentError, ModelError, ReadingError
 from toolchain.models.distribution import table, uniform
 from toolchain.models.fusion import exact_posterior, fuse
 from toolchain.models.joint import JointDistribution
 from toolchain.models.model import Known, Model, PriorSelect, dimension
 from toolchain.models.symbol import IntegerType, LabelType, Symbol
-from toolchain.options import BuildOptions, Scale
-from toolchain.quantise import quantise, written_prior
 
 OPTIONS = BuildOptions(uri="ws://robot:9090", topic="/readings", type="std_msgs/Float64MultiArray")
 FINE = {"prob_bits": 14, "counter_bits": 16, "target_count": 20000}

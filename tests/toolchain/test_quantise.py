@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 
 from machines.encode import decode_code, encode_probability
 from machines.errors import ParameterError
+from toolchain.building.quantise import quantise, scaled
+from toolchain.deployment import Scale
 from toolchain.models.conditional import normal, wrapped_normal
 from toolchain.models.model import Known, Model, dimension
-from toolchain.options import Scale
-from toolchain.quantise import quantise, scaled
 
 
 def model_of(*tables, prior=None, **fields):

@@ -7,10 +7,10 @@ from typer.testing import CliRunner
 
 from bridge.errors import PathError
 from bridge.fields import parse_path
+from toolchain.building.sources_file import read_sources
 from toolchain.commands.main import app
 from toolchain.deployment import Variable, deployment_hash, load_deployment, write_deployment
 from toolchain.deployment.fields import MESSAGE_PATH
-from toolchain.deployment.sources import read_sources
 from toolchain.errors import BuildError
 
 MODEL = """
@@ -107,7 +107,7 @@ def test_a_prior_of_one_of_them(tmp_path, written):
     assert (prior.source, prior.path) == (2, "data")
     refused = build(tmp_path, *flags)
     assert refused.exit_code == 2
-    assert "says where a written prior comes from: add --prior-mode written" in refused.stderr
+    assert "names the place of a written prior: add --prior-mode written" in refused.stderr
 
 
 @pytest.mark.parametrize(
@@ -121,9 +121,9 @@ def test_a_prior_of_one_of_them(tmp_path, written):
         (
             "near = ",
             "q = ",
-            "line 4: in [[source]] 1: the model has no variable 'q'; it has near, left, turn",
+            "line 4: in [[source]] 1: the model has no variable 'q'; expected one of near, left, turn",
         ),
-        ("left = ", "near = ", "line 11: in [[source]] 2: near comes from source 1 already"),
+        ("left = ", "near = ", "line 11: in [[source]] 2: near already comes from source 1"),
         (
             "compression",
             "compresion",
@@ -169,7 +169,7 @@ def test_a_variable_that_no_source_has(written):
     more = tuple(Variable(name=name, bits=3, values=4) for name in ("back", "front"))
     file = read_sources(path, "ws://one:9090")
     assert [each.source for each in file.place(VARIABLES)] == [0, 1, 2]
-    with pytest.raises(BuildError, match="no source has back, front; add them to a source's variables"):
+    with pytest.raises(BuildError, match="no source has back, front; add them to the variables"):
         file.place(VARIABLES + more)
 
 

@@ -15,17 +15,17 @@ import numpy as np
 from machines.errors import MachineError
 from machines.parameters import PriorMode, SensorMode
 from pcie_shim.errors import PcieShimError
-from toolchain.board_interface import board_interface
-from toolchain.build import assemble, machine_parameters
+from toolchain.building.agreement import check_agreement, read_images
+from toolchain.building.board_layout import board_layout
+from toolchain.building.build import assemble
+from toolchain.building.machine import machine_parameters
+from toolchain.building.partition import partition_lines
 from toolchain.checks.checked_machine import CheckedMachine
 from toolchain.checks.finding import Finding, Severity
 from toolchain.checks.generators import generator_findings
-from toolchain.deployment import load_deployment
+from toolchain.deployment import Scale, load_deployment
 from toolchain.errors import ToolchainError
-from toolchain.options import Scale
 from toolchain.outputs.output_files import Change, compare_files, memory_files, quartus_files
-from toolchain.partition import partition_lines
-from toolchain.regenerate import check_agreement, read_images
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -34,10 +34,10 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pcie_shim.programming_file import Image
+    from toolchain.building.options import BuildOptions
+    from toolchain.building.quantise import Quantised
     from toolchain.deployment import Deployment, Dimension, Variable
     from toolchain.models.model import Model
-    from toolchain.options import BuildOptions
-    from toolchain.quantise import Quantised
 
 _MOST_RANGES: Final = 4
 _LOST_OFTEN: Final = 0.02
@@ -93,17 +93,11 @@ def _refusals(model: Model, options: BuildOptions, first: ToolchainError) -> lis
     """Return why a model can't be built: each part is tried by itself, so that one mistake hides no other."""
     tries: list[tuple[str, Callable[[], object]]] = [
         ("the partitions", lambda: partition_lines(model.lines, options.partitions)),
+        ("the machine", lambda: machine_parameters(model, options)),
         (
             "the interface",
-            lambda: board_interface(
-                model,
-                partition_lines(model.lines, options.partitions),
-                options.interface,
-                sensor_mode=options.sensor_mode,
-                replicas=options.replicas,
-            ),
+            lambda: board_layout(machine_parameters(model, options), options.partitions, options.interface),
         ),
-        ("the machine", lambda: machine_parameters(model, options)),
     ]
     found: dict[str, Finding] = {}
     for about, attempt in tries:

@@ -10,7 +10,7 @@ from toolchain.commands.flags import BuildFlags, ModelPath
 from toolchain.deployment import Queue
 
 if TYPE_CHECKING:
-    from toolchain.options import BuildOptions
+    from toolchain.building.options import BuildOptions
 
 
 def build(
@@ -46,9 +46,10 @@ def build(
     --topic /boat/sensors --type boat_msgs/Sensors`, or of a network `toolchain build asia.bif --searched bronc
     --known smoke,dysp -o build/asia --uri ws://localhost:9090 --topic /patient --type clinic_msgs/Patient`
     """
-    from toolchain.build import build_date, build_deployment, check_options
+    from toolchain.building.build import build_date, build_deployment
+    from toolchain.building.options import check_options
+    from toolchain.building.report import REPORT_NAME
     from toolchain.commands.request import build_options, fit_to_device, model_file, read_model, read_named
-    from toolchain.report import REPORT_NAME
 
     options = _with_sources(
         replace(
@@ -78,7 +79,7 @@ def _with_sources(options: "BuildOptions", path: Path | None) -> "BuildOptions":
     Raises:
         BuildError: A mistake in the file, flags that repeat it, or neither the file nor all flags.
     """
-    from toolchain.deployment.sources import read_sources
+    from toolchain.building.sources_file import read_sources
     from toolchain.errors import BuildError
 
     target = {"--uri": options.uri, "--topic": options.topic, "--type": options.type}

@@ -10,9 +10,8 @@ import typer
 from machines.parameters import RngKind, SensorMode
 from toolchain.commands.flags import Bits, MaxCycles, ModelFlags, Partitions, ReadingFlags, StopWhen
 from toolchain.commands.progress import progress
-from toolchain.deployment import Stop
+from toolchain.deployment import Scale, Stop
 from toolchain.errors import BuildError
-from toolchain.options import Scale
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

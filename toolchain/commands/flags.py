@@ -7,8 +7,8 @@ from typing import Annotated, TypeAlias
 import typer
 
 from machines.parameters import PriorMode, RngKind, RngReset, SensorMode
-from toolchain.deployment import Stop
-from toolchain.options import OnMissing, Scale
+from toolchain.building.options import OnMissing
+from toolchain.deployment import Scale, Stop
 
 Bits: TypeAlias = Annotated[
     list[str] | None,

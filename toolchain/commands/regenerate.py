@@ -13,7 +13,7 @@ from toolchain.commands.registration import add_commands
 from toolchain.deployment import FILE_NAME, Queue, Stop
 
 if TYPE_CHECKING:
-    from toolchain.regenerate import Changes
+    from toolchain.building.regenerate import Changes
 
 app = CommandLine(no_args_is_help=True)
 
@@ -43,10 +43,10 @@ def memories(
     For example `toolchain regenerate memories build/boat --model casestudies/boat`. Topics, endpoints and everything
     else in deployment.toml that says nothing of the tables stays as it is.
     """
-    from toolchain.build import build_date
+    from toolchain.building.build import build_date
+    from toolchain.building.regenerate import regenerate_memories
     from toolchain.commands.request import model_file, read_model
     from toolchain.errors import BuildError
-    from toolchain.regenerate import regenerate_memories
 
     if model is not None:
         read = read_model(model, flags)
@@ -66,7 +66,7 @@ def project(directory: Directory) -> None:
 
     For example `toolchain regenerate project build/boat`.
     """
-    from toolchain.regenerate import regenerate_project
+    from toolchain.building.regenerate import regenerate_project
 
     changes = regenerate_project(directory)
     _print_changes(changes)
@@ -108,8 +108,9 @@ def deployment(
     For example `toolchain regenerate deployment build/boat --order D2,D1,D3,B1,B2,B3` where the first two readings were
     mixed up. No image, memory or board is touched. What is left out stays as it is.
     """
+    from toolchain.building.edits import DeploymentEdits
+    from toolchain.building.regenerate import regenerate_deployment
     from toolchain.flag_values import key_values, names_in
-    from toolchain.regenerate import DeploymentEdits, regenerate_deployment
 
     edits = DeploymentEdits(
         uri=uri,

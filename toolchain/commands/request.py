@@ -10,14 +10,14 @@ from machines.errors import MachineError
 from machines.parameters import ADDRESS_BITS_MAX, RngKind
 from toolchain.analysis.resources.boards_needed import boards_needed
 from toolchain.analysis.resources.device import device_named
-from toolchain.board_interface import DEFAULT_INTERFACE
-from toolchain.build import machine_parameters
+from toolchain.building.board_layout import DEFAULT_INTERFACE
+from toolchain.building.machine import machine_parameters
+from toolchain.building.options import BuildOptions
 from toolchain.deployment import parse_interface
 from toolchain.errors import BuildError
 from toolchain.flag_values import key_values, names_in
 from toolchain.models.case_study import load_model, model_path
 from toolchain.networks import is_network, read_network
-from toolchain.options import BuildOptions
 from toolchain.outputs.rng_table import LENGTH, read_table
 
 if TYPE_CHECKING:

@@ -1,25 +1,22 @@
 """The deployment: everything that follows from the model and that the services read."""
 
-from toolchain.deployment.deployment_file import (
-    FILE_NAME,
-    REPLICA,
+from toolchain.deployment.deployment import FILE_NAME, REPLICA, Deployment, DeploymentFile
+from toolchain.deployment.deployment_hash import deployment_hash
+from toolchain.deployment.load import load_deployment
+from toolchain.deployment.sections import (
     Board,
-    Deployment,
-    DeploymentFile,
     Dimension,
     MachineSection,
     Output,
     Queue,
+    Scale,
     Source,
     Stop,
     Variable,
     WrittenPrior,
-    deployment_hash,
-    deployment_text,
-    load_deployment,
     parse_interface,
-    write_deployment,
 )
+from toolchain.deployment.write import deployment_text, write_deployment
 
 __all__ = [
     "FILE_NAME",
@@ -31,6 +28,7 @@ __all__ = [
     "MachineSection",
     "Output",
     "Queue",
+    "Scale",
     "Source",
     "Stop",
     "Variable",

@@ -15,14 +15,13 @@ import numpy as np
 
 from machines.parameters import SensorMode
 from toolchain.deployment.address import to_address
+from toolchain.deployment.written_codes import written_codes
 from toolchain.errors import NotANumberError, ReadingError, ReadingMissingError
-from toolchain.options import Scale
-from toolchain.quantise import written_codes
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from toolchain.deployment import Deployment, Variable
+    from toolchain.deployment import Deployment, Scale, Variable
 
 MISSING: Final = -1
 """Stands for a missing reading among the addresses, in all lines of its machine."""
@@ -51,7 +50,7 @@ def to_addresses(deployment: Deployment, variable: Variable, value: object) -> l
         to_address(variable, None if value is None else [])  # says what it is, where it must not be missing
         return None
     if machine.sensor_mode is SensorMode.THRESHOLD and variable.kind == "sensor":
-        addresses = _codes(variable, numbers, machine.prob_bits, Scale(machine.scale))
+        addresses = _codes(variable, numbers, machine.prob_bits, machine.scale)
     else:
         addresses = _addresses(variable, numbers)
     if variable.kind == "sensor" and machine.sensor_mode is not SensorMode.COLUMN:

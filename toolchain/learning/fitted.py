@@ -12,8 +12,8 @@ import numpy as np
 import tomli_w
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from toolchain.deployment.toml_file import parse_toml, read_text, validate
 from toolchain.errors import ModelError
+from toolchain.files.toml_file import TomlFile
 from toolchain.models.conditional import normal_table, wrapped_normal_table
 from toolchain.models.model import Known, Model, Normal
 
@@ -212,9 +212,7 @@ def read_fit(path: Path) -> Fit:
     """
     if path.suffix == ".npz":
         return _read_tables(path)
-    text = read_text(path, ModelError)
-    tables = parse_toml(text, path, ModelError)
-    file = validate(FitFile, tables, text, path, ModelError)
+    file = TomlFile.read(path, ModelError).validated(FitFile)
     if file.method != "normals":
         raise ModelError(f"{path} says method = {file.method!r}, whose tables `toolchain fit` writes as .npz")
     return Fit(file=file, tables={})

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
 
-from toolchain.bounded_file import read_bounded
 from toolchain.errors import ModelError, NetworkFileError
+from toolchain.files.bounded_file import read_bounded
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -40,7 +40,7 @@ def read_network(path: Path, *, on_missing: Literal["error", "missing"] = "error
 
     path = Path(path)
     reader = _reader(path)
-    data = read_bounded(path, MAX_BYTES, NetworkFileError, "the most that is read of a network")
+    data = read_bounded(path, MAX_BYTES, NetworkFileError)
     builder = NetworkBuilder(path, on_missing=on_missing)
     reader(data, builder)
     try:

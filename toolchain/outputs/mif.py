@@ -10,8 +10,8 @@ import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, NoReturn
 
-from toolchain.bounded_file import read_bounded
 from toolchain.errors import MifError
+from toolchain.files.bounded_file import read_bounded
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -92,7 +92,7 @@ def read_mif(path: Path) -> Mif:
     Raises:
         MifError: The file can't be read, or is no MIF; says where and what was expected.
     """
-    data = read_bounded(path, MOST_BYTES, MifError, "no memory of this project")
+    data = read_bounded(path, MOST_BYTES, MifError)
     return parse_mif(data.decode("latin-1"), str(path))
 
 

@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 from casestudies.boat.geometry import BEACONS, SENSOR_NAMES, bearing, distance, distance_sigma, map_grid
 from casestudies.boat.model import model
 from machines.parameters import BM1Parameters
+from toolchain.building.quantise import quantise
 from toolchain.deployment.address import to_address
 from toolchain.errors import ModelError
 from toolchain.models.fusion import exact_posterior
-from toolchain.quantise import quantise
 
 BOAT = model()
 GRID = map_grid()

@@ -19,8 +19,9 @@ from services.supervision.parent import DIRECTORY_VARIABLE
 from services.supervision.private_directory import PrivateDirectory
 from terminal.errors import StoppedError
 from tests.integration.conftest import build_boat
+from toolchain.building.edits import DeploymentEdits
+from toolchain.building.regenerate import regenerate_deployment
 from toolchain.deployment import load_deployment
-from toolchain.regenerate import DeploymentEdits, regenerate_deployment
 
 
 @pytest.fixture(scope="module")

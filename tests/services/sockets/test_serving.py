@@ -11,8 +11,9 @@ from services.sockets.local_socket import RecordProtocol, open_connection, own_h
 from services.sockets.records import Trouble
 from services.sockets.serving import MasterLink, outdated
 from tests.integration.conftest import build_boat
+from toolchain.building.edits import DeploymentEdits
+from toolchain.building.regenerate import regenerate_deployment
 from toolchain.deployment import load_deployment
-from toolchain.regenerate import DeploymentEdits, regenerate_deployment
 
 
 @pytest.fixture(scope="module")

@@ -6,10 +6,11 @@ import pytest
 from machines.bm1 import BM1Machine
 from machines.parameters import BM1Parameters
 from tests.toolchain.corridor import corridor, machine_of
-from toolchain.analysis.accuracy.emulation import EmulatedBoards, split
+from toolchain.analysis.accuracy.emulation import EmulatedBoards
 from toolchain.analysis.accuracy.intervals import bootstrap, share_of_frames
 from toolchain.analysis.accuracy.measurement import _difference, _line_probabilities, measure
 from toolchain.analysis.accuracy.readings import MISSING, Readings, sample_readings
+from toolchain.building.partition import split
 from toolchain.deployment import Stop
 from toolchain.errors import ModelError
 from toolchain.models.fusion import exact_posterior

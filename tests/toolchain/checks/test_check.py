@@ -13,14 +13,15 @@ from typer.testing import CliRunner
 from machines.bm1 import Start, StopReason
 from machines.parameters import PriorMode, RngKind, RngReset, SensorMode
 from machines.reference import ReferenceBM1
-from toolchain.build import assemble, build_deployment
+from toolchain.building.build import assemble, build_deployment
+from toolchain.building.options import BuildOptions
 from toolchain.checks.check import check_deployment, check_model, line_name, reading
 from toolchain.checks.finding import Severity
 from toolchain.commands.main import app
+from toolchain.deployment import Scale
 from toolchain.errors import ModelError
 from toolchain.models.conditional import normal, wrapped_normal
 from toolchain.models.model import Known, Model, PriorSelect, cell_centres, dimension, interval
-from toolchain.options import BuildOptions, Scale
 from toolchain.outputs.mif import Mif, mif_text
 
 OPTIONS = BuildOptions(uri="ws://robot:9090", topic="/readings", type="std_msgs/Float64MultiArray")

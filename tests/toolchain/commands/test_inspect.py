@@ -7,7 +7,7 @@ from typer.testing import CliRunner
 
 from toolchain.analysis.inspection.inspection import machines_of
 from toolchain.analysis.inspection.report import _unit
-from toolchain.build import build_deployment
+from toolchain.building.build import build_deployment
 from toolchain.commands.main import app
 from toolchain.deployment import load_deployment
 
@@ -142,7 +142,7 @@ def test_no_deployment(tmp_path):
 def test_the_machines_are_those_that_were_built(case, deployment):
     machines = machines_of(load_deployment(deployment))
     assert [machine.parameters.lines for machine in machines] == [6, 6]
-    assert build_deployment.__module__ == "toolchain.build"
+    assert build_deployment.__module__ == "toolchain.building.build"
 
 
 def test_a_build_on_a_device_takes_its_own_number_of_boards(case):

@@ -15,11 +15,11 @@ from hypothesis import strategies as st
 from machines.parameters import PriorMode, RngKind, RngReset
 from machines.rng import random_numbers
 from pcie_shim.programming_file import read_image
-from toolchain.build import build_deployment
+from toolchain.building.build import build_deployment
+from toolchain.building.options import BuildOptions
 from toolchain.deployment import load_deployment
 from toolchain.models.conditional import normal
 from toolchain.models.model import Known, Model, PriorSelect, cell_centres, interval
-from toolchain.options import BuildOptions
 from toolchain.outputs.memories import packed_words
 from toolchain.outputs.mif import parse_mif, read_mif
 from toolchain.outputs.rng_table import random_table
@@ -361,7 +361,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 from tests.toolchain.outputs.test_memories import OPTIONS, model
-from toolchain.build import build_deployment
+from toolchain.building.build import build_deployment
 build_deployment(model(), Path(sys.argv[1]), replace(OPTIONS, partitions=2, build_date="2020-02-02T02:02:02Z"))
 """
 

@@ -13,7 +13,6 @@ from machines.parameters import COUNTER_BITS_MAX, CYCLES_MAX, BM1Parameters
 from machines.posterior import joint_posterior
 from toolchain.deployment import Stop
 from toolchain.errors import BuildError
-from toolchain.partition import partition_lines
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -153,23 +152,6 @@ def inputs_of_boards(inputs: Inputs, machines: Sequence[BM1Machine]) -> list[Inp
 def one_replica(machine: BM1Machine) -> BM1Machine:
     """Return one of a board's replicas as a machine by itself, which counts the same."""
     return replace(machine, parameters=replace(machine.parameters, replicas=1))
-
-
-def split(machine: BM1Machine, boards: int) -> tuple[BM1Machine, ...]:
-    """Return the boards' parts of a whole machine, as a build splits it.
-
-    Raises:
-        BuildError: More boards than lines.
-    """
-    return tuple(
-        BM1Machine(
-            replace(machine.parameters, lines=block.lines),
-            np.ascontiguousarray(machine.prior[:, block.offset : block.end]),
-            tuple(np.ascontiguousarray(table[:, block.offset : block.end]) for table in machine.tables),
-            machine.rng_table,
-        )
-        for block in partition_lines(machine.parameters.lines, boards)
-    )
 
 
 def joined(machines: Sequence[BM1Machine]) -> BM1Machine:

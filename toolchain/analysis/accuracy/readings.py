@@ -9,11 +9,11 @@ import numpy as np
 
 from machines.encode import decode_code
 from toolchain.deployment.address import to_address
+from toolchain.deployment.written_codes import written_codes
 from toolchain.errors import BuildError, ModelError, ReadingError
 from toolchain.flag_values import key_values
 from toolchain.learning.recording import read_recording
 from toolchain.models.model import Known, Model, PriorSelect
-from toolchain.quantise import written_codes
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -23,8 +23,7 @@ if TYPE_CHECKING:
 
     from machines.bm1 import BM1Machine
     from toolchain.analysis.accuracy.emulation import Inputs
-    from toolchain.deployment import Dimension, Variable
-    from toolchain.options import Scale
+    from toolchain.deployment import Dimension, Scale, Variable
 
 MISSING: Final = -1
 MOST_FRAMES: Final = 100_000

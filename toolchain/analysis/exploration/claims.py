@@ -19,12 +19,11 @@ from machines.parameters import BM1Parameters
 from machines.rng import random_numbers
 from toolchain.analysis.accuracy.emulation import EmulatedBoards
 from toolchain.analysis.accuracy.readings import sample_readings
-from toolchain.deployment import Stop
+from toolchain.building.quantise import quantise
+from toolchain.deployment import Scale, Stop
 from toolchain.models.conditional import normal
 from toolchain.models.fusion import exact_posterior
 from toolchain.models.model import Model, cell_centres, interval
-from toolchain.options import Scale
-from toolchain.quantise import quantise
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from toolchain.bounded_file import read_bounded
 from toolchain.errors import BuildError
+from toolchain.files.bounded_file import read_bounded
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -90,7 +90,7 @@ class Results:
         self.points: dict[str, Point] = {}
         content = b""
         if path.exists():
-            content = read_bounded(path, MAX_FILE_BYTES, BuildError, "it is no file of results")
+            content = read_bounded(path, MAX_FILE_BYTES, BuildError)
         lines = content.split(b"\n")
         # A power cut in the middle of a line leaves a last line without its end: that point is measured again.
         torn = lines.pop()

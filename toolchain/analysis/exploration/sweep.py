@@ -9,29 +9,27 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from machines.bm1 import BM1Machine
-from machines.errors import MachineError
 from machines.parameters import RngKind, SensorMode
-from toolchain.analysis.accuracy.emulation import EmulatedBoards, one_replica, split
+from toolchain.analysis.accuracy.emulation import EmulatedBoards, one_replica
 from toolchain.analysis.accuracy.measurement import measure
 from toolchain.analysis.accuracy.readings import check_frames, readings_of_lines, sample_readings
 from toolchain.analysis.exploration.results import Point
 from toolchain.analysis.resources.boards_needed import with_lines
 from toolchain.analysis.resources.estimate import Pcie, estimate
-from toolchain.board_interface import DEFAULT_INTERFACE, board_interface
-from toolchain.build import check_options, machine_parameters
+from toolchain.building.board_layout import DEFAULT_INTERFACE, board_layout
+from toolchain.building.machine import machine_parameters, whole_machine
+from toolchain.building.options import BuildOptions, check_options
+from toolchain.building.partition import partition_lines, split
+from toolchain.building.quantise import quantise
 from toolchain.errors import BuildError
-from toolchain.options import BuildOptions, Scale
-from toolchain.outputs.rng_table import random_table
-from toolchain.partition import partition_lines
-from toolchain.quantise import quantise
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
+    from machines.bm1 import BM1Machine
     from toolchain.analysis.accuracy.readings import Readings
     from toolchain.analysis.resources.device import Device
-    from toolchain.deployment import Stop
+    from toolchain.deployment import Scale, Stop
     from toolchain.models.model import Model
 
 MAX_POINTS: Final = 10_000
@@ -203,10 +201,9 @@ def tasks(model: Model, sweep: Sweep, frames: Frames, device: Device) -> list[Ta
     for options in sweep.options():
         try:
             check_options(options)
-            blocks = partition_lines(model.lines, options.partitions)
-            board_interface(model, blocks, None, sensor_mode=options.sensor_mode, replicas=options.replicas)
             parameters = machine_parameters(model, options)
-        except (MachineError, BuildError) as reason:
+            board_layout(parameters, options.partitions, None)
+        except BuildError as reason:
             refused = refused or str(reason)
             continue
         words = {
@@ -235,18 +232,11 @@ def run_task(model: Model, task: Task, frames: Frames, device: Device, banks: in
         ToolchainError: It can't be built or run.
     """
     options = task.options
-    try:
-        parameters = machine_parameters(model, options)
-        quantised = quantise(
-            model,
-            prob_bits=options.prob_bits,
-            scale=options.scaling,
-            sensor_mode=options.sensor_mode,
-        )
-        table = random_table(options.prob_bits) if options.rng is RngKind.TABLE else None
-        whole = one_replica(BM1Machine(parameters, quantised.prior, quantised.tables, table))
-    except MachineError as reason:
-        raise BuildError(str(reason)) from reason
+    parameters = machine_parameters(model, options)
+    quantised = quantise(
+        model, prob_bits=options.prob_bits, scale=options.scaling, sensor_mode=options.sensor_mode
+    )
+    whole = one_replica(whole_machine(parameters, quantised, options))
     machines = split(whole, options.partitions)
     target = options.target_count or parameters.target_count_max
     boards = EmulatedBoards(machines, target_count=target, max_cycles=options.max_cycles, stop=options.stop)

@@ -21,11 +21,11 @@ from toolchain.analysis.accuracy.readings import (
 from toolchain.analysis.resources.energy import energy
 from toolchain.analysis.resources.estimate import estimate
 from toolchain.analysis.resources.table_memories import Tables
+from toolchain.building.quantise import quantise
+from toolchain.building.report import REPORT_NAME
+from toolchain.deployment import Scale
 from toolchain.errors import BuildError, DeploymentError
-from toolchain.options import Scale
 from toolchain.outputs.rng_table import table_length
-from toolchain.quantise import quantise
-from toolchain.report import REPORT_NAME
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -38,9 +38,9 @@ if TYPE_CHECKING:
     from toolchain.analysis.resources.device import Device
     from toolchain.analysis.resources.energy import Energy
     from toolchain.analysis.resources.estimate import Estimate, Pcie
+    from toolchain.building.quantise import ColumnLoss
     from toolchain.deployment import Deployment
     from toolchain.models.model import Model
-    from toolchain.quantise import ColumnLoss
 
     Progress = Callable[[int], AbstractContextManager[Callable[[str], None]]]
 

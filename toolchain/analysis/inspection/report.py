@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from toolchain.analysis.resources.energy import ASSUMPTIONS
 from toolchain.analysis.resources.estimate import Pcie
-from toolchain.report import loss_heading, many_sentence
+from toolchain.building.report import loss_heading, many_sentence
 
 if TYPE_CHECKING:
     from toolchain.analysis.accuracy.intervals import Interval

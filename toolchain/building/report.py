@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Final
 from machines.parameters import PriorMode, SensorMode
 
 if TYPE_CHECKING:
+    from toolchain.building.quantise import Quantised
     from toolchain.deployment import Deployment, MachineSection
     from toolchain.models.model import Model
-    from toolchain.quantise import Quantised
 
 REPORT_NAME: Final = "report.txt"
 

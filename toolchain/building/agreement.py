@@ -1,0 +1,65 @@
+"""Agreement of `deployment.toml` with the images that it names."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from pcie_shim.programming_file import Image, Partition, read_image
+from toolchain.errors import DeploymentError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from toolchain.deployment import Deployment
+
+_MACHINE_KEYS: Final = (
+    "prob_bits",
+    "prior_bits",
+    "prior_mode",
+    "counter_bits",
+    "rng",
+    "rng_banks",
+    "rng_reset",
+    "shared",
+    "steps_per_clock",
+    "sensor_mode",
+    "replicas",
+)
+
+
+def read_images(deployment: Deployment) -> list[Image]:
+    """Return the boards' images."""
+    return [read_image(deployment.image_path(board)) for board in range(len(deployment.boards))]
+
+
+def check_agreement(deployment: Deployment, images: Sequence[Image]) -> None:
+    """Refuse a `deployment.toml` that says something else of the machine than its images.
+
+    Raises:
+        DeploymentError: Names the key, and what the image says.
+    """
+    machine = deployment.machine
+    for index, (board, image) in enumerate(zip(deployment.boards, images, strict=True)):
+        parameters = image.machine.parameters
+        found = {key: getattr(parameters, key) for key in _MACHINE_KEYS}
+        said = {key: getattr(machine, key) for key in _MACHINE_KEYS}
+        for variable, bits in zip(deployment.sensors, parameters.sensor_bits, strict=False):
+            found[f"bits of {variable.name}"], said[f"bits of {variable.name}"] = bits, variable.bits
+        found |= {
+            "number of sensors": parameters.sensors,
+            "interface": f"{image.interface_sensors}x{image.interface_results}",
+            "lines of the board": parameters.lines,
+            "part of the model": image.partition,
+        }
+        said |= {
+            "number of sensors": len(deployment.sensors),
+            "interface": machine.interface,
+            "lines of the board": board.lines,
+            "part of the model": Partition(index, len(images), board.line_offset, machine.lines),
+        }
+        for key, value in found.items():
+            if value != said[key]:
+                raise DeploymentError(
+                    f"{deployment.path} says {key} = {said[key]}, but {board.image} was built with {value}: set it back, "
+                    "or build again with 'toolchain build'"
+                )

@@ -1,0 +1,124 @@
+"""The straight line from a model to a deployment (thesis 3.4).
+
+model ──▶ machine_parameters ──▶ quantise ──▶ whole_machine ──▶ board_images ──▶ describe ──▶ files
+└─▶ board_layout (lines and interface of each board, before tables are computed)
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from toolchain.building.board_layout import board_layout
+from toolchain.building.describe import describe
+from toolchain.building.images import board_images
+from toolchain.building.machine import machine_parameters, whole_machine
+from toolchain.building.options import check_options
+from toolchain.building.quantise import Quantised, quantise
+from toolchain.building.report import REPORT_NAME, build_report, with_remark
+from toolchain.deployment import FILE_NAME, Deployment, write_deployment
+from toolchain.errors import BuildError, DeploymentError
+from toolchain.outputs.output_files import image_files, memory_files, quartus_files, text_file, write_files
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from pcie_shim.programming_file import Image
+    from toolchain.building.options import BuildOptions
+    from toolchain.models.model import Model
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Built:
+    """A deployment, the images of its boards, and a report about both."""
+
+    deployment: Deployment
+    """The content of `deployment.toml`."""
+    images: tuple[Image, ...]
+    """One per board."""
+    quantised: Quantised
+    """The codes before they were split over boards, and what was lost."""
+    interface_reason: str
+    """A clause that says why the boards' interface is not the default one; empty where it is."""
+    report: str
+    """The content of `report.txt`."""
+
+
+def build_deployment(model: Model, directory: Path, options: BuildOptions, *, remark: str = "") -> Built:
+    """Write a model's deployment: `deployment.toml`, an image per board, a report, and the hardware project.
+
+    The same model and options give the same bytes.
+
+    Args:
+        model: The model.
+        directory: The deployment's folder, which is created; a deployment in it is replaced.
+        options: Everything else.
+        remark: A sentence for the report about how the options were chosen.
+
+    Raises:
+        BuildError: The options don't fit each other, the model or the register map, or the folder can't be written.
+    """
+    built = assemble(model, options)
+    built = replace(built, report=with_remark(built.report, remark))
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        # a process that reads the folder half-way finds no deployment, not parts of two
+        (directory / FILE_NAME).unlink(missing_ok=True)
+    except OSError as reason:
+        raise BuildError(
+            f"{directory} can't be written: {reason.strerror or reason}; choose another folder with -o"
+        ) from None
+    for part in (
+        image_files(built.deployment, built.images),
+        memory_files(built.deployment, built.images),
+        quartus_files(built.deployment, built.images),
+        text_file(REPORT_NAME, built.report),
+    ):
+        write_files(directory, part)
+    try:
+        return replace(built, deployment=write_deployment(directory, built.deployment))
+    except DeploymentError as reason:
+        raise BuildError(str(reason)) from None
+
+
+def assemble(model: Model, options: BuildOptions) -> Built:
+    """Return a model's deployment without writing anything.
+
+    Raises:
+        BuildError: The options don't fit each other, the model or the register map.
+    """
+    check_options(options)
+    parameters = machine_parameters(model, options)
+    layout = board_layout(parameters, options.partitions, options.interface)
+    quantised = quantise(
+        model, prob_bits=parameters.prob_bits, scale=options.scaling, sensor_mode=parameters.sensor_mode
+    )
+    machine = whole_machine(parameters, quantised, options)
+    images = board_images(model, machine, layout, options.build_date)
+    deployment = describe(model, parameters, layout, images, options)
+    report = build_report(model, deployment, quantised, layout.reason)
+    return Built(
+        deployment=deployment,
+        images=images,
+        quantised=quantised,
+        interface_reason=layout.reason,
+        report=report,
+    )
+
+
+def build_date(model_file: Path) -> str:
+    """Return the date that a build of this model file carries, ISO 8601 in UTC.
+
+    It is `SOURCE_DATE_EPOCH` where that is set, else the file's last change: the same input gives the same bytes.
+
+    Raises:
+        BuildError: `SOURCE_DATE_EPOCH` is not a time.
+    """
+    epoch = os.environ.get("SOURCE_DATE_EPOCH")
+    try:
+        seconds = int(model_file.stat().st_mtime) if epoch is None else int(epoch)
+        return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(seconds))
+    except (ValueError, OverflowError, OSError):
+        raise BuildError(f"SOURCE_DATE_EPOCH is {epoch!r}, expected a number of seconds since 1970") from None

@@ -1,0 +1,66 @@
+"""The machine of a whole model, before it is split over boards."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from machines.bm1 import BM1Machine
+from machines.errors import ParameterError
+from machines.parameters import BM1Parameters, PriorMode, RngKind, SensorMode
+from toolchain.errors import BuildError
+from toolchain.outputs.rng_table import random_table
+
+if TYPE_CHECKING:
+    from toolchain.building.options import BuildOptions
+    from toolchain.building.quantise import Quantised
+    from toolchain.models.model import Model
+
+
+def machine_parameters(model: Model, options: BuildOptions) -> BM1Parameters:
+    """Return the parameters of the whole model's machine.
+
+    Raises:
+        BuildError: The options don't fit the model, or no such machine can be built.
+    """
+    if options.prior_mode is PriorMode.TABLE and options.written_prior is not None:
+        flag = "--prior-path" if options.sources is None else options.sources.toml.path
+        raise BuildError(f"{flag} names the place of a written prior: add --prior-mode written")
+    if options.prior_mode is PriorMode.WRITTEN and model.prior_select is not None:
+        raise BuildError(
+            f"the prior is selected by {model.prior_select.name}, so it can't be written too: leave "
+            "--prior-mode written out, or the selection"
+        )
+    per_line_codes = options.sensor_mode is SensorMode.THRESHOLD
+    try:
+        return BM1Parameters(
+            lines=model.lines,
+            sensor_bits=tuple(options.prob_bits if per_line_codes else known.bits for known in model.known),
+            prob_bits=options.prob_bits,
+            prior_bits=0 if model.prior_select is None else model.prior_select.bits,
+            prior_mode=options.prior_mode,
+            counter_bits=options.counter_bits,
+            rng=options.rng,
+            shared=options.shared,
+            steps_per_clock=options.steps_per_clock,
+            rng_banks=options.rng_banks,
+            rng_reset=options.rng_reset,
+            sensor_mode=options.sensor_mode,
+            replicas=options.replicas,
+        )
+    except ParameterError as reason:
+        raise BuildError(str(reason)) from reason
+
+
+def whole_machine(parameters: BM1Parameters, quantised: Quantised, options: BuildOptions) -> BM1Machine:
+    """Return the machine that holds all lines of a model.
+
+    Raises:
+        BuildError: The machine can't be built, such as with random numbers that its generators can't play.
+    """
+    table = options.rng_table
+    if table is None and parameters.rng is RngKind.TABLE:
+        table = random_table(parameters.prob_bits)
+    try:
+        return BM1Machine(parameters, quantised.prior, quantised.tables, table)
+    except ParameterError as reason:
+        raise BuildError(str(reason)) from reason

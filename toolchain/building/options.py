@@ -1,0 +1,145 @@
+"""The options of a build: everything but the model itself (thesis 3.2, 3.4)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import TYPE_CHECKING, Final
+
+from pydantic import ValidationError
+
+from machines.parameters import REPLICAS_MAX, PriorMode, RngKind, RngReset, SensorMode
+from toolchain.deployment import Output, Queue, Scale, Source, Stop, WrittenPrior
+from toolchain.errors import BuildError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from toolchain.building.sources_file import SourcesFile
+
+
+_FLAGS: Final = {"tolerance_s": "--tolerance", "path": "--prior-path"}
+"""Flags that are not called like the field."""
+
+
+class OnMissing(StrEnum):
+    """The meaning of an absent reading."""
+
+    ERROR = "error"
+    """An error: every frame has all readings."""
+    MISSING = "missing"
+    """A missing reading, which leaves the posterior as it is."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BuildOptions:
+    """The options of a build."""
+
+    uri: str
+    """The rosbridge server that readings come from."""
+    topic: str
+    """The topic of the readings."""
+    type: str
+    """That topic's type."""
+    output: str = "/BMresults"
+    """The topic of the posteriors."""
+    partitions: int = 1
+    """The number of boards that the lines are split over."""
+    interface: tuple[int, int] | None = None
+    """Inputs and results of the boards' registers; None for the thesis's 20 x 1200, or the model's size
+    where that is larger."""
+    scale: Scale | None = None
+    """The part of a table that is divided by its maximum before quantising; None for addresses where a column
+    shares one, else for whole columns."""
+    prob_bits: int = 8
+    """Bits of a code (W)."""
+    prior_mode: PriorMode = PriorMode.TABLE
+    """Whether the prior is the images' table, or written by the host."""
+    prior_path: str | None = None
+    """The place of a written prior in the message, one number for each line; None where it comes from elsewhere."""
+    counter_bits: int = 8
+    """Bits of a line's counter."""
+    target_count: int | None = None
+    """The count that stops a machine; None for the counters' largest."""
+    max_cycles: int = 2**17
+    """The cycles after which a machine stops anyway."""
+    stop: Stop = Stop.SLICES
+    """Whether boards stop together after slices, or each at its own overflow."""
+    rng: RngKind = RngKind.LFSR32
+    """Kind of the random number generators."""
+    rng_table: NDArray[np.uint32] | None = None
+    """uint32[length], the numbers that `rng = table` plays; None to make them."""
+    shared: bool = True
+    """One generator a column, shared by its lines; else one a cell."""
+    steps_per_clock: int = 0
+    """Steps of a generator between two cycles; 0 for as many as give fresh bits."""
+    sensor_mode: SensorMode = SensorMode.COLUMN
+    """The input of a cell: its column's reading, a reading of its own, or its code (`threshold`)."""
+    replicas: int = 1
+    """Machines on a board that share its generators."""
+    rng_banks: int = 16
+    """Sets of seeds."""
+    rng_reset: RngReset = RngReset.BANK
+    """Whether a frame restarts the generators."""
+    queue: Queue = Queue.LATEST
+    """The treatment of frames that arrive faster than they are computed."""
+    tolerance_s: float = 0.05
+    """The most seconds between readings of several topics that belong together."""
+    sources: SourcesFile | None = None
+    """Several topics and the variables of each, in place of `uri`, `topic` and `type`; or None."""
+    build_date: str = ""
+    """The date of the build, ISO 8601: part of the images' manifests, but not of their hashes."""
+
+    @property
+    def scaling(self) -> Scale:
+        """The part of a table that is divided by its maximum: `scale`, or its default."""
+        if self.scale is not None:
+            return self.scale
+        return Scale.ADDRESS if self.sensor_mode is SensorMode.COLUMN else Scale.COLUMN
+
+    @property
+    def all_sources(self) -> tuple[Source, ...]:
+        """The sources of readings, as a deployment has them."""
+        if self.sources is not None:
+            return self.sources.sources
+        return (Source(uri=self.uri, topic=self.topic, type=self.type),)
+
+    @property
+    def written_prior(self) -> WrittenPrior | None:
+        """The place that a written prior comes from, or None."""
+        if self.sources is not None:
+            return self.sources.prior
+        return None if self.prior_path is None else WrittenPrior(path=self.prior_path)
+
+
+def check_options(options: BuildOptions) -> None:
+    """Refuse wrong options, and options that exclude each other, before anything is computed.
+
+    Raises:
+        BuildError: An option is wrong; names its flag and what was expected.
+    """
+    try:
+        Output(topic=options.output), options.all_sources, options.written_prior
+    except ValidationError as reason:
+        raise refused_option(reason) from None
+    if options.sensor_mode is not SensorMode.COLUMN and options.scaling is Scale.ADDRESS:
+        raise BuildError(
+            f"--scale address does not go with --sensor-mode {options.sensor_mode}: lines look at different addresses in a "
+            "frame, so the factors of addresses would not cancel; use --scale column or none"
+        )
+    if not 1 <= options.replicas <= REPLICAS_MAX:
+        raise BuildError(f"--replicas is {options.replicas}, expected 1 to {REPLICAS_MAX}")
+
+
+def refused_option(reason: ValidationError) -> BuildError:
+    """Return pydantic's refusal of a field as an error that names the field's flag."""
+    detail = reason.errors(include_url=False)[0]
+    key = str(detail["loc"][0]) if detail["loc"] else ""
+    flag = "--output" if reason.title == "Output" else _FLAGS.get(key, "--" + key.replace("_", "-"))
+    if detail["type"] == "value_error":
+        sentence = str(detail["ctx"]["error"])
+        return BuildError(f"{flag}: {sentence}" if key else sentence)
+    return BuildError(
+        f"{flag} is {detail['input']!r}, expected {detail['msg'].removeprefix('Input should be ')}"
+    )

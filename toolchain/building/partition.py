@@ -1,0 +1,56 @@
+"""The split of a machine's lines over boards, in contiguous blocks (thesis 3.4, 4.2)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from machines.bm1 import BM1Machine
+from toolchain.errors import BuildError
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """The lines of one board: `lines` of them from `offset` on."""
+
+    offset: int
+    lines: int
+
+    @property
+    def end(self) -> int:
+        """The line after the last one."""
+        return self.offset + self.lines
+
+
+def partition_lines(lines: int, count: int) -> tuple[Block, ...]:
+    """Return the blocks of `lines` lines on `count` boards, in order; the first `lines` mod `count` are one longer.
+
+    Raises:
+        BuildError: Fewer than 1 board, or more boards than lines.
+    """
+    if not 1 <= count <= lines:
+        raise BuildError(
+            f"{lines} lines can't be split over {count} boards: expected 1 to {lines} partitions"
+        )
+    shorter, longer = divmod(lines, count)
+    return tuple(
+        Block(board * shorter + min(board, longer), shorter + (board < longer)) for board in range(count)
+    )
+
+
+def split(machine: BM1Machine, count: int) -> tuple[BM1Machine, ...]:
+    """Return the machines of the boards that a whole machine is split over.
+
+    Raises:
+        BuildError: Fewer than 1 board, or more boards than lines.
+    """
+    return tuple(
+        BM1Machine(
+            replace(machine.parameters, lines=block.lines),
+            np.ascontiguousarray(machine.prior[:, block.offset : block.end]),
+            tuple(np.ascontiguousarray(table[:, block.offset : block.end]) for table in machine.tables),
+            machine.rng_table,
+        )
+        for block in partition_lines(machine.parameters.lines, count)
+    )

@@ -1,0 +1,33 @@
+"""The hash that guards a deployment against edits.
+
+It covers everything that follows from the model and nothing that says where things run (URIs and endpoints): a deployment
+stays valid when it is pointed at another robot, and not when a rule is edited that the tables were made from.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from toolchain.deployment.deployment import Deployment, DeploymentFile
+
+
+def deployment_hash(deployment: DeploymentFile) -> str:
+    """Return the SHA-256 (hexadecimal) of all that follows from the model: all but URIs, endpoints and compression."""
+    content = deployment.model_dump(
+        mode="json",
+        exclude={
+            "hash": True,
+            "sources": {"__all__": {"uri", "compression"}},
+            "boards": {"__all__": {"endpoint"}},
+            "outputs": {"__all__": {"uri"}},
+        },
+    )
+    return hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+
+def with_hash(deployment: Deployment) -> Deployment:
+    """Return a deployment with the hash of its content."""
+    return deployment.replace(hash=deployment_hash(deployment))

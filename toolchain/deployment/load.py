@@ -1,0 +1,80 @@
+"""Reading a deployment: `deployment.toml`, its hash and its images, each mistake named with file and line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from toolchain.deployment.deployment import FILE_NAME, FORMAT, Deployment, DeploymentFile
+from toolchain.deployment.deployment_hash import deployment_hash
+from toolchain.errors import DamagedDeploymentError, DeploymentError, DeploymentVersionError
+from toolchain.files.toml_file import TomlFile
+
+
+def load_deployment(directory: Path, *, images: bool = True, edited: bool = False) -> Deployment:
+    """Read and check a deployment.
+
+    Args:
+        directory: The folder that `toolchain build` wrote.
+        images: Whether to read the boards' images too and compare their hashes; a process that drives no
+            boards may leave it out, and starts without NumPy.
+        edited: Whether `deployment.toml` may have been edited, so that its hash is not that of what it says.
+
+    Raises:
+        DeploymentError: Not there, not TOML, a wrong key or value (file, line, nearest right name).
+        DeploymentVersionError: Another format.
+        DamagedDeploymentError: `deployment.toml` or an image is not what was built; says which file and
+            which hash.
+    """
+    directory = Path(directory)
+    path = directory / FILE_NAME
+    if directory.is_file():
+        raise DeploymentError(
+            f"{directory} is a file; give the folder that 'toolchain build' wrote, here perhaps {directory.parent}"
+        )
+    if not path.is_file():
+        raise DeploymentError(
+            f"{directory} holds no deployment: {path} does not exist; make one with 'toolchain build'"
+        )
+    toml = TomlFile.read(path, DeploymentError)
+    version = toml.tables.get("format")
+    if version != FORMAT or isinstance(version, bool):
+        found = "has no key 'format'" if version is None else f"is of format {version!r}"
+        raise DeploymentVersionError(
+            f"{path} {found}, and this version reads format {FORMAT}: build it again with 'toolchain build'"
+        )
+    file = toml.validated(DeploymentFile)
+    computed = deployment_hash(file)
+    if computed != file.hash and not edited:
+        raise DamagedDeploymentError(
+            f"{path} is not as it was built: its hash is {computed[:16]}, "
+            f"but it names {file.hash[:16] or 'none'}; only URIs, endpoints and compression may be edited: "
+            "build it again with 'toolchain build', or keep the edit with 'toolchain regenerate deployment'"
+        )
+    deployment = Deployment(**dict(file), directory=directory)
+    if images:
+        _check_images(deployment)
+    return deployment
+
+
+def _check_images(deployment: Deployment) -> None:
+    # Here, not above: a subscriber loads a deployment without NumPy.
+    from pcie_shim.errors import DamagedImageError, PcieShimError
+    from pcie_shim.programming_file import read_image
+
+    for index, board in enumerate(deployment.boards):
+        path = deployment.image_path(index)
+        if not path.is_file():
+            raise DamagedDeploymentError(
+                f"{path}, the image of board {index}, does not exist: build it again with 'toolchain build'"
+            )
+        try:
+            image = read_image(path)
+        except DamagedImageError as reason:
+            raise DamagedDeploymentError(str(reason)) from reason
+        except PcieShimError as reason:
+            raise DeploymentError(str(reason)) from reason
+        if image.image_hash != board.image_hash:
+            raise DamagedDeploymentError(
+                f"{path} is another board's or another build's image: its hash is {image.image_hash[:16]}, "
+                f"{deployment.path} says {board.image_hash[:16]}"
+            )

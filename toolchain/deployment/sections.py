@@ -1,0 +1,259 @@
+"""The sections of `deployment.toml`, each checked by itself (thesis 3.3, 3.4)."""
+
+from __future__ import annotations
+
+import re
+from enum import StrEnum
+from pathlib import PurePosixPath
+from typing import Any, Final, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+
+from machines.parameters import (
+    COUNTER_BITS_MAX,
+    CYCLES_MAX,
+    REPLICAS_MAX,
+    PriorMode,
+    RngKind,
+    RngReset,
+    SensorMode,
+)
+from toolchain.deployment.fields import (
+    Choice,
+    MessagePath,
+    MessageType,
+    Name,
+    PathOrName,
+    Sha256,
+    States,
+    Step,
+    Topic,
+    WebSocketUri,
+    states_fit,
+    websocket_uri,
+)
+
+_INTERFACE: Final = re.compile(r"([1-9]\d{0,4})x([1-9]\d{0,5})")
+
+
+class Stop(StrEnum):
+    """When the boards of a partitioned machine stop."""
+
+    SLICES = "slices"
+    """All at the end of the slice in which the first one overflows."""
+    OWN = "own"
+    """Each at its own overflow, as in the thesis."""
+
+
+class Queue(StrEnum):
+    """What happens to frames that come faster than they are computed."""
+
+    LATEST = "latest"
+    """The newest wins; what was passed over is counted."""
+    ALL = "all"
+    """All are computed, in order."""
+
+
+class Scale(StrEnum):
+    """What is divided by its maximum before quantising."""
+
+    ADDRESS = "address"
+    """Every address of a column by itself: the fewest cycles."""
+    COLUMN = "column"
+    """A column's whole table."""
+    NONE = "none"
+    """Nothing: the raw probabilities."""
+
+
+class Section(BaseModel):
+    """Base of all sections: strict (`"8"` is not an integer), frozen, and without unknown keys."""
+
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", strict=True, allow_inf_nan=False, validate_by_name=True
+    )
+
+    def replace(self, **changes: Any) -> Self:
+        """Return a copy with some fields replaced, checked like a new one.
+
+        Raises:
+            ValidationError: A new value is wrong, or does not fit the other fields.
+        """
+        return type(self)(**dict(self) | changes)
+
+
+class Source(Section):
+    """`[[source]]`: a topic on a rosbridge server from which readings come."""
+
+    uri: WebSocketUri
+    topic: Topic
+    type: MessageType
+    compression: Literal["none", "cbor"] = Field(default="none", exclude_if=lambda way: way == "none")
+
+
+class Variable(Section):
+    """`[[variable]]`: a known variable, and how its readings become addresses.
+
+    Of kind `sensor` it is a column of the machine; of kind `prior_select` it chooses the row of the prior's table
+    (thesis 2.1.2), whose top row is the prior without it: what a missing reading chooses.
+    """
+
+    name: Name
+    source: int = Field(default=0, ge=0)
+    path: PathOrName = ""
+    kind: Literal["sensor", "prior_select"] = "sensor"
+    bits: int = Field(ge=1, le=16)
+    offset: float = 0.0
+    step: Step = 1.0
+    period: int | None = Field(default=None, ge=1)
+    values: int = Field(ge=1)
+    on_range: Literal["error", "clamp", "missing"] = "error"
+    on_missing: Literal["error", "missing"] = "error"
+    states: States = ()
+
+    @model_validator(mode="after")
+    def _addresses_fit(self) -> Self:
+        if self.values > 2**self.bits - 1:
+            bits = "1 bit holds" if self.bits == 1 else f"{self.bits} bits hold"
+            raise ValueError(
+                f"{self.name} serves {self.values} values, but {bits} {2**self.bits - 1} "
+                "beside the address of a missing reading"
+            )
+        states_fit(self.name, self.states, self.values)
+        return self
+
+
+class Dimension(Section):
+    """`[[searched]]`: one searched variable, a dimension of the grid of lines; the first is the slowest."""
+
+    label: Name
+    size: int = Field(ge=1)
+    offset: float = 0.0
+    step: Step = 1.0
+    states: States = ()
+
+    @model_validator(mode="after")
+    def _every_cell_has_a_name(self) -> Self:
+        states_fit(self.label, self.states, self.size)
+        return self
+
+    def value(self, index: float) -> float:
+        """Return the variable's value at an index: a cell's centre where the index is whole."""
+        return self.offset + index * self.step
+
+
+class MachineSection(Section):
+    """`[machine]`: the BM1's parameters, the registers it is reached through, and when it stops."""
+
+    type: Literal["BM1"] = "BM1"
+    lines: int = Field(ge=1)
+    interface: str = "20x1200"
+    prob_bits: int = Field(default=8, ge=1, le=16)
+    scale: Choice[Scale] = Field(default=Scale.ADDRESS, exclude_if=lambda scale: scale == Scale.ADDRESS)
+    prior_bits: int = Field(default=0, ge=0, le=16)
+    prior_mode: Choice[PriorMode] = PriorMode.TABLE
+    counter_bits: int = Field(default=8, ge=1, le=32)
+    rng: Choice[RngKind] = RngKind.LFSR32
+    rng_banks: int = Field(default=16, ge=1)
+    rng_reset: Choice[RngReset] = RngReset.BANK
+    shared: bool = True
+    steps_per_clock: int = Field(default=8, ge=1)
+    target_count: int = Field(default=255, ge=1)
+    max_cycles: int = Field(default=2**17, ge=1, le=CYCLES_MAX)
+    stop: Choice[Stop] = Stop.SLICES
+    sensor_mode: Choice[SensorMode] = Field(
+        default=SensorMode.COLUMN, exclude_if=lambda mode: mode == SensorMode.COLUMN
+    )
+    replicas: int = Field(default=1, ge=1, le=REPLICAS_MAX, exclude_if=lambda replicas: replicas == 1)
+
+    @field_validator("interface")
+    @classmethod
+    def _inputs_by_results(cls, text: str) -> str:
+        parse_interface(text)
+        return text
+
+    @model_validator(mode="after")
+    def _target_fits(self) -> Self:
+        if self.target_count > 2**self.counter_bits - 1:
+            message = (
+                f"target_count = {self.target_count} does not fit counters of {self.counter_bits} bits; "
+                f"expected 1 to {2**self.counter_bits - 1}"
+            )
+            if (enough := self.target_count.bit_length()) <= COUNTER_BITS_MAX:
+                message += f", or counters of {enough} bits (--counter-bits {enough})"
+            raise ValueError(message)
+        return self
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether it is one machine with one reading a column: readings are numbers, and a result is one posterior."""
+        return self.replicas == 1 and self.sensor_mode is SensorMode.COLUMN
+
+    @property
+    def results(self) -> int:
+        """Probabilities of a frame: one a line, for every replica."""
+        return self.replicas * self.lines
+
+    @property
+    def interface_sensors(self) -> int:
+        """Inputs that the boards' registers have room for."""
+        return parse_interface(self.interface)[0]
+
+    @property
+    def interface_results(self) -> int:
+        """Results that the boards' registers have room for."""
+        return parse_interface(self.interface)[1]
+
+
+class WrittenPrior(Section):
+    """`[prior]`: where a written prior comes from: one number for each line, of which ratios count.
+
+    Without this section a machine with `prior_mode = written` keeps the prior of its images until a host writes
+    another.
+    """
+
+    source: int = Field(default=0, ge=0)
+    path: MessagePath
+    on_missing: Literal["error", "model"] = "error"
+
+
+class Board(Section):
+    """`[[board]]`: one board of the mini-cluster, its image and its lines of the machine."""
+
+    image: str
+    image_hash: Sha256
+    line_offset: int = Field(ge=0)
+    lines: int = Field(ge=1)
+    endpoint: str = ""
+
+    @field_validator("image")
+    @classmethod
+    def _inside(cls, image: str) -> str:
+        path = PurePosixPath(image)
+        if path.is_absolute() or ".." in path.parts or not path.name:
+            raise ValueError(f"{image!r} must be a path inside the deployment's folder")
+        return image
+
+
+class Output(Section):
+    """`[[output]]`: a topic on which posteriors go out; an empty URI is that of the first source."""
+
+    topic: Topic = "/BMresults"
+    type: Literal["std_msgs/Float64MultiArray"] = "std_msgs/Float64MultiArray"
+    uri: str = ""
+
+    @field_validator("uri")
+    @classmethod
+    def _uri_or_nothing(cls, uri: str) -> str:
+        return websocket_uri(uri) if uri else uri
+
+
+def parse_interface(text: str) -> tuple[int, int]:
+    """Return inputs and results of an interface such as `20x1200` (thesis 3.2).
+
+    Raises:
+        ValueError: Not two numbers from 1 with an `x` between.
+    """
+    match = _INTERFACE.fullmatch(text)
+    if not match:
+        raise ValueError(f"{text!r} is no interface; expected inputs x results, such as '20x1200'")
+    return int(match[1]), int(match[2])

@@ -1,0 +1,76 @@
+"""The codes of numbers that a frame brings: likelihoods (`sensor_mode = threshold`) and written priors."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from machines.encode import encode_probability
+from toolchain.deployment.sections import Scale
+from toolchain.errors import ReadingError
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
+
+
+def written_codes(likelihoods: NDArray[np.float64], *, prob_bits: int, scale: Scale) -> NDArray[np.uint16]:
+    """Return the codes of likelihoods that a frame brings, one for each line (`sensor_mode = threshold`).
+
+    Args:
+        likelihoods: float64[..., lines] of one sensor: P(its reading | S = line).
+        prob_bits: Bits of a code (W), 1 to 16.
+        scale: `column`: of each row only ratios count, it is divided by its maximum; `none`: they are encoded as they
+            are, up to 1.
+
+    Returns:
+        uint16 codes of the same shape.
+
+    Raises:
+        ReadingError: One is no probability, or all of a row are 0.
+    """
+    if not np.isfinite(likelihoods).all():
+        raise ReadingError("a likelihood is not finite")
+    if (least := float(likelihoods.min())) < 0:
+        raise ReadingError(f"{least:g} is no probability")
+    largest = likelihoods.max(axis=-1, keepdims=True)
+    if scale is Scale.NONE:
+        if float(largest.max()) > 1:
+            raise ReadingError(f"{float(largest.max()):g} is no probability, expected 0 to 1 (scale = none)")
+        return encode_probability(likelihoods, prob_bits)
+    if not (largest > 0).all():
+        raise ReadingError("all lines have 0, so that none is possible")
+    return encode_probability(likelihoods / largest, prob_bits)
+
+
+def written_prior(prior: ArrayLike, *, lines: int, prob_bits: int, replicas: int = 1) -> NDArray[np.uint16]:
+    """Return a written prior's codes, uint16[lines]: of the numbers only ratios count.
+
+    Args:
+        prior: One number for each line of the machine, such as a posterior of an earlier frame. With replicas, so many
+            serve all of them, and `replicas` times as many are each one's own, one after the other.
+        lines: Lines of the machine, over all boards.
+        prob_bits: Bits of a code (W), 1 to 16.
+        replicas: Machines on a board. With several, uint16[replicas, lines] is returned.
+
+    Raises:
+        ReadingError: Another number of numbers, one that is no probability, or all of them 0.
+    """
+    try:
+        numbers = np.asarray(prior, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ReadingError("the prior to write is not an array of numbers") from None
+    if replicas > 1 and numbers.size == replicas * lines:
+        numbers = numbers.reshape(replicas, lines)
+    elif numbers.shape != (lines,):
+        message = (
+            f"the prior to write has shape {numbers.shape}, expected one number for each of {lines} lines"
+        )
+        raise ReadingError(message + (f", or for each of {replicas} replicas" if replicas > 1 else ""))
+    largest = numbers.max(axis=-1, keepdims=True)
+    if not np.all(np.isfinite(numbers)) or np.any(numbers < 0) or not np.all(largest > 0):
+        raise ReadingError(
+            "the prior to write is no distribution: it holds a negative, infinite or NaN number, or only zeros"
+        )
+    codes = encode_probability(numbers / largest, prob_bits)
+    return codes if replicas == 1 else np.broadcast_to(codes, (replicas, lines)).copy()

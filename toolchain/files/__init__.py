@@ -1,0 +1,1 @@
+"""Bounded reading of the files that users name."""

@@ -1,0 +1,57 @@
+"""Bounded reading of a file that a user names."""
+
+from __future__ import annotations
+
+import os
+import stat
+from typing import TYPE_CHECKING, BinaryIO
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from toolchain.errors import ToolchainError
+
+
+def open_regular(path: Path, error: type[ToolchainError], most: int | None = None) -> BinaryIO:
+    """Open a regular file for reading: a FIFO or a device could block for ever, or never end.
+
+    Args:
+        path: The file.
+        error: The type of the error that is raised.
+        most: The most bytes that the file may have; None for no bound.
+
+    Raises:
+        error: The file is absent, can't be read, is not a regular file, or is larger.
+    """
+    try:
+        number = os.open(path, os.O_RDONLY | os.O_NONBLOCK)  # without it, opening a FIFO waits for a writer
+    except OSError as reason:
+        raise error(f"{path} can't be read: {reason.strerror or reason}") from None
+    state = os.fstat(number)
+    if stat.S_ISREG(state.st_mode) and (most is None or state.st_size <= most):
+        return os.fdopen(number, "rb")
+    os.close(number)
+    if not stat.S_ISREG(state.st_mode):
+        raise error(f"{path} is not a regular file, and nothing else is read")
+    raise error(f"{path} has more than {most} bytes, the most that is read")
+
+
+def read_bounded(path: Path, most: int, error: type[ToolchainError]) -> bytes:
+    """Return a file's content.
+
+    Args:
+        path: The file.
+        most: The most bytes that it may have.
+        error: The type of the error that is raised.
+
+    Raises:
+        error: The file is absent, can't be read, is not a regular file, or is larger.
+    """
+    try:
+        with open_regular(path, error, most) as file:
+            data = file.read(most + 1)
+    except OSError as reason:
+        raise error(f"{path} can't be read: {reason.strerror or reason}") from None
+    if len(data) > most:  # it has grown since, or is one of /proc, which say that they are empty
+        raise error(f"{path} has more than {most} bytes, the most that is read")
+    return data

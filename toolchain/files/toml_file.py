@@ -1,0 +1,173 @@
+"""Reading of TOML files into pydantic models, each mistake with its file, line and nearest right name."""
+
+from __future__ import annotations
+
+import difflib
+import re
+import tomllib
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final, Self, TypeVar, get_args
+
+from pydantic import BaseModel, ValidationError
+
+from toolchain.files.bounded_file import read_bounded
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from pydantic_core import ErrorDetails
+
+    from toolchain.errors import ToolchainError
+
+Model = TypeVar("Model", bound=BaseModel)
+
+_MOST_BYTES: Final = 4 << 20
+"""Of a configuration file; a deployment has a few kilobytes."""
+_MOST_PARTS: Final = 32
+"""Of a dotted key; what is read here has two at most."""
+_PART: Final = r"""(?:[\w-]++|"(?:[^"\\\n]|\\.)*+"|'[^'\n]*+')"""
+_DEEP_KEY: Final = re.compile(
+    rf"(?:^|[{{,\[])[ \t]*+{_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{{_MOST_PARTS},}}+", re.MULTILINE
+)
+_HEADER: Final = re.compile(r"^\s*(\[\[?)\s*([^\[\]]+?)\s*\]\]?\s*(?:#.*)?$")
+_PLACE: Final = re.compile(r"\s*\(at (?:line (\d+), column \d+|end of document)\)$")
+_SHOWN: Final = 60
+
+
+@dataclass(frozen=True, slots=True)
+class TomlFile:
+    """A TOML file that was read."""
+
+    path: Path
+    """Where it is."""
+    error: type[ToolchainError]
+    """The type of the errors that it raises."""
+    text: str
+    """Its content, which tells the lines of mistakes."""
+    tables: dict[str, Any]
+    """Its tables, not checked yet."""
+
+    @classmethod
+    def read(cls, path: Path, error: type[ToolchainError]) -> Self:
+        """Read a file.
+
+        Raises:
+            error: The file is absent, not readable, too large, not UTF-8 or not TOML; names the line.
+        """
+        data = read_bounded(path, _MOST_BYTES, error)
+        try:
+            text = data.decode()
+        except UnicodeDecodeError as reason:
+            line = data.count(b"\n", 0, reason.start) + 1
+            raise error("not UTF-8 text", path=path, line=line) from None
+        if deep := _DEEP_KEY.search(text):  # tomllib's memory grows with the square of a key's parts
+            line = text.count("\n", 0, deep.start()) + 1
+            raise error(f"a key has more than {_MOST_PARTS} parts", path=path, line=line)
+        try:
+            return cls(path, error, text, tomllib.loads(text))
+        except (tomllib.TOMLDecodeError, RecursionError) as reason:
+            found = _PLACE.search(str(reason))
+            line = int(found[1]) if found and found[1] else text.count("\n") + 1
+            raise error(_PLACE.sub("", str(reason)), path=path, line=line) from None
+
+    def validated(self, model: type[Model]) -> Model:
+        """Return the tables as a pydantic model, by its fields' aliases.
+
+        Raises:
+            error: A key or a value is wrong; names the line and the nearest right name.
+        """
+        try:
+            return model.model_validate(self.tables, by_alias=True, by_name=False)
+        except ValidationError as reason:
+            details = reason.errors(include_url=False)
+            # an unknown key is usually the misspelling behind a missing one: report that first
+            first = min(details, key=lambda detail: detail["type"] != "extra_forbidden")
+            raise self._wrong_value(model, first) from None
+
+    def mistake(self, place: tuple[str | int, ...], sentence: str) -> ToolchainError:
+        """Return an error about a key, with its line."""
+        return self.error(sentence, path=self.path, line=self._line_of(place), place=place)
+
+    def _line_of(self, place: Sequence[str | int]) -> int | None:
+        """Return the line (from 1) of the key at a place like `("variable", 2, "bits")`, or of what holds it."""
+        table, index, key = _split(place)
+        number = -1
+        here = not table
+        found: int | None = None
+        for count, line in enumerate(self.text.splitlines(), start=1):
+            if header := _HEADER.match(line):
+                if here:
+                    return found
+                if header[2] == table:
+                    number += 1
+                    here = index is None or header[1] == "[" or number == index
+                    found = count if here else None
+            elif (here and key and re.match(rf"\s*[\"']?{re.escape(key)}[\"']?\s*=", line)) or (
+                found is None and not here and re.match(rf"\s*{re.escape(table)}\s*=", line)
+            ):
+                return count
+        return found
+
+    def _wrong_value(self, model: type[BaseModel], detail: ErrorDetails) -> ToolchainError:
+        place = detail["loc"]
+        line = self._line_of(place)
+        whole_table = line is None and len(place) == 1
+        if whole_table:
+            line = self._line_of((*place, 0)) or self._line_of((*place, ""))
+        table, index, key = _split(place)
+        section = f" in [{table}]" if table and index is None else f" in [[{table}]] {(index or 0) + 1}"
+        section = section if table else ""
+        value = repr(detail["input"])
+        value = value if len(value) <= _SHOWN else value[:_SHOWN] + "..."
+        match detail["type"]:
+            case "extra_forbidden":
+                known = _keys(_model_at(model, place[:-1]))
+                sentence = f"unknown key '{place[-1]}'{section}; {nearest_name(str(place[-1]), known)}"
+            case "missing":
+                sentence = f"the key '{place[-1]}' is missing{section}"
+            case "literal_error" | "enum":
+                expected = [word.strip("' ") for word in re.split(r",| or ", str(detail["ctx"]["expected"]))]
+                nearest = nearest_name(str(detail["input"]), expected)
+                sentence = f"{key} = {value}{section} is not a value it can have; {nearest}"
+            case "value_error":
+                subject = f"in [{key}]" if whole_table else f"{key}{section}".lstrip()
+                sentence = ": ".join(part for part in (subject, str(detail["ctx"]["error"])) if part)
+            case _:
+                sentence = f"{key or place} = {value}{section}: expected {detail['msg'].removeprefix('Input should be ')}"
+        return self.error(sentence, path=self.path, line=line, place=place)
+
+
+def _split(place: Sequence[str | int]) -> tuple[str, int | None, str]:
+    """Take a place apart into its table, the number in an array of tables, and the key."""
+    match list(place):
+        case [str(table), int(index), *rest]:
+            return table, index, str(rest[0]) if rest else ""
+        case [str(table), str(key), *_]:
+            return table, None, key
+        case [str(key)]:
+            return "", None, key
+        case _:
+            return "", None, ""
+
+
+def nearest_name(word: str, known: Sequence[str]) -> str:
+    """Return the advice after a wrong name: the nearest right one, or all that there are."""
+    close = difflib.get_close_matches(word, known, n=1, cutoff=0.5)
+    return f"did you mean '{close[0]}'?" if close else f"expected one of {', '.join(known) or 'none'}"
+
+
+def _keys(model: type[BaseModel]) -> list[str]:
+    return [str(field.validation_alias or name) for name, field in model.model_fields.items()]
+
+
+def _model_at(model: type[BaseModel], place: Sequence[str | int]) -> type[BaseModel]:
+    """Follow a place through the models' fields to the model whose keys stand there."""
+    for step in place:
+        if isinstance(step, int):
+            continue
+        for name, field in model.model_fields.items():
+            if step in (name, field.validation_alias):
+                inner = [field.annotation, *get_args(field.annotation)]
+                model = next(t for t in inner if isinstance(t, type) and issubclass(t, BaseModel))
+    return model

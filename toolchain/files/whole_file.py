@@ -1,0 +1,33 @@
+"""Writing of files whole or not at all, so that no reader finds half of one."""
+
+from __future__ import annotations
+
+from contextlib import contextmanager, suppress
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from toolchain.errors import ToolchainError
+
+
+@contextmanager
+def whole_file(path: Path, error: type[ToolchainError]) -> Iterator[Path]:
+    """Yield the path of a partial file, which takes the place of the file at the end of the block.
+
+    A partial file that was removed in the block leaves the file as it is.
+
+    Raises:
+        error: The file can't be written.
+    """
+    partial = path.with_name(path.name + ".part")
+    try:
+        yield partial
+        if partial.exists():
+            partial.replace(path)
+    except OSError as reason:
+        raise error(f"{path} can't be written: {reason.strerror or reason}") from None
+    finally:
+        with suppress(OSError):
+            partial.unlink(missing_ok=True)
