@@ -14,6 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from pcie_shim import hardware_map
+
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
@@ -21,6 +23,9 @@ ROOT: Final = Path(__file__).resolve().parent.parent
 SOURCE: Final = ROOT / "hdl" / "bm_registers.rdl"
 MODULE: Final = ROOT / "pcie_shim" / "register_map.py"
 DOCUMENT: Final = ROOT / "docs" / "registers.md"
+PACKAGE: Final = ROOT / "hdl" / "bm_register_map.vhd"
+REGISTER_BLOCK: Final = ROOT / "hdl" / "bm_register_block.vhd"
+HEADER: Final = ROOT / "hdl" / "bm_registers.h"
 
 
 @dataclass(frozen=True)
@@ -282,18 +287,30 @@ def _size(block: Block) -> str:
     return words if block.width == 32 else f"{words} of one {block.width}-bit value"
 
 
+def generated_files(register_map: RegisterMap) -> dict[Path, str]:
+    """Return the text of every file that is made from the SystemRDL file."""
+    registers = hardware_map.read_registers(SOURCE)
+    return {
+        MODULE: module_text(register_map),
+        DOCUMENT: document_text(register_map),
+        PACKAGE: hardware_map.package_text(register_map),
+        REGISTER_BLOCK: hardware_map.block_text(registers),
+        HEADER: hardware_map.header_text(SOURCE),
+    }
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Write both files, or with ``--check`` say whether they are what the SystemRDL file makes of them."""
+    """Write all files, or with ``--check`` say whether they are what the SystemRDL file makes of them."""
     parser = argparse.ArgumentParser(
         prog="scripts/registers",
-        description="Makes pcie_shim/register_map.py and docs/registers.md from hdl/bm_registers.rdl.",
+        description="Makes the constants module, the documentation, the VHDL and the C header from hdl/bm_registers.rdl.",
         epilog="example: scripts/registers --check",
     )
     parser.add_argument("--check", action="store_true", help="write nothing; exit 1 if a file is out of date")
     check = parser.parse_args(arguments).check
     register_map = read_map()
     stale = False
-    for path, text in ((MODULE, module_text(register_map)), (DOCUMENT, document_text(register_map))):
+    for path, text in generated_files(register_map).items():
         if path.is_file() and path.read_text() == text:
             continue
         if check:

@@ -126,7 +126,24 @@ def _prior(deployment: Deployment, board: int, image: Image) -> Memory:
         what = "P(S), until the host writes another"
     else:
         what = "P(S)"
+    if parameters.prior_mode is PriorMode.WRITTEN:
+        return _written_prior(prior_name(board), what, image)
     return _codes(prior_name(board), f"prior elements, {what}", image, image.machine.prior)
+
+
+def _written_prior(name: str, what: str, image: Image) -> Memory:
+    """Return what the words that the host may write hold first: a word for every line."""
+    part = image.partition
+    return Memory(
+        name=name,
+        width=image.machine.parameters.prob_bits,
+        depth=image.machine.parameters.lines,
+        words=lambda: (int(code) for code in image.machine.prior[0]),
+        comments=(
+            f"prior elements, {what}",
+            f"address = the line of the board, from line {part.line_offset} of the model on",
+        ),
+    )
 
 
 def _columns(deployment: Deployment, board: int, image: Image) -> Iterator[Memory]:

@@ -62,7 +62,7 @@ def parameters_vhd(deployment: Deployment, images: Sequence[Image]) -> str:
             _constant("COUNTER_BITS", "positive", parameters.counter_bits),
             _section("The prior"),
             _flag("PRIOR_WRITTEN", parameters.prior_mode is PriorMode.WRITTEN, "the host writes it"),
-            _generators(parameters),
+            _generators(image),
             _seeds(image),
             _section("When a machine stops, until the host writes other values"),
             _constant("TARGET_COUNT", _vector(32), _hexadecimal(deployment.machine.target_count, 32)),
@@ -143,7 +143,8 @@ def _sensor_widths(deployment: Deployment, parameters: BM1Parameters) -> str:
     return title + _array("SENSOR_BITS", "natural_array_t", rows, f"1 to {parameters.sensors}")
 
 
-def _generators(parameters: BM1Parameters) -> str:
+def _generators(image: Image) -> str:
+    parameters, table = image.machine.parameters, image.machine.rng_table
     exponents = POLYNOMIALS.get(parameters.rng)
     text = _section("The random number generators") + _constant(
         "RNG_KIND", "rng_kind_t", f"RNG_{parameters.rng.upper()}"
@@ -153,8 +154,14 @@ def _generators(parameters: BM1Parameters) -> str:
         polynomial = " + ".join(f"x^{exponent}" for exponent in exponents) + " + 1"
         text += _constant("RNG_BITS", "positive", exponents[0], "of a generator's state")
         text += _constant("RNG_TAPS", _vector(exponents[0]), _hexadecimal(taps, exponents[0]), polynomial)
+    else:
+        width = seed_width(image.machine)
+        text += _constant("RNG_BITS", "positive", width, "of a generator's state: a place in the table")
+        text += _constant("RNG_TAPS", _vector(width), _hexadecimal(0, width), "no LFSR")
+    length = 1 if table is None else table.size
     return (
         text
+        + _constant("RNG_TABLE_LENGTH", "positive", length, "numbers in the table" if table is not None else "no table")
         + _flag("RNG_SHARED", parameters.shared, "one a column, shared by its lines; else one a cell")
         + _constant("STEPS_PER_CLOCK", "positive", parameters.steps_per_clock)
         + _flag("RNG_RESET_BANK", parameters.rng_reset is RngReset.BANK, "a frame restarts the generators")

@@ -1,0 +1,151 @@
+-- ================================================================================================
+-- rosbayes: bm1_generators
+-- All random number generators of a board, and the chain that loads a bank of seeds into them.
+-- MIT licence; datasheet: docs/hardware/bm1_generators.md
+-- ================================================================================================
+library ieee;
+  use ieee.std_logic_1164.all;
+  use ieee.numeric_std.all;
+
+library work;
+  use work.bm1_parameters.all;
+  use work.bm1_utilities.all;
+
+entity bm1_generators is
+  generic (
+    GENERATORS   : positive;         -- how many: one a column, or one a cell
+    KIND         : rng_kind_t;       -- LFSR or table
+    STATE_BITS   : positive;         -- width of a state
+    TAPS         : std_logic_vector; -- of an LFSR; STATE_BITS wide
+    STEPS        : positive;         -- steps in a clock
+    BANKS        : positive;         -- sets of seeds
+    PROB_BITS    : positive;         -- width of a number
+    SEED_FILE    : string;           -- MIF of the seeds: bank by bank, generator by generator
+    TABLE_FILE   : string;           -- MIF of the random numbers, where a table is played
+    TABLE_LENGTH : positive          -- how many these are
+  );
+  port (
+    clk_i     : in    std_logic;                                              -- clock
+    rst_i     : in    std_logic;                                              -- load bank 0
+    restart_i : in    std_logic;                                              -- load the bank
+    bank_i    : in    std_logic_vector(bits_for(BANKS) - 1 downto 0);         -- number of the bank
+    step_i    : in    std_logic;                                              -- a cycle is run
+    ready_o   : out   std_logic;                                              -- all seeds are loaded
+    randoms_o : out   std_logic_vector(GENERATORS * PROB_BITS - 1 downto 0);  -- numbers, generator 0 lowest
+    states_o  : out   std_logic_vector(GENERATORS * STATE_BITS - 1 downto 0)  -- states, generator 0 lowest
+  );
+end entity bm1_generators;
+
+architecture rtl of bm1_generators is
+
+  constant SEEDS        : positive := BANKS * GENERATORS;
+  constant ADDRESS_BITS : positive := bits_for(SEEDS);
+  constant INDEX_BITS   : positive := bits_for(GENERATORS + 1);
+
+  -- seeds(0) is what the memory shows, seeds(g + 1) the state of generator g
+  signal chain     : std_logic_vector((GENERATORS + 1) * STATE_BITS - 1 downto 0);
+  signal address   : unsigned(ADDRESS_BITS - 1 downto 0)                     := (others => '0');
+  signal remaining : unsigned(INDEX_BITS - 1 downto 0)                       := (others => '0');
+  signal reading   : std_logic;
+  signal shift     : std_logic                                               := '0';
+  signal ready     : std_logic                                               := '0';
+
+begin
+
+  -- The seeds go in at generator 0 and are shifted on, so the last generator's is read first.
+  load_seeds : process (clk_i) is
+
+    variable bank : natural range 0 to 2 ** bits_for(BANKS) - 1;
+
+  begin
+
+    if rising_edge(clk_i) then
+      shift <= reading;
+      if (rst_i = '1' or restart_i = '1') then
+        bank      := 0;
+        if (rst_i = '0') then
+          bank := to_integer(unsigned(bank_i));
+        end if;
+        address   <= to_unsigned((bank mod BANKS) * GENERATORS + GENERATORS - 1, ADDRESS_BITS);
+        remaining <= to_unsigned(GENERATORS, INDEX_BITS);
+        shift     <= '0';
+        ready     <= '0';
+      elsif (reading = '1') then
+        remaining <= remaining - 1;
+        -- the last address may be 0: it must not wrap below the memory's first word
+        if (remaining /= 1) then
+          address <= address - 1;
+        end if;
+      else
+        ready <= '1';
+      end if;
+    end if;
+
+  end process load_seeds;
+
+  reading <= '1' when remaining /= 0 else
+             '0';
+  ready_o <= ready;
+
+  seeds_memory : component bm1_table
+    generic map (
+      FILE_NAME    => SEED_FILE,
+      WORD_BITS    => STATE_BITS,
+      DEPTH        => SEEDS,
+      ADDRESS_BITS => ADDRESS_BITS,
+      FIRST_BIT    => 0,
+      DATA_BITS    => STATE_BITS
+    )
+    port map (
+      clk_i     => clk_i,
+      enable_i  => reading,
+      address_i => std_logic_vector(address),
+      data_o    => chain(STATE_BITS - 1 downto 0)
+    );
+
+  each_generator : for g in 0 to GENERATORS - 1 generate
+
+    kind_of_generator : if KIND = RNG_TABLE generate
+
+      generator : entity work.bm1_table_player
+        generic map (
+          STATE_BITS => STATE_BITS,
+          PROB_BITS  => PROB_BITS,
+          TABLE_FILE => TABLE_FILE,
+          LENGTH     => TABLE_LENGTH,
+          STEPS      => STEPS
+        )
+        port map (
+          clk_i    => clk_i,
+          shift_i  => shift,
+          seed_i   => chain((g + 1) * STATE_BITS - 1 downto g * STATE_BITS),
+          step_i   => step_i,
+          state_o  => chain((g + 2) * STATE_BITS - 1 downto (g + 1) * STATE_BITS),
+          random_o => randoms_o((g + 1) * PROB_BITS - 1 downto g * PROB_BITS)
+        );
+
+    else generate
+
+      generator : entity work.bm1_lfsr
+        generic map (
+          STATE_BITS => STATE_BITS,
+          TAPS       => TAPS,
+          STEPS      => STEPS
+        )
+        port map (
+          clk_i   => clk_i,
+          shift_i => shift,
+          seed_i  => chain((g + 1) * STATE_BITS - 1 downto g * STATE_BITS),
+          step_i  => step_i,
+          state_o => chain((g + 2) * STATE_BITS - 1 downto (g + 1) * STATE_BITS)
+        );
+
+      randoms_o((g + 1) * PROB_BITS - 1 downto g * PROB_BITS) <=
+        chain((g + 1) * STATE_BITS + PROB_BITS - 1 downto (g + 1) * STATE_BITS);
+    end generate kind_of_generator;
+
+  end generate each_generator;
+
+  states_o <= chain((GENERATORS + 1) * STATE_BITS - 1 downto STATE_BITS);
+
+end architecture rtl;

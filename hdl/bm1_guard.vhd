@@ -1,0 +1,213 @@
+-- ================================================================================================
+-- rosbayes: bm1_guard
+-- Decides whether an access is allowed, and why not: address, state of the board, and value.
+-- MIT licence; datasheet: docs/hardware/bm1_guard.md
+-- ================================================================================================
+library ieee;
+  use ieee.std_logic_1164.all;
+  use ieee.numeric_std.all;
+
+library work;
+  use work.bm_register_map.all;
+
+entity bm1_guard is
+  generic (
+    REPLICAS           : positive; -- machines around the same generators
+    COUNTER_BITS       : positive; -- width of a counter
+    PRIOR_BITS         : natural;  -- width of the prior's address
+    BANKS              : positive; -- sets of seeds
+    SENSORS_DEPTH      : natural;  -- words of SENSORS that exist
+    INPUTS_DEPTH       : natural;  -- words of INPUTS that exist
+    PRIOR_SELECTS_DEPTH : natural; -- words of PRIOR_SELECTS that exist
+    OUTCOMES_DEPTH     : natural;  -- words of OUTCOMES that exist
+    RESULTS_DEPTH      : natural;  -- words of RESULTS that exist
+    PRIOR_CODES_DEPTH  : natural   -- words of PRIOR_CODES that exist
+  );
+  port (
+    -- access
+    write_i      : in    std_logic;                                       -- it writes; else it reads
+    address_i    : in    std_logic_vector(BAR_ADDRESS_BITS - 1 downto 0); -- in bytes
+    strobe_i     : in    std_logic_vector(3 downto 0);                    -- bytes that are written
+    data_i       : in    std_logic_vector(31 downto 0);                   -- data to write
+    -- state
+    running_i    : in    std_logic;                                       -- the machine runs
+    can_resume_i : in    std_logic;                                       -- it stands at the end of a slice
+    ready_i      : in    std_logic_vector(REPLICAS - 1 downto 0);         -- replicas that can be resumed
+    done_i       : in    std_logic_vector(31 downto 0);                   -- number of the last start or resume that has stopped
+    cycles_i     : in    std_logic_vector(63 downto 0);                   -- cycles of the frame
+    -- settings
+    target_i     : in    std_logic_vector(31 downto 0);                   -- target count
+    max_cycles_i : in    std_logic_vector(63 downto 0);                   -- most cycles
+    run_until_i  : in    std_logic_vector(63 downto 0);                   -- end of the slice
+    bank_i       : in    std_logic_vector(31 downto 0);                   -- set of seeds
+    prior_i      : in    std_logic_vector(31 downto 0);                   -- prior select of a single machine
+    halt_i       : in    std_logic_vector(255 downto 0);                  -- replicas to halt
+    bad_input_i  : in    std_logic;                                       -- an input word is too large
+    -- verdict
+    error_o      : out   std_logic_vector(7 downto 0);                    -- why it is refused; 0: it is not
+    ring_o       : out   std_logic                                        -- it is a doorbell that rings
+  );
+end entity bm1_guard;
+
+architecture rtl of bm1_guard is
+
+  type access_t is (ABSENT, READABLE, WRITABLE);
+
+  -- Whether an address lies in the first words of a block.
+
+  function is_in (
+    address : unsigned;
+    first   : natural;
+    words   : natural
+  ) return boolean is
+  begin
+
+    return address >= first and address < first + 4 * words;
+
+  end function is_in;
+
+  signal kind    : access_t;
+  signal due     : unsigned(31 downto 0);
+  signal doorbell_error : natural range 0 to 255;
+  signal start_is_bad   : std_logic;
+  signal resume_is_bad  : std_logic;
+  signal is_start  : std_logic;
+  signal is_resume : std_logic;
+
+begin
+
+  find_block : process (all) is
+
+    variable address : unsigned(BAR_ADDRESS_BITS - 1 downto 0);
+
+  begin
+
+    address := unsigned(address_i);
+    kind    <= ABSENT;
+
+    for block_number in BLOCKS'range loop
+      if (not BLOCKS(block_number).memory
+          and is_in(address, BLOCKS(block_number).address, BLOCKS(block_number).words)) then
+        if (BLOCKS(block_number).writable) then
+          kind <= WRITABLE;
+        else
+          kind <= READABLE;
+        end if;
+      end if;
+    end loop;
+
+    if (is_in(address, SENSORS_ADDRESS, SENSORS_DEPTH)
+        or is_in(address, INPUTS_ADDRESS, INPUTS_DEPTH)
+        or is_in(address, PRIOR_SELECTS_ADDRESS, PRIOR_SELECTS_DEPTH)
+        or is_in(address, PRIOR_CODES_ADDRESS, PRIOR_CODES_DEPTH)) then
+      kind <= WRITABLE;
+    end if;
+
+    if (is_in(address, OUTCOMES_ADDRESS, OUTCOMES_DEPTH) or is_in(address, RESULTS_ADDRESS, RESULTS_DEPTH)) then
+      kind <= READABLE;
+    end if;
+
+  end process find_block;
+
+  is_start  <= '1' when write_i = '1' and unsigned(address_i) = START_ADDRESS and unsigned(data_i) /= 0 else
+               '0';
+  is_resume <= '1' when write_i = '1' and unsigned(address_i) = RESUME_ADDRESS and unsigned(data_i) /= 0 else
+               '0';
+
+  -- numbers go round from 2^32 - 1 to 1
+  due <= to_unsigned(1, 32) when (and done_i) = '1' else
+         unsigned(done_i) + 1;
+
+  check_start : process (all) is
+  begin
+
+    start_is_bad <= bad_input_i or max_cycles_i(63);
+
+    if (unsigned(target_i) = 0 or unsigned(max_cycles_i) = 0 or unsigned(bank_i) >= BANKS) then
+      start_is_bad <= '1';
+    end if;
+
+    for bit_number in COUNTER_BITS to 31 loop
+      if (target_i(bit_number) = '1') then
+        start_is_bad <= '1';
+      end if;
+    end loop;
+
+    if (REPLICAS = 1 and (or prior_i(31 downto PRIOR_BITS)) = '1') then
+      start_is_bad <= '1';
+    end if;
+
+  end process check_start;
+
+  check_resume : process (all) is
+  begin
+
+    resume_is_bad <= '0';
+
+    if (unsigned(run_until_i) /= 0 and unsigned(run_until_i) <= unsigned(cycles_i)) then
+      resume_is_bad <= '1';
+    end if;
+
+    if (REPLICAS > 1) then
+      if ((or (ready_i and not halt_i(REPLICAS - 1 downto 0))) = '0') then
+        resume_is_bad <= '1';
+      end if;
+      for replica in REPLICAS to 255 loop
+        if (halt_i(replica) = '1') then
+          resume_is_bad <= '1';
+        end if;
+      end loop;
+    end if;
+
+  end process check_resume;
+
+  check_doorbell : process (all) is
+  begin
+
+    doorbell_error <= ERROR_CODE_NONE;
+
+    if (unsigned(data_i) /= due) then
+      doorbell_error <= ERROR_CODE_DOORBELL;
+    elsif (run_until_i(63) = '1') then
+      doorbell_error <= ERROR_CODE_BAD_VALUE;
+    elsif (is_resume = '1' and can_resume_i = '0') then
+      doorbell_error <= ERROR_CODE_DOORBELL;
+    elsif ((is_resume = '1' and resume_is_bad = '1') or (is_start = '1' and start_is_bad = '1')) then
+      doorbell_error <= ERROR_CODE_BAD_VALUE;
+    end if;
+
+  end process check_doorbell;
+
+  judge : process (all) is
+
+    variable code : natural range 0 to 255;
+
+  begin
+
+    code := ERROR_CODE_NONE;
+
+    if (address_i(1 downto 0) /= "00" or (write_i = '1' and strobe_i /= "1111")) then
+      code := ERROR_CODE_MISALIGNED;
+    elsif (kind = ABSENT) then
+      code := ERROR_CODE_OUTSIDE;
+    elsif (write_i = '1') then
+      if (kind /= WRITABLE) then
+        code := ERROR_CODE_READ_ONLY;
+      elsif (running_i = '1'
+             and not (unsigned(address_i) = CONTROL_ADDRESS and data_i(CONTROL_RESET_LOW) = '1')) then
+        code := ERROR_CODE_BUSY;
+      elsif (is_start = '1' or is_resume = '1') then
+        code := doorbell_error;
+      end if;
+    end if;
+
+    error_o <= std_logic_vector(to_unsigned(code, 8));
+    ring_o  <= '0';
+
+    if (code = ERROR_CODE_NONE) then
+      ring_o <= is_start or is_resume;
+    end if;
+
+  end process judge;
+
+end architecture rtl;

@@ -1,0 +1,52 @@
+-- ================================================================================================
+-- rosbayes: bm1_lfsr
+-- Random number generator: a Fibonacci LFSR that makes several steps in a clock.
+-- MIT licence; datasheet: docs/hardware/bm1_lfsr.md
+-- ================================================================================================
+library ieee;
+  use ieee.std_logic_1164.all;
+
+entity bm1_lfsr is
+  generic (
+    STATE_BITS : positive;         -- width of the register
+    TAPS       : std_logic_vector; -- mask of the bits whose parity comes in; STATE_BITS wide
+    STEPS      : positive          -- steps in a clock
+  );
+  port (
+    clk_i   : in    std_logic;                                 -- clock
+    shift_i : in    std_logic;                                 -- take the seed
+    seed_i  : in    std_logic_vector(STATE_BITS - 1 downto 0); -- next seed of the chain
+    step_i  : in    std_logic;                                 -- make the steps of a cycle
+    state_o : out   std_logic_vector(STATE_BITS - 1 downto 0)  -- state, whose low bits are the number
+  );
+end entity bm1_lfsr;
+
+architecture rtl of bm1_lfsr is
+
+  signal state : std_logic_vector(STATE_BITS - 1 downto 0) := (others => '0');
+
+begin
+
+  generate_numbers : process (clk_i) is
+
+    variable following : std_logic_vector(STATE_BITS - 1 downto 0);
+
+  begin
+
+    if rising_edge(clk_i) then
+      if (shift_i = '1') then
+        state <= seed_i;
+      elsif (step_i = '1') then
+        following := state;
+        for step in 1 to STEPS loop
+          following := following(STATE_BITS - 2 downto 0) & (xor (following and TAPS));
+        end loop;
+        state <= following;
+      end if;
+    end if;
+
+  end process generate_numbers;
+
+  state_o <= state;
+
+end architecture rtl;

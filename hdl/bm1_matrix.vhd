@@ -1,0 +1,195 @@
+-- ================================================================================================
+-- rosbayes: bm1_matrix
+-- Lines and columns of one machine: prior elements, tile elements and counters (thesis, figure 2.4).
+-- MIT licence; datasheet: docs/hardware/bm1_matrix.md
+-- ================================================================================================
+library ieee;
+  use ieee.std_logic_1164.all;
+
+library work;
+  use work.bm1_parameters.all;
+  use work.bm1_utilities.all;
+
+entity bm1_matrix is
+  generic (
+    LINES         : positive;        -- lines of this board
+    SENSORS       : natural;         -- sensor columns
+    MODE          : sensor_mode_t;   -- what the cells of a sensor column are given
+    ADDRESS_BITS  : natural_array_t; -- of each sensor column, 1 to SENSORS
+    PROB_BITS     : positive;        -- width of a code
+    PRIOR_BITS    : natural;         -- width of the prior's address
+    WRITTEN       : boolean;         -- the host writes the prior
+    COUNTER_BITS  : positive;        -- width of a counter
+    RNG_SHARED        : boolean;         -- one random number a column; else one a cell
+    MEMORY_PREFIX : string           -- path and board of the MIFs
+  );
+  port (
+    clk_i         : in    std_logic; -- clock
+    -- control
+    load_i        : in    std_logic;                                           -- take the frame's codes
+    clear_i       : in    std_logic;                                           -- clear the counters
+    enable_i      : in    std_logic;                                           -- run a cycle
+    target_i      : in    std_logic_vector(COUNTER_BITS - 1 downto 0);         -- target count
+    overflow_o    : out   std_logic;                                           -- a counter is at the target
+    impossible_o  : out   std_logic;                                           -- every line has a code 0
+    -- inputs of the frame
+    prior_i       : in    std_logic_vector(SLOT_BITS - 1 downto 0);            -- address of the prior
+    prior_codes_i : in    std_logic_vector(LINES * SLOT_BITS - 1 downto 0);    -- written prior, line 0 lowest
+    inputs_i      : in    std_logic_vector(SENSORS * inputs_per_column(MODE, LINES) * SLOT_BITS - 1 downto 0); -- column by column
+    -- random numbers
+    randoms_i     : in    std_logic_vector(
+      (SENSORS + 1) * (LINES + to_natural(RNG_SHARED) * (1 - LINES)) * PROB_BITS - 1 downto 0); -- generator 0 lowest
+    -- results
+    counts_o      : out   std_logic_vector(LINES * COUNTER_BITS - 1 downto 0)  -- counters, line 0 lowest
+  );
+end entity bm1_matrix;
+
+architecture rtl of bm1_matrix is
+
+  constant COLUMNS    : positive := SENSORS + 1;
+  constant PER_COLUMN : positive := inputs_per_column(MODE, LINES);
+
+  signal prior_row   : std_logic_vector(LINES * PROB_BITS - 1 downto 0);
+  signal column_rows : std_logic_vector(COLUMNS * LINES * PROB_BITS - 1 downto 0);
+  signal never       : std_logic_vector(LINES - 1 downto 0);
+  signal full        : std_logic_vector(LINES - 1 downto 0);
+
+begin
+
+  prior_table : if not WRITTEN generate
+
+    prior_probabilities : component bm1_table
+      generic map (
+        FILE_NAME    => MEMORY_PREFIX & "prior.mif",
+        WORD_BITS    => LINES * PROB_BITS,
+        DEPTH        => 2 ** PRIOR_BITS,
+        ADDRESS_BITS => PRIOR_BITS + to_natural(PRIOR_BITS = 0),
+        FIRST_BIT    => 0,
+        DATA_BITS    => LINES * PROB_BITS
+      )
+      port map (
+        clk_i     => clk_i,
+        enable_i  => load_i,
+        address_i => prior_i(PRIOR_BITS + to_natural(PRIOR_BITS = 0) - 1 downto 0),
+        data_o    => prior_row
+      );
+
+  end generate prior_table;
+
+  column_tables : if MODE = SENSOR_COLUMN generate
+
+    each_column : for c in 1 to SENSORS generate
+
+      probabilities : component bm1_table
+        generic map (
+          FILE_NAME    => MEMORY_PREFIX & "column" & padded(c, SENSORS) & ".mif",
+          WORD_BITS    => LINES * PROB_BITS,
+          DEPTH        => 2 ** ADDRESS_BITS(c),
+          ADDRESS_BITS => ADDRESS_BITS(c),
+          FIRST_BIT    => 0,
+          DATA_BITS    => LINES * PROB_BITS
+        )
+        port map (
+          clk_i     => clk_i,
+          enable_i  => load_i,
+          address_i => inputs_i((c - 1) * SLOT_BITS + ADDRESS_BITS(c) - 1 downto (c - 1) * SLOT_BITS),
+          data_o    => column_rows((c + 1) * LINES * PROB_BITS - 1 downto c * LINES * PROB_BITS)
+        );
+
+    end generate each_column;
+
+  end generate column_tables;
+
+  each_line : for l in 0 to LINES - 1 generate
+
+    signal bits       : std_logic_vector(COLUMNS - 1 downto 0);
+    signal nevers     : std_logic_vector(COLUMNS - 1 downto 0);
+    signal prior_code : std_logic_vector(PROB_BITS - 1 downto 0);
+
+    -- number of the generator that this line's first cell sees
+    constant FIRST : natural := l * COLUMNS * to_natural(not RNG_SHARED);
+
+  begin
+
+    prior_source : if WRITTEN generate
+      prior_code <= prior_codes_i(l * SLOT_BITS + PROB_BITS - 1 downto l * SLOT_BITS);
+    else generate
+      prior_code <= prior_row((l + 1) * PROB_BITS - 1 downto l * PROB_BITS);
+    end generate prior_source;
+
+    prior : entity work.bm1_prior_element
+      generic map (
+        PROB_BITS => PROB_BITS,
+        WRITTEN   => WRITTEN
+      )
+      port map (
+        clk_i    => clk_i,
+        load_i   => load_i,
+        code_i   => prior_code,
+        random_i => randoms_i((FIRST + 1) * PROB_BITS - 1 downto FIRST * PROB_BITS),
+        bit_o    => bits(0),
+        never_o  => nevers(0)
+      );
+
+    each_tile : for c in 1 to SENSORS generate
+
+      signal given : std_logic_vector(SLOT_BITS - 1 downto 0);
+
+      constant INPUT : natural := (c - 1) * PER_COLUMN + l * to_natural(MODE /= SENSOR_COLUMN);
+
+    begin
+
+      given_source : if MODE = SENSOR_COLUMN generate
+        given(PROB_BITS - 1 downto 0) <= column_rows((c * LINES + l + 1) * PROB_BITS - 1 downto (c * LINES + l) * PROB_BITS);
+
+        unused_bits : if PROB_BITS < SLOT_BITS generate
+          given(SLOT_BITS - 1 downto PROB_BITS) <= (others => '0');
+        end generate unused_bits;
+
+      else generate
+        given <= inputs_i((INPUT + 1) * SLOT_BITS - 1 downto INPUT * SLOT_BITS);
+      end generate given_source;
+
+      tile : entity work.bm1_tile_element
+        generic map (
+          PROB_BITS    => PROB_BITS,
+          MODE         => MODE,
+          ADDRESS_BITS => ADDRESS_BITS(c),
+          TABLE_FILE   => MEMORY_PREFIX & "column" & padded(c, SENSORS) & ".mif",
+          LINES        => LINES,
+          LINE         => l
+        )
+        port map (
+          clk_i    => clk_i,
+          load_i   => load_i,
+          given_i  => given,
+          random_i => randoms_i((FIRST + c + 1) * PROB_BITS - 1 downto (FIRST + c) * PROB_BITS),
+          bit_i    => bits(c - 1),
+          never_i  => nevers(c - 1),
+          bit_o    => bits(c),
+          never_o  => nevers(c)
+        );
+
+    end generate each_tile;
+
+    counter : entity work.bm1_counter
+      generic map (
+        COUNTER_BITS => COUNTER_BITS
+      )
+      port map (
+        clk_i    => clk_i,
+        clear_i  => clear_i,
+        enable_i => enable_i,
+        bit_i    => bits(COLUMNS - 1),
+        target_i => target_i,
+        count_o  => counts_o((l + 1) * COUNTER_BITS - 1 downto l * COUNTER_BITS),
+        full_o   => full(l)
+      );
+
+    never(l) <= nevers(COLUMNS - 1);
+  end generate each_line;
+
+  overflow_o   <= or full;
+  impossible_o <= and never;
+
+end architecture rtl;

@@ -1,0 +1,27 @@
+-- ================================================================================================
+-- rosbayes: bm1_table
+-- Read-only memory whose contents come from a MIF; one clock from address to data.
+-- MIT licence; datasheet: docs/hardware/bm1_table.md
+-- ================================================================================================
+library ieee;
+  use ieee.std_logic_1164.all;
+
+-- The architecture is chosen by the file that is compiled with this one:
+-- simulation/bm1_table_textio.vhd or synthesis/bm1_table_block.vhd.
+
+entity bm1_table is
+  generic (
+    FILE_NAME    : string;   -- MIF
+    WORD_BITS    : positive; -- width of the MIF's words
+    DEPTH        : positive; -- number of words
+    ADDRESS_BITS : positive; -- width of the address
+    FIRST_BIT    : natural;  -- lowest bit of a word that is read
+    DATA_BITS    : positive  -- number of bits that are read
+  );
+  port (
+    clk_i     : in    std_logic;                                   -- clock
+    enable_i  : in    std_logic;                                   -- read; else the data stay
+    address_i : in    std_logic_vector(ADDRESS_BITS - 1 downto 0); -- must be less than DEPTH
+    data_o    : out   std_logic_vector(DATA_BITS - 1 downto 0)     -- part of the word, a clock later
+  );
+end entity bm1_table;

@@ -1,0 +1,93 @@
+-- ================================================================================================
+-- rosbayes: bm1_table_player
+-- Random number generator: plays a table of recorded random numbers in a ring.
+-- MIT licence; datasheet: docs/hardware/bm1_table_player.md
+-- ================================================================================================
+library ieee;
+  use ieee.std_logic_1164.all;
+  use ieee.numeric_std.all;
+
+library work;
+  use work.bm1_utilities.all;
+
+entity bm1_table_player is
+  generic (
+    STATE_BITS : positive; -- width of the place in the table
+    PROB_BITS  : positive; -- width of a number
+    TABLE_FILE : string;   -- MIF of the numbers
+    LENGTH     : positive; -- how many there are
+    STEPS      : positive  -- places in a clock
+  );
+  port (
+    clk_i    : in    std_logic;                                 -- clock
+    shift_i  : in    std_logic;                                 -- take the seed
+    seed_i   : in    std_logic_vector(STATE_BITS - 1 downto 0); -- next seed of the chain
+    step_i   : in    std_logic;                                 -- make the steps of a cycle
+    state_o  : out   std_logic_vector(STATE_BITS - 1 downto 0); -- place in the table
+    random_o : out   std_logic_vector(PROB_BITS - 1 downto 0)   -- number at that place
+  );
+end entity bm1_table_player;
+
+architecture rtl of bm1_table_player is
+
+  constant STRIDE : natural := STEPS mod LENGTH;
+
+  signal place     : unsigned(STATE_BITS - 1 downto 0) := (others => '0');
+  signal following : unsigned(STATE_BITS - 1 downto 0);
+  signal enable    : std_logic;
+
+begin
+
+  choose_next : process (all) is
+
+    variable sum : unsigned(STATE_BITS downto 0);
+
+  begin
+
+    sum := resize(place, STATE_BITS + 1) + STRIDE;
+
+    if (sum >= LENGTH) then
+      sum := sum - LENGTH;
+    end if;
+
+    if (shift_i = '1') then
+      following <= unsigned(seed_i);
+    else
+      following <= sum(STATE_BITS - 1 downto 0);
+    end if;
+
+  end process choose_next;
+
+  enable <= shift_i or step_i;
+
+  hold_place : process (clk_i) is
+  begin
+
+    if rising_edge(clk_i) then
+      if (enable = '1') then
+        place <= following;
+      end if;
+    end if;
+
+  end process hold_place;
+
+  -- The memory is read at the next place, so that its output always belongs to this one.
+  numbers : component bm1_table
+    generic map (
+      FILE_NAME    => TABLE_FILE,
+      WORD_BITS    => PROB_BITS,
+      DEPTH        => LENGTH,
+      ADDRESS_BITS => STATE_BITS,
+      FIRST_BIT    => 0,
+      DATA_BITS    => PROB_BITS
+    )
+    port map (
+      clk_i     => clk_i,
+      enable_i  => enable,
+      address_i => std_logic_vector(following),
+      data_o    => random_o
+    );
+
+  state_o <= std_logic_vector(place);
+
+end architecture rtl;

@@ -1,0 +1,95 @@
+-- ================================================================================================
+-- rosbayes: bm1_tile_element
+-- Cell of a sensor column: multiplies the line's bitstream by that of P(K | S) (thesis, figure 2.2).
+-- MIT licence; datasheet: docs/hardware/bm1_tile_element.md
+-- ================================================================================================
+library ieee;
+  use ieee.std_logic_1164.all;
+
+library work;
+  use work.bm1_parameters.all;
+  use work.bm1_utilities.all;
+
+entity bm1_tile_element is
+  generic (
+    PROB_BITS    : positive;      -- width of a code
+    MODE         : sensor_mode_t; -- what the cell is given
+    ADDRESS_BITS : positive;      -- of the table; SENSOR_CELL
+    TABLE_FILE   : string;        -- MIF of the column; SENSOR_CELL
+    LINES        : positive;      -- lines in the MIF's words; SENSOR_CELL
+    LINE         : natural        -- the cell's line; SENSOR_CELL
+  );
+  port (
+    clk_i    : in    std_logic;                                -- clock
+    load_i   : in    std_logic;                                -- a frame starts: take the cell's input
+    given_i  : in    std_logic_vector(SLOT_BITS - 1 downto 0); -- code of the column's table, address, or code
+    random_i : in    std_logic_vector(PROB_BITS - 1 downto 0); -- random number of the column or cell
+    bit_i    : in    std_logic;                                -- bitstream of the cells to the left
+    never_i  : in    std_logic;                                -- one of their codes is 0
+    bit_o    : out   std_logic;                                -- bitstream of the product
+    never_o  : out   std_logic                                 -- one of the codes so far is 0
+  );
+end entity bm1_tile_element;
+
+architecture rtl of bm1_tile_element is
+
+  signal code  : std_logic_vector(PROB_BITS - 1 downto 0);
+  signal one   : std_logic;
+  signal never : std_logic;
+
+begin
+
+  source : case MODE generate
+
+    when SENSOR_COLUMN =>
+      -- The tables of a column see the same address: they lie side by side in one memory outside.
+      code <= given_i(PROB_BITS - 1 downto 0);
+
+    when SENSOR_CELL =>
+
+      probabilities : component bm1_table
+        generic map (
+          FILE_NAME    => TABLE_FILE,
+          WORD_BITS    => LINES * PROB_BITS,
+          DEPTH        => 2 ** ADDRESS_BITS,
+          ADDRESS_BITS => ADDRESS_BITS,
+          FIRST_BIT    => LINE * PROB_BITS,
+          DATA_BITS    => PROB_BITS
+        )
+        port map (
+          clk_i     => clk_i,
+          enable_i  => load_i,
+          address_i => given_i(ADDRESS_BITS - 1 downto 0),
+          data_o    => code
+        );
+
+    when SENSOR_THRESHOLD =>
+
+      hold_code : process (clk_i) is
+      begin
+
+        if rising_edge(clk_i) then
+          if (load_i = '1') then
+            code <= given_i(PROB_BITS - 1 downto 0);
+          end if;
+        end if;
+
+      end process hold_code;
+
+  end generate source;
+
+  generator : entity work.bm1_stochastic_bitstream_generator
+    generic map (
+      PROB_BITS => PROB_BITS
+    )
+    port map (
+      random_i => random_i,
+      code_i   => code,
+      bit_o    => one,
+      never_o  => never
+    );
+
+  bit_o   <= bit_i and one;
+  never_o <= never_i or never;
+
+end architecture rtl;

@@ -1,0 +1,129 @@
+"""Everything that the hardware's verification takes from the rest of the project.
+
+Machines, their emulation, the emulated board and the files of a build are imported here and nowhere else under `hdl/test`.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from machines.bm1 import BM1Kernel, BM1Machine, Start, StopReason
+from machines.parameters import BM1Parameters, PriorMode, RngKind, RngReset, SensorMode
+from machines.reference import ReferenceBM1, ReferenceReplicas
+from pcie_shim import register_map
+from pcie_shim.doorbell import following
+from pcie_shim.emulated_board import EmulatedBoard, RefusedError
+from pcie_shim.programming_file import Image, Partition, image_bytes, interface_words
+from pcie_shim.register_map import BoardState, ErrorCode
+from toolchain.deployment.deployment_file import (
+    Board,
+    Deployment,
+    Dimension,
+    MachineSection,
+    Source,
+    Variable,
+)
+from toolchain.outputs.memories import memories
+from toolchain.outputs.vhdl_parameters import parameters_vhd
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+__all__ = [
+    "BM1Kernel",
+    "BM1Machine",
+    "BM1Parameters",
+    "BoardState",
+    "EmulatedBoard",
+    "ErrorCode",
+    "Image",
+    "Partition",
+    "PriorMode",
+    "RefusedError",
+    "ReferenceBM1",
+    "ReferenceReplicas",
+    "RngKind",
+    "RngReset",
+    "SensorMode",
+    "Start",
+    "StopReason",
+    "following",
+    "image_bytes",
+    "image_of",
+    "interface_words",
+    "reference_kernel",
+    "register_map",
+    "write_hardware_files",
+]
+
+PARAMETERS_FILE: Final = "bm1_parameters.vhd"
+MEMORY_FOLDER: Final = "Memory_MIFs"
+
+_NO_MODEL: Final = "0" * 64
+
+
+def reference_kernel(machine: BM1Machine) -> BM1Kernel:
+    """Return the reference that every other kernel is checked against."""
+    return ReferenceBM1(machine) if machine.parameters.replicas == 1 else ReferenceReplicas(machine)
+
+
+def image_of(machine: BM1Machine, more_inputs: int = 0, more_results: int = 0) -> Image:
+    """Return a board's image of a machine, with an interface that is so many words larger than the machine."""
+    inputs, results = interface_words(machine.parameters)
+    return Image(
+        machine=machine,
+        partition=Partition(0, 1, 0, machine.parameters.lines),
+        interface_sensors=max(inputs, 1) + more_inputs,
+        interface_results=results + more_results,
+        model_hash=_NO_MODEL,
+        build_date="2020-01-01T00:00:00Z",
+        tool_version="test",
+    )
+
+
+def write_hardware_files(image: Image, folder: Path) -> None:
+    """Write what a build writes for an image's hardware: the package of parameters and all memories."""
+    deployment = _deployment(image)
+    (folder / PARAMETERS_FILE).write_text(parameters_vhd(deployment, [image]), "ascii")
+    (folder / MEMORY_FOLDER).mkdir(exist_ok=True)
+    for memory in memories(deployment, [image]):
+        (folder / MEMORY_FOLDER / memory.name).write_text("".join(memory.lines()), "ascii")
+
+
+def _deployment(image: Image) -> Deployment:
+    """Return a deployment that has this image on its only board."""
+    parameters = image.machine.parameters
+    selects = ("prior_select",) if parameters.prior_bits else ()
+    columns = [("sensor", bits) for bits in parameters.sensor_bits]
+    return Deployment(
+        name="random machine",
+        sources=(Source(uri="ws://localhost:9090", topic="/readings", type="std_msgs/Float64MultiArray"),),
+        variables=tuple(
+            Variable(name=f"variable {at}", path=f"data[{at}]", kind=kind, bits=bits, values=2**bits - 1)
+            for at, (kind, bits) in enumerate(
+                [*columns, *((kind, parameters.prior_bits) for kind in selects)]
+            )
+        ),
+        searched=(Dimension(label="line", size=parameters.lines),),
+        machine=MachineSection(
+            lines=parameters.lines,
+            interface=f"{image.interface_sensors}x{image.interface_results}",
+            prob_bits=parameters.prob_bits,
+            prior_bits=parameters.prior_bits,
+            prior_mode=parameters.prior_mode,
+            counter_bits=parameters.counter_bits,
+            rng=parameters.rng,
+            rng_banks=parameters.rng_banks,
+            rng_reset=parameters.rng_reset,
+            shared=parameters.shared,
+            steps_per_clock=parameters.steps_per_clock,
+            target_count=min(255, parameters.target_count_max),
+            sensor_mode=parameters.sensor_mode,
+            replicas=parameters.replicas,
+        ),
+        boards=(
+            Board(
+                image="boards/board0.bm", image_hash=image.image_hash, line_offset=0, lines=parameters.lines
+            ),
+        ),
+    )

@@ -1,0 +1,359 @@
+"""The register map for hardware and for C: a VHDL package, the VHDL register block, and the C header.
+
+`scripts/registers` writes all three from the SystemRDL file, beside the constants module (`map_generator`).
+
+The register block is written here and not by peakrdl-regblock-vhdl, which was tried:
+
+- A board takes every word by itself, as the emulated one does. The exporter demands write buffers for 64-bit registers,
+  in which the low word has no effect until the high one is written.
+- A board refuses accesses by their address, its state and the value written. That takes a decoder of its own in front of
+  the exporter's block.
+- The exported text needs a VHDL package out of the exporter's wheel, which whoever builds the hardware would need too.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+if TYPE_CHECKING:
+    from pcie_shim.map_generator import Encoding, RegisterMap
+
+_HEAD: Final = """\
+-- ================================================================================================
+-- rosbayes: {name}
+-- {title}
+-- Generated from hdl/bm_registers.rdl by scripts/registers: change that file, not this one.
+-- MIT licence; datasheet: docs/hardware/bm_register_block.md
+-- ================================================================================================
+library ieee;
+  use ieee.std_logic_1164.all;
+"""
+
+
+@dataclass(frozen=True)
+class Register:
+    """A register of the block, as hardware sees it.
+
+    Attributes:
+        name: Lower case.
+        address: Of its first word, in bytes.
+        words: How many 32-bit words it has.
+        title: What it is.
+        stored: Mask of the bits that the block stores, within one word; 0 where hardware drives all bits.
+        pulsed: Mask of the bits that are passed on for one clock and read 0.
+        driven: Whether hardware gives what is read.
+        constant: What is read, where nobody drives it.
+        reset: Of the stored bits.
+        latched: Whether reading the low word holds the high word for the next read.
+    """
+
+    name: str
+    address: int
+    words: int
+    title: str
+    stored: int
+    pulsed: int
+    driven: bool
+    constant: int
+    reset: int
+    latched: bool
+
+    def choice(self, word: int) -> str:
+        """Return what chooses one of its words: the word's number in the map."""
+        more = f" + {word}" if word else ""
+        return f"{self.name.upper()}_ADDRESS / 4{more}"
+
+    @property
+    def bits(self) -> int:
+        """Bits of all its words."""
+        return 32 * self.words
+
+    @property
+    def written(self) -> bool:
+        """Whether software writes it."""
+        return bool(self.stored | self.pulsed)
+
+
+def read_registers(source: Path) -> tuple[Register, ...]:
+    """Return the registers of a SystemRDL file, memories left out, in the order of their addresses."""
+    from systemrdl.compiler import RDLCompiler
+    from systemrdl.node import RegNode
+
+    compiler = RDLCompiler()
+    compiler.compile_file(str(source))
+    top = compiler.elaborate().top
+    return tuple(_register(node) for node in top.children(unroll=False) if isinstance(node, RegNode))
+
+
+def _register(node: Any) -> Register:
+    stored = pulsed = constant = reset = 0
+    driven = False
+    for field in node.fields():
+        # a field of 64 bits is stored word by word
+        mask = ((1 << (field.high + 1)) - (1 << field.low)) & 0xFFFFFFFF
+        value = (field.get_property("reset") or 0) << field.low
+        if field.get_property("singlepulse"):
+            pulsed |= mask
+        elif field.is_sw_writable:
+            stored |= mask
+            reset |= value
+        else:
+            constant |= value
+        driven |= field.is_hw_writable
+    words = node.total_size // 4
+    return Register(
+        name=node.inst_name.lower(),
+        address=node.raw_address_offset,
+        words=words,
+        title=node.get_property("name"),
+        stored=stored,
+        pulsed=pulsed,
+        driven=driven,
+        constant=constant,
+        reset=reset,
+        latched=driven and not stored and node.get_property("regwidth") == 64,
+    )
+
+
+def package_text(register_map: RegisterMap) -> str:
+    """Return the VHDL package `bm_register_map`: addresses, sizes, fields and encodings."""
+    lines = [_HEAD.format(name="bm_register_map", title="The boards' register map as constants.")]
+    lines += ["package bm_register_map is", ""]
+    lines += [f"  constant BAR_ADDRESS_BITS : positive := {(register_map.bar_size - 1).bit_length()};", ""]
+    digest = register_map.hash.upper()
+    lines += [
+        "  -- SHA-256 of the map's definition, first byte in the highest bits",
+        f'  constant MAP_SHA256 : std_logic_vector(255 downto 0) := x"{digest}";',
+        "",
+        "  -- registers and memories: address in bytes, number of 32-bit words, what software may do",
+    ]
+    for block in register_map.blocks:
+        lines += [
+            f"  constant {block.name}_ADDRESS  : natural := 16#{block.address:05X}#;",
+            f"  constant {block.name}_WORDS    : positive := {block.words};",
+            f"  constant {block.name}_WRITABLE : boolean := {str('w' in block.access).lower()};",
+        ]
+    lines += [
+        "",
+        "  -- all of these; a memory's words exist as far as the board implements them",
+        "  type block_t is record",
+        "    address  : natural;",
+        "    words    : positive;",
+        "    writable : boolean;",
+        "    memory   : boolean;",
+        "  end record block_t;",
+        "",
+        "  type blocks_t is array (natural range <>) of block_t;",
+        "",
+        f"  constant BLOCKS : blocks_t(0 to {len(register_map.blocks) - 1}) := (",
+    ]
+    for at, block in enumerate(register_map.blocks):
+        comma = "," if at < len(register_map.blocks) - 1 else ""
+        memory = str(not block.fields).lower()
+        lines.append(
+            f"    {at} => ({block.name}_ADDRESS, {block.name}_WORDS, {block.name}_WRITABLE, {memory}){comma}"
+        )
+    lines += ["  );", "", "  -- fields of registers that have several: lowest and highest bit"]
+    for block in register_map.blocks:
+        if len(block.fields) > 1:
+            for field in block.fields:
+                lines.append(f"  constant {block.name}_{field.name}_LOW  : natural := {field.low};")
+                lines.append(f"  constant {block.name}_{field.name}_HIGH : natural := {field.high};")
+    for encoding in register_map.encodings:
+        lines += ["", f"  -- {_title(encoding)}"]
+        prefix = encoding.name.upper()
+        lines += [
+            f"  constant {prefix}_{member.name} : natural := {member.value};" for member in encoding.members
+        ]
+    lines += ["", "end package bm_register_map;", ""]
+    return "\n".join(lines)
+
+
+def _title(encoding: Encoding) -> str:
+    return encoding.name.replace("_", " ")
+
+
+def block_text(registers: tuple[Register, ...]) -> str:
+    """Return the VHDL entity `bm_register_block`: what software writes is stored, what it reads is selected."""
+    ports = []
+    for register in registers:
+        size = f"std_logic_vector({register.bits - 1} downto 0)"
+        if register.driven:
+            ports.append((f"{register.name}_i : in    {size}", f"{register.title}, as read"))
+        if register.written:
+            ports.append((f"{register.name}_o : out   {size}", f"{register.title}, as written"))
+    return "\n".join(
+        [
+            _HEAD.format(
+                name="bm_register_block",
+                title="Registers of a board: stores what software writes and selects what it reads.",
+            ).rstrip(),
+            "  use ieee.numeric_std.all;",
+            "",
+            "library work;",
+            "  use work.bm_register_map.all;",
+            "",
+            "entity bm_register_block is",
+            "  port (",
+            "    clk_i   : in    std_logic; -- clock",
+            "    rst_i   : in    std_logic; -- reset of the board",
+            "    write_i : in    std_logic; -- write the word; it must be allowed",
+            "    read_i  : in    std_logic; -- read the word",
+            "    word_i  : in    std_logic_vector(7 downto 0); -- number of the word: address / 4",
+            "    data_i  : in    std_logic_vector(31 downto 0); -- data to write",
+            "    data_o  : out   std_logic_vector(31 downto 0); -- data read, a clock after read_i",
+            *(
+                f"    {port}{';' if at < len(ports) - 1 else ''} -- {comment}"
+                for at, (port, comment) in enumerate(ports)
+            ),
+            "  );",
+            "end entity bm_register_block;",
+            "",
+            "architecture rtl of bm_register_block is",
+            "",
+            *_signals(registers),
+            "",
+            "begin",
+            "",
+            *_writes(registers),
+            *_reads(registers),
+            "end architecture rtl;",
+            "",
+        ]
+    )
+
+
+def _literal(value: int) -> str:
+    return f'x"{value:08X}"'
+
+
+def _signals(registers: tuple[Register, ...]) -> list[str]:
+    lines = []
+    for register in registers:
+        if register.written:
+            lines.append(
+                f"  signal {register.name} : std_logic_vector({register.bits - 1} downto 0) := {_reset(register)};"
+            )
+        if register.latched:
+            lines.append(
+                f"  signal {register.name}_high : std_logic_vector(31 downto 0) := (others => '0');"
+            )
+            lines.append(f"  signal {register.name}_held : std_logic := '0';")
+    return lines
+
+
+def _reset(register: Register) -> str:
+    return " & ".join([_literal(register.reset)] * register.words)
+
+
+def _writes(registers: tuple[Register, ...]) -> list[str]:
+    written = [register for register in registers if register.written]
+    lines = ["  store : process (clk_i) is", "  begin", "", "    if rising_edge(clk_i) then"]
+    for register in written:
+        for bit in _bits(register.pulsed):
+            lines.append(f"      {register.name}({bit}) <= '0';")
+    lines += ["      if (rst_i = '1') then"]
+    lines += [f"        {register.name} <= {_reset(register)};" for register in written]
+    lines += ["      elsif (write_i = '1') then", "", "        case to_integer(unsigned(word_i)) is", ""]
+    for register in written:
+        for word in range(register.words):
+            lines += [f"          when {register.choice(word)} =>", ""]
+            mask = register.stored | register.pulsed
+            lines += [
+                f"            {register.name}({32 * word + high} downto {32 * word + low}) <= data_i({high} downto {low});"
+                for low, high in _runs(mask)
+            ]
+            lines.append("")
+    lines += [
+        "          when others =>",
+        "",
+        "            null;",
+        "",
+        "        end case;",
+        "",
+        "      end if;",
+        "    end if;",
+        "",
+        "  end process store;",
+        "",
+    ]
+    lines += [f"  {register.name}_o <= {register.name};" for register in written]
+    return [*lines, ""]
+
+
+def _reads(registers: tuple[Register, ...]) -> list[str]:
+    lines = ["  select_word : process (clk_i) is", "  begin", "", "    if rising_edge(clk_i) then"]
+    latched = [register for register in registers if register.latched]
+    lines.append("      if (read_i = '1') then")
+    lines += ["", "        case to_integer(unsigned(word_i)) is", ""]
+    for register in registers:
+        for word in range(register.words):
+            lines += [f"          when {register.choice(word)} =>", ""]
+            lines += [f"            {line}" for line in _read(register, word)]
+            lines.append("")
+    lines += ["          when others =>", "", "            data_o <= (others => '0');", "", "        end case;", ""]
+    lines += ["      end if;"]
+    if latched:
+        lines.append("      if (rst_i = '1') then")
+        lines += [f"        {register.name}_held <= '0';" for register in latched]
+        lines.append("      end if;")
+    return [*lines, "    end if;", "", "  end process select_word;", ""]
+
+
+def _read(register: Register, word: int) -> list[str]:
+    """Return the statements that answer the read of a word."""
+    part = f"({32 * word + 31} downto {32 * word})"
+    if register.latched and word == 0:
+        return [
+            f"data_o <= {register.name}_i{part};",
+            "-- the high word is held until it is read, so that the pair is never torn",
+            f"{register.name}_high <= {register.name}_i(63 downto 32);",
+            f"{register.name}_held <= '1';",
+        ]
+    if register.latched:
+        return [
+            f"if ({register.name}_held = '1') then",
+            f"  data_o <= {register.name}_high;",
+            "else",
+            f"  data_o <= {register.name}_i{part};",
+            "end if;",
+            f"{register.name}_held <= '0';",
+        ]
+    if register.driven:
+        return [f"data_o <= {register.name}_i{part};"]
+    if register.stored:
+        if register.stored == 0xFFFFFFFF:
+            return [f"data_o <= {register.name}{part};"]
+        return [f"data_o <= {register.name}{part} and {_literal(register.stored)};"]
+    return [f"data_o <= {_literal(register.constant)};"]
+
+
+def _bits(mask: int) -> list[int]:
+    return [bit for bit in range(mask.bit_length()) if mask >> bit & 1]
+
+
+def _runs(mask: int) -> list[tuple[int, int]]:
+    """Return the runs of ones of a mask: lowest and highest bit of each."""
+    runs: list[tuple[int, int]] = []
+    for bit in _bits(mask):
+        if runs and runs[-1][1] == bit - 1:
+            runs[-1] = (runs[-1][0], bit)
+        else:
+            runs.append((bit, bit))
+    return runs
+
+
+def header_text(source: Path) -> str:
+    """Return the C header that PeakRDL makes of a SystemRDL file."""
+    from peakrdl_cheader.exporter import CHeaderExporter
+    from systemrdl.compiler import RDLCompiler
+
+    compiler = RDLCompiler()
+    compiler.compile_file(str(source))
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "bm_registers.h"
+        CHeaderExporter().export(compiler.elaborate().top, str(path))
+        return path.read_text()
