@@ -238,9 +238,7 @@ def _signals(registers: tuple[Register, ...]) -> list[str]:
                 f"  signal {register.name} : std_logic_vector({register.bits - 1} downto 0) := {_reset(register)};"
             )
         if register.latched:
-            lines.append(
-                f"  signal {register.name}_high : std_logic_vector(31 downto 0) := (others => '0');"
-            )
+            lines.append(f"  signal {register.name}_high : std_logic_vector(31 downto 0) := (others => '0');")
             lines.append(f"  signal {register.name}_held : std_logic := '0';")
     return lines
 
@@ -253,8 +251,7 @@ def _writes(registers: tuple[Register, ...]) -> list[str]:
     written = [register for register in registers if register.written]
     lines = ["  store : process (clk_i) is", "  begin", "", "    if rising_edge(clk_i) then"]
     for register in written:
-        for bit in _bits(register.pulsed):
-            lines.append(f"      {register.name}({bit}) <= '0';")
+        lines += [f"      {register.name}({bit}) <= '0';" for bit in _bits(register.pulsed)]
     lines += ["      if (rst_i = '1') then"]
     lines += [f"        {register.name} <= {_reset(register)};" for register in written]
     lines += ["      elsif (write_i = '1') then", "", "        case to_integer(unsigned(word_i)) is", ""]
@@ -294,7 +291,14 @@ def _reads(registers: tuple[Register, ...]) -> list[str]:
             lines += [f"          when {register.choice(word)} =>", ""]
             lines += [f"            {line}" for line in _read(register, word)]
             lines.append("")
-    lines += ["          when others =>", "", "            data_o <= (others => '0');", "", "        end case;", ""]
+    lines += [
+        "          when others =>",
+        "",
+        "            data_o <= (others => '0');",
+        "",
+        "        end case;",
+        "",
+    ]
     lines += ["      end if;"]
     if latched:
         lines.append("      if (rst_i = '1') then")

@@ -9,7 +9,6 @@ A cocotb module; `simulation.run_bench` runs it. The case is that of the variabl
 from __future__ import annotations
 
 import copy
-import logging
 import os
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
@@ -34,6 +33,8 @@ from hdl.test.project import (
     image_bytes,
     interface_words,
     reference_kernel,
+)
+from hdl.test.project import (
     register_map as rm,
 )
 from hdl.test.random_machines import Case, codes, random_case
@@ -326,7 +327,13 @@ class Session:
         p, both = self.parameters, self.both
         target = int(
             self.random.choice(
-                [1, 2, int(self.random.integers(1, 40)), int(self.random.integers(1, 200)), p.target_count_max]
+                [
+                    1,
+                    2,
+                    int(self.random.integers(1, 40)),
+                    int(self.random.integers(1, 200)),
+                    p.target_count_max,
+                ]
             )
         )
         await both.write(rm.TARGET_COUNT, min(target, p.target_count_max))
@@ -445,11 +452,9 @@ class Session:
             assert before is not None
             await both.write(address, value)
             await both.read(address)
-            if both.board.done or True:
-                taken = await both.write(rm.START, due)
-                if taken:  # the wrong value means nothing to this machine
-                    await both.finish()
-                    due = following(both.board.done)
+            if await both.write(rm.START, due):  # the value means nothing to this machine
+                await both.finish()
+                due = following(both.board.done)
             await both.write(address, before)
 
     # ---- while it runs ----------------------------------------------------------------------------------
@@ -472,7 +477,9 @@ class Session:
                 return True
         accesses = min((left - 10) // (3 * _ACCESS_CLOCKS), 6)
         for _ in range(max(accesses, 0)):
-            address = self.pick([rm.TARGET_COUNT, self.inputs, rm.START, rm.RESUME, rm.CONTROL, rm.BANK, rm.HALT])
+            address = self.pick(
+                [rm.TARGET_COUNT, self.inputs, rm.START, rm.RESUME, rm.CONTROL, rm.BANK, rm.HALT]
+            )
             value = self.pick([0, 1, 2, number, following(number)])
             if not (address == rm.CONTROL and value & 1):
                 assert not await both.write(address, value)
@@ -540,13 +547,12 @@ class Session:
 @cocotb.test()
 async def same_as_the_emulated_board(dut: Any) -> None:
     """Play a session of the case's seed on both boards."""
-    logging.getLogger(f"cocotb.{dut._name}").setLevel(logging.WARNING)
     case = random_case(int(os.environ["HDL_SEED"]))
     frames = int(os.environ.get("HDL_FRAMES", FRAMES))
     for channel in ("awvalid", "wvalid", "arvalid", "bready", "rready"):
         getattr(dut, f"axi_{channel}").value = 0
     dut.rstn_i.value = 0
-    cocotb.start_soon(Clock(dut.clk_i, _NS, "ns").start(start_high=False))
+    Clock(dut.clk_i, _NS, "ns").start(start_high=False)
     both = Both(dut, case)
     await both.reset_pin()
     cocotb.start_soon(both.count_interrupts())

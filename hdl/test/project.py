@@ -11,8 +11,8 @@ from machines.bm1 import BM1Kernel, BM1Machine, Start, StopReason
 from machines.parameters import BM1Parameters, PriorMode, RngKind, RngReset, SensorMode
 from machines.reference import ReferenceBM1, ReferenceReplicas
 from pcie_shim import register_map
+from pcie_shim.board.emulated_board import EmulatedBoard, RefusedError
 from pcie_shim.doorbell import following
-from pcie_shim.emulated_board import EmulatedBoard, RefusedError
 from pcie_shim.programming_file import Image, Partition, image_bytes, interface_words
 from pcie_shim.register_map import BoardState, ErrorCode
 from toolchain.deployment.deployment_file import (
@@ -39,9 +39,9 @@ __all__ = [
     "Image",
     "Partition",
     "PriorMode",
-    "RefusedError",
     "ReferenceBM1",
     "ReferenceReplicas",
+    "RefusedError",
     "RngKind",
     "RngReset",
     "SensorMode",
@@ -93,16 +93,19 @@ def write_hardware_files(image: Image, folder: Path) -> None:
 def _deployment(image: Image) -> Deployment:
     """Return a deployment that has this image on its only board."""
     parameters = image.machine.parameters
-    selects = ("prior_select",) if parameters.prior_bits else ()
-    columns = [("sensor", bits) for bits in parameters.sensor_bits]
+    widths = [*parameters.sensor_bits, *([parameters.prior_bits] if parameters.prior_bits else [])]
     return Deployment(
         name="random machine",
         sources=(Source(uri="ws://localhost:9090", topic="/readings", type="std_msgs/Float64MultiArray"),),
         variables=tuple(
-            Variable(name=f"variable {at}", path=f"data[{at}]", kind=kind, bits=bits, values=2**bits - 1)
-            for at, (kind, bits) in enumerate(
-                [*columns, *((kind, parameters.prior_bits) for kind in selects)]
+            Variable(
+                name=f"variable {at}",
+                path=f"data[{at}]",
+                kind="sensor" if at < parameters.sensors else "prior_select",
+                bits=bits,
+                values=2**bits - 1,
             )
+            for at, bits in enumerate(widths)
         ),
         searched=(Dimension(label="line", size=parameters.lines),),
         machine=MachineSection(

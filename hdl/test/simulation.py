@@ -141,7 +141,10 @@ def run_bench(
 
 
 def run_tool(
-    command: Sequence[str], folder: Path, environment: Mapping[str, str] | None = None, limit: float = _LIMIT_S
+    command: Sequence[str],
+    folder: Path,
+    environment: Mapping[str, str] | None = None,
+    limit: float = _LIMIT_S,
 ) -> str:
     """Run a tool in a folder and return what it printed.
 

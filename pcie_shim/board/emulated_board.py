@@ -372,8 +372,11 @@ class EmulatedBoard:
             return None
         shape = parameters.count_shape
         words = np.frombuffer(self._memory, "<u4", math.prod(shape), rm.PRIOR_CODES).reshape(shape)
-        # a code has 16 bits at most: what is cut off must not make a valid code of a wrong one
-        codes: npt.NDArray[np.uint16] = np.minimum(words, 0xFFFF).astype(np.uint16)
+        if int(words.max()) > parameters.ones_code:
+            self._refuse(
+                ErrorCode.BAD_VALUE, f"a prior code is {words.max()}; the highest is {parameters.ones_code}"
+            )
+        codes: npt.NDArray[np.uint16] = words.astype(np.uint16)
         return codes
 
     def step(self) -> None:

@@ -401,6 +401,15 @@ def test_a_written_prior_is_the_images_until_it_is_written() -> None:
             start(board, 2, 2)
 
 
+def test_a_prior_code_of_17_bits_is_refused_by_the_widest_machine() -> None:
+    board = programmed(machine(6, lines=5, prior_mode=PriorMode.WRITTEN, prob_bits=16, zeros=0))
+    board.write(rm.PRIOR_CODES, words(0xFFFF))
+    start(board, 2, 2)
+    board.write(rm.PRIOR_CODES, words(0x1FFFF))
+    with refused(ErrorCode.BAD_VALUE, "a prior code is 131071; the highest is 65535"):
+        start(board, 2, 2)
+
+
 def test_an_impossible_frame_runs_nothing() -> None:
     of = machine(7, lines=3, sensor_bits=(1,), zeros=1.0)
     board = programmed(of)

@@ -161,7 +161,12 @@ def _generators(image: Image) -> str:
     length = 1 if table is None else table.size
     return (
         text
-        + _constant("RNG_TABLE_LENGTH", "positive", length, "numbers in the table" if table is not None else "no table")
+        + _constant(
+            "RNG_TABLE_LENGTH",
+            "positive",
+            length,
+            "numbers in the table" if table is not None else "no table",
+        )
         + _flag("RNG_SHARED", parameters.shared, "one a column, shared by its lines; else one a cell")
         + _constant("STEPS_PER_CLOCK", "positive", parameters.steps_per_clock)
         + _flag("RNG_RESET_BANK", parameters.rng_reset is RngReset.BANK, "a frame restarts the generators")
