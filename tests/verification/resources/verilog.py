@@ -116,15 +116,13 @@ def verilog(machine: BM1Machine, *, tables: bool) -> str:
     """
     parameters = machine.parameters
     if parameters.rng.lfsr_bits is None:
-        message = f"rng = {parameters.rng} has no logic here: use an LFSR"
-        raise BuildError(message)
+        raise BuildError(f"rng = {parameters.rng} has no logic here: use an LFSR")
     if parameters.replicas * parameters.lines * parameters.columns > MAX_CELLS:
         times = f", {parameters.replicas} times," if parameters.replicas > 1 else ""
-        message = (
+        raise BuildError(
             f"{parameters.lines} lines of {parameters.columns} columns{times} are more than {MAX_CELLS} cells, too many to "
             "be written cell by cell"
         )
-        raise BuildError(message)
     parts = [
         _PARTS,
         _generator(parameters),

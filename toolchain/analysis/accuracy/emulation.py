@@ -68,11 +68,11 @@ class EmulatedBoards:
         highest = machines[0].parameters.target_count_max
         if not 1 <= target_count <= highest:
             bits = machines[0].parameters.counter_bits
-            message = f"a target count of {target_count} does not fit counters of {bits} bits: expected 1 to {highest}"
-            raise BuildError(message)
+            raise BuildError(
+                f"a target count of {target_count} does not fit counters of {bits} bits: expected 1 to {highest}"
+            )
         if not 1 <= max_cycles <= CYCLES_MAX:
-            message = f"max_cycles is {max_cycles}, expected 1 to {CYCLES_MAX}"
-            raise BuildError(message)
+            raise BuildError(f"max_cycles is {max_cycles}, expected 1 to {CYCLES_MAX}")
         self.machines = tuple(machines)
         self.target_count = target_count
         self.max_cycles = max_cycles

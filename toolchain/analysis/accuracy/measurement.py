@@ -163,8 +163,9 @@ def measure(
         ModelError: No frame that the model finds possible.
     """
     if len(readings) < replicas:
-        message = f"a frame of {replicas} replicas takes {replicas} readings, and there are {len(readings)} ({readings.source})"
-        raise BuildError(message)
+        raise BuildError(
+            f"a frame of {replicas} replicas takes {replicas} readings, and there are {len(readings)} ({readings.source})"
+        )
     parameters = boards.parameters
     banks = max(1, min(banks, parameters.rng_banks if parameters.rng_reset is RngReset.BANK else banks))
     found = _Findings(boards, readings, banks)
@@ -180,8 +181,7 @@ def measure(
         found.add(place, place // replicas, exact)
         advance()
     if not found.posteriors:
-        message = f"none of the readings ({readings.source}) is possible in the model"
-        raise ModelError(message)
+        raise ModelError(f"none of the readings ({readings.source}) is possible in the model")
     return found.summary()
 
 

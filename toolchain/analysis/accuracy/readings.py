@@ -90,8 +90,7 @@ def check_frames(frames: int) -> None:
         BuildError: None, or more than `MOST_FRAMES`.
     """
     if not 1 <= frames <= MOST_FRAMES:
-        message = f"--frames is {frames}, expected 1 to {MOST_FRAMES}"
-        raise BuildError(message)
+        raise BuildError(f"--frames is {frames}, expected 1 to {MOST_FRAMES}")
 
 
 def check_columns(recording: Path | None, columns: Sequence[str] | None) -> None:
@@ -156,8 +155,7 @@ def readings_of_lines(
         BuildError: The readings were not drawn, so that their true line is not known.
     """
     if drawn.lines is None:
-        message = "only readings that were drawn know their true line"
-        raise BuildError(message)
+        raise BuildError("only readings that were drawn know their true line")
     frames = len(drawn)
     shape = (frames, len(model.known), model.lines)
     random = np.random.default_rng((seed, 1))
@@ -273,8 +271,7 @@ def recorded_readings(
             continue
         rows.append([MISSING if address is None else address for address in row])
     if not rows:
-        message = f"{path} has no row that this machine takes" + (f": {first}" if first else "")
-        raise ModelError(message)
+        raise ModelError(f"{path} has no row that this machine takes" + (f": {first}" if first else ""))
     addresses = np.array(rows, dtype=np.int64).reshape(len(rows), len(variables))
     sensors = [at for at, variable in enumerate(variables) if variable.kind == "sensor"]
     selects = [at for at, variable in enumerate(variables) if variable.kind == "prior_select"]
@@ -305,8 +302,9 @@ def reading_columns(names: Sequence[str], given: Sequence[str], flag: str = "--r
             )
         ]
         if not fitting:
-            message = f"{flag} {pattern}: there is no such known variable; there are {', '.join(names[:20])}"
-            raise BuildError(message)
+            raise BuildError(
+                f"{flag} {pattern}: there is no such known variable; there are {', '.join(names[:20])}"
+            )
         for name in fitting:
             same = name[len(before) : len(name) - len(after)] if star else ""
             columns[name] = column.replace("*", same)

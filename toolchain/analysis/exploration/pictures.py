@@ -29,15 +29,13 @@ def check_pictures_possible(path: Path | None = None) -> None:
         BuildError: matplotlib is not installed, the file can't be written, or its name is not a picture's.
     """
     if find_spec("matplotlib") is None:
-        message = (
+        raise BuildError(
             "a plot needs matplotlib, which is not installed: run pip install matplotlib, or leave out --plot"
         )
-        raise BuildError(message)
     if path is None:
         return
     if path.suffix not in _SUFFIXES:
-        message = f"{path} is no picture's name: expected one that ends in {', '.join(_SUFFIXES)}"
-        raise BuildError(message)
+        raise BuildError(f"{path} is no picture's name: expected one that ends in {', '.join(_SUFFIXES)}")
     there = path.exists()
     try:
         with path.open("ab"):
@@ -45,8 +43,7 @@ def check_pictures_possible(path: Path | None = None) -> None:
         if not there:
             path.unlink()
     except OSError as reason:
-        message = f"{path} can't be written: {reason.strerror or reason}; name another file"
-        raise BuildError(message) from None
+        raise BuildError(f"{path} can't be written: {reason.strerror or reason}; name another file") from None
 
 
 def draw_sweep(path: Path, name: str, points: Sequence[Point], front: Sequence[Point]) -> None:
@@ -175,5 +172,4 @@ def _save(figure: Any, path: Path) -> None:
     try:
         figure.savefig(path, dpi=_DPI, metadata={"Software": None} if path.suffix == ".png" else None)
     except (OSError, ValueError) as reason:
-        message = f"{path} can't be written: {getattr(reason, 'strerror', None) or reason}"
-        raise BuildError(message) from None
+        raise BuildError(f"{path} can't be written: {getattr(reason, 'strerror', None) or reason}") from None

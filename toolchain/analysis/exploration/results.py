@@ -101,8 +101,9 @@ class Results:
             try:
                 point = Point.model_validate_json(line)
             except ValidationError:
-                message = f"{path}, line {number}, is no result of a sweep: name another file with -o"
-                raise BuildError(message) from None
+                raise BuildError(
+                    f"{path}, line {number}, is no result of a sweep: name another file with -o"
+                ) from None
             self.points[point.key] = point
 
     def check_writable(self) -> None:
@@ -136,8 +137,7 @@ class Results:
         except OSError as reason:
             raise self._not_writable(reason) from None
         if written != len(line):
-            message = f"{self.path} can't be written: the disk is full"
-            raise BuildError(message)
+            raise BuildError(f"{self.path} can't be written: the disk is full")
 
     def _opened(self) -> int:
         return os.open(self.path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)

@@ -82,12 +82,10 @@ class Sweep:
         )
         count = math.prod(map(len, lists))
         if not 0 < count <= MAX_POINTS:
-            message = f"these lists combine to {count} machines, expected 1 to {MAX_POINTS}"
-            raise BuildError(message)
+            raise BuildError(f"these lists combine to {count} machines, expected 1 to {MAX_POINTS}")
         for mode, replicas, scale, rng, steps, prob_bits, target in itertools.product(*lists):
             if target < 1:
-                message = f"a target count of {target} stops nothing: expected 1 or more"
-                raise BuildError(message)
+                raise BuildError(f"a target count of {target} stops nothing: expected 1 or more")
             yield BuildOptions(
                 uri="ws://nowhere:9090",  # a sweep has no robot
                 topic="/readings",
@@ -168,11 +166,10 @@ class Frames:
             ToolchainError: None can be had: recorded readings are those of columns.
         """
         if self._recorded is not None and options.sensor_mode is not SensorMode.COLUMN:
-            message = (
+            raise BuildError(
                 f"a recording's columns are numbers, and with --sensor-modes {options.sensor_mode} readings are arrays, one "
                 "number for each line: leave --readings out, and readings are drawn"
             )
-            raise BuildError(message)
         # other lines' readings are drawn too, with the seed; codes follow from the tables
         of_lines = options.sensor_mode is not SensorMode.COLUMN
         if (options.replicas, of_lines) not in self._fingerprints:
@@ -220,8 +217,7 @@ def tasks(model: Model, sweep: Sweep, frames: Frames, device: Device) -> list[Ta
         key = hashlib.sha256(json.dumps(words, sort_keys=True).encode()).hexdigest()
         found.setdefault(key, Task(options, key))  # 0 steps and the number that they are make one machine
     if not found:
-        message = f"none of these machines can be built: {refused}"
-        raise BuildError(message)
+        raise BuildError(f"none of these machines can be built: {refused}")
     return list(found.values())
 
 

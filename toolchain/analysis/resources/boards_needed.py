@@ -55,16 +55,14 @@ def boards_needed(
         largest_lines = min(largest_lines, room[0] // (parameters.replicas * parameters.sensors))
     most = _most_lines(lambda lines: on(lines).fits, min(parameters.lines, largest_lines))
     if most == 0 and largest_lines == 0:
-        message = (
+        raise BuildError(
             f"not even one line of {parameters.replicas} replicas fits the register map: it has room for {room[0]} inputs "
             f"and {room[1]} results; use fewer --replicas"
         )
-        raise BuildError(message)
     if most == 0:
-        message = (
+        raise BuildError(
             f"not even one line fits a {device.title}: {on(1).why_not}; use narrower tables or another device"
         )
-        raise BuildError(message)
     count = math.ceil(parameters.lines / most)
     largest = partition_lines(parameters.lines, count)[0].lines
     took = on(largest)

@@ -55,5 +55,4 @@ def device_named(name: str) -> Device:
     try:
         return DEVICES[name]
     except KeyError:
-        message = f"--device {name}: expected one of {', '.join(DEVICES)}"
-        raise BuildError(message) from None
+        raise BuildError(f"--device {name}: expected one of {', '.join(DEVICES)}") from None

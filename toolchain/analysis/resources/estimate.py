@@ -116,8 +116,7 @@ def estimate(
         BuildError: Generators that no FPGA has, or a controller that the device has not.
     """
     if pcie is Pcie.HARD and not device.hard_pcie:
-        message = f"{device.title} has no hard PCIe controller: use --pcie soft"
-        raise BuildError(message)
+        raise BuildError(f"{device.title} has no hard PCIe controller: use --pcie soft")
     logic = logic_of(parameters, inputs=interface[0], results=interface[1], table_length=table_length)
     soft = tuple(elements / ELEMENTS_PER_ALM for elements in SOFT_PCIE_ELEMENTS)
     return Estimate(

@@ -184,8 +184,7 @@ def logic_of(
     """
     p = parameters
     if p.rng is RngKind.IDEAL:
-        message = "rng = ideal exists emulated only: no FPGA has it; use an LFSR"
-        raise BuildError(message)
+        raise BuildError("rng = ideal exists emulated only: no FPGA has it; use an LFSR")
     lines = p.replicas * p.lines
     cells = lines * p.columns
     generators = p.columns * (1 if p.shared else p.lines)  # replicas share them
