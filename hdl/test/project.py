@@ -15,7 +15,7 @@ from pcie_shim.board.emulated_board import EmulatedBoard, RefusedError
 from pcie_shim.doorbell import following
 from pcie_shim.programming_file import Image, Partition, image_bytes, interface_words
 from pcie_shim.register_map import BoardState, ErrorCode
-from toolchain.deployment.deployment_file import (
+from toolchain.deployment import (
     Board,
     Deployment,
     Dimension,

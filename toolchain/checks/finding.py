@@ -1,36 +1,61 @@
-"""What a check has found: how bad it is, about what, what is wrong and what to change."""
+"""Findings of a check: severity, subject, mistake and advice."""
 
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from enum import StrEnum
+from functools import partial
+from typing import Final
 
 
 class Severity(StrEnum):
     """How bad a finding is."""
 
     ERROR = "error"
-    """It can't be built, or what it computes is wrong."""
+    """It can't be built, or computes something wrong."""
     WARNING = "warning"
-    """Some readings get no posterior or a wrong one, or nothing is gained by what is spent."""
+    """Some readings get no posterior or a wrong one, or resources are wasted."""
     NOTE = "note"
-    """Good to know; it may be meant so."""
+    """It may be intended."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+class Check(StrEnum):
+    """The checks, as `toolchain check --json` names them; docs/toolchain.md describes each."""
+
+    CANNOT_BE_BUILT = "cannot-be-built"
+    DEAD_LINES = "dead-lines"
+    DEAD_BOARD = "dead-board"
+    IMPOSSIBLE_READINGS = "impossible-readings"
+    COLUMN_WITHOUT_EFFECT = "column-without-effect"
+    SAME_READING = "same-reading"
+    ADDRESS_BITS = "address-bits"
+    RANGE = "range"
+    STOPPING = "stopping"
+    VANISHED_FLOOR = "vanished-floor"
+    LOST_MASS = "lost-mass"
+    FILES = "files"
+    RNG = "rng"
+    RNG_BANKS = "rng-banks"
+    RNG_STEPS = "rng-steps"
+    RNG_PERIOD = "rng-period"
+    RNG_RELATION = "rng-relation"
+    RNG_TABLE = "rng-table"
+
+
+@dataclass(frozen=True, slots=True)
 class Finding:
-    """One thing that a check has to say.
+    """One finding of a check.
 
     Attributes:
         severity: How bad it is.
-        check: Which check found it, a word or two with hyphens.
-        about: A variable's name, or what else it concerns.
-        what: What is wrong, in the model's own names.
-        advice: What to change; empty where nothing need be.
+        check: The check that found it.
+        about: A variable's name, or another part of the machine.
+        what: The mistake, in the model's own names.
+        advice: The change that removes it; empty where none is needed.
     """
 
     severity: Severity
-    check: str
+    check: Check
     about: str
     what: str
     advice: str = ""
@@ -41,5 +66,10 @@ class Finding:
         return f"{self.severity}: {self.about}: {self.what}{f'; {self.advice}' if self.advice else ''}"
 
     def as_dict(self) -> dict[str, str]:
-        """The finding as its fields, for JSON."""
+        """Return the fields by name, for JSON."""
         return {key: str(value) for key, value in asdict(self).items()}
+
+
+error: Final = partial(Finding, Severity.ERROR)
+warning: Final = partial(Finding, Severity.WARNING)
+note: Final = partial(Finding, Severity.NOTE)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from machines.parameters import RngKind, RngReset
-from toolchain.checks.finding import Finding, Severity
+from toolchain.checks.finding import Check, Finding, Severity, error, note, warning
 from toolchain.checks.rng_relations import relations
 from toolchain.outputs.memories import seed_words
 
@@ -28,21 +28,19 @@ def generator_findings(machine: CheckedMachine) -> Iterator[Finding]:
     """Numbers that repeat, are shared, or are related from column to column."""
     parameters = machine.parameters
     if parameters.rng is RngKind.IDEAL:
-        yield Finding(
-            severity=Severity.NOTE,
-            check="rng",
-            about="rng = ideal",
-            what="such generators exist emulated only: no hardware project is made",
-            advice="for a board use an LFSR",
+        yield note(
+            Check.RNG,
+            "rng = ideal",
+            "such generators exist emulated only: no hardware project is made",
+            "for a board use an LFSR",
         )
         return
     if parameters.rng_banks == 1 and parameters.rng_reset is RngReset.BANK:
-        yield Finding(
-            severity=Severity.WARNING,
-            check="rng-banks",
-            about="rng_banks = 1",
-            what="every frame sees the same random numbers, which leaves an error that averaging frames never removes",
-            advice="use --rng-banks 16, or --rng-reset free",
+        yield warning(
+            Check.RNG_BANKS,
+            "rng_banks = 1",
+            "every frame sees the same random numbers, which leaves an error that averaging frames never removes",
+            "use --rng-banks 16, or --rng-reset free",
         )
     width = parameters.rng.lfsr_bits
     length = 2**width - 1 if width is not None else len(_table(machine.board))
@@ -51,15 +49,14 @@ def generator_findings(machine: CheckedMachine) -> Iterator[Finding]:
         yield from _table_numbers(machine)
         return
     if parameters.steps_per_clock < parameters.prob_bits:
-        yield Finding(
-            severity=Severity.WARNING,
-            check="rng-steps",
-            about=f"steps_per_clock = {parameters.steps_per_clock}",
-            what=(
+        yield warning(
+            Check.RNG_STEPS,
+            f"steps_per_clock = {parameters.steps_per_clock}",
+            (
                 f"numbers of {parameters.prob_bits} bits share {parameters.prob_bits - parameters.steps_per_clock} bits "
                 "with those of the next cycle: means are right, but counts vary up to 2.6 times as much"
             ),
-            advice="leave --steps-per-clock out, unless it is to be the thesis's machine",
+            "leave --steps-per-clock out, unless it is to be the thesis's machine",
         )
     yield from _relations(machine)
 
@@ -74,15 +71,14 @@ def _period(machine: CheckedMachine, length: int) -> Iterator[Finding]:
             if period == length
             else f" ({length} steps, of which a clock takes {parameters.steps_per_clock})"
         )
-        yield Finding(
-            severity=Severity.WARNING,
-            check="rng-period",
-            about=f"rng = {parameters.rng}",
-            what=(
+        yield warning(
+            Check.RNG_PERIOD,
+            f"rng = {parameters.rng}",
+            (
                 f"the random numbers repeat after {period} cycles{shortened}, and a frame may run {limits.max_cycles}: "
                 "the later ones say nothing new"
             ),
-            advice=f"use --max-cycles {period}, or {longer}",
+            f"use --max-cycles {period}, or {longer}",
         )
 
 
@@ -107,23 +103,22 @@ def _relations(machine: CheckedMachine) -> Iterator[Finding]:
             severity = Severity.WARNING if count < 4 else Severity.NOTE
         clean = first.group if parameters.shared else 0
         yield Finding(
-            severity=severity,
-            check="rng-relation",
-            about=f"rng = {parameters.rng}",
-            what=(
+            severity,
+            Check.RNG_RELATION,
+            f"rng = {parameters.rng}",
+            (
                 f"in {len(related)} of {found.groups} {what_groups} {count} random bits of {'different' if apart else 'several'} columns "
                 f"{'are the same' if count == 2 else 'XOR to 0'} in every cycle ({where}: {bits}), so these columns are not "
                 "independent"
             ),
-            advice="use a wider --rng or fewer --prob-bits"
+            "use a wider --rng or fewer --prob-bits"
             + (f", or --rng-banks {clean}, which leaves these banks out" if clean > 1 else ""),
         )
     if found.groups < len(seeds):
-        yield Finding(
-            severity=Severity.NOTE,
-            check="rng-relation",
-            about=f"rng = {parameters.rng}",
-            what=f"relations were looked for in {found.groups} of {len(seeds)} {what_groups}, for time's sake",
+        yield note(
+            Check.RNG_RELATION,
+            f"rng = {parameters.rng}",
+            f"relations were looked for in {found.groups} of {len(seeds)} {what_groups}, for time's sake",
         )
 
 
@@ -137,27 +132,25 @@ def _table_numbers(machine: CheckedMachine) -> Iterator[Finding]:
     errors = np.abs(below - np.arange(1, codes - 1) / codes)
     worst = int(errors.argmax()) if errors.size else 0
     if errors.size and errors[worst] > 0.5 / codes:
-        yield Finding(
-            severity=Severity.WARNING,
-            check="rng-table",
-            about="rng = table",
-            what=(
+        yield warning(
+            Check.RNG_TABLE,
+            "rng = table",
+            (
                 f"code {worst + 1} counts in {below[worst]:.4g} of the cycles instead of {(worst + 1) / codes:.4g}, for "
                 "the numbers are not equally often in the table"
             ),
-            advice="use a table with every number equally often, such as the one made without --rng-table",
+            "use a table with every number equally often, such as the one made without --rng-table",
         )
     starts = seed_words(machine.board).reshape(-1, parameters.columns)
     for group, row in enumerate(starts):
         order = np.argsort(row, kind="stable")
         for one, other in pairwise(int(index) for index in order):
             if row[one] == row[other]:
-                yield Finding(
-                    severity=Severity.ERROR,
-                    check="rng-relation",
-                    about=f"{names[one]} and {names[other]}",
-                    what=f"they play the table from the same place (place {row[one]}, group {group}), so they are the same",
-                    advice="use a longer --rng-table",
+                yield error(
+                    Check.RNG_RELATION,
+                    f"{names[one]} and {names[other]}",
+                    f"they play the table from the same place (place {row[one]}, group {group}), so they are the same",
+                    "use a longer --rng-table",
                 )
                 return
     yield from _table_correlation(machine, numbers, starts)
@@ -180,15 +173,14 @@ def _table_correlation(
     worst = int(found.argmax()) if found.size else 0
     if found.size and found[worst] > limit:
         pair = [machine.names[one[worst]], machine.names[other[worst]]]
-        yield Finding(
-            severity=Severity.WARNING,
-            check="rng-relation",
-            about=" and ".join(pair),
-            what=(
+        yield warning(
+            Check.RNG_RELATION,
+            " and ".join(pair),
+            (
                 f"their random numbers correlate by {found[worst]:.2g}; {limit:.2g} and less is what chance does in a "
                 f"table of {length}"
             ),
-            advice="use a table in a more random order, such as the one made without --rng-table",
+            "use a table in a more random order, such as the one made without --rng-table",
         )
 
 

@@ -15,7 +15,8 @@ from machines.parameters import PriorMode, RngKind, RngReset, SensorMode
 from machines.reference import ReferenceBM1
 from toolchain.building.build import assemble, build_deployment
 from toolchain.building.options import BuildOptions
-from toolchain.checks.check import check_deployment, check_model, line_name, reading
+from toolchain.checks.check import check_deployment, check_model
+from toolchain.checks.codes import line_name, reading
 from toolchain.checks.finding import Severity
 from toolchain.commands.main import app
 from toolchain.deployment import Scale

@@ -1,0 +1,235 @@
+"""Findings about codes: lines that never count, readings without a posterior, columns without effect."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from machines.parameters import PriorMode, SensorMode
+from toolchain.checks.finding import Check, Finding, error, note, warning
+from toolchain.deployment import Scale
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from numpy.typing import NDArray
+
+    from toolchain.building.options import BuildOptions
+    from toolchain.building.quantise import Quantised
+    from toolchain.checks.checked_machine import CheckedMachine
+    from toolchain.deployment import Deployment, Dimension, Variable
+
+_MOST_RANGES: Final = 4
+_LOST_OFTEN: Final = 0.02
+
+
+def code_findings(machine: CheckedMachine) -> Iterator[Finding]:
+    """Find dead lines, impossible readings, columns without effect, and a target that is never reached."""
+    yield from _lines(machine)
+    yield from _readings(machine)
+    yield from _columns(machine)
+    yield from _stopping(machine)
+
+
+def loss_findings(quantised: Quantised, options: BuildOptions) -> Iterator[Finding]:
+    """Find floors that vanish, and frames in which the true line has code 0."""
+    for floor in quantised.floors:
+        yield warning(Check.VANISHED_FLOOR, floor.name, floor.what, floor.advice)
+    mass = sum(loss.mass for loss in quantised.losses)
+    if mass > _LOST_OFTEN:
+        worst = max(quantised.losses, key=lambda loss: loss.mass)
+        yield warning(
+            Check.LOST_MASS,
+            "the codes",
+            (
+                f"in up to {min(mass, 1):.1%} of the model's own frames some reading has code 0 on the true line, most "
+                f"often one of {worst.name} ({worst.mass:.1%})"
+            ),
+            "use more --prob-bits"
+            + (
+                ""
+                if options.scaling is Scale.ADDRESS or options.sensor_mode is not SensorMode.COLUMN
+                else " or --scale address"
+            )
+            + ", or a floor for outliers",
+        )
+
+
+def line_name(searched: Sequence[Dimension], line: int) -> str:
+    """Return a line by the values of the searched variables: `y = 1.5, x = 3`."""
+    places = np.unravel_index(line, [dimension.size for dimension in searched])
+    return ", ".join(
+        f"{dimension.label} = {dimension.states[at] if dimension.states else f'{dimension.value(float(at)):g}'}"
+        for dimension, at in zip(searched, places, strict=True)
+    )
+
+
+def reading(variable: Variable, address: int) -> str:
+    """Return a value of a variable as a user knows it: `3.5`, `open`, or `a missing reading`."""
+    if address >= variable.values:
+        return "a missing reading"
+    if variable.states:
+        return variable.states[address]
+    return f"{variable.offset + address * variable.step:g}"
+
+
+def _alive(machine: CheckedMachine) -> NDArray[np.bool_]:
+    """Return which lines can count for at least some readings: bool[lines]."""
+    alive = np.ones(machine.prior.shape[1], dtype=np.bool_)
+    if machine.parameters.prior_mode is PriorMode.TABLE:  # what the host writes is not known here
+        alive &= machine.prior_rows().any(axis=0)
+    for column in range(len(machine.tables)):
+        alive &= machine.served(column).any(axis=0)
+    return alive
+
+
+def _lines(machine: CheckedMachine) -> Iterator[Finding]:
+    """Lines that can never count, whatever is read."""
+    deployment = machine.deployment
+    dead = ~_alive(machine)
+    if dead.all():
+        yield error(
+            Check.DEAD_LINES,
+            "the machine",
+            "no line can ever count, whatever is read: each has code 0 in the prior or in some whole column",
+            _wider(machine),
+        )
+        return
+    if machine.parameters.prior_mode is PriorMode.TABLE:
+        yield from _dead_prior(machine)
+    for column, variable in enumerate(deployment.sensors[: len(machine.tables)]):
+        lines = np.flatnonzero(~machine.served(column).any(axis=0))
+        if lines.size:
+            yield warning(
+                Check.DEAD_LINES,
+                variable.name,
+                f"every value of it has code 0 at {_some_lines(deployment, lines)}, which can never count",
+                _wider(machine),
+            )
+    for index, board in enumerate(deployment.boards):
+        if dead[board.line_offset : board.line_offset + board.lines].all():
+            yield warning(
+                Check.DEAD_BOARD,
+                f"board {index}",
+                "none of its lines can ever count, whatever is read",
+                "use fewer --partitions, or a model that searches what is possible",
+            )
+
+
+def _dead_prior(machine: CheckedMachine) -> Iterator[Finding]:
+    deployment, model = machine.deployment, machine.model
+    dead = ~machine.prior_rows().any(axis=0)
+    meant = np.zeros_like(dead)
+    if model is not None:
+        meant = model.prior_distribution == 0
+        if model.prior_select is not None:
+            meant &= ~model.prior_select.table.any(axis=0)
+    if (lines := np.flatnonzero(dead & meant)).size:
+        yield note(
+            Check.DEAD_LINES,
+            "the prior",
+            f"the model says that {_some_lines(deployment, lines)} is never the case, so it never counts",
+        )
+    if (lines := np.flatnonzero(dead & ~meant)).size:
+        yield warning(
+            Check.DEAD_LINES,
+            "the prior",
+            f"it has code 0 at {_some_lines(deployment, lines)}, which can never count",
+            "" if model is None else _wider(machine),
+        )
+
+
+def _readings(machine: CheckedMachine) -> Iterator[Finding]:
+    """Readings for which every line has a 0 code: a frame with one ends as `impossible`."""
+    deployment, model = machine.deployment, machine.model
+    alive = _alive(machine)
+    if not alive.any() or machine.parameters.sensor_mode is not SensorMode.COLUMN:
+        return  # where each line has a reading of its own, a value says nothing of the other lines
+    rows: list[tuple[Variable, NDArray[np.uint16], NDArray[np.float64] | None]] = [
+        (variable, table, None if model is None else model.known[column].table @ model.prior_distribution)
+        for column, (variable, table) in enumerate(zip(deployment.sensors, machine.tables, strict=True))
+    ]
+    if deployment.prior_select is not None:
+        rows.append((deployment.prior_select, machine.prior, None))
+    for variable, table, probabilities in rows:
+        impossible = ~table[: variable.values, alive].any(axis=1)
+        possible = np.ones_like(impossible) if probabilities is None else probabilities > 0
+        if (addresses := np.flatnonzero(impossible & possible)).size:
+            often = "" if probabilities is None else f", {probabilities[addresses].sum():.2g} of all readings"
+            yield warning(
+                Check.IMPOSSIBLE_READINGS,
+                variable.name,
+                (
+                    f"{addresses.size} of its {variable.values} values ({_values(variable, addresses)}{often}) have code "
+                    "0 on every line that can count, so such a frame gives no posterior"
+                ),
+                _wider(machine),
+            )
+        if (addresses := np.flatnonzero(impossible & ~possible)).size:
+            yield note(
+                Check.IMPOSSIBLE_READINGS,
+                variable.name,
+                (
+                    f"the model says that {addresses.size} of its {variable.values} values "
+                    f"({_values(variable, addresses)}) never occur; a frame with one gives no posterior"
+                ),
+                "a floor for outliers would let such a reading pass",
+            )
+
+
+def _columns(machine: CheckedMachine) -> Iterator[Finding]:
+    """Columns that say nothing, and two that read the same."""
+    of_columns = machine.parameters.sensor_mode is SensorMode.COLUMN
+    for variable, table in zip(
+        machine.deployment.sensors, machine.tables if of_columns else (), strict=of_columns
+    ):
+        served = table[: variable.values]
+        if served.shape[1] > 1 and (served == served[:, :1]).all():
+            yield note(
+                Check.COLUMN_WITHOUT_EFFECT,
+                variable.name,
+                "each of its values has the same code on every line, so its readings change nothing",
+                "leave it out, or use more --prob-bits",
+            )
+
+
+def _stopping(machine: CheckedMachine) -> Iterator[Finding]:
+    limits = machine.deployment.machine
+    if limits.target_count > limits.max_cycles:
+        yield warning(
+            Check.STOPPING,
+            "the machine",
+            (
+                f"no counter can reach {limits.target_count} in {limits.max_cycles} cycles, so every frame takes all of "
+                "them"
+            ),
+            f"use --max-cycles above {limits.target_count}, or a smaller --target-count",
+        )
+
+
+def _wider(machine: CheckedMachine) -> str:
+    scale = "" if machine.deployment.machine.scale == "address" else "--scale address or "
+    return f"use {scale}more --prob-bits"
+
+
+def _some_lines(deployment: Deployment, lines: NDArray[np.int64]) -> str:
+    first = line_name(deployment.searched, int(lines[0]))
+    if len(lines) == 1:
+        return first
+    return f"{len(lines)} of {deployment.machine.lines} lines ({first} and others)"
+
+
+def _values(variable: Variable, addresses: NDArray[np.int64]) -> str:
+    """Return addresses as values, neighbours as ranges."""
+    ranges: list[list[int]] = []
+    for address in addresses.tolist():
+        if ranges and address == ranges[-1][1] + 1:
+            ranges[-1][1] = address
+        else:
+            ranges.append([address, address])
+    shown = [
+        reading(variable, low) if low == high else f"{reading(variable, low)} to {reading(variable, high)}"
+        for low, high in ranges[:_MOST_RANGES]
+    ]
+    return ", ".join(shown) + (" and others" if len(ranges) > _MOST_RANGES else "")
