@@ -27,11 +27,13 @@ from services.sockets.control_socket import control_served
 from services.sockets.records import (
     AnyRecord,
     Begin,
+    FailureReason,
     Frame,
     FrameFailed,
     FrameResult,
     Notice,
     NotReloaded,
+    Outcome,
     Prepared,
     Publish,
     Published,
@@ -400,7 +402,7 @@ class Master:
             self.fail(ReportedError(record.exit_code, record.sentence))
             return
         self._losses["failed on a board"] += 1
-        if "is not back yet" not in record.sentence:
+        if record.reason is not FailureReason.AWAY:
             now = time.monotonic()
             self._failures.append(now)
             recent = [each for each in self._failures if now - each <= RESTARTS_WITHIN]
@@ -418,7 +420,7 @@ class Master:
     def _was_published(self, record: Published) -> None:
         self._at_publisher = max(0, self._at_publisher - 1)
         self._published_at = time.monotonic()
-        if record.outcome == "published":
+        if record.outcome is Outcome.PUBLISHED:
             self._published += 1
             self._last = (record.number, time.monotonic_ns())
             if record.missed:
@@ -432,7 +434,7 @@ class Master:
                     f"the result was published, but not seen on the wire within {self._settings.seen_timeout:g} s"
                 )
         elif self._once:
-            if record.outcome == "no posterior":
+            if record.outcome is Outcome.NO_POSTERIOR:
                 msg = f"frame {record.number} has no posterior: no line of the model counted for its readings; nothing was published"
                 self.fail(VariableError(msg))
             else:

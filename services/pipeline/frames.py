@@ -14,7 +14,7 @@ from bridge.errors import BridgeError
 from bridge.fields import Field
 from bridge.stamps import header_stamp_ns
 from services.errors import OverflowedQueueError, VariableError
-from services.sockets.records import Addresses
+from services.sockets.records import Addresses, Reading
 from toolchain.deployment import Deployment, MachineSection, Variable, WrittenPrior
 from toolchain.deployment.address import to_address
 from toolchain.errors import ReadingError
@@ -29,20 +29,6 @@ TELLING = 8
 """Messages of every topic without a pair after which it is said how far apart they are."""
 
 Item = TypeVar("Item")
-
-
-@dataclass(frozen=True, slots=True)
-class CompleteReading:
-    """One address per variable (None: missing; a row of them where it has several), with the newest stamp or receipt.
-
-    `prior_codes` is a written prior, two bytes a line (and replica); empty where the machine's own stands.
-    """
-
-    addresses: Addresses
-    stamp_ns: int
-    received_ns: int
-    received_tick: int
-    prior_codes: bytes = b""
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,7 +157,7 @@ class FrameAssembler:
 
     def take(
         self, source: int, message: dict[str, Any], received_ns: int, received_tick: int
-    ) -> CompleteReading | None:
+    ) -> Reading | None:
         """One message of one source; the frame that it completes, if any.
 
         Args:
@@ -192,8 +178,12 @@ class FrameAssembler:
             self._readers[source].prior(message),
         )
         if len(self._fresh) == 1:
-            return CompleteReading(
-                list(taken.addresses), taken.stamp_ns, received_ns, received_tick, taken.prior_codes
+            return Reading(
+                stamp_ns=taken.stamp_ns,
+                received_ns=received_ns,
+                received_tick=received_tick,
+                addresses=list(taken.addresses),
+                prior_codes=taken.prior_codes,
             )
         self._newest[source] = taken.stamp_ns, stamp is not None
         self._waited[source] += 1
@@ -204,7 +194,7 @@ class FrameAssembler:
         queue.append(taken)
         return self._pair(source, taken)
 
-    def _pair(self, newest: int, arrived: _Message) -> CompleteReading | None:
+    def _pair(self, newest: int, arrived: _Message) -> Reading | None:
         chosen: dict[int, _Message] = {newest: arrived}
         for source, queue in enumerate(self._fresh):
             if source == newest:
@@ -228,7 +218,13 @@ class FrameAssembler:
         self._waited = [0] * len(self._waited)
         latest = max(chosen.values(), key=lambda each: each.stamp_ns)
         last = max(chosen.values(), key=lambda each: each.received_tick)
-        return CompleteReading(addresses, latest.stamp_ns, last.received_ns, last.received_tick, prior_codes)
+        return Reading(
+            stamp_ns=latest.stamp_ns,
+            received_ns=last.received_ns,
+            received_tick=last.received_tick,
+            addresses=addresses,
+            prior_codes=prior_codes,
+        )
 
     def forget(self) -> None:
         """Wait for no partners any more: messages that have none yet are counted as unpaired."""

@@ -28,10 +28,11 @@ from pcie_shim.host.mini_cluster import PROGRAMMING_S, MiniCluster
 from pcie_shim.programming_file import Image, read_image
 from services.errors import StackError
 from services.pipeline.generations import Generations
+from services.pipeline.results import encode_boards
 from services.settings import Settings
 from services.sockets.records import (
     Addresses,
-    BoardOutcome,
+    FailureReason,
     Frame,
     FrameFailed,
     FrameResult,
@@ -45,6 +46,10 @@ from toolchain.deployment import Deployment
 
 TICK = 0.2
 """Seconds between attempts to open a board that is gone, and for each of them."""
+
+
+class BoardAwayError(BoardError):
+    """A board that failed an earlier frame is not back yet."""
 
 
 class Boards:
@@ -237,7 +242,7 @@ class Boards:
         if self._cluster is None or self.gone:
             board, why = next(iter(self.gone.items()), (0, "it was not opened"))
             msg = f"board {board} is not back yet ({why})"
-            raise BoardError(msg, board=board)
+            raise BoardAwayError(msg, board=board)
         return self._cluster
 
     def _input(self, frame: Frame) -> FrameInput:
@@ -389,16 +394,7 @@ def result_record(number: int, output: FrameOutput) -> FrameResult:
     """The boards' outcome as a record."""
     return FrameResult(
         number=number,
-        boards=[
-            BoardOutcome(
-                board.words,
-                board.cycles,
-                int(board.reason),
-                list(board.replica_cycles),
-                [int(reason) for reason in board.replica_reasons],
-            )
-            for board in output.boards
-        ],
+        boards=encode_boards(output.boards),
         register_writes_ns=output.register_writes_ns,
         compute_ns=output.compute_ns,
         reads_ns=output.reads_ns,
@@ -408,4 +404,5 @@ def result_record(number: int, output: FrameOutput) -> FrameResult:
 
 def frame_failed(number: int, error: BoardError) -> FrameFailed:
     """A frame that the boards did not finish, as a record."""
-    return FrameFailed(number, error.board, exit_code_of(error), str(error))
+    reason = FailureReason.AWAY if isinstance(error, BoardAwayError) else FailureReason.FAILED
+    return FrameFailed(number, error.board, exit_code_of(error), str(error), reason)

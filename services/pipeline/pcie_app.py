@@ -30,6 +30,7 @@ from services.sockets.records import (
     AnyRecord,
     Frame,
     Hello,
+    LossReason,
     Notice,
     Prepare,
     Ready,
@@ -98,7 +99,7 @@ class Progress:
             frames=FrameCounts(
                 received=self.asked,
                 completed=self._computed,
-                lost=reasons({"failed on a board": self.failed}),
+                lost=reasons({LossReason.FAILED: self.failed}),
                 last_number=number or None,
                 last_age_s=seconds_since(tick),
             ),

@@ -21,6 +21,7 @@ import typer
 from bridge.client import Publication, Ros, State, Subscription, connect
 from bridge.errors import BridgeError, DisconnectedError, NoMessageError, SlowPeerError
 from machines.bm1 import StopReason
+from pcie_shim.host.frame import BoardResult
 from posteriors.results import FRAME_TOPIC, FRAME_TYPE, MAX_RESULT
 from services.commands import flags as options
 from services.errors import InputLineError, SettingsError
@@ -28,6 +29,7 @@ from services.pipeline.generations import Generations
 from services.pipeline.results import (
     FrameReport,
     Inferred,
+    encode_boards,
     posterior_layout,
     times_of,
 )
@@ -35,9 +37,9 @@ from services.settings import Settings, load_settings
 from services.sockets.records import (
     AnyRecord,
     Begin,
-    BoardOutcome,
     FrameResult,
     Hello,
+    Outcome,
     Prepare,
     Publish,
     Published,
@@ -190,7 +192,7 @@ class ResultTopics:
             elif error is not None:
                 raise error
         published = self.publish_now(publish, inferred)
-        if look and published.outcome == "published" and inferred.posterior is not None:
+        if look and published.outcome is Outcome.PUBLISHED and inferred.posterior is not None:
             seen = await self._seen(inferred.posterior.tolist(), self._settings.seen_timeout)
             published = msgspec.structs.replace(published, seen=seen)
         return published
@@ -213,10 +215,10 @@ class ResultTopics:
                     missed += not _sent(publication, {"layout": self._layout, "data": posterior})
         self._previous_out_ns = time.monotonic_ns() - started
         if posterior is None:
-            return _became_of(publish, inferred, "no posterior" if told else "rosbridge away")
+            return _became_of(publish, inferred, Outcome.NO_POSTERIOR if told else Outcome.ROSBRIDGE_AWAY)
         if missed == len(self._outputs):
-            return _became_of(publish, inferred, "rosbridge away")
-        return _became_of(publish, inferred, "published", missed)
+            return _became_of(publish, inferred, Outcome.ROSBRIDGE_AWAY)
+        return _became_of(publish, inferred, Outcome.PUBLISHED, missed)
 
     async def publish_array(self, values: Any) -> None:
         """Publish probabilities (float64, one per line) on every output."""
@@ -233,7 +235,7 @@ def _sent(publication: Publication, message: dict[str, Any]) -> bool:
     return True
 
 
-def _became_of(publish: Publish, inferred: Inferred, outcome: str, missed: int = 0) -> Published:
+def _became_of(publish: Publish, inferred: Inferred, outcome: Outcome, missed: int = 0) -> Published:
     posterior = inferred.posterior
     return Published(
         number=publish.result.number,
@@ -241,7 +243,7 @@ def _became_of(publish: Publish, inferred: Inferred, outcome: str, missed: int =
         seen=None,
         best_line=inferred.best,
         best_probability=float(posterior[inferred.best]) if posterior is not None else 0.0,
-        cycles=max((board.cycles for board in publish.result.boards), default=0),
+        cycles=max((board.cycles for board in inferred.boards), default=0),
         total_ns=time.monotonic_ns() - publish.received_tick,
         missed=missed,
     )
@@ -262,7 +264,7 @@ class Publisher:
         self._log = get_logger(ROLE, settings.log_level)
         self._run_directory = settings.run_directory
         self._where = ""
-        self._outcomes: Counter[str] = Counter()
+        self._outcomes: Counter[Outcome] = Counter()
         self._last = (0, 0)
 
     def status(self) -> ProcessStatus:
@@ -280,8 +282,10 @@ class Publisher:
             connections=connections(self._topics.rosbridges),
             frames=FrameCounts(
                 received=outcomes.total() + self._waiting.qsize(),
-                completed=outcomes["published"],
-                lost=reasons({reason: count for reason, count in outcomes.items() if reason != "published"}),
+                completed=outcomes[Outcome.PUBLISHED],
+                lost=reasons(
+                    {reason: count for reason, count in outcomes.items() if reason is not Outcome.PUBLISHED}
+                ),
                 last_number=number or None,
                 last_age_s=seconds_since(tick),
             ),
@@ -302,8 +306,8 @@ class Publisher:
             try:
                 self._waiting.put_nowait(record)
             except asyncio.QueueFull:
-                self._outcomes["rosbridge away"] += 1
-                self._link.send(Published(record.result.number, "rosbridge away", None, -1, 0.0, 0, 0))
+                self._outcomes[Outcome.ROSBRIDGE_AWAY] += 1
+                self._link.send(Published(record.result.number, Outcome.ROSBRIDGE_AWAY, None, -1, 0.0, 0, 0))
         elif isinstance(record, Hello):
             self._generations.greeted(record)
             self._topics.use(self._generations.deployment, record.generation)
@@ -320,7 +324,7 @@ class Publisher:
         """What became of a result."""
         self._link.send(published)
         self._outcomes[published.outcome] += 1
-        if published.outcome == "published":
+        if published.outcome is Outcome.PUBLISHED:
             self._last = (published.number, time.monotonic_ns())
         if self._follows:
             self._log.debug(
@@ -431,16 +435,16 @@ def result_from_line(
             msg = f"line {number} of standard input has {len(board.counts)} counts on a board of {each} replicas"
             raise InputLineError(msg)
     boards = [
-        BoardOutcome(
+        BoardResult(
             np.array(board.counts, dtype="<u4").tobytes(),
             board.cycles,
             board.reason,
-            board.replica_cycles,
-            [int(reason) for reason in board.replica_reasons],
+            tuple(board.replica_cycles),
+            tuple(board.replica_reasons),
         )
         for board in value.boards
     ]
-    return FrameResult(value.number, boards, 0, 0, 0, 0), value.stamp_ns
+    return FrameResult(value.number, encode_boards(boards), 0, 0, 0, 0), value.stamp_ns
 
 
 async def publish_lines(settings: Settings, deployment: Deployment) -> int:
@@ -449,7 +453,7 @@ async def publish_lines(settings: Settings, deployment: Deployment) -> int:
     async with topics.opened() as where:
         say(where)
         number = 0
-        outcomes: Counter[str] = Counter()
+        outcomes: Counter[Outcome] = Counter()
         async for line in _lines():
             number += 1
             if not line.strip():
@@ -465,9 +469,11 @@ async def publish_lines(settings: Settings, deployment: Deployment) -> int:
                 outcomes[published.outcome] += 1
             else:
                 await topics.publish_array(result)
-                outcomes["published"] += 1
-    others = ", ".join(f"{count} {outcome}" for outcome, count in outcomes.items() if outcome != "published")
-    say(f"{outcomes['published']} published{f'; not published: {others}' if others else ''}")
+                outcomes[Outcome.PUBLISHED] += 1
+    others = ", ".join(
+        f"{count} {outcome}" for outcome, count in outcomes.items() if outcome is not Outcome.PUBLISHED
+    )
+    say(f"{outcomes[Outcome.PUBLISHED]} published{f'; not published: {others}' if others else ''}")
     return 0
 
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import accumulate
 from typing import Any, Literal
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
 import orjson
@@ -13,6 +15,7 @@ import orjson
 from bridge.stamps import header
 from machines.bm1 import StopReason
 from machines.posterior import joint_posterior, posterior_of_lines
+from pcie_shim.host.frame import BoardResult
 from services.sockets.records import FrameResult, Publish
 from toolchain.deployment import Deployment
 
@@ -39,15 +42,20 @@ class Times:
     rosbridge_out: float
 
 
-def counts_of(result: FrameResult) -> list[npt.NDArray[np.uint32]]:
-    """The boards' counts as uint32 arrays, one per board, in the order of the lines."""
-    return [np.frombuffer(board.counts, dtype="<u4") for board in result.boards]
+_encoder = msgspec.msgpack.Encoder()
+_decoder = msgspec.msgpack.Decoder(list[BoardResult])
+
+
+def encode_boards(boards: Sequence[BoardResult]) -> msgspec.Raw:
+    """Return the boards' part of a `FrameResult`, which the master passes on as it is."""
+    return msgspec.Raw(_encoder.encode(boards))
 
 
 class Inferred:
     """What the counts of a result come to.
 
     Attributes:
+        boards: What each board returned.
         posterior: float64[all lines], the joint posterior; None when no line of any board counted. Of replicas
             float64[replicas * all lines], one posterior after the other, zeros for a replica that has none; None when
             none has.
@@ -56,12 +64,12 @@ class Inferred:
     """
 
     def __init__(self, result: FrameResult) -> None:
-        boards = result.boards
+        boards = self.boards = _decoder.decode(result.boards)
         if boards and boards[0].replica_cycles:
-            self._of_replicas(result)
+            self._of_replicas()
             return
-        counts = np.frombuffer(b"".join([board.counts for board in boards]), dtype="<u4")
-        lines = [len(board.counts) // 4 for board in boards]
+        counts = np.frombuffer(b"".join([board.words for board in boards]), dtype="<u4")
+        lines = [len(board.words) // 4 for board in boards]
         self.totals: list[int] = []
         self.posterior: npt.NDArray[np.float64] | None = None
         if lines and all(lines):
@@ -70,10 +78,10 @@ class Inferred:
             self.posterior = posterior_of_lines(counts, lines, [board.cycles for board in boards])
         self.best = -1 if self.posterior is None else int(self.posterior.argmax())
 
-    def _of_replicas(self, result: FrameResult) -> None:
-        boards, replicas = result.boards, len(result.boards[0].replica_cycles)
+    def _of_replicas(self) -> None:
+        boards, replicas = self.boards, len(self.boards[0].replica_cycles)
         # each board has its lines of every replica
-        counts = [np.frombuffer(board.counts, dtype="<u4").reshape(replicas, -1) for board in boards]
+        counts = [np.frombuffer(board.words, dtype="<u4").reshape(replicas, -1) for board in boards]
         self.totals = [int(of_board.sum(dtype=np.uint64)) for of_board in counts]
         joints = [
             joint_posterior(
@@ -186,7 +194,7 @@ class FrameReport:
         published = inferred.posterior is not None
         if published:
             overall = "posterior"
-        elif all(board.reason == StopReason.IMPOSSIBLE for board in result.boards):
+        elif all(board.reason is StopReason.IMPOSSIBLE for board in inferred.boards):
             overall = "no posterior: the readings are impossible for every line"
         else:
             overall = "no posterior: no line counted within max_cycles"
@@ -197,7 +205,7 @@ class FrameReport:
                 overall,
                 result.number,
                 "true" if published else "false",
-                max((board.cycles for board in result.boards), default=0),
+                max((board.cycles for board in inferred.boards), default=0),
                 sum(totals),
                 publish.received_ns,
                 sent_ns,
@@ -211,12 +219,12 @@ class FrameReport:
                 times.rosbridge_out,
             )
         ]
-        for index, (board, total) in enumerate(zip(result.boards, totals, strict=True)):
-            words = REASON_WORDS[StopReason(board.reason)]
+        for index, (board, total) in enumerate(zip(inferred.boards, totals, strict=True)):
+            words = REASON_WORDS[board.reason]
             said = (index, words, index, board.cycles, total, words)
             if board.replica_cycles:
                 cycles = ",".join(map(str, board.replica_cycles))
-                reasons = ",".join(REASON_WORDS[StopReason(reason)] for reason in board.replica_reasons)
+                reasons = ",".join(REASON_WORDS[reason] for reason in board.replica_reasons)
                 statuses.append(self._board_of_replicas % (*said, cycles, reasons))
             else:
                 statuses.append(self._board % said)

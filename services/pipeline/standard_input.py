@@ -9,11 +9,10 @@ import msgspec
 import numpy as np
 import orjson
 
-from machines.bm1 import StopReason
 from pcie_shim.errors import FrameInputError
 from services.errors import InputLineError
-from services.pipeline.mini_cluster import Boards, result_record
-from services.pipeline.results import REASON_WORDS, counts_of
+from services.pipeline.mini_cluster import Boards
+from services.pipeline.results import REASON_WORDS
 from services.sockets.records import Addresses, Frame
 from terminal.logs import say
 
@@ -55,7 +54,7 @@ def compute_lines(boards: Boards, banks: int) -> int:
             codes = np.array(reading.prior_codes, "<u2").tobytes()
             frame = Frame(number, reading.addresses, number % banks, codes)
             try:
-                result = result_record(number, boards.run(frame))
+                output = boards.run(frame)
             except FrameInputError as error:
                 msg = f"line {number} of standard input: {error}"
                 raise InputLineError(msg) from error
@@ -64,10 +63,10 @@ def compute_lines(boards: Boards, banks: int) -> int:
                 "stamp_ns": reading.stamp_ns,
                 "boards": [
                     {
-                        "counts": counts.tolist(),
+                        "counts": np.frombuffer(board.words, "<u4").tolist(),
                         "cycles": board.cycles,
                         "reason": board.reason,
-                        "why": REASON_WORDS[StopReason(board.reason)],
+                        "why": REASON_WORDS[board.reason],
                     }
                     | (
                         {
@@ -77,7 +76,7 @@ def compute_lines(boards: Boards, banks: int) -> int:
                         if board.replica_cycles
                         else {}
                     )
-                    for board, counts in zip(result.boards, counts_of(result), strict=True)
+                    for board in output.boards
                 ],
             }
             sys.stdout.buffer.write(orjson.dumps(printed) + b"\n")

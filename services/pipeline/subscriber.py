@@ -8,6 +8,7 @@ import time
 from functools import partial
 from typing import Annotated
 
+import msgspec
 import typer
 from pydantic import ValidationError
 
@@ -15,7 +16,7 @@ from bridge.client import Message, Ros, State, Subscription, connect
 from bridge.errors import BridgeError, NoMessageError
 from services.commands import flags as options
 from services.errors import RosbridgeLostError, SettingsError, VariableError
-from services.pipeline.frames import CompleteReading, FrameAssembler
+from services.pipeline.frames import FrameAssembler
 from services.pipeline.generations import Generations
 from services.pipeline.printed_readings import print_addresses, print_readings
 from services.settings import Settings, load_settings
@@ -24,10 +25,10 @@ from services.sockets.records import (
     AnyRecord,
     Begin,
     Hello,
+    LossReason,
     Notice,
     NotReloaded,
     Prepare,
-    Reading,
     Ready,
     Switch,
     Switched,
@@ -152,9 +153,9 @@ class Subscriber:
                 completed=self._completed,
                 lost=reasons(
                     {
-                        "passed over": self._passed_over + self._passed_over_before,
-                        "with an unusable variable": self._unusable,
-                        "unpaired": self._unpaired,
+                        LossReason.PASSED_OVER: self._passed_over + self._passed_over_before,
+                        LossReason.UNUSABLE: self._unusable,
+                        LossReason.UNPAIRED: self._unpaired,
                     }
                 ),
                 last_number=None,
@@ -276,8 +277,12 @@ class Subscriber:
             self._passed_over += 1
             return
         unpaired = self._unpaired
-        record = _reading_record(
-            reading, self._passed_over, unpaired - self._unpaired_told, self._generations.number
+        record = msgspec.structs.replace(
+            reading,
+            sent_tick=time.monotonic_ns(),
+            passed_over=self._passed_over,
+            unpaired=unpaired - self._unpaired_told,
+            generation=self._generations.number,
         )
         if self._link.send(record):
             self._completed += 1
@@ -287,20 +292,6 @@ class Subscriber:
             self._once = (
                 False  # its frame is on its way; what comes later must not end a service that goes on
             )
-
-
-def _reading_record(reading: CompleteReading, passed_over: int, unpaired: int, generation: int) -> Reading:
-    return Reading(
-        stamp_ns=reading.stamp_ns,
-        received_ns=reading.received_ns,
-        received_tick=reading.received_tick,
-        sent_tick=time.monotonic_ns(),
-        addresses=reading.addresses,
-        passed_over=passed_over,
-        unpaired=unpaired,
-        prior_codes=reading.prior_codes,
-        generation=generation,
-    )
 
 
 app = make_app(

@@ -67,7 +67,8 @@ class RecordSplitter:
             if len(pending) < end:
                 break
             try:
-                records.append(_decoder.decode(memoryview(pending)[at + _LENGTH.size : end]))
+                # a copy: parts of a record that stay encoded keep their buffer
+                records.append(_decoder.decode(bytes(memoryview(pending)[at + _LENGTH.size : end])))
             except (msgspec.MsgspecError, RecursionError) as error:
                 msg = f"{self._peer} sent bytes that are no record of rosbayes ({error})"
                 raise LocalSocketError(msg) from error

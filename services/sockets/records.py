@@ -1,4 +1,4 @@
-"""What the services tell each other: the records that cross the local sockets.
+"""Records that cross the local sockets between the services.
 
 Every record is a MessagePack array whose first element is its tag. Times called `*_ns` are Unix
 time; those called `*_tick` are the machine's monotonic clock, comparable between its processes.
@@ -6,7 +6,45 @@ time; those called `*_tick` are the machine's monotonic clock, comparable betwee
 
 from __future__ import annotations
 
+from enum import StrEnum
+
 import msgspec
+
+
+class LossReason(StrEnum):
+    """Reason why a reading has no result, or not everywhere, as `status` shows it."""
+
+    PASSED_OVER = "passed over"
+    """A newer reading took its place (`queue = latest`)."""
+    UNPAIRED = "unpaired"
+    """No message came on another topic within the tolerance."""
+    UNUSABLE = "with an unusable variable"
+    FAILED = "failed on a board"
+    WITH_APP = "lost with pcie-app"
+    WITH_PUBLISHER = "lost with the publisher"
+    IN_RELOAD = "lost in a reload"
+    NO_POSTERIOR = "no posterior"
+    ROSBRIDGE_AWAY = "rosbridge away"
+    SOME_TOPICS = "on some topics only"
+    """Published, but not on the topics of a server that was away."""
+
+
+class Outcome(StrEnum):
+    """Fate of a result at the publisher."""
+
+    PUBLISHED = "published"
+    NO_POSTERIOR = "no posterior"
+    """No line of the model counted."""
+    ROSBRIDGE_AWAY = "rosbridge away"
+
+
+class FailureReason(StrEnum):
+    """Reason why the boards did not finish a frame."""
+
+    FAILED = "failed"
+    """A board failed while it computed the frame."""
+    AWAY = "away"
+    """A board that failed an earlier frame is not back yet."""
 
 
 class Record(msgspec.Struct, array_like=True, frozen=True):
@@ -14,9 +52,9 @@ class Record(msgspec.Struct, array_like=True, frozen=True):
 
 
 class Hello(Record, tag="hello", frozen=True):
-    """First record in each direction: who speaks, which version, for which model.
+    """First record in each direction: the sender's role, version and deployment.
 
-    `generation` is the master's to say: how often the run has changed its deployment. The service counts on from there.
+    `generation` comes from the master: how often the run has changed its deployment. The service continues from there.
     """
 
     role: str
@@ -26,7 +64,7 @@ class Hello(Record, tag="hello", frozen=True):
 
 
 class Begin(Record, tag="begin", frozen=True):
-    """Master to a service: go ahead. `once`: this run ends after its first frame."""
+    """Master to a service: begin. With `once` the run ends after its first frame."""
 
     once: bool
 
@@ -38,9 +76,9 @@ class Ready(Record, tag="ready", frozen=True):
 
 
 class Notice(Record, tag="notice", frozen=True):
-    """A service to the master: something that the user should read, but that ends nothing.
+    """A service to the master: a message for the user that does not end the run.
 
-    With `--log-level debug` the master sends one to the subscriber for each frame, which carries the frame's number.
+    With `--log-level debug` the master sends one per frame to the subscriber, with the frame's number.
     """
 
     level: str
@@ -55,31 +93,31 @@ class Trouble(Record, tag="trouble", frozen=True):
 
 
 Addresses = list[int | list[int] | None]
-"""What a frame's readings became, in the order of the variables: an address, None for a missing one, or, where replicas or
-lines have readings of their own, a row of them (row by row, -1 for a missing one)."""
+"""Addresses of a frame's readings, in the order of the variables: one, None for a missing one, or, where replicas or lines
+have readings of their own, a flat list (row by row, -1 for a missing one)."""
 
 
 class Reading(Record, tag="reading", frozen=True):
-    """Subscriber to master: one complete set of addresses, in the order of the machine's columns.
+    """Subscriber to master: one complete set of addresses, with the newest stamp or receipt.
 
-    `addresses` holds None for a missing reading; `passed_over` counts the readings that the
-    subscriber lost since the last one it sent, `unpaired` the messages whose partners on other topics did not come.
-    `generation` is that of the deployment by which the addresses were made: the boards' tables have to be of the same.
+    `prior_codes` is a written prior, two bytes per line (and replica); empty for the machine's own. `passed_over` counts
+    the readings that the subscriber lost since the last one it sent, `unpaired` the messages without a partner on other
+    topics. `generation` is that of the deployment by which the addresses were computed: boards need tables of the same.
     """
 
     stamp_ns: int
     received_ns: int
     received_tick: int
-    sent_tick: int
-    addresses: Addresses
-    passed_over: int
+    sent_tick: int = 0
+    addresses: Addresses = []
+    passed_over: int = 0
     unpaired: int = 0
     prior_codes: bytes = b""
     generation: int = 0
 
 
 class Unusable(Record, tag="unusable", frozen=True):
-    """Subscriber to master: a message that makes no frame. Equal causes have equal `cause`."""
+    """Subscriber to master: a message that can't become a frame. Equal causes have equal `cause`."""
 
     cause: str
     sentence: str
@@ -94,24 +132,14 @@ class Frame(Record, tag="frame", frozen=True):
     prior_codes: bytes = b""
 
 
-class BoardOutcome(Record, tag="board", frozen=True):
-    """What one board returned: counts as little-endian uint32, one per line of its partition, replica after replica.
+class FrameResult(Record, tag="result", frozen=True):
+    """pcie-app to master: the boards' results, and where the time went.
 
-    Where there are several replicas each has its own cycles and reason; then `cycles` are those of the one that ran longest.
+    `boards` is a list of `pcie_shim.host.frame.BoardResult`, which only its sender and the publisher read.
     """
 
-    counts: bytes
-    cycles: int
-    reason: int
-    replica_cycles: list[int] = []
-    replica_reasons: list[int] = []
-
-
-class FrameResult(Record, tag="result", frozen=True):
-    """pcie-app to master: the boards' counts and where the time went."""
-
     number: int
-    boards: list[BoardOutcome]
+    boards: msgspec.Raw
     register_writes_ns: int
     compute_ns: int
     reads_ns: int
@@ -125,6 +153,7 @@ class FrameFailed(Record, tag="failed", frozen=True):
     board: int
     exit_code: int
     sentence: str
+    reason: FailureReason
 
 
 class Publish(Record, tag="publish", frozen=True):
@@ -139,16 +168,15 @@ class Publish(Record, tag="publish", frozen=True):
 
 
 class Published(Record, tag="published", frozen=True):
-    """Publisher to master: what became of a result.
+    """Publisher to master: the fate of a result.
 
-    `outcome` is "published", "no posterior" or "rosbridge away"; `seen` says whether it was seen on
-    the wire (None where nobody looked). `best_line` has `best_probability`; `total_ns` is the time
-    from the reading's receipt to the result's sending. `missed` counts the outputs that it did not go to, of several,
-    because their servers were away.
+    `seen` is whether it was seen on the wire (None where nobody looked). `best_line` has `best_probability`;
+    `total_ns` is the time from the reading's receipt to the result's sending. `missed` counts the outputs, of several,
+    whose servers were away.
     """
 
     number: int
-    outcome: str
+    outcome: Outcome
     seen: bool | None
     best_line: int
     best_probability: float
@@ -158,7 +186,7 @@ class Published(Record, tag="published", frozen=True):
 
 
 class Prepare(Record, tag="prepare", frozen=True):
-    """Master to a service: read this deployment, check it, and keep it ready; nothing changes yet."""
+    """Master to a service: read and check this deployment, and keep it ready; nothing changes yet."""
 
     generation: int
     folder: str
@@ -184,7 +212,7 @@ class Switched(Record, tag="switched", frozen=True):
 
 
 class NotReloaded(Record, tag="not reloaded", frozen=True):
-    """A service to the master: it could not prepare or switch, and goes on with what it had."""
+    """A service to the master: it could not prepare or switch, and keeps the deployment that it had."""
 
     generation: int
     exit_code: int

@@ -41,7 +41,8 @@ def test_a_result_and_an_array():
     counted, stamp = result_from_line(
         b'{"number": 1, "boards": [{"counts": [1, 258], "cycles": 5, "reason": 1}]}', 1, 2
     )
-    assert (counted.boards[0].counts, counted.boards[0].cycles, stamp) == (b"\1\0\0\0\2\1\0\0", 5, None)
+    (board,) = Inferred(counted).boards
+    assert (board.words, board.cycles, stamp) == (b"\1\0\0\0\2\1\0\0", 5, None)
     assert result_from_line(b"[0.25, 0.75]", 1, 2) == [0.25, 0.75]
 
 
@@ -136,7 +137,7 @@ OF_REPLICAS = {
 def test_a_result_of_replicas():
     line = json.dumps({"number": 1, "boards": [OF_REPLICAS]}).encode()
     counted, _ = result_from_line(line, 1, 4, 2)
-    assert counted.boards[0].replica_cycles == [9, 5]
+    assert Inferred(counted).boards[0].replica_cycles == (9, 5)
     assert Inferred(counted).posterior == pytest.approx([1 / 3, 2 / 3, 3 / 7, 4 / 7])
 
 

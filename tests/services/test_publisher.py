@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 
 from bridge.client import State
+from pcie_shim.host.frame import BoardResult
 from services.pipeline.publisher import ResultTopics
+from services.pipeline.results import encode_boards
 from services.settings import Settings
-from services.sockets.records import BoardOutcome, FrameResult, Publish
+from services.sockets.records import FrameResult, Publish
 from tests.fake_rosbridge import FakeRosbridge
 from tests.integration.conftest import build_boat
 from toolchain.deployment import Output, load_deployment
@@ -40,10 +42,10 @@ async def topics_of(boat, first, second):
 
 def result(boat, number, count=1):
     boards = [
-        BoardOutcome(np.full(board.lines, count, "<u4").tobytes(), 9, REASON if count else 4)
+        BoardResult(np.full(board.lines, count, "<u4").tobytes(), 9, REASON if count else 4)
         for board in boat.boards
     ]
-    return Publish(FrameResult(number, boards, 0, 0, 0, 0), 0, 0, 0, 0, 0)
+    return Publish(FrameResult(number, encode_boards(boards), 0, 0, 0, 0), 0, 0, 0, 0, 0)
 
 
 async def gone(topics, fake):

@@ -9,13 +9,14 @@ import pytest
 from machines.bm1 import StopReason
 from machines.parameters import SensorMode
 from pcie_shim.errors import FrameInputError
+from pcie_shim.host.frame import BoardResult
 from posteriors.results import read_frame_report, read_posterior
 from services.errors import VariableError
 from services.pipeline.frames import FrameAssembler
 from services.pipeline.mini_cluster import machine_inputs
-from services.pipeline.results import FrameReport, Inferred, posterior_layout, times_of
+from services.pipeline.results import FrameReport, Inferred, encode_boards, posterior_layout, times_of
 from services.printed.result_picture import axes_of
-from services.sockets.records import BoardOutcome, FrameResult, Publish
+from services.sockets.records import FrameResult, Publish
 from toolchain.building.build import assemble
 from toolchain.building.options import BuildOptions
 from toolchain.models.model import Known, Model, PriorSelect, dimension
@@ -94,12 +95,12 @@ def test_rows_that_do_not_fit_are_refused(addresses, sentence):
 
 
 def result(*boards) -> FrameResult:
-    return FrameResult(7, list(boards), 1, 2, 3, 4)
+    return FrameResult(7, encode_boards(boards), 1, 2, 3, 4)
 
 
-def board(counts, cycles, reasons) -> BoardOutcome:
+def board(counts, cycles, reasons) -> BoardResult:
     words = np.array(counts, "<u4").tobytes()
-    return BoardOutcome(words, max(cycles), int(reasons[0]), cycles, [int(reason) for reason in reasons])
+    return BoardResult(words, max(cycles), reasons[0], tuple(cycles), tuple(reasons))
 
 
 OVERFLOW, SLICE, IMPOSSIBLE = StopReason.OVERFLOW, StopReason.SLICE, StopReason.IMPOSSIBLE

@@ -13,9 +13,11 @@ from services.pipeline.frames import QUEUE_ALL_DEPTH, WaitingFrames
 from services.settings import Settings
 from services.sockets.control_socket import ReloadOrder
 from services.sockets.records import (
+    FailureReason,
     Frame,
     FrameFailed,
     FrameResult,
+    Outcome,
     Prepare,
     Prepared,
     Published,
@@ -84,7 +86,7 @@ def read(run, count):
 def compute(run, count):
     for _ in range(count):
         number = run._peers.app.protocol.frames[-1].number
-        run.take(run._peers.app, FrameFailed(number, 0, 5, "it is not back yet"))
+        run.take(run._peers.app, FrameFailed(number, 0, 5, "", FailureReason.AWAY))
 
 
 async def test_readings_that_come_while_boards_are_held_end_no_run(run):
@@ -129,7 +131,10 @@ async def test_no_more_is_published_than_was_asked_for(boat):
     read(run, 10)
 
     def computed():
-        run.take(run._peers.app, FrameResult(run._peers.app.protocol.frames[-1].number, [], 0, 0, 0, 0))
+        run.take(
+            run._peers.app,
+            FrameResult(run._peers.app.protocol.frames[-1].number, msgspec.Raw(b"\x90"), 0, 0, 0, 0),
+        )
 
     def published(number, outcome):
         run.take(run._peers.publisher, Published(number, outcome, None, 0, 1.0, 1, 1))
@@ -137,20 +142,20 @@ async def test_no_more_is_published_than_was_asked_for(boat):
     for _ in range(5):
         computed()
     assert len(run._peers.app.protocol.frames) == 3
-    published(1, "no posterior")  # so one more is needed
+    published(1, Outcome.NO_POSTERIOR)  # so one more is needed
     assert len(run._peers.app.protocol.frames) == 4
     computed()
     for number in (2, 3, 4):
         assert not run._end.done()
-        published(number, "published")
+        published(number, Outcome.PUBLISHED)
     assert run._end.done()
     assert len(run._peers.app.protocol.frames) == 4
 
 
 async def test_a_result_that_went_to_some_servers_only_is_counted(run):
-    run.take(run._peers.publisher, Published(1, "published", None, 0, 1.0, 1, 1, missed=1))
-    run.take(run._peers.publisher, Published(2, "published", None, 0, 1.0, 1, 1))
-    run.take(run._peers.publisher, Published(3, "rosbridge away", None, 0, 1.0, 1, 1))
+    run.take(run._peers.publisher, Published(1, Outcome.PUBLISHED, None, 0, 1.0, 1, 1, missed=1))
+    run.take(run._peers.publisher, Published(2, Outcome.PUBLISHED, None, 0, 1.0, 1, 1))
+    run.take(run._peers.publisher, Published(3, Outcome.ROSBRIDGE_AWAY, None, 0, 1.0, 1, 1))
     assert run.status().frames.lost == {MISSED: 1, "rosbridge away": 1}
     assert run._summary().endswith(", 1 of them on some topics only; not published: 1 rosbridge away")
 
