@@ -1,6 +1,7 @@
 """Codes and their loss, against loops that follow machines.md word for word."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from machines.errors import ParameterError
 from toolchain.building.quantise import quantise, scaled
 from toolchain.deployment import Scale
 from toolchain.models.conditional import normal, wrapped_normal
-from toolchain.models.model import Known, Model, dimension
+from toolchain.models.model import Known, Model, PriorSelect, dimension
 
 
 def model_of(*tables, prior=None, **fields):
@@ -65,36 +66,48 @@ def test_every_address_by_its_scale_then_the_nearest_code(model, prob_bits, scal
         assert (codes[-1] == ones).all()
 
 
+def check_loss(loss, exact_rows, approximate_rows):
+    """Compare a loss with sums over rows of P(S, K): the exact ones and those of the codes, up to a factor each."""
+    mass, divergence, dead = 0.0, 0.0, 0
+    for exact, approximate in zip(exact_rows, approximate_rows, strict=True):
+        mass += exact[approximate == 0].sum()
+        if exact.sum() > 0 and approximate.sum() == 0:
+            dead += 1
+        elif exact.sum() > 0:
+            p, q = exact / exact.sum(), approximate / approximate.sum()
+            divergence += exact.sum() * sum(b * math.log2(b / a) for a, b in zip(p, q, strict=True) if b > 0)
+    assert loss.values == len(exact_rows)
+    assert loss.mass == pytest.approx(mass, abs=1e-12)
+    assert loss.kl_bits == pytest.approx(max(0, divergence), abs=1e-9)
+    assert loss.dead_values == dead
+
+
 @given(models(), st.sampled_from([2, 4, 8, 16]), st.sampled_from(list(Scale)))
 def test_the_loss_is_the_mass_of_vanished_cells_and_the_divergence_of_the_rest(model, prob_bits, scale):
     quantised = quantise(model, prob_bits=prob_bits, scale=scale)
     prior = model.prior_distribution
     for known, codes, loss in zip(model.known, quantised.tables, quantised.losses[1:], strict=True):
-        mass, divergence, dead = 0.0, 0.0, 0
-        decoded = decode_code(codes, prob_bits)
-        for k in range(known.values):
-            exact = prior * known.table[k]
-            approximate = prior * decoded[k]
-            mass += exact[approximate == 0].sum()
-            if exact.sum() > 0 and approximate.sum() == 0:
-                dead += 1
-            elif exact.sum() > 0:
-                p, q = exact / exact.sum(), approximate / approximate.sum()
-                divergence += exact.sum() * sum(
-                    b * math.log2(b / a) for a, b in zip(p, q, strict=True) if b > 0
-                )
-        assert loss.mass == pytest.approx(mass, abs=1e-12)
-        assert loss.kl_bits == pytest.approx(max(0, divergence), abs=1e-9)
-        assert loss.dead_values == dead
-        assert any("code 0 on every line" in warning for warning in quantised.warnings) or not dead
+        decoded = decode_code(codes, prob_bits)[: known.values]
+        check_loss(loss, prior * known.table, prior * decoded)
+        assert loss.bits == known.bits
+        assert len(quantised.warnings) == sum(each.dead_values > 0 for each in quantised.losses[1:])
 
 
-def test_the_prior_is_a_column_too():
-    prior = np.array([0.5, 0.499, 0.001])
-    quantised = quantise(model_of(np.full((2, 3), 0.5), prior=prior))
-    assert quantised.prior.tolist() == [[255, 255, 1]]
-    assert quantise(model_of(np.full((2, 3), 0.5), prior=prior), prob_bits=6).losses[0].mass == 0.001
-    assert quantised.losses[0].name == "prior"
+@given(models(), st.sampled_from([2, 4, 8]), st.sampled_from(list(Scale)), st.integers(1, 5), st.data())
+def test_the_prior_is_a_column_too_and_its_rows_are_selected_equally_often(
+    model, prob_bits, scale, values, data
+):
+    random = np.random.default_rng(data.draw(st.integers(0, 2**32 - 1)))
+    rows = random.dirichlet(np.full(model.lines, 0.1), size=values)
+    select = PriorSelect(name="A", table=rows, bits=data.draw(st.sampled_from([0, 4])))
+    for given_model, exact in (
+        (model, model.prior_distribution[np.newaxis]),
+        (replace(model, prior_select=select), rows / values),
+    ):
+        quantised = quantise(given_model, prob_bits=prob_bits, scale=scale)
+        loss = quantised.losses[0]
+        assert (loss.name, loss.bits) == ("prior", 0 if given_model is model else select.bits)
+        check_loss(loss, exact, decode_code(quantised.prior, prob_bits)[: len(exact)])
 
 
 def test_more_bits_lose_less():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from machines.bm1 import BM1Machine
 from machines.errors import ParameterError
@@ -14,6 +14,9 @@ if TYPE_CHECKING:
     from toolchain.building.options import BuildOptions
     from toolchain.building.quantise import Quantised
     from toolchain.models.model import Model
+
+_MOST_CODES: Final = 1 << 30
+"""Of all columns together, 2 bytes each while they are computed."""
 
 
 def machine_parameters(model: Model, options: BuildOptions) -> BM1Parameters:
@@ -29,6 +32,11 @@ def machine_parameters(model: Model, options: BuildOptions) -> BM1Parameters:
         raise BuildError(
             f"the prior is selected by {model.prior_select.name}, so it can't be written too: leave "
             "--prior-mode written out, or the selection"
+        )
+    codes = model.lines * sum(2**known.bits for known in model.known)
+    if codes > _MOST_CODES and options.sensor_mode is not SensorMode.THRESHOLD:
+        raise BuildError(
+            f"the tables have {codes} codes, and a machine can have {_MOST_CODES}: use fewer lines, or fewer --bits"
         )
     per_line_codes = options.sensor_mode is SensorMode.THRESHOLD
     try:

@@ -7,7 +7,7 @@ from collections import Counter
 from typing import Annotated, Final, TypeVar
 from urllib.parse import urlsplit
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, FailFast, Field
 
 NAME_MAX: Final = 200
 """Characters of a name."""
@@ -89,7 +89,7 @@ Step = Annotated[float, AfterValidator(_not_zero)]
 
 Item = TypeVar("Item")
 # TOML has arrays and strings, we keep tuples and enums; what is inside them stays strict.
-Sequence = Annotated[tuple[Item, ...], Field(strict=False)]
+Sequence = Annotated[tuple[Item, ...], Field(strict=False), FailFast()]
 Choice = Annotated[Item, Field(strict=False)]
 # What says nothing is left out of the file and of its hash.
 States = Annotated[tuple[Name, ...], Field(strict=False, exclude_if=lambda states: not states)]

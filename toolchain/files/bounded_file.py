@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import os
 import stat
-from typing import TYPE_CHECKING, BinaryIO
+from typing import TYPE_CHECKING, BinaryIO, Final
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from toolchain.errors import ToolchainError
+
+_PIECE: Final = 1 << 18
 
 
 def open_regular(path: Path, error: type[ToolchainError], most: int | None = None) -> BinaryIO:
@@ -49,9 +51,14 @@ def read_bounded(path: Path, most: int, error: type[ToolchainError]) -> bytes:
     """
     try:
         with open_regular(path, error, most) as file:
-            data = file.read(most + 1)
+            pieces, size = [], 0
+            while size <= most and (
+                piece := file.read(_PIECE)
+            ):  # read(most) would allocate that much at once
+                pieces.append(piece)
+                size += len(piece)
     except OSError as reason:
         raise error(f"{path} can't be read: {reason.strerror or reason}") from None
-    if len(data) > most:  # it has grown since, or is one of /proc, which say that they are empty
+    if size > most:  # it has grown since, or is one of /proc, which say that they are empty
         raise error(f"{path} has more than {most} bytes, the most that is read")
-    return data
+    return b"".join(pieces)

@@ -24,6 +24,8 @@ Model = TypeVar("Model", bound=BaseModel)
 
 _MOST_BYTES: Final = 4 << 20
 """Of a configuration file; a deployment has a few kilobytes."""
+_MOST_SIGNS: Final = 100_000
+"""Of `[`, `{` and `=`: tables and keys take a thousand times their bytes; a deployment of 4,096 boards has 30,000."""
 _MOST_PARTS: Final = 32
 """Of a dotted key; what is read here has two at most."""
 _PART: Final = r"""(?:[\w-]++|"(?:[^"\\\n]|\\.)*+"|'[^'\n]*+')"""
@@ -61,6 +63,8 @@ class TomlFile:
         except UnicodeDecodeError as reason:
             line = data.count(b"\n", 0, reason.start) + 1
             raise error("not UTF-8 text", path=path, line=line) from None
+        if sum(map(text.count, "[{=")) > _MOST_SIGNS:
+            raise error("more tables and keys than any configuration file has", path=path)
         if deep := _DEEP_KEY.search(text):  # tomllib's memory grows with the square of a key's parts
             line = text.count("\n", 0, deep.start()) + 1
             raise error(f"a key has more than {_MOST_PARTS} parts", path=path, line=line)

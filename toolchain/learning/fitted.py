@@ -10,9 +10,12 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 import tomli_w
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field, ValidationError
 
+from toolchain.deployment.fields import Sequence  # noqa: TC001 - pydantic evaluates annotations
+from toolchain.deployment.sections import Section
 from toolchain.errors import ModelError
+from toolchain.files.bounded_file import open_regular
 from toolchain.files.toml_file import TomlFile
 from toolchain.models.conditional import normal_table, wrapped_normal_table
 from toolchain.models.model import Known, Model, Normal
@@ -26,6 +29,7 @@ if TYPE_CHECKING:
 FORMAT: Final = 1
 MAX_TABLE_BYTES: Final = 1 << 28
 MAX_BYTES: Final = 1 << 30
+_MAX_META_BYTES: Final = 4 << 20
 
 _HEADER: Final = (
     "# Written by `toolchain fit`; read by toolchain.learning.fitted.with_fit. docs/models.md has the keys.\n"
@@ -34,13 +38,7 @@ _META: Final = "fit.json"
 _EPOCH: Final = (1980, 1, 1, 0, 0, 0)
 
 
-class _Section(BaseModel):
-    model_config = ConfigDict(
-        frozen=True, extra="forbid", strict=True, allow_inf_nan=False, validate_by_name=True
-    )
-
-
-class FittedRecording(_Section):
+class FittedRecording(Section):
     """`[[recording]]`: what was learnt from."""
 
     file: str
@@ -48,7 +46,7 @@ class FittedRecording(_Section):
     rows: int = Field(ge=0)
 
 
-class FittedVariable(_Section):
+class FittedVariable(Section):
     """`[[variable]]`: one known variable; of counted ones only name and rows, for their tables are arrays."""
 
     name: str
@@ -58,15 +56,15 @@ class FittedVariable(_Section):
     outliers: float = Field(default=0.0, ge=0, le=1)
 
 
-class FitFile(_Section):
+class FitFile(Section):
     """What the file says."""
 
     format: Literal[1] = FORMAT
     method: Literal["normals", "counts"]
     model: str
     floor: float = Field(default=0.0, ge=0, lt=1)
-    recordings: tuple[FittedRecording, ...] = Field(default=(), validation_alias="recording", strict=False)
-    variables: tuple[FittedVariable, ...] = Field(default=(), validation_alias="variable", strict=False)
+    recordings: Sequence[FittedRecording] = Field(default=(), validation_alias="recording")
+    variables: Sequence[FittedVariable] = Field(default=(), validation_alias="variable")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -233,10 +231,10 @@ def _write_tables(path: Path, content: dict[str, Any], tables: Mapping[str, NDAr
 
 def _read_tables(path: Path) -> Fit:
     try:
-        with zipfile.ZipFile(path) as archive:
+        with open_regular(path, ModelError, MAX_BYTES) as packed, zipfile.ZipFile(packed) as archive:
             if sum(entry.file_size for entry in archive.infolist()) > MAX_BYTES:
                 raise ModelError(f"{path} is larger than {MAX_BYTES} bytes, unpacked; the most that is read")
-            content = json.loads(_member(archive, _META, MAX_TABLE_BYTES))
+            content = json.loads(_member(archive, _META, _MAX_META_BYTES))
             content = {
                 {"recordings": "recording", "variables": "variable"}.get(key, key): value
                 for key, value in content.items()

@@ -12,9 +12,11 @@ import re
 from bisect import bisect_left
 from contextlib import suppress
 from dataclasses import dataclass
+from io import TextIOWrapper
 from typing import TYPE_CHECKING, Any, Final, TextIO
 
 from toolchain.errors import ModelError
+from toolchain.files.bounded_file import open_regular
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -60,7 +62,7 @@ def _read_csv(path: Path, columns: Sequence[str]) -> Recording:
     found: dict[str, list[object]] = {column: [] for column in columns}
     rows = 0
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
+        with TextIOWrapper(open_regular(path, ModelError), encoding="utf-8-sig", newline="") as file:
             lines = csv.reader(_lines(path, file), strict=True)
             heading = [name.strip() for name in next(lines, [])]
             places = {column: _place(path, heading, column) for column in found}

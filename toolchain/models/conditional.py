@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final, Literal
 import numpy as np
 
 from toolchain.errors import ModelError
-from toolchain.models.model import Known, Normal
+from toolchain.models.model import Known, Normal, check_table
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
@@ -187,6 +187,7 @@ def _checked(
         raise ModelError(
             f"variable {name!r}: {shape.outliers:g} of its readings are outliers, expected 0 to 1"
         )
+    check_table(f"P({name} | S)", values, len(mean))
     return mean, np.broadcast_to(spread, mean.shape)
 
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from toolchain.errors import ModelError
 from toolchain.models.conditional import normal_table, wrapped_normal_table
+from toolchain.models.limits import MAX_ENTRIES, check_size
 from toolchain.models.model import Normal
 
 if TYPE_CHECKING:
@@ -24,9 +25,6 @@ if TYPE_CHECKING:
 
     Formula: TypeAlias = Callable[..., ArrayLike] | ArrayLike
     """Of the given symbols' values, one float64 array each of the same shape; or numbers that need none."""
-
-MAX_ENTRIES: Final = 2**24
-"""The largest table, in entries (128 MiB as float64): larger ones are refused by name."""
 
 _SUM_TOLERANCE: Final = 1e-6
 
@@ -112,6 +110,7 @@ def table(symbol: Symbol, values: ArrayLike, *, given: Sequence[Symbol] = ()) ->
 
 def uniform(symbol: Symbol) -> Distribution:
     """Return the P(symbol) in which every value is as probable as any other."""
+    _scope(symbol, ())
     return table(symbol, np.full(symbol.size, 1 / symbol.size))
 
 
@@ -216,11 +215,7 @@ def _scope(symbol: Symbol, given: tuple[Symbol, ...]) -> tuple[Symbol, ...]:
     scope = (symbol, *given)
     if len({each.name for each in scope}) < len(scope):
         raise ModelError(f"{_title(symbol, given)} names a symbol twice")
-    entries = math.prod(each.size for each in scope)
-    if entries > MAX_ENTRIES:
-        raise ModelError(
-            f"{_title(symbol, given)} would be a table of {entries} entries; the most is {MAX_ENTRIES}"
-        )
+    check_size(_title(symbol, given), math.prod(each.size for each in scope), MAX_ENTRIES)
     return scope
 
 

@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Final, TypeAlias
 import numpy as np
 
 from toolchain.errors import ModelError
-from toolchain.models.distribution import MAX_ENTRIES, Distribution, Factor
+from toolchain.models.distribution import Distribution, Factor
 from toolchain.models.elimination import Term, eliminate, product, reduced
+from toolchain.models.limits import MAX_ENTRIES, MAX_MODEL_ENTRIES, check_size
 from toolchain.models.model import Known, Model, Normal, PriorSelect, dimension
 from toolchain.models.separation import Links, relevant, without_idle
 
@@ -167,12 +168,12 @@ class Question:
         searched = [symbol.name for symbol in self.searched]
         sizes = {symbol.name: symbol.size for symbol in self.joint.symbols}
         lines = math.prod(symbol.size for symbol in self.searched)
-        widest = max((symbol.size for symbol in self.observed), default=1)
-        if lines * widest > MAX_ENTRIES:
-            raise ModelError(
-                f"{self.joint.name}: {lines} lines with {widest} values each are a table of {lines * widest} entries; the "
-                f"most is {MAX_ENTRIES}: search fewer variables"
-            )
+        values = [symbol.size for symbol in self.observed]
+        tables = f"{self.joint.name}: a table of {lines} lines"
+        check_size(tables, lines * max(values, default=1), MAX_ENTRIES, ": search fewer variables")
+        check_size(
+            f"{tables} for all", lines * sum(values), MAX_MODEL_ENTRIES, ": search or know fewer variables"
+        )
         links = Links(terms, factors, {*searched, *self.given})
         if links.joined(observed):
             raise self._refusal(active, observed)

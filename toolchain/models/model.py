@@ -17,14 +17,10 @@ from pydantic import ValidationError
 from toolchain.deployment import Dimension, Variable
 from toolchain.deployment.fields import NAME_MAX
 from toolchain.errors import ModelError
+from toolchain.models.limits import MAX_LINES, MAX_TABLE_ENTRIES, MAX_VALUES, check_size
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
-
-MAX_LINES: Final = 2**24
-"""Values of what is searched, over all boards: 4,096 boards of as many lines as the register map has room for."""
-MAX_VALUES: Final = 2**16 - 1
-"""A column has at most 16 address bits, and its top address means a missing reading."""
 
 _SUM_TOLERANCE: Final = 1e-6
 
@@ -199,9 +195,9 @@ class Model:
                     f"P({known.name} | S) has {known.table.shape[1]} lines, but the searched dimensions "
                     f"({' x '.join(str(d.size) for d in self.searched)}) have {self.lines} cells"
                 )
+        if self.prior is not None and np.shape(self.prior) != (self.lines,):
+            raise ModelError(f"the prior P(S) has shape {np.shape(self.prior)}, expected ({self.lines},)")
         prior = self._default_prior() if self.prior is None else np.array(self.prior, float)
-        if prior.shape != (self.lines,):
-            raise ModelError(f"the prior P(S) has shape {prior.shape}, expected ({self.lines},)")
         _check_distribution("the prior P(S)", prior)
         if self.prior_select is not None:
             self._default_prior()  # checks that its rows have this model's lines
@@ -260,6 +256,7 @@ def dimension(
     Raises:
         ModelError: No cells, no name, another number of states than cells, or a step of 0.
     """
+    check_size(f"searched dimension {str(label)[:NAME_MAX]!r}", size, MAX_LINES)
     try:
         return Dimension(label=label, size=size, offset=offset, step=step, states=states)
     except ValidationError as reason:
@@ -280,6 +277,7 @@ def interval(label: str, low: float, high: float, *, cells: int) -> Dimension:
 
 def cell_centres(*searched: Dimension) -> tuple[NDArray[np.float64], ...]:
     """Return each dimension's value at the centre of every line's cell: float64[lines] per dimension."""
+    check_size("the grid of cells", math.prod(each.size for each in searched), MAX_LINES)
     axes = [d.offset + np.arange(d.size) * d.step for d in searched]
     return tuple(axis.ravel() for axis in np.meshgrid(*axes, indexing="ij"))
 
@@ -305,16 +303,27 @@ def _variable(known: Known | PriorSelect, kind: Literal["sensor", "prior_select"
 
 def _keep_table(variable: Known | PriorSelect, what: str) -> None:
     """Keep a variable's table as a copy that nobody can write to, and as many address bits as hold it where none are said."""
-    table = np.array(variable.table, dtype=np.float64)
-    if table.ndim != 2 or 0 in table.shape:
-        raise ModelError(f"{what} has shape {table.shape}, expected (values, lines)")
-    if len(table) > MAX_VALUES:
-        raise ModelError(
-            f"{what} has {len(table)} values; a column serves at most {MAX_VALUES}: use a larger step"
-        )
+    given = np.asarray(variable.table)
+    if given.ndim != 2 or 0 in given.shape:
+        raise ModelError(f"{what} has shape {given.shape}, expected (values, lines)")
+    check_table(what, *given.shape)
+    table = np.array(given, dtype=np.float64)
     table.flags.writeable = False
     object.__setattr__(variable, "table", table)
     object.__setattr__(variable, "bits", variable.bits or len(table).bit_length())
+
+
+def check_table(what: str, values: int, lines: int) -> None:
+    """Refuse a known variable's table that is too large, before it is made.
+
+    Raises:
+        ModelError: More values than a column serves, or more entries than a table may have.
+    """
+    if values > MAX_VALUES:
+        raise ModelError(
+            f"{what} has {values} values; a column serves at most {MAX_VALUES}: use a larger step"
+        )
+    check_size(what, values * lines, MAX_TABLE_ENTRIES, ": use larger steps or fewer lines")
 
 
 def _check_distribution(what: str, table: NDArray[np.float64]) -> None:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Final, Literal, TypeAlias
 import numpy as np
 
 from toolchain.errors import ModelError
+from toolchain.models.limits import MAX_ENTRIES, check_size
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -193,6 +194,7 @@ class Symbol:
         """
         if not self.name:
             raise ModelError("a symbol needs a name")
+        check_size(f"the symbol {self.name!r}", self.type.size, MAX_ENTRIES)
 
     @property
     def size(self) -> int:

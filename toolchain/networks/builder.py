@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Final, Literal, Protocol
 import numpy as np
 
 from toolchain.errors import ModelError, NetworkFileError
-from toolchain.models.distribution import MAX_ENTRIES, Factor, potential, table
+from toolchain.models.distribution import Factor, potential, table
 from toolchain.models.joint import JointDistribution
+from toolchain.models.limits import MAX_ENTRIES
 from toolchain.models.symbol import IntegerType, LabelType, Symbol
 
 if TYPE_CHECKING:

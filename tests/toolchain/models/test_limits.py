@@ -1,0 +1,88 @@
+"""Sizes above the limits are refused before anything of that size is allocated."""
+
+import tracemalloc
+
+import numpy as np
+import pytest
+
+from toolchain.building.machine import machine_parameters
+from toolchain.building.options import BuildOptions
+from toolchain.building.partition import partition_lines
+from toolchain.errors import BuildError, ModelError
+from toolchain.models import IntegerType, IntervalType, Known, Model, PriorSelect, Symbol
+from toolchain.models.conditional import normal, wrapped_normal
+from toolchain.models.distribution import conditional_normal, table
+from toolchain.models.joint import JointDistribution
+from toolchain.models.model import cell_centres, dimension, interval
+
+AXIS = dimension("x", size=5000)
+
+
+def view(*shape):
+    """Return an array of this shape that takes no memory."""
+    return np.broadcast_to(1 / shape[0], shape)
+
+
+def model_of_views(lines, bits):
+    known = Known(name="K", table=np.full((2, 1), 0.5), bits=bits)
+    object.__setattr__(known, "table", view(2, lines))
+    return Model(name="m", searched=(dimension("s", size=lines),), known=(known,), prior=view(lines))
+
+
+def wide_question():
+    symbols = [Symbol(f"k{i}", IntegerType(0, 9999)) for i in range(20)]
+    searched = Symbol("s", IntegerType(0, 1500))
+    factors = [table(each, view(each.size)) for each in (searched, *symbols)]
+    return JointDistribution("j", tuple(factors)).ask([searched], symbols)
+
+
+@pytest.mark.parametrize(
+    "too_large",
+    [
+        lambda: interval("x", 0, 1, cells=10**9),
+        lambda: dimension("x", size=2**24 + 1),
+        lambda: cell_centres(AXIS, AXIS),
+        lambda: normal("K", mean=np.zeros(2), sigma=1, values=10**9),
+        lambda: normal("K", mean=np.zeros(5000), sigma=1, values=2**16 - 1),
+        lambda: wrapped_normal("K", mean=np.zeros(2), sigma=1, values=10**9),
+        lambda: Known(name="K", table=view(2, 10**9)),
+        lambda: PriorSelect(name="K", table=view(10**9, 2)),
+        lambda: Model(name="m", searched=(dimension("s", size=4),), known=(), prior=view(10**9)),
+        lambda: Symbol("n", IntegerType(0, 10**9)),
+        lambda: Symbol("n", IntervalType(0.0, 1.0, 10**9)),
+        lambda: conditional_normal(
+            Symbol("n", IntegerType(0, 9999)), [Symbol("m", IntegerType(0, 9999))], mean=0, sigma=1
+        ),
+    ],
+)
+def test_a_model_part_above_its_limit_is_refused_unmade(too_large):
+    tracemalloc.start()
+    try:
+        with pytest.raises(ModelError):
+            too_large()
+        assert tracemalloc.get_traced_memory()[1] < 4 << 20
+    finally:
+        tracemalloc.stop()
+
+
+def test_tables_that_are_too_large_together_are_refused_unmade():
+    question = wide_question()
+    tracemalloc.start()
+    try:
+        with pytest.raises(ModelError):
+            question.model()
+        assert tracemalloc.get_traced_memory()[1] < 64 << 20
+    finally:
+        tracemalloc.stop()
+
+
+def test_codes_that_no_memory_holds_are_refused_before_they_are_made():
+    options = BuildOptions(uri="ws://robot:9090", topic="/readings", type="a/B")
+    assert machine_parameters(model_of_views(2**14, 16), options).lines == 2**14
+    with pytest.raises(BuildError):
+        machine_parameters(model_of_views(2**14 + 1, 16), options)
+
+
+@pytest.mark.timeout(20)
+def test_a_board_for_every_line_takes_linear_time():
+    assert partition_lines(2**18, 2**18)[-1].end == 2**18
