@@ -1,4 +1,4 @@
-"""Probabilities to codes and back: the values that a cell of `prob_bits` bits can make."""
+"""Conversion of probabilities to the codes of a cell, and back."""
 
 import numpy as np
 import numpy.typing as npt
@@ -8,7 +8,7 @@ from machines.parameters import PROB_BITS_MAX
 
 
 def encode_probability(p: npt.ArrayLike, prob_bits: int) -> npt.NDArray[np.uint16]:
-    """The code of the nearest probability that a cell can make; ties go up.
+    """Return the code of the nearest probability that a cell can make; ties go up.
 
     A cell of W bits makes k / 2**W for 0 <= k <= 2**W - 2, and 1 with the all-ones code.
 
@@ -20,12 +20,12 @@ def encode_probability(p: npt.ArrayLike, prob_bits: int) -> npt.NDArray[np.uint1
         uint16 codes, of the same shape.
 
     Raises:
-        ParameterError: A probability is not from 0 to 1 (or is NaN), or there are no codes of so many bits.
+        ParameterError: A probability is not from 0 to 1 (or is NaN), or `prob_bits` is out of range.
     """
     _check_bits(prob_bits)
     probabilities = np.asarray(p, dtype=np.float64)
     if not ((probabilities >= 0) & (probabilities <= 1)).all():
-        raise ParameterError("A probability that is to be encoded is not a number from 0 to 1.")
+        raise ParameterError("A probability to encode is not a number from 0 to 1.")
     ones = (1 << prob_bits) - 1
     scaled = probabilities * (1 << prob_bits)  # exact: a power of two
     below = np.floor(scaled)
@@ -36,7 +36,7 @@ def encode_probability(p: npt.ArrayLike, prob_bits: int) -> npt.NDArray[np.uint1
 
 
 def decode_code(codes: npt.ArrayLike, prob_bits: int) -> npt.NDArray[np.float64]:
-    """The probability that a cell with this code makes: code / 2**W, and 1 for the all-ones code.
+    """Return the probability that a cell with this code makes: code / 2**W, and 1 for the all-ones code.
 
     Args:
         codes: Codes of any shape.
@@ -46,13 +46,13 @@ def decode_code(codes: npt.ArrayLike, prob_bits: int) -> npt.NDArray[np.float64]
         float64 probabilities, of the same shape.
 
     Raises:
-        ParameterError: A code has more bits, or there are no codes of so many bits.
+        ParameterError: A code has more bits, or `prob_bits` is out of range.
     """
     _check_bits(prob_bits)
     array = np.asarray(codes)
     ones = (1 << prob_bits) - 1
     if array.dtype.kind not in "ui" or not ((array >= 0) & (array <= ones)).all():
-        raise ParameterError(f"A code that is to be decoded is no integer from 0 to {ones}.")
+        raise ParameterError(f"A code to decode is not an integer from 0 to {ones}.")
     return np.where(array == ones, 1.0, array / (1 << prob_bits))
 
 

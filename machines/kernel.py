@@ -1,24 +1,234 @@
-"""Which kernel runs a machine: the fast one where it can, else the reference."""
+"""The kernels of a BM1: what they have in common, the checks of their arguments, and the choice of one."""
 
-from machines.bm1 import BM1Kernel, BM1Machine
-from machines.reference import ReferenceBM1, ReferenceReplicas
+from abc import ABC, abstractmethod
+from collections.abc import Collection
+
+import numpy as np
+import numpy.typing as npt
+
+from machines.bm1 import BM1Machine, Start, StopReason, checked_codes, joint_reason
+from machines.errors import ParameterError, StartError
+from machines.parameters import CYCLES_MAX, BM1Parameters, PriorMode, SensorMode
+
+
+class BM1Kernel(ABC):
+    """A running machine of `replicas` replicas, which share its generators (thesis 2.1.2 and 4.4).
+
+    Each replica counts and stops by itself; the generators step until the last one has stopped. Counts, cycles,
+    reasons and states are the same to the bit in every kernel.
+    """
+
+    def __init__(self, machine: BM1Machine) -> None:
+        self._machine = machine
+        self._cycles = [0] * machine.parameters.replicas
+        self._reasons = [StopReason.NONE] * machine.parameters.replicas
+        self._halted: set[int] = set()
+        self._target_count = 1
+        self._max_cycles = 1
+
+    @property
+    def machine(self) -> BM1Machine:
+        """The machine that this kernel runs."""
+        return self._machine
+
+    @property
+    def cycles(self) -> int:
+        """Cycles of this frame: those of the replica that ran longest, which the generators stepped."""
+        return max(self._cycles)
+
+    @property
+    def reason(self) -> StopReason:
+        """Why the machine stopped: the `joint_reason` of its replicas."""
+        return joint_reason(self._reasons, self._halted)
+
+    @property
+    def replica_cycles(self) -> tuple[int, ...]:
+        """Cycles that each replica ran in this frame."""
+        return tuple(self._cycles)
+
+    @property
+    def replica_reasons(self) -> tuple[StopReason, ...]:
+        """Why each replica stopped."""
+        return tuple(self._reasons)
+
+    @property
+    @abstractmethod
+    def counts(self) -> npt.NDArray[np.uint32]:
+        """The counters, a copy: uint32[lines], with several replicas uint32[replicas, lines]."""
+
+    @property
+    @abstractmethod
+    def rng_state(self) -> npt.NDArray[np.uint64]:
+        """The generators' states, a copy: uint64[columns], or uint64[lines, columns] if unshared."""
+
+    def reset(self) -> None:
+        """Set counters and cycles to 0, reasons to `NONE`, and the generators to the start of bank 0."""
+        self._reset()
+        self._cycles = [0] * len(self._cycles)
+        self._reasons = [StopReason.NONE] * len(self._reasons)
+        self._halted = set()
+
+    def prepare(self) -> None:
+        """Do beforehand what would slow the first frames, and reset the machine; no result changes."""
+        self.reset()
+
+    def start(self, start: Start) -> StopReason:
+        """Run a new frame to its end, or to the end of its first slice.
+
+        Counters start at 0; generators restart from the start's bank (`rng_reset` = `bank`) or go on
+        (`free`).
+
+        Raises:
+            StartError: The start does not fit the machine, which is unchanged.
+        """
+        check_start(self._machine.parameters, start)
+        self._target_count = int(start.target_count)
+        self._max_cycles = int(start.max_cycles)
+        self._halted = set()
+        self._start(start)
+        return self.reason
+
+    def resume(self, run_until: int, halted: Collection[int] = ()) -> StopReason:
+        """Run the next slice of the same frame, to cycle `run_until` at most; 0 for no further slices.
+
+        Args:
+            run_until: Where the slice ends.
+            halted: Numbers of replicas that do not go on, for the rest of the frame: they keep the reason `SLICE`.
+
+        Raises:
+            StartError: There is no frame that can go on, or `run_until` is not a later cycle; nothing has changed.
+        """
+        halts = self._halted | set(halted)
+        self._check_resume(run_until, halted, halts)
+        self._halted = halts
+        going = [
+            replica
+            for replica, reason in enumerate(self._reasons)
+            if reason is StopReason.SLICE and replica not in halts
+        ]
+        self._resume(going, int(run_until))
+        return self.reason
+
+    @abstractmethod
+    def _reset(self) -> None:
+        """Set the counters to 0 and the generators to the start of bank 0."""
+
+    @abstractmethod
+    def _start(self, start: Start) -> None:
+        """Run the first slice of a checked start; sets cycles and reasons."""
+
+    @abstractmethod
+    def _resume(self, going: list[int], run_until: int) -> None:
+        """Run the next slice of these replicas; sets their cycles and reasons."""
+
+    def _check_resume(self, run_until: int, halted: Collection[int], halts: Collection[int]) -> None:
+        replicas = len(self._reasons)
+        if not all(0 <= replica < replicas for replica in halted):
+            raise StartError(
+                f"Replicas {', '.join(map(str, sorted(halted)))} cannot be halted; this machine's are 0 to {replicas - 1}."
+            )
+        reason = joint_reason(self._reasons, halts)
+        if reason is not StopReason.SLICE:
+            raise StartError(
+                "There is no slice to resume: every replica has stopped or is halted."
+                if halted
+                else f"There is no slice to resume: the machine has stopped with reason {reason.name.lower()}."
+            )
+        if run_until != 0:
+            _check("run_until", run_until, self.cycles + 1, CYCLES_MAX)
 
 
 def make_kernel(machine: BM1Machine) -> BM1Kernel:
-    """A kernel for a machine; counts, cycles, reasons and states are the same to the bit whichever it is."""
+    """Return the fastest kernel that can run the machine."""
     if machine.parameters.shared and machine.parameters.rng.lfsr_bits is not None:
-        # Here, not above: numba is loaded by who runs such machines, not by who describes them.
-        from machines.fast import FastBM1, FastReplicas
+        # only a process that runs such machines loads numba
+        from machines.fast import FastBM1
 
-        return FastBM1(machine) if machine.parameters.replicas == 1 else FastReplicas(machine)
-    return ReferenceBM1(machine) if machine.parameters.replicas == 1 else ReferenceReplicas(machine)
+        return FastBM1(machine)
+    from machines.reference import ReferenceBM1
+
+    return ReferenceBM1(machine)
 
 
 def warm_up() -> None:
-    """Load (the first time: compile) the fast kernel, so that no frame waits for it.
-
-    A process that is forked from one that has called this starts with it loaded.
-    """
+    """Load (the first time: compile) the fast kernel, so that no frame waits for it; a fork has it loaded too."""
     from machines import fast
 
     fast.warm_up()
+
+
+def check_start(parameters: BM1Parameters, start: Start) -> None:
+    """Refuse a start that does not fit the machine.
+
+    Raises:
+        StartError: Names the part and its range.
+    """
+    if not _are_plain_addresses(parameters, start.addresses):
+        _check_inputs(parameters, start.addresses)
+    if isinstance(start.prior_address, tuple):
+        if parameters.replicas == 1 or len(start.prior_address) != parameters.replicas:
+            raise StartError(
+                f"There are {len(start.prior_address)} prior addresses; this machine takes one, or with several "
+                f"replicas one each: it has {parameters.replicas}."
+            )
+        for replica, address in enumerate(start.prior_address):
+            _check(f"prior_address of replica {replica}", address, 0, parameters.prior_addresses - 1)
+    else:
+        _check("prior_address", start.prior_address, 0, parameters.prior_addresses - 1)
+    _check("target_count", start.target_count, 1, parameters.target_count_max)
+    _check("max_cycles", start.max_cycles, 1, CYCLES_MAX)
+    _check("bank", start.bank, 0, parameters.rng_banks - 1)
+    _check("run_until", start.run_until, 0, CYCLES_MAX)
+    if start.prior_codes is not None:
+        if parameters.prior_mode is not PriorMode.WRITTEN:
+            raise StartError(
+                "The start has prior codes, but this machine's prior is a table (prior_mode = table)."
+            )
+        own = parameters.replicas > 1 and np.shape(start.prior_codes) == parameters.count_shape
+        shape = parameters.count_shape if own else (parameters.lines,)
+        try:
+            checked_codes("The written prior", start.prior_codes, shape, parameters)
+        except ParameterError as error:
+            raise StartError(str(error)) from None
+
+
+def _are_plain_addresses(parameters: BM1Parameters, given: object) -> bool:
+    """Return whether these are one integer per column, all in range: a quick check for almost every frame."""
+    if type(given) is not tuple or parameters.input_shape != (len(given),):
+        return False
+    # a generator expression would slow every frame
+    for address, bits in zip(given, parameters.sensor_bits, strict=True):  # noqa: SIM110
+        if type(address) is not int or not 0 <= address < 1 << bits:
+            return False
+    return True
+
+
+def _check_inputs(parameters: BM1Parameters, given: object) -> None:
+    """Refuse inputs that do not have the machine's shape, and values that its columns do not have."""
+    inputs, shape = np.asarray(given), parameters.input_shape
+    if inputs.size == 0 and not parameters.sensors:
+        return
+    if inputs.shape != shape or inputs.dtype.kind not in "ui":
+        raise StartError(
+            f"The inputs have the shape {inputs.shape} and are {inputs.dtype}; this machine takes integers of the "
+            f"shape {shape}."
+        )
+    by_column = inputs.reshape(parameters.replicas, parameters.sensors, -1)
+    tops = (1 << np.array(parameters.sensor_bits, dtype=np.int64)) - 1
+    wrong = np.argwhere((by_column < 0) | (by_column > tops[:, np.newaxis]))
+    if len(wrong):
+        replica, column, line = (int(at) for at in wrong[0])
+        name = "The address" if parameters.has_tables else "The code"
+        where = f" at line {line}" if parameters.sensor_mode is not SensorMode.COLUMN else ""
+        where += f" of replica {replica}" if parameters.replicas > 1 else ""
+        _check(
+            f"{name} of column {column + 1}{where}", by_column[replica, column, line], 0, int(tops[column])
+        )
+
+
+def _check(name: str, value: object, lowest: int, highest: int) -> None:
+    """Refuse a value that is not an integer from `lowest` to `highest`."""
+    if not isinstance(value, int | np.integer) or isinstance(value, bool):
+        raise StartError(f"{name} is {value!r}; it must be an integer.")
+    if not lowest <= value <= highest:
+        raise StartError(f"{name} is {value}; it must be from {lowest} to {highest}.")

@@ -1,4 +1,4 @@
-"""What a BM1 is built with: sizes, widths and random number generators (thesis 2.1.2)."""
+"""The parameters of a BM1: sizes, widths and random number generators (thesis 2.1.2)."""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -16,20 +16,20 @@ COUNTER_BITS_MAX: Final = 32
 """Widest counter, in bits: a result register holds 32."""
 
 STEPS_PER_CLOCK_MAX: Final = 256
-"""Most steps of a generator in a clock: logic unrolls them, and the reference takes them one by one."""
+"""Most steps of a generator in a clock: hardware unrolls them, and the reference takes them one by one."""
 
 RNG_BANKS_MAX: Final = 65536
 """Most sets of seeds."""
 
 REPLICAS_MAX: Final = 256
-"""Most machines on a board: the register map has room for the outcomes of so many."""
+"""Most machines on a board: the register map has room for the outcomes of that many."""
 
 CYCLES_MAX: Final = 2**63 - 1
-"""Highest `max_cycles` and `run_until`: both are 64-bit registers that a signed number must hold."""
+"""Highest `max_cycles` and `run_until`: 64-bit registers whose values must fit a signed number."""
 
 
 class RngKind(StrEnum):
-    """How a column makes its random numbers. `machines.rng` says how each one works."""
+    """The kinds of random number generator; `machines.rng` implements them."""
 
     LFSR8 = "lfsr8"
     LFSR16 = "lfsr16"
@@ -40,7 +40,7 @@ class RngKind(StrEnum):
 
     @property
     def lfsr_bits(self) -> int | None:
-        """Width of the LFSR's state in bits; None where the kind is no LFSR."""
+        """Width of the LFSR's state in bits; None for other kinds."""
         return _LFSR_BITS.get(self)
 
 
@@ -48,7 +48,7 @@ _LFSR_BITS: Final = {RngKind.LFSR8: 8, RngKind.LFSR16: 16, RngKind.LFSR24: 24, R
 
 
 class RngReset(StrEnum):
-    """Where a new frame's random numbers start: at the bank that it names, or where they are (`free`)."""
+    """Where a new frame's random numbers start: at the frame's bank, or where the last frame left them (`free`)."""
 
     BANK = "bank"
     FREE = "free"
@@ -62,10 +62,7 @@ class PriorMode(StrEnum):
 
 
 class SensorMode(StrEnum):
-    """What a sensor column's cells are given (thesis 4.4).
-
-    One address for the whole column, an address for each cell, or (`threshold`) each cell's code itself.
-    """
+    """The inputs of a sensor column (thesis 4.4): one address, an address for each cell, or each cell's code."""
 
     COLUMN = "column"
     CELL = "cell"
@@ -82,16 +79,16 @@ class BM1Parameters:
             column stands for a missing reading, so a column of b bits serves 2**b - 1 values.
         prob_bits: Bits of a code (W), 1 to 16.
         prior_bits: Address bits of the prior's table; 0 is a table of a single row.
-        prior_mode: `table`, or `written`: the host writes the codes with the start, and the table's single
-            row stands until it does.
+        prior_mode: `table`, or `written`: the host writes the codes with the start; until then the table's
+            single row is used.
         counter_bits: Bits of a line's counter, 1 to 32.
         rng: Kind of random number generator. An LFSR must be wider than a code, or its low bits would
-            never all be 0 and code 1 would be dead.
+            never all be 0 and code 1 would never count.
         shared: One generator per column, shared by all its lines; else one per cell.
-        steps_per_clock: Steps of a generator between two cycles. 0 asks for the default, which takes its
-            place here: for an LFSR the smallest power of two that is not below `prob_bits`, so that every
-            cycle sees fresh bits; 1 for `table` and `ideal`, whose every step is fresh.
-        rng_banks: Sets of seeds that a start can choose from.
+        steps_per_clock: Steps of a generator between two cycles. 0 is replaced by the default: for an LFSR the
+            smallest power of two that is not below `prob_bits`, so that every cycle sees fresh bits; 1 for
+            `table` and `ideal`, whose every step is fresh.
+        rng_banks: Number of sets of seeds, of which a start selects one.
         rng_reset: Whether a start restarts the generators.
         ideal_seed: Seed of the `ideal` generator, 64 bits.
         sensor_mode: `column`: one address serves a whole sensor column; `cell`: every cell has its own;
@@ -118,9 +115,7 @@ class BM1Parameters:
     replicas: int = 1
 
     def __post_init__(self) -> None:
-        """Refuse what can't be built, and put the default in the place of `steps_per_clock = 0`."""
-        # A plain string from a file is as good as the member it names; everything after this line sees
-        # members.
+        """Check every parameter, convert strings to enum members, and set the default of `steps_per_clock`."""
         for name, kind in (
             ("prior_mode", PriorMode),
             ("rng", RngKind),
@@ -148,20 +143,19 @@ class BM1Parameters:
             for column, bits in enumerate(self.sensor_bits, start=1):
                 if bits != self.prob_bits:
                     raise ParameterError(
-                        f"sensor_bits of column {column} is {bits} with sensor_mode = threshold; "
-                        f"a cell's input is its code then, so it must be prob_bits = {self.prob_bits}."
+                        f"sensor_bits of column {column} is {bits}; with sensor_mode = threshold it must be "
+                        f"prob_bits = {self.prob_bits}, since a cell's input is its code."
                     )
         if self.prior_mode is PriorMode.WRITTEN and self.prior_bits != 0:
             raise ParameterError(
-                f"prior_bits is {self.prior_bits} with prior_mode = written; "
-                "a written prior has no address, so it must be 0."
+                f"prior_bits is {self.prior_bits}; with prior_mode = written it must be 0, since a written prior "
+                "has no address."
             )
         width = self.rng.lfsr_bits
         if width is not None and width <= self.prob_bits:
             raise ParameterError(
-                f"{self.rng} is too narrow for prob_bits = {self.prob_bits}: "
-                "the generator must have more bits than a code; "
-                f"use at most {width - 1} bits or a wider generator."
+                f"{self.rng} is too narrow for prob_bits = {self.prob_bits}; "
+                f"use a wider generator, or at most {width - 1} bits."
             )
         if self.steps_per_clock == 0:
             steps = 1 if width is None else 1 << (self.prob_bits - 1).bit_length()
@@ -179,18 +173,18 @@ class BM1Parameters:
 
     @property
     def has_tables(self) -> bool:
-        """Whether sensor columns hold tables: not where their cells are given codes."""
+        """Whether sensor columns hold tables; in `threshold` mode their inputs are codes."""
         return self.sensor_mode is not SensorMode.THRESHOLD
 
     @property
     def input_shape(self) -> tuple[int, ...]:
-        """Shape of a frame's sensor inputs: [sensors], with lines behind it for inputs per cell, replicas before it."""
+        """Shape of a frame's sensor inputs: [sensors] or, per cell, [sensors, lines]; several replicas come first."""
         shape = (self.sensors,) if self.sensor_mode is SensorMode.COLUMN else (self.sensors, self.lines)
         return shape if self.replicas == 1 else (self.replicas, *shape)
 
     @property
     def count_shape(self) -> tuple[int, ...]:
-        """Shape of a frame's counts: [lines], or [replicas, lines] where there are several machines."""
+        """Shape of a frame's counts: [lines], or [replicas, lines] of several replicas."""
         return (self.lines,) if self.replicas == 1 else (self.replicas, self.lines)
 
     @property
@@ -209,7 +203,7 @@ class BM1Parameters:
         return (1 << self.counter_bits) - 1
 
     def missing_address(self, column: int) -> int:
-        """Address that stands for a missing reading in sensor column `column` (1..N): the top one.
+        """Return the address of a missing reading in sensor column `column` (1..N): the top one.
 
         Raises:
             ParameterError: There is no such sensor column.
@@ -222,7 +216,7 @@ class BM1Parameters:
 
 
 def _check(name: str, value: object, lowest: int, highest: int) -> None:
-    """Refuse a value that is no integer from `lowest` to `highest`; `name` says whose it is."""
+    """Refuse a value that is not an integer from `lowest` to `highest`."""
     if not isinstance(value, int) or isinstance(value, bool):
         raise ParameterError(f"{name} is {value!r}; it must be an integer.")
     if not lowest <= value <= highest:

@@ -1,9 +1,8 @@
-"""The random number generators of a machine: where each kind starts, what it shows, and how it steps.
+"""The random number generators of a machine: seeds, steps, and the numbers shown to the cells.
 
-One generator stands in each column, or in each cell where they are not shared. They are numbered: column c
-is number c, a cell is number line * columns + column, and bank b begins at b times as many as there are. A
-generator's state is one uint64, and a cell compares its code with the low `prob_bits` bits of what that
-shows.
+There is one generator in each column, or in each cell where they are not shared. They are numbered: column c
+is number c, a cell is number line * columns + column, and bank b begins at b times their count. A generator's
+state is one uint64, and a cell compares its code with the low `prob_bits` bits of the number that the state shows.
 """
 
 from dataclasses import dataclass
@@ -19,10 +18,10 @@ from machines.parameters import BM1Parameters, RngKind
 Words: TypeAlias = npt.NDArray[np.uint64]
 
 GOLDEN: Final = 0x9E3779B97F4A7C15
-"""2**64 over the golden ratio, made odd: multiples of it are spread evenly, whatever their number."""
+"""2**64 over the golden ratio, rounded to an odd number: any number of its multiples are spread evenly."""
 
 BASE_STATE: Final = 0x2545F4914F6CDD1D
-"""Its low bits are the state that every LFSR's seeds are reached from."""
+"""Its low bits are the state from which every LFSR's seeds are reached."""
 
 POLYNOMIALS: Final = {
     RngKind.LFSR8: (8, 6, 5, 4),
@@ -30,24 +29,24 @@ POLYNOMIALS: Final = {
     RngKind.LFSR24: (24, 23, 22, 17),
     RngKind.LFSR32: (32, 22, 2, 1),
 }
-"""Exponents of each LFSR's polynomial but for its 1, the highest first; all are maximal."""
+"""Exponents of each LFSR's maximal polynomial, except for the 1, in descending order."""
 
 
 class RandomNumbers(Protocol):
     """All generators of a machine at once: arrays hold one element per generator."""
 
     def restart(self, bank: int) -> Words:
-        """The states that a bank starts from: uint64[columns], or uint64[lines, columns] if unshared."""
+        """Return the states at the start of a bank: uint64[columns], or uint64[lines, columns] if unshared."""
 
     def show(self, states: Words) -> Words:
-        """The numbers that the states show to the cells, `prob_bits` bits each."""
+        """Return the numbers that the states show to the cells, `prob_bits` bits each."""
 
     def clock(self, states: Words) -> Words:
-        """The states after one clock: `steps_per_clock` steps on."""
+        """Return the states after one clock, which is `steps_per_clock` steps."""
 
 
 def random_numbers(machine: BM1Machine) -> RandomNumbers:
-    """The generators that a machine is built with."""
+    """Return the generators of a machine."""
     parameters = machine.parameters
     if parameters.rng in POLYNOMIALS:
         return LFSRNumbers(parameters)
@@ -57,7 +56,7 @@ def random_numbers(machine: BM1Machine) -> RandomNumbers:
 
 
 def generator_numbers(parameters: BM1Parameters, bank: int) -> Words:
-    """The numbers of a bank's generators: uint64[columns], or uint64[lines, columns] if unshared."""
+    """Return the numbers of a bank's generators: uint64[columns], or uint64[lines, columns] if unshared."""
     shape = (parameters.columns,) if parameters.shared else (parameters.lines, parameters.columns)
     count = int(np.prod(shape, dtype=np.int64))
     return np.arange(bank * count, (bank + 1) * count, dtype=np.uint64).reshape(shape)
@@ -67,8 +66,8 @@ def generator_numbers(parameters: BM1Parameters, bank: int) -> Words:
 class LFSR:
     """A Fibonacci linear feedback shift register of `bits` bits (here all up to 32).
 
-    A step shifts the state left and puts the parity of the bits e - 1, for every exponent e of the
-    polynomial, in at the low end. Its period is 2**bits - 1: every state but 0.
+    A step shifts the state left and shifts in, at the low end, the parity of the bits e - 1 for every exponent e
+    of the polynomial. Its period is 2**bits - 1: every state but 0.
     """
 
     kind: RngKind
@@ -80,21 +79,21 @@ class LFSR:
 
     @property
     def period(self) -> int:
-        """Steps after which a state returns."""
+        """Steps after which a state repeats."""
         return (1 << self.bits) - 1
 
     @property
     def taps(self) -> int:
-        """Mask of the state's bits whose parity comes in."""
+        """Mask of the state's bits whose parity is shifted in."""
         return sum(1 << (exponent - 1) for exponent in POLYNOMIALS[self.kind])
 
     def step(self, states: Words) -> Words:
-        """The states one step on."""
+        """Return the states after one step."""
         parity: Words = (np.bitwise_count(states & np.uint64(self.taps)) & np.uint8(1)).astype(np.uint64)
         return ((states << np.uint64(1)) & np.uint64(self.period)) | parity
 
     def jump(self, states: Words, steps: Words) -> Words:
-        """The states that many steps on (one number of steps each), at the cost of a few look-ups."""
+        """Return each state after its number of steps, at the cost of a few look-ups."""
         steps = steps % np.uint64(self.period)
         for bit, tables in enumerate(jump_tables(self.kind, 1)):
             taken = (steps >> np.uint64(bit)) & np.uint64(1) == 1
@@ -102,10 +101,10 @@ class LFSR:
         return states
 
     def seeds(self, numbers: Words) -> Words:
-        """The first states of generators of these numbers.
+        """Return the first states of the generators with these numbers.
 
-        They lie at scattered distances behind a base state, not evenly spaced: evenly spaced phases of 3, 5
-        or 17 columns XOR to 0, because these divide 2**32 - 1, and the AND of such columns is wrong for ever.
+        Their distances from a base state are scattered, not evenly spaced: evenly spaced phases of 3, 5
+        or 17 columns XOR to 0, because these divide 2**32 - 1, and the AND of such columns is wrong at any length.
         """
         base = BASE_STATE & self.period or 1
         distances = ((numbers + np.uint64(1)) * np.uint64(GOLDEN)) >> np.uint64(32)
@@ -114,20 +113,20 @@ class LFSR:
 
 @dataclass(frozen=True, slots=True)
 class LFSRNumbers:
-    """Generators that are LFSRs: the low bits of the state are shown."""
+    """LFSRs, which show the low bits of their states."""
 
     parameters: BM1Parameters
 
     def restart(self, bank: int) -> Words:
-        """The seeds of the bank's generators."""
+        """Return the seeds of the bank's generators."""
         return LFSR(self.parameters.rng).seeds(generator_numbers(self.parameters, bank))
 
     def show(self, states: Words) -> Words:
-        """The low `prob_bits` bits of the states."""
+        """Return the low `prob_bits` bits of the states."""
         return states & np.uint64(self.parameters.ones_code)
 
     def clock(self, states: Words) -> Words:
-        """`steps_per_clock` steps, one by one."""
+        """Take `steps_per_clock` steps, one by one."""
         lfsr = LFSR(self.parameters.rng)
         for _ in range(self.parameters.steps_per_clock):
             states = lfsr.step(states)
@@ -136,7 +135,7 @@ class LFSRNumbers:
 
 @dataclass(frozen=True, slots=True)
 class TableNumbers:
-    """Generators that all play one recorded table in a ring; the state is the index.
+    """Generators that all play one recorded table in a ring; a state is an index.
 
     Generator n of `count` starts at floor(n * length / count), and bank b goes b / banks of the way to the
     next one's start.
@@ -146,19 +145,19 @@ class TableNumbers:
     table: npt.NDArray[np.uint32]
 
     def restart(self, bank: int) -> Words:
-        """The first indices."""
+        """Return the first indices."""
         numbers = generator_numbers(self.parameters, 0)
         banks = self.parameters.rng_banks
-        # Python's integers: the products may pass 64 bits.
+        # Python's integers: the products may exceed 64 bits
         starts = [(n * banks + bank) * len(self.table) // (numbers.size * banks) for n in range(numbers.size)]
         return np.array(starts, dtype=np.uint64).reshape(numbers.shape)
 
     def show(self, states: Words) -> Words:
-        """The low `prob_bits` bits of the table's numbers."""
+        """Return the low `prob_bits` bits of the table's numbers."""
         return self.table[states] & np.uint64(self.parameters.ones_code)
 
     def clock(self, states: Words) -> Words:
-        """`steps_per_clock` places on."""
+        """Advance the indices by `steps_per_clock`."""
         return (states + np.uint64(self.parameters.steps_per_clock)) % np.uint64(len(self.table))
 
 
@@ -173,33 +172,33 @@ class IdealNumbers:
     parameters: BM1Parameters
 
     def restart(self, bank: int) -> Words:
-        """The first states."""
+        """Return the first states."""
         seed = mix(np.array([self.parameters.ideal_seed], dtype=np.uint64))
         numbers = generator_numbers(self.parameters, bank)
         return mix(seed + (numbers + np.uint64(1)) * np.uint64(GOLDEN))
 
     def show(self, states: Words) -> Words:
-        """The low `prob_bits` bits of the mixed states."""
+        """Return the low `prob_bits` bits of the mixed states."""
         return mix(states) & np.uint64(self.parameters.ones_code)
 
     def clock(self, states: Words) -> Words:
-        """`steps_per_clock` additions at once."""
+        """Take `steps_per_clock` steps in one addition."""
         return states + np.uint64(self.parameters.steps_per_clock * GOLDEN % 2**64)
 
 
 def mix(words: Words) -> Words:
-    """splitmix64's finaliser (Steele, Lea and Flood 2014): every output bit depends on every input bit."""
+    """Apply splitmix64's finaliser (Steele, Lea and Flood 2014): every output bit depends on every input bit."""
     words = (words ^ (words >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     words = (words ^ (words >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     return words ^ (words >> np.uint64(31))
 
 
-# An LFSR's step is linear over GF(2), and so are any number of steps. A linear map of a state is held as one
+# An LFSR's step is linear over GF(2), and so is any number of steps. A linear map of a state is held as one
 # table of 256 words per byte of the state: the image is the XOR of one word from each.
 
 
 def map_tables(images: Words) -> Words:
-    """The tables of the linear map that takes state bit j to `images[j]`: uint64[bits / 8, 256]."""
+    """Return the tables of the linear map that takes state bit j to `images[j]`: uint64[bits / 8, 256]."""
     tables = np.zeros((len(images) // 8, 256), dtype=np.uint64)
     for j, image in enumerate(images):
         table, half = tables[j // 8], 1 << (j % 8)
@@ -208,7 +207,7 @@ def map_tables(images: Words) -> Words:
 
 
 def apply_map(tables: Words, states: Words) -> Words:
-    """The images of states under a linear map."""
+    """Return the images of states under a linear map."""
     images = np.zeros_like(states)
     for byte, table in enumerate(tables):
         images ^= table[(states >> np.uint64(8 * byte)) & np.uint64(255)]
@@ -217,7 +216,7 @@ def apply_map(tables: Words, states: Words) -> Words:
 
 @cache
 def jump_tables(kind: RngKind, stride: int) -> Words:
-    """The maps of stride * 2**i steps, one for every bit i of the state: uint64[bits, bits / 8, 256]."""
+    """Return the maps of stride * 2**i steps, one for every bit i of the state: uint64[bits, bits / 8, 256]."""
     lfsr = LFSR(kind)
     basis = np.uint64(1) << np.arange(lfsr.bits, dtype=np.uint64)
     images = basis

@@ -30,7 +30,8 @@ if TYPE_CHECKING:
 
     import numpy.typing as npt
 
-    from machines.bm1 import BM1Kernel, BM1Machine
+    from machines.bm1 import BM1Machine
+    from machines.kernel import BM1Kernel
     from machines.parameters import BM1Parameters
     from pcie_shim.programming_file import Image
 

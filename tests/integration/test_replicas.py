@@ -13,7 +13,7 @@ import pytest
 
 from machines.bm1 import Start
 from machines.posterior import joint_posterior
-from machines.reference import ReferenceReplicas
+from machines.reference import ReferenceBM1
 from pcie_shim.host.frame import FrameInput
 from pcie_shim.programming_file import read_image
 from posteriors.results import read_frame_report, read_posterior
@@ -173,7 +173,7 @@ def test_the_machines_alone_are_the_reference(tmp_path):
     message = message_of(deployment, 2)
     inputs, light = inputs_of(deployment, message)
     image = read_image(deployment.image_path(0))
-    reference = ReferenceReplicas(image.machine)
+    reference = ReferenceBM1(image.machine)
     tops = np.array([[image.machine.parameters.missing_address(column)] for column in (1, 2)])
     reference.start(
         Start(

@@ -1,11 +1,12 @@
-"""Random machines and what is done with them, for properties that hold for every BM1."""
+"""Random machines and their frames, for properties that hold for every BM1."""
 
 from dataclasses import dataclass
 
 import numpy as np
 from hypothesis import strategies as st
 
-from machines.bm1 import BM1Kernel, BM1Machine, Start, StopReason
+from machines.bm1 import BM1Machine, Start, StopReason
+from machines.kernel import BM1Kernel
 from machines.parameters import BM1Parameters, PriorMode, RngKind, RngReset, SensorMode
 
 ONE = st.just(1)
@@ -165,7 +166,7 @@ def play(kernel: BM1Kernel, frames: tuple[Frame, ...]):
 
 
 def seen(kernel: BM1Kernel, returned: StopReason):
-    """What a kernel shows: reason, cycles, counts, generators' states, and each replica's reason and cycles."""
+    """Return all that a kernel shows: reason, cycles, counts, states, and each replica's reason and cycles."""
     assert kernel.cycles == max(kernel.replica_cycles)
     assert kernel.counts.shape == kernel.machine.parameters.count_shape
     assert kernel.reason is returned
@@ -176,5 +177,6 @@ def seen(kernel: BM1Kernel, returned: StopReason):
         kernel.cycles,
         kernel.counts.tolist(),
         kernel.rng_state.tolist(),
-        *((kernel.replica_reasons, kernel.replica_cycles) if kernel.machine.parameters.replicas > 1 else ()),
+        kernel.replica_reasons,
+        kernel.replica_cycles,
     )

@@ -1,4 +1,4 @@
-"""A machine's tables and a frame's start: what is taken, and what is refused with which sentence."""
+"""A machine's tables, a frame's start and a slice's resume: what is taken and what is refused."""
 
 import numpy as np
 import pytest
@@ -42,77 +42,70 @@ def test_machines_are_equal_by_what_they_hold():
 
 
 @pytest.mark.parametrize(
-    ("arguments", "sentence"),
+    "arguments",
     [
-        ({"prior": np.full((2, 3), 1)}, "The prior's table has the shape (2, 3); it must be (1, 3)"),
-        ({"prior": np.full((1, 3), 256)}, "The prior's table holds codes from 256 to 256"),
-        ({"prior": np.full((1, 3), -1)}, "The prior's table holds codes from -1 to -1"),
-        ({"prior": np.full((1, 3), 0.5)}, "The prior's table holds float64; codes are integers"),
-        ({"tables": (np.full((2, 3), 255),)}, "There are 1 sensor tables"),
-        (
-            {"tables": (np.full((2, 3), 255), np.full((4, 3), 254))},
-            "The table of column 2 has other codes than all-ones (255) at its top address 3",
-        ),
-        (
-            {"sensor_mode": "threshold", "sensor_bits": (8, 8)},
-            "There are 2 sensor tables; with sensor_mode = threshold cells are given codes, so there must be none.",
-        ),
-        ({"rng_table": np.arange(5)}, "rng = lfsr32 plays none"),
-        ({"rng": RngKind.TABLE}, "needs a table of random numbers"),
-        ({"rng": RngKind.TABLE, "rng_table": np.zeros((2, 2), int)}, "has the shape (2, 2)"),
-        ({"rng": RngKind.TABLE, "rng_table": np.zeros(0, int)}, "has the shape (0,)"),
-        ({"rng": RngKind.TABLE, "rng_table": np.array([2**32])}, "something else than integers"),
-        ({"rng": RngKind.TABLE, "rng_table": np.array([0.5])}, "something else than integers"),
+        {"prior": np.full((2, 3), 1)},
+        {"prior": np.full((1, 3), 256)},
+        {"prior": np.full((1, 3), -1)},
+        {"prior": np.full((1, 3), 0.5)},
+        {"tables": (np.full((2, 3), 255),)},
+        {"tables": (np.full((2, 3), 255), np.full((4, 3), 254))},
+        {"sensor_mode": "threshold", "sensor_bits": (8, 8)},
+        {"rng_table": np.arange(5)},
+        {"rng": RngKind.TABLE},
+        {"rng": RngKind.TABLE, "rng_table": np.zeros((2, 2), int)},
+        {"rng": RngKind.TABLE, "rng_table": np.zeros(0, int)},
+        {"rng": RngKind.TABLE, "rng_table": np.array([2**32])},
+        {"rng": RngKind.TABLE, "rng_table": np.array([0.5])},
     ],
 )
-def test_arrays_of_no_such_machine_are_refused(arguments, sentence):
-    with pytest.raises(ParameterError) as refusal:
+def test_arrays_that_do_not_fit_the_parameters_are_refused(arguments):
+    with pytest.raises(ParameterError):
         build(**arguments)
-    assert sentence in str(refusal.value)
 
 
 FINE = {"addresses": (0, 3), "target_count": 15, "max_cycles": 20}
 
 
 @pytest.mark.parametrize(
-    ("changes", "sentence"),
+    "changes",
     [
-        ({"addresses": (0,)}, "There are 1 addresses; this machine has 2 sensor columns"),
-        ({"addresses": (0, 4)}, "The address of column 2 is 4; it must be from 0 to 3"),
-        ({"addresses": (-1, 0)}, "The address of column 1 is -1"),
-        ({"addresses": (0.0, 0)}, "The address of column 1 is 0.0; it must be an integer"),
-        ({"addresses": (None, 0)}, "The address of column 1 is None; it must be an integer"),
-        ({"prior_address": 1}, "prior_address is 1; it must be from 0 to 0"),
-        ({"target_count": 0}, "target_count is 0; it must be from 1 to 15"),
-        ({"target_count": 16}, "target_count is 16; it must be from 1 to 15"),
-        ({"max_cycles": 0}, "max_cycles is 0"),
-        ({"max_cycles": CYCLES_MAX + 1}, "max_cycles is"),
-        ({"bank": 2}, "bank is 2; it must be from 0 to 1"),
-        ({"run_until": -1}, "run_until is -1"),
-        ({"prior_codes": np.full(3, 9)}, "this machine's prior is a table"),
+        {"addresses": (0,)},
+        {"addresses": (0, 4)},
+        {"addresses": (-1, 0)},
+        {"addresses": (0.0, 0)},
+        {"addresses": (None, 0)},
+        {"prior_address": 1},
+        {"prior_address": (0,)},
+        {"target_count": 0},
+        {"target_count": 16},
+        {"max_cycles": 0},
+        {"max_cycles": 2.0},
+        {"max_cycles": True},
+        {"max_cycles": CYCLES_MAX + 1},
+        {"bank": 2},
+        {"run_until": -1},
+        {"prior_codes": np.full(3, 9)},
     ],
 )
-def test_a_start_that_the_machine_can_not_take_changes_nothing(make, changes, sentence):
+def test_a_start_that_does_not_fit_changes_nothing(make, changes):
     kernel = make(build())
     kernel.start(Start(**FINE))
     before = kernel.reason, kernel.cycles, kernel.counts.tolist(), kernel.rng_state.tolist()
-    with pytest.raises(StartError) as refusal:
-        kernel.start(Start(**{**FINE, **changes}))
-    assert sentence in str(refusal.value)
+    with pytest.raises(StartError):
+        kernel.start(Start(**FINE | changes))
     assert (kernel.reason, kernel.cycles, kernel.counts.tolist(), kernel.rng_state.tolist()) == before
 
 
-@pytest.mark.parametrize(
-    ("codes", "sentence"),
-    [
-        (np.full(2, 9), "The written prior has the shape (2,)"),
-        (np.full(3, 256), "The written prior holds codes from 256 to 256"),
-    ],
-)
-def test_a_written_prior_has_one_code_a_line(make, codes, sentence):
-    with pytest.raises(StartError) as refusal:
+def test_a_refusal_names_the_column_its_value_and_its_range(make):
+    with pytest.raises(StartError, match=r"^The address of column 2 is 4; it must be from 0 to 3\.$"):
+        make(build()).start(Start(**FINE | {"addresses": (0, 4)}))
+
+
+@pytest.mark.parametrize("codes", [np.full(2, 9), np.full(3, 256)])
+def test_a_written_prior_has_one_code_a_line(make, codes):
+    with pytest.raises(StartError):
         make(build(prior_mode=PriorMode.WRITTEN)).start(Start(**FINE, prior_codes=codes))
-    assert sentence in str(refusal.value)
 
 
 def test_a_written_prior_holds_for_its_frame(make):
@@ -139,42 +132,35 @@ def test_numbers_may_be_numpys(make):
 
 
 @pytest.mark.parametrize(
-    ("until", "last", "reason"),
+    ("prior", "last", "reason"),
     [
-        (None, 0, "none"),
-        (0, 15, "overflow"),
-        (0, 255, "max_cycles"),
+        (128, None, StopReason.NONE),
+        (128, 15, StopReason.OVERFLOW),
+        (128, 255, StopReason.MAX_CYCLES),
+        (0, 15, StopReason.IMPOSSIBLE),
     ],
 )
-def test_a_frame_that_is_over_can_not_be_resumed(make, until, last, reason):
-    kernel = make(build(np.array([[128] * 3]), counter_bits=8))
-    if until is not None:
-        kernel.start(Start(addresses=(0, 3), target_count=last, max_cycles=50, run_until=until))
-    with pytest.raises(StartError, match=f"There is no slice to resume: .* reason {reason}"):
+def test_a_frame_that_is_over_can_not_be_resumed(make, prior, last, reason):
+    kernel = make(build(np.full((1, 3), prior), counter_bits=8))
+    if last is not None:
+        kernel.start(Start(addresses=(0, 3), target_count=last, max_cycles=50))
+    assert kernel.reason is reason
+    with pytest.raises(StartError):
         kernel.resume(1000)
-
-
-def test_an_impossible_frame_can_not_be_resumed(make):
-    kernel = make(build(np.zeros((1, 3), int)))
-    kernel.start(Start(**FINE, run_until=3))
-    with pytest.raises(StartError, match="reason impossible"):
-        kernel.resume(5)
 
 
 @pytest.mark.parametrize("until", [10, 1, -1, CYCLES_MAX + 1])
 def test_a_slice_must_end_later(make, until):
     kernel = make(build(np.array([[1] * 3])))
-    assert (
-        kernel.start(Start(addresses=(0, 3), target_count=15, max_cycles=50, run_until=10))
-        is StopReason.SLICE
-    )
-    with pytest.raises(StartError, match=r"run_until is .*; it must be from 11 to"):
+    start = Start(addresses=(0, 3), target_count=15, max_cycles=50, run_until=10)
+    assert kernel.start(start) is StopReason.SLICE
+    with pytest.raises(StartError):
         kernel.resume(until)
     assert (kernel.reason, kernel.cycles) == (StopReason.SLICE, 10)
     assert kernel.resume(11) is StopReason.SLICE
 
 
-def test_what_a_kernel_shows_is_the_readers_own(make):
+def test_counts_and_states_are_copies(make):
     kernel = make(build())
     kernel.start(Start(**FINE))
     counts, states = kernel.counts, kernel.rng_state

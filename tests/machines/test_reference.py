@@ -4,8 +4,8 @@ import numpy as np
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from machines.bm1 import BM1Kernel, BM1Machine, Start, StopReason, addressed_codes
-from machines.parameters import BM1Parameters, RngKind, RngReset
+from machines.bm1 import Start, StopReason, addressed_codes
+from machines.parameters import RngKind
 from machines.reference import ReferenceBM1
 from machines.rng import random_numbers
 from tests.machines.random_machines import sessions
@@ -57,11 +57,3 @@ def test_counts_are_the_ands_of_every_cell(session):
     assert kernel.cycles == last + 1
     assert (kernel.counts == counts[last]).all()
     assert (kernel.rng_state == states[last + 1]).all()
-
-
-def test_it_is_a_kernel():
-    kernel: BM1Kernel = ReferenceBM1(
-        BM1Machine(BM1Parameters(lines=2, sensor_bits=(), rng_reset=RngReset.FREE), np.array([[1, 2]]), ())
-    )
-    assert kernel.machine.parameters.lines == 2
-    assert kernel.rng_state.shape == (1,)
