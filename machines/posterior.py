@@ -1,4 +1,4 @@
-"""From counts to probabilities: over all boards of a model, and in one call for a notebook."""
+"""Posteriors from counts: over all boards of a model, and in one call for a notebook."""
 
 from collections.abc import Sequence, Sized
 from typing import TypeAlias, cast
@@ -14,18 +14,18 @@ from machines.parameters import BM1Parameters, SensorMode
 def joint_posterior(
     counts: Sequence[npt.NDArray[np.uint32]], cycles: Sequence[int]
 ) -> npt.NDArray[np.float64] | None:
-    """The posterior over the lines of all boards, normalised jointly (thesis equation 2.3 for several boards).
+    """Return the posterior over the lines of all boards, normalised jointly (thesis equation 2.3).
 
     A line's probability is proportional to its count over its board's cycles; a board that ran no cycle (no line
-    of it can count) has the weight 0. Boards' counts can't be normalised one by one: each stopped at a cycle of
-    its own.
+    of it can count) has the weight 0. Boards' counts can't be normalised board by board, since each board stopped at
+    its own cycle.
 
     Args:
         counts: One uint32[lines] per board, in the order of the model's lines.
         cycles: Cycles that each board ran.
 
     Returns:
-        float64[all lines] with the sum 1, or None where every count is 0: there is no posterior then.
+        float64[all lines] with the sum 1, or None if every count is 0.
 
     Raises:
         MachineError: There are not as many cycles as boards, or a board has counts and ran no cycle.
@@ -40,7 +40,7 @@ def joint_posterior(
 def posterior_of_lines(
     counts: npt.NDArray[np.uint32], lines: Sequence[int], cycles: Sequence[int]
 ) -> npt.NDArray[np.float64] | None:
-    """The same as `joint_posterior`, of counts that lie one after the other.
+    """Return `joint_posterior` of counts that are concatenated already.
 
     Args:
         counts: uint32[all lines], board after board.
@@ -48,7 +48,7 @@ def posterior_of_lines(
         cycles: Cycles that each board ran.
 
     Returns:
-        float64[all lines] with the sum 1, or None where every count is 0.
+        float64[all lines] with the sum 1, or None if every count is 0.
 
     Raises:
         MachineError: A board has counts and ran no cycle.
@@ -79,49 +79,44 @@ def posterior(
     max_cycles: int = 2**17,
     bank: int = 0,
 ) -> npt.NDArray[np.float64]:
-    """The posterior that one machine computes from one set of readings: no board, no process (thesis 2.1.2).
+    """Run one machine, without boards or processes, and return the posterior for its readings (thesis 2.1.2).
 
     Args:
-        machine: What to run.
+        machine: The machine to run.
         readings: One address per sensor column, columns 1..N; None for a missing reading. Where cells have inputs
-            of their own (`sensor_mode`), a column's reading is a row of one address, or one code, per line. With
-            replicas there is one such set of readings for each; integers without a missing reading may be one array of
-            the shape `machine.parameters.input_shape`.
+            of their own (`sensor_mode`), a column's reading is a row of one address, or one code, per line. Several
+            replicas take one such set each; without a missing reading that may be one array of integers of the
+            shape `machine.parameters.input_shape`.
         prior_address: Row of the prior's table; with replicas one for all, or a tuple of one each.
         prior_codes: uint16[lines], a written prior, where the machine takes one; with replicas the same for all, or
             uint16[replicas, lines].
         target_count: The count at which the best line stops the machine.
-        max_cycles: The cycle at which it stops at the latest.
-        bank: Set of seeds; another one gives another draw of the same distribution.
+        max_cycles: Most cycles.
+        bank: Set of seeds; each gives another draw of the same distribution.
 
     Returns:
-        float64[lines] with the sum 1. With replicas float64[replicas, lines], where the row of one that has no
-        posterior is 0.
+        float64[lines] with the sum 1. With several replicas float64[replicas, lines]; the row of a replica without
+        a posterior is 0.
 
     Raises:
         NoPosteriorError: No line (of any replica) can count for these readings, or none did before `max_cycles`.
-        StartError: A reading or another argument is not what this machine can take.
+        StartError: A reading or another argument does not fit the machine.
     """
     from machines.kernel import make_kernel
 
     if not isinstance(readings, Sized):
-        raise StartError(f"Readings are a list, one for each sensor column; {readings!r} is none.")
+        raise StartError(f"Readings are a list, one for each sensor column; {readings!r} is not.")
     parameters = machine.parameters
-    addresses: tuple[int, ...] | npt.NDArray[np.integer]
-    if parameters.replicas == 1 and parameters.sensor_mode is SensorMode.COLUMN:
-        addresses = _addresses(parameters, cast("Sequence[int | None]", readings))
-    elif parameters.replicas == 1:
-        addresses = _inputs(parameters, cast("Sequence[Reading]", readings))
-    elif len(readings) != parameters.replicas:
+    sets = [readings] if parameters.replicas == 1 else readings
+    if len(sets) != parameters.replicas:
         raise StartError(
-            f"There are readings of {len(readings)} machines; this machine has {parameters.replicas} replicas."
+            f"There are readings of {len(sets)} machines; this machine has {parameters.replicas} replicas."
         )
-    else:
-        addresses = np.stack([_inputs(parameters, cast("Sequence[Reading]", own)) for own in readings])
+    inputs = [_inputs(parameters, cast("Sequence[Reading]", own)) for own in sets]
     kernel = make_kernel(machine)
     kernel.start(
         Start(
-            addresses=addresses,
+            addresses=np.reshape(inputs, parameters.input_shape),
             prior_address=prior_address,
             prior_codes=prior_codes,
             target_count=target_count,
@@ -144,21 +139,12 @@ def posterior(
     return rows[0] if parameters.replicas == 1 else np.stack(rows)
 
 
-def _addresses(parameters: BM1Parameters, readings: Sequence[int | None]) -> tuple[int, ...]:
-    """One address per column: the top one where a reading is missing."""
-    _check_number(parameters, readings)
-    addresses = []
-    for column, reading in enumerate(readings, start=1):
-        missing = parameters.missing_address(column)
-        if reading == missing:
-            raise _reserved(f"The reading of column {column}", missing)
-        addresses.append(missing if reading is None else reading)
-    return tuple(addresses)
-
-
 def _inputs(parameters: BM1Parameters, readings: Sequence[Reading]) -> npt.NDArray[np.integer]:
-    """The inputs of one machine: int64[sensors], or int64[sensors, lines]."""
-    _check_number(parameters, readings)
+    """Return the inputs of one replica: int64[sensors], or int64[sensors, lines]."""
+    if len(readings) != parameters.sensors:
+        raise StartError(
+            f"There are {len(readings)} readings; this machine has {parameters.sensors} sensor columns."
+        )
     per_cell = parameters.sensor_mode is not SensorMode.COLUMN
     shape = (parameters.lines,) if per_cell else ()
     inputs = np.empty((parameters.sensors, *shape), dtype=np.int64)
@@ -179,17 +165,8 @@ def _inputs(parameters: BM1Parameters, readings: Sequence[Reading]) -> npt.NDArr
             )
         # as a code the top value is 1 for certain, like any other probability
         if parameters.has_tables and (row == missing).any():
-            raise _reserved(f"The reading of column {column}", missing)
+            raise StartError(
+                f"The reading of column {column} is {missing}, the address of a missing reading: give None for that."
+            )
         inputs[column - 1] = row
     return inputs
-
-
-def _check_number(parameters: BM1Parameters, readings: Sequence[Reading]) -> None:
-    if len(readings) != parameters.sensors:
-        raise StartError(
-            f"There are {len(readings)} readings; this machine has {parameters.sensors} sensor columns."
-        )
-
-
-def _reserved(what: str, missing: int) -> StartError:
-    return StartError(f"{what} is {missing}, the address that stands for a missing one: give None for that.")

@@ -7,9 +7,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from machines.bm1 import BM1Kernel, BM1Machine, Start, StopReason
+from machines.bm1 import BM1Machine, Start, StopReason
+from machines.kernel import BM1Kernel
 from machines.parameters import BM1Parameters, PriorMode, RngKind, RngReset, SensorMode
-from machines.reference import ReferenceBM1, ReferenceReplicas
+from machines.reference import ReferenceBM1
 from pcie_shim import register_map
 from pcie_shim.board.emulated_board import EmulatedBoard, RefusedError
 from pcie_shim.doorbell import following
@@ -40,7 +41,6 @@ __all__ = [
     "Partition",
     "PriorMode",
     "ReferenceBM1",
-    "ReferenceReplicas",
     "RefusedError",
     "RngKind",
     "RngReset",
@@ -64,7 +64,7 @@ _NO_MODEL: Final = "0" * 64
 
 def reference_kernel(machine: BM1Machine) -> BM1Kernel:
     """Return the reference that every other kernel is checked against."""
-    return ReferenceBM1(machine) if machine.parameters.replicas == 1 else ReferenceReplicas(machine)
+    return ReferenceBM1(machine)
 
 
 def image_of(machine: BM1Machine, more_inputs: int = 0, more_results: int = 0) -> Image:

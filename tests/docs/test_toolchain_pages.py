@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import typer
 from pydantic import BaseModel
-from toolchain.deployment.sources import read_sources
 from typer.testing import CliRunner
 
 from toolchain.building.build import assemble

@@ -62,19 +62,19 @@ def test_shapes_stay():
 
 
 @pytest.mark.parametrize("p", [-0.01, 1.01, np.nan, np.inf])
-def test_what_is_no_probability_is_refused(p):
-    with pytest.raises(ParameterError, match="not a number from 0 to 1"):
+def test_a_number_that_is_not_a_probability_is_refused(p):
+    with pytest.raises(ParameterError):
         encode_probability([0.5, p], 8)
 
 
 @pytest.mark.parametrize("codes", [[256], [-1], [0.5]])
-def test_what_is_no_code_is_refused(codes):
-    with pytest.raises(ParameterError, match="no integer from 0 to 255"):
+def test_a_number_that_is_not_a_code_is_refused(codes):
+    with pytest.raises(ParameterError):
         decode_code(codes, 8)
 
 
 @pytest.mark.parametrize("prob_bits", [0, 17])
 def test_there_are_no_codes_of_so_many_bits(prob_bits):
     for function in (encode_probability, decode_code):
-        with pytest.raises(ParameterError, match=f"prob_bits is {prob_bits}"):
+        with pytest.raises(ParameterError):
             function([0], prob_bits)

@@ -1,10 +1,10 @@
-"""Parameters: what can be built, what can't, and what stands where nothing is said."""
+"""Parameters: their defaults, their ranges, and the combinations that are refused."""
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from machines.errors import MachineError, ParameterError
+from machines.errors import ParameterError
 from machines.parameters import BM1Parameters, PriorMode, RngKind, RngReset
 
 
@@ -47,45 +47,48 @@ def test_an_lfsr_must_be_wider_than_a_code(kind, prob_bits):
     if kind.lfsr_bits is None or prob_bits < kind.lfsr_bits:
         assert build().prob_bits == prob_bits
     else:
-        with pytest.raises(ParameterError, match=f"{kind} is too narrow for prob_bits = {prob_bits}"):
+        with pytest.raises(ParameterError):
             build()
 
 
 @pytest.mark.parametrize(
-    ("changes", "sentence"),
+    "changes",
     [
-        ({"lines": 0}, "lines is 0; it must be from 1"),
-        ({"lines": 2.0}, "lines is 2.0; it must be an integer"),
-        ({"lines": True}, "lines is True; it must be an integer"),
-        ({"sensor_bits": (3, 0)}, "sensor_bits of column 2 is 0; it must be from 1 to 16"),
-        ({"sensor_bits": (17,)}, "sensor_bits of column 1 is 17"),
-        ({"prob_bits": 0}, "prob_bits is 0; it must be from 1 to 16"),
-        ({"prob_bits": 17}, "prob_bits is 17"),
-        ({"prior_bits": -1}, "prior_bits is -1"),
-        ({"prior_bits": 1, "prior_mode": "written"}, "a written prior has no address"),
-        ({"prior_mode": "guessed"}, "prior_mode is 'guessed'; it must be one of table, written"),
-        ({"sensor_mode": "pixel"}, "sensor_mode is 'pixel'; it must be one of column, cell, threshold"),
-        (
-            {"sensor_mode": "threshold", "sensor_bits": (8, 7)},
-            "is 7 with sensor_mode = threshold; a cell's input is its code then, so it must be prob_bits = 8.",
-        ),
-        ({"replicas": 0}, "replicas is 0; it must be from 1 to 256"),
-        ({"replicas": 257}, "replicas is 257"),
-        ({"counter_bits": 33}, "counter_bits is 33; it must be from 1 to 32"),
-        ({"steps_per_clock": -1}, "steps_per_clock is -1"),
-        ({"steps_per_clock": 257}, "steps_per_clock is 257"),
-        ({"rng_banks": 0}, "rng_banks is 0"),
-        ({"rng": "lfsr12"}, "rng is 'lfsr12'; it must be one of lfsr8, lfsr16"),
-        ({"rng_reset": ""}, "rng_reset is ''"),
-        ({"ideal_seed": 2**64}, "ideal_seed is"),
+        {"lines": 0},
+        {"lines": 2.0},
+        {"lines": True},
+        {"sensor_bits": (3, 0)},
+        {"sensor_bits": (17,)},
+        {"prob_bits": 0},
+        {"prob_bits": 17},
+        {"prior_bits": -1},
+        {"prior_bits": 17},
+        {"prior_bits": 1, "prior_mode": "written"},
+        {"prior_mode": "guessed"},
+        {"sensor_mode": "pixel"},
+        {"sensor_mode": "threshold", "sensor_bits": (8, 7)},
+        {"replicas": 0},
+        {"replicas": 257},
+        {"counter_bits": 0},
+        {"counter_bits": 33},
+        {"steps_per_clock": -1},
+        {"steps_per_clock": 257},
+        {"rng_banks": 0},
+        {"rng_banks": 65537},
+        {"rng": "lfsr12"},
+        {"rng_reset": ""},
+        {"ideal_seed": 2**64},
     ],
 )
-def test_what_can_not_be_built_is_refused(changes, sentence):
+def test_parameters_of_no_machine_are_refused(changes):
     with pytest.raises(ParameterError) as refusal:
         BM1Parameters(**{"lines": 4, "sensor_bits": (1,), **changes})
-    assert sentence in str(refusal.value)
-    assert isinstance(refusal.value, MachineError)
     assert refusal.value.exit_code == 2
+
+
+def test_a_refusal_names_the_parameter_its_value_and_its_range():
+    with pytest.raises(ParameterError, match=r"^sensor_bits of column 2 is 0; it must be from 1 to 16\.$"):
+        BM1Parameters(lines=4, sensor_bits=(3, 0))
 
 
 def test_names_from_a_file_become_members():
@@ -97,7 +100,7 @@ def test_names_from_a_file_become_members():
 
 @pytest.mark.parametrize("column", [0, 2])
 def test_only_sensor_columns_can_miss_a_reading(column):
-    with pytest.raises(ParameterError, match=f"There is no sensor column {column}"):
+    with pytest.raises(ParameterError):
         BM1Parameters(lines=1, sensor_bits=(2,)).missing_address(column)
 
 

@@ -40,9 +40,9 @@ def test_without_counts_there_is_none(boards, cycles):
 
 
 def test_boards_and_cycles_must_belong_together():
-    with pytest.raises(MachineError, match="counts of 2 boards and cycles of 1"):
+    with pytest.raises(MachineError):
         joint_posterior(counts([1], [1]), [3])
-    with pytest.raises(MachineError, match="Board 1 has counts, but ran 0 cycles"):
+    with pytest.raises(MachineError):
         joint_posterior(counts([1], [1]), [3, 0])
 
 
@@ -86,30 +86,14 @@ def test_readings_give_the_product(machine, readings):
 
 
 def test_readings_that_no_line_allows_have_no_posterior(machine):
-    with pytest.raises(NoPosteriorError, match="every line has a code 0") as none:
+    with pytest.raises(NoPosteriorError) as none:
         posterior(machine, [1, 0])
     assert none.value.exit_code == 4
 
 
 def test_too_few_cycles_have_no_posterior(machine):
-    with pytest.raises(NoPosteriorError, match="no line counted in 1 cycles"):
+    with pytest.raises(NoPosteriorError):
         posterior(machine, [2, 1], max_cycles=1)
-
-
-@pytest.mark.parametrize(
-    ("readings", "options", "sentence"),
-    [
-        ([0], {}, "There are 1 readings; this machine has 2"),
-        ([0, 3], {}, "The reading of column 2 is 3, the address that stands for a missing one"),
-        ([0, 4], {}, "The address of column 2 is 4"),
-        ([0, 0], {"target_count": 256}, "target_count is 256"),
-        ([0, 0], {"bank": 16}, "bank is 16"),
-    ],
-)
-def test_what_the_machine_can_not_take_is_refused(machine, readings, options, sentence):
-    with pytest.raises(StartError) as refusal:
-        posterior(machine, readings, **options)
-    assert sentence in str(refusal.value)
 
 
 def test_a_posterior_can_become_the_next_prior(machine):
@@ -153,7 +137,7 @@ def test_a_replica_without_a_posterior_is_zeros_unless_none_has_one(machine):
     rows = posterior(of(machine, replicas=2), [(1, 0), (0, 0)])
     assert rows[0].tolist() == [0, 0, 0]
     assert rows[1].sum() == pytest.approx(1)
-    with pytest.raises(NoPosteriorError, match="every line has a code 0"):
+    with pytest.raises(NoPosteriorError):
         posterior(of(machine, replicas=2), [(1, 0), (1, 1)])
 
 
@@ -181,45 +165,29 @@ def test_a_threshold_is_the_code_itself(machine):
     assert posterior(bare, [given[0], None]).tolist() == posterior(machine, [0, None]).tolist()
 
 
+CELL = {"sensor_mode": SensorMode.CELL}
+
+
 @pytest.mark.parametrize(
-    ("change", "readings", "sentence"),
+    ("change", "readings", "options"),
     [
-        ({"replicas": 2}, [(0, 0)], "There are readings of 1 machines; this machine has 2 replicas."),
-        ({"replicas": 2}, [(0, 0), (0,)], "There are 1 readings; this machine has 2 sensor columns."),
-        ({"replicas": 2}, [(0, 0), (0, 3)], "The reading of column 2 is 3, the address that stands for"),
-        (
-            {"replicas": 2},
-            [(0, 0), (0, 4)],
-            "The address of column 2 of replica 1 is 4; it must be from 0 to 3.",
-        ),
-        (
-            {"sensor_mode": SensorMode.CELL},
-            [0, 0],
-            "The reading of column 1 has the shape () and holds int64; this machine takes 3 integers, one per line",
-        ),
-        (
-            {"sensor_mode": SensorMode.CELL},
-            [[0, 0, 0], [0, [1], 2]],
-            "The reading of column 2 has the shape (0,) and holds object",
-        ),
-        (
-            {"sensor_mode": SensorMode.CELL},
-            [[0, 0, 0], [0, 3, 0]],
-            "The reading of column 2 is 3, the address",
-        ),
-        (
-            {"sensor_mode": SensorMode.CELL},
-            [[0, 0, 0], [0, 9, 0]],
-            "The address of column 2 at line 1 is 9; it must be from 0 to 3.",
-        ),
+        ({}, 3, {}),
+        ({}, [0], {}),
+        ({}, [0, 3], {}),  # the address of a missing reading, which is None here
+        ({}, [0, 4], {}),
+        ({}, [0, 0.5], {}),
+        ({}, [0, 0], {"target_count": 256}),
+        ({}, [0, 0], {"bank": 16}),
+        ({"replicas": 2}, [(0, 0)], {}),
+        ({"replicas": 2}, [(0, 0), (0,)], {}),
+        ({"replicas": 2}, [(0, 0), (0, 3)], {}),
+        ({"replicas": 2}, [(0, 0), (0, 4)], {}),
+        (CELL, [0, 0], {}),
+        (CELL, [[0, 0, 0], [0, [1], 2]], {}),
+        (CELL, [[0, 0, 0], [0, 3, 0]], {}),
+        (CELL, [[0, 0, 0], [0, 9, 0]], {}),
     ],
 )
-def test_what_cells_and_replicas_can_not_take_is_refused(machine, change, readings, sentence):
-    with pytest.raises(StartError) as refusal:
-        posterior(of(machine, **change), readings)
-    assert sentence in str(refusal.value)
-
-
-def test_what_is_no_list_of_readings_is_said_in_a_sentence(machine):
-    with pytest.raises(StartError, match=r"^Readings are a list, one for each sensor column; 3 is none\.$"):
-        posterior(machine, 3)
+def test_readings_that_do_not_fit_are_refused(machine, change, readings, options):
+    with pytest.raises(StartError):
+        posterior(of(machine, **change), readings, **options)

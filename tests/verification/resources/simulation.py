@@ -8,7 +8,7 @@ import numpy as np
 
 from machines.bm1 import BM1Machine, Start, StopReason, missing_inputs
 from machines.parameters import PriorMode
-from machines.reference import ReferenceBM1, ReferenceReplicas
+from machines.reference import ReferenceBM1
 from tests.verification.resources import verilog
 from tests.verification.resources.cases import Case, machine_of
 from tests.verification.resources.tools import run
@@ -100,7 +100,7 @@ def frames_of(case: Case) -> list[Frame]:
 
 def reference(machine: BM1Machine, frames: Sequence[Frame]) -> tuple[list[Outcome], list[Frame]]:
     """Return the reference machine's outcomes, and the frames with those of their resumes that it took."""
-    kernel = ReferenceBM1(machine) if machine.parameters.replicas == 1 else ReferenceReplicas(machine)
+    kernel = ReferenceBM1(machine)
     outcomes, played = [], []
     for frame in frames:
         kernel.start(frame.start)
