@@ -1,7 +1,7 @@
-"""Arrays in messages as a reader wants them: lists become NumPy arrays, NumPy arrays lists.
+"""Conversion of whole messages between lists of numbers and NumPy arrays.
 
-For topics whose server or whose neighbour wants it otherwise: one that was asked for CBOR and sends JSON, or two
-topics of one client of which one wants arrays and the other lists.
+It serves topics whose wire form differs from the reader's wish: one that was requested as CBOR and arrives as JSON, or
+two subscriptions of one client of which one wants arrays and the other lists.
 """
 
 from typing import Any, Final
@@ -10,20 +10,14 @@ _REALS: Final = frozenset({int, float, type(None)})
 
 
 def with_arrays(value: Any) -> Any:
-    """Replace every list of numbers in a message that came as JSON.
+    """Replace every list of numbers in a message that arrived as JSON, in place.
 
-    Floats become float64, with NaN for a null among them; integers become int64 (uint64 where that is too small), and
-    bytes uint8. What is a list of something else, or mixed with booleans, stays a list.
-
-    Args:
-        value: a message; it is changed where it stands.
-
-    Returns:
-        The message.
+    Floats become float64, with NaN for a null among them; integers become int64, or uint64 where int64 is too
+    small; bytes become uint8. Lists of anything else, also of numbers mixed with booleans, stay lists.
     """
     import numpy as np
 
-    def replaced(part: Any) -> Any:
+    def array_of(part: Any) -> Any:
         kinds = set(map(type, part))
         if not kinds or not kinds <= _REALS:
             return None
@@ -38,33 +32,26 @@ def with_arrays(value: Any) -> Any:
         except OverflowError:
             return np.array(part, np.uint64) if min(part) >= 0 else None
 
-    return _walk(value, list, replaced)
+    return _replace(value, list, array_of)
 
 
 def with_lists(value: Any) -> Any:
-    """Replace every NumPy array in a message: uint8 becomes bytes, all others lists of numbers.
-
-    Args:
-        value: a message; it is changed where it stands.
-
-    Returns:
-        The message.
-    """
+    """Replace every NumPy array in a message, in place: uint8 becomes bytes, all others lists of numbers."""
     import numpy as np
 
-    def replaced(part: Any) -> Any:
+    def list_of(part: Any) -> Any:
         return part.tobytes() if part.dtype == np.uint8 else part.tolist()
 
-    return _walk(value, np.ndarray, replaced)
+    return _replace(value, np.ndarray, list_of)
 
 
-def _walk(message: Any, kind: type, replaced: Any) -> Any:
+def _replace(message: Any, kind: type, convert: Any) -> Any:
     inner = [message]
     while inner:
         container = inner.pop()
         for key, part in list(container.items() if type(container) is dict else enumerate(container)):
-            if type(part) is kind and (other := replaced(part)) is not None:
-                container[key] = other
+            if type(part) is kind and (converted := convert(part)) is not None:
+                container[key] = converted
             elif type(part) is dict or (type(part) is list and part):
                 inner.append(part)
     return message

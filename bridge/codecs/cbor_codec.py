@@ -1,13 +1,13 @@
-"""CBOR on the wire: one map in, one out, typed arrays without lists in between, within limits of size and depth.
+"""CBOR on the wire: one map per message, typed arrays without intermediate lists, limits of size and depth.
 
-rosbridge servers send CBOR (RFC 8949) to a subscriber that asks for ``compression: cbor``: numeric arrays as
-typed arrays (RFC 8746, little endian), ``uint8[]`` as a byte string. What a client sends is JSON.
+rosbridge servers send CBOR (RFC 8949) to subscribers that ask for `compression: cbor`: arrays of numbers as
+typed arrays (RFC 8746, little endian), `uint8[]` as a byte string. Clients send JSON.
 
-Inbound, of all that CBOR can say only what a ROS message needs is taken: maps with text keys, arrays, text, byte
-strings, numbers, booleans, null, and the typed arrays. Every other tag (shared references, bignums, regular
-expressions, dates) is refused before anything is made of it. NaN and infinities are numbers here, as in ROS.
+Inbound, only the part of CBOR that ROS messages need is accepted: maps with text keys, arrays, text, byte strings,
+numbers, booleans, null, and typed arrays. Every other tag (shared references, bignums, regular expressions, dates)
+is refused before it is decoded. NaN and infinities are numbers here, as in ROS.
 
-NumPy is imported when the first array is wanted, never before.
+NumPy is imported with the first array that a reader wants.
 """
 
 from array import array
@@ -22,10 +22,9 @@ import cbor2
 from bridge.codecs.json_codec import MAX_DEPTH, MAX_SIZE, excerpt
 from bridge.errors import DecodeError, EncodeError
 
-#: What becomes of a typed array: a list of numbers (bytes for ``uint8[]``), or a read-only NumPy array.
 Arrays = Literal["list", "numpy"]
+"""Form of a decoded typed array: a list of numbers (bytes for `uint8[]`), or a read-only NumPy array."""
 
-#: By tag: NumPy's name of the elements, and that of the module ``array``.
 TYPED_ARRAYS: Final = {
     64: ("<u1", "B"),
     69: ("<u2", "H"),
@@ -38,8 +37,9 @@ TYPED_ARRAYS: Final = {
     85: ("<f4", "f"),
     86: ("<f8", "d"),
 }
+"""Element types by tag: as NumPy and as the module `array` name them."""
+_BYTES_TAG: Final = 64
 _TAGS: Final = {name[1:]: tag for tag, (name, _code) in TYPED_ARRAYS.items()}
-_FLOAT64: Final = 86
 _LEAVES: Final = frozenset({str, int, float, bool, type(None)})
 _NUMBERS: Final = frozenset({int, float, type(None)})
 
@@ -52,21 +52,21 @@ def decode(
     """Read one message.
 
     Args:
-        data: a whole WebSocket message.
-        max_size: bytes at most.
-        max_depth: maps, arrays and tags within each other at most, the outermost included (an empty one
-            inside the last does not count).
-        arrays: what typed arrays and byte strings become: ``list`` makes lists of numbers, and bytes of
-            ``uint8[]``; ``numpy`` makes read-only arrays of one dimension, which share the message's memory.
+        data: A whole WebSocket message.
+        max_size: Maximum of bytes.
+        max_depth: Maximum of nested maps, arrays and tags, including the outermost (an empty one inside
+            the last does not count).
+        arrays: Form of typed arrays and byte strings: `list` makes lists of numbers, and bytes of `uint8[]`;
+            `numpy` makes read-only one-dimensional arrays that share the message's memory.
 
     Returns:
         The map. Its numbers may be NaN or infinite.
 
     Raises:
-        DecodeError: too large, too deep, no CBOR, CBOR but no map, or something that no ROS message holds.
+        DecodeError: The data is too large, too deep, not a CBOR map, or contains what ROS messages cannot.
     """
     if len(data) > max_size:
-        raise DecodeError(f"a message of {len(data)} bytes arrived, at most {max_size} are taken")
+        raise DecodeError(f"a message of {len(data)} bytes arrived, expected at most {max_size}")
     source = BytesIO(data)
     try:
         message = cbor2.CBORDecoder(
@@ -74,39 +74,44 @@ def decode(
         ).decode()
     except (cbor2.CBORError, ValueError, OverflowError, RecursionError) as error:
         why = error.__cause__ if isinstance(error.__cause__, DecodeError) else error
-        raise DecodeError(f"a message that is no usable CBOR arrived ({why}): {excerpt(data)}") from None
+        raise DecodeError(f"a message that is not usable CBOR arrived ({why}): {excerpt(data)}") from None
     if type(message) is not dict or source.tell() != len(data):
-        raise DecodeError(f"a message that is no single CBOR map arrived: {excerpt(data)}")
+        raise DecodeError(f"a message that is not a single CBOR map arrived: {excerpt(data)}")
     _check(message, arrays, data)
     return message
 
 
 class _Tags(dict[int, _Decoder]):
-    """What is made of each tag: typed arrays of those that stand here, nothing of all others."""
+    """Decoders of the accepted tags, and a refusal for every other."""
 
     def __missing__(self, tag: int) -> _Decoder:
-        """Refuse a tag, also those that the library would make something of."""
+        """Refuse a tag, even one that the library could decode."""
 
         def refuse(_value: object, _immutable: bool) -> Any:
-            raise DecodeError(f"tag {tag} is none of a typed array")
+            raise DecodeError(f"tag {tag} is not a typed array's")
 
         return refuse
 
 
 @lru_cache(maxsize=2)
 def _decoders(arrays: Arrays) -> _Tags:
-    make = _numpy_array if arrays == "numpy" else _plain_array
-    return _Tags({tag: make(tag) for tag in TYPED_ARRAYS})
+    return _Tags({tag: _decoder(tag, arrays) for tag in TYPED_ARRAYS})
 
 
-def _plain_array(tag: int) -> _Decoder:
-    code = TYPED_ARRAYS[tag][1]
+def _decoder(tag: int, arrays: Arrays) -> _Decoder:
+    name, code = TYPED_ARRAYS[tag]
     size = array(code).itemsize
 
-    def make(value: object, _immutable: bool) -> "array[Any]":
+    def make(value: object, _immutable: bool) -> Any:
         if type(value) is not bytes or len(value) % size:
-            raise DecodeError(f"a typed array (tag {tag}) has no whole number of {size}-byte elements")
-        numbers = array(code, value)  # a list once all is read: no tag around it takes it for its own content
+            raise DecodeError(f"a typed array (tag {tag}) does not consist of {size}-byte elements")
+        if arrays == "numpy":
+            import numpy as np
+
+            return np.frombuffer(value, name)
+        numbers = array(
+            code, value
+        )  # `_check` makes the list, so that no tag around it can take it for its content
         if byteorder == "big":
             numbers.byteswap()
         return numbers
@@ -114,30 +119,15 @@ def _plain_array(tag: int) -> _Decoder:
     return make
 
 
-def _numpy_array(tag: int) -> _Decoder:
-    import numpy as np
-
-    dtype = np.dtype(TYPED_ARRAYS[tag][0])
-
-    def make(value: object, _immutable: bool) -> Any:
-        if type(value) is not bytes or len(value) % dtype.itemsize:
-            raise DecodeError(
-                f"a typed array (tag {tag}) has no whole number of {dtype.itemsize}-byte elements"
-            )
-        return np.frombuffer(value, dtype)
-
-    return make
-
-
 def _check(message: dict[str, Any], arrays: Arrays, data: bytes) -> None:
-    """Refuse what the library makes of what no message holds; give byte strings the form that is wanted."""
-    from_bytes = _decoders("numpy")[64] if arrays == "numpy" else None
+    """Refuse decoded values that ROS messages cannot contain, and finish byte strings and arrays."""
+    from_bytes = _decoders("numpy")[_BYTES_TAG] if arrays == "numpy" else None
     inner: list[Any] = [message]
     while inner:
         container = inner.pop()
         if type(container) is dict:
             if set(map(type, container)) - {str}:
-                raise DecodeError(f"a message with a key that is no text arrived: {excerpt(data)}")
+                raise DecodeError(f"a message with a key that is not text arrived: {excerpt(data)}")
             items: Any = container.items()
         elif set(map(type, container)) <= _LEAVES:
             continue
@@ -155,7 +145,7 @@ def _check(message: dict[str, Any], arrays: Arrays, data: bytes) -> None:
             elif kind is array:
                 container[key] = value.tobytes() if value.typecode == "B" else value.tolist()
             elif kind is cbor2.CBORSimpleValue or value is cbor2.undefined:
-                raise DecodeError(f"a message with a value that has no meaning arrived: {excerpt(data)}")
+                raise DecodeError(f"a message with a meaningless value arrived: {excerpt(data)}")
 
 
 def encode(
@@ -168,68 +158,67 @@ def encode(
     """Write one message.
 
     Args:
-        message: what to send. NumPy arrays (C order, any shape, flattened) become typed arrays, byte strings
+        message: The object. NumPy arrays (of any shape, flattened in C order) become typed arrays, byte strings
             stay such; `typed_array` makes typed arrays of anything else.
-        max_size: bytes at most.
-        max_depth: maps and arrays within each other at most.
-        pack_floats: whether lists of numbers with at least one float among them become typed arrays of
-            float64, a None (JSON's null) among them NaN. That is what a server does that has the message as
-            JSON and no definition of its type: lists of integers alone stay lists, since nobody can tell
-            whether they are of 8 or of 64 bits.
+        max_size: Maximum of bytes.
+        max_depth: Maximum of nested maps and arrays.
+        pack_floats: Whether lists of numbers with at least one float become typed arrays of float64, with NaN for a
+            None (JSON's null). A server does so that has the message as JSON and no definition of its type; lists
+            of integers alone stay lists, because their width is unknown.
 
     Raises:
-        EncodeError: a type that CBOR has not got here, a key that is no string, too deep or too large.
+        EncodeError: A type without a CBOR form here, a key that is not a string, too deep or too large.
     """
     try:
         data = cbor2.dumps(_prepare(message, max_depth, pack_floats))
     except (cbor2.CBORError, ValueError, OverflowError, RecursionError) as error:
         raise EncodeError(f"the message cannot be written as CBOR: {error.__cause__ or error}") from None
     if len(data) > max_size:
-        raise EncodeError(f"the message has {len(data)} bytes as CBOR, at most {max_size} are sent")
+        raise EncodeError(f"the message has {len(data)} bytes as CBOR, expected at most {max_size}")
     return data
 
 
 def typed_array(values: Any, elements: str) -> cbor2.CBORTag:
-    """A typed array to be a value in a message that `encode` writes.
+    """Make a typed array, as a value in a message for `encode`.
 
     Args:
-        values: numbers, in anything that can be iterated.
-        elements: what each is: ``u1 u2 u4 u8 i1 i2 i4 i8 f4 f8``.
+        values: Any iterable of numbers.
+        elements: Their type: `u1 u2 u4 u8 i1 i2 i4 i8 f4 f8`.
 
     Raises:
-        EncodeError: a value is none of these, or the elements have another name.
+        EncodeError: A value does not have this type, or the type has another name.
     """
     tag = _TAGS.get(elements)
     if tag is None:
-        raise EncodeError(f"{elements!r} names no elements of a typed array, these do: {' '.join(_TAGS)}")
+        raise EncodeError(
+            f"{elements!r} is not an element type of typed arrays, expected one of {' '.join(_TAGS)}"
+        )
     try:
         numbers = array(TYPED_ARRAYS[tag][1], values)
     except (TypeError, OverflowError, ValueError) as error:
-        raise EncodeError(f"the values make no typed array of {elements}: {error}") from None
+        raise EncodeError(f"the values do not fit a typed array of {elements}: {error}") from None
     if byteorder == "big":
         numbers.byteswap()
     return cbor2.CBORTag(tag, numbers.tobytes())
 
 
 def _prepare(value: Any, levels: int, pack_floats: bool) -> Any:
-    """The value with everything in it that is no CBOR yet made so; ``levels`` may still be within each other."""
+    """Return the value with CBOR types only, nested at most `levels` deep."""
     kind = type(value)
     if kind in _LEAVES or kind is bytes or kind is cbor2.CBORTag:
         return value
+    if not isinstance(value, Mapping | list | tuple):
+        return _from_numpy(value)
+    if levels < 1:
+        raise EncodeError("the message is nested too deeply")
     if isinstance(value, Mapping):
-        if levels < 1:
-            raise EncodeError("the message is nested too deeply")
         if set(map(type, value)) - {str}:
-            raise EncodeError("the message has a key that is no string")
+            raise EncodeError("the message has a key that is not a string")
         return {key: _prepare(part, levels - 1, pack_floats) for key, part in value.items()}
-    if isinstance(value, list | tuple):
-        if levels < 1:
-            raise EncodeError("the message is nested too deeply")
-        kinds = set(map(type, value))
-        if pack_floats and float in kinds and kinds <= _NUMBERS:
-            return _packed_floats(value, kinds)
-        return value if kinds <= _LEAVES else [_prepare(part, levels - 1, pack_floats) for part in value]
-    return _from_numpy(value)
+    kinds = set(map(type, value))
+    if pack_floats and float in kinds and kinds <= _NUMBERS:
+        return _packed_floats(value, kinds)
+    return value if kinds <= _LEAVES else [_prepare(part, levels - 1, pack_floats) for part in value]
 
 
 def _packed_floats(values: list[Any] | tuple[Any, ...], kinds: set[type]) -> Any:
@@ -237,17 +226,17 @@ def _packed_floats(values: list[Any] | tuple[Any, ...], kinds: set[type]) -> Any
         values = [float("nan") if value is None else value for value in values]
     try:
         return typed_array(values, "f8")
-    except EncodeError:  # an integer that no float64 holds
+    except EncodeError:  # an integer beyond float64
         return values
 
 
 def _from_numpy(value: Any) -> Any:
-    """What stands for a NumPy array or scalar."""
+    """Return the CBOR form of a NumPy array or scalar."""
     if isinstance(value, str | int | float) and not hasattr(value, "dtype"):
-        return value  # of a class that is one of these, an enumeration for example
+        return value  # of a subclass, an enumeration for example
     dtype = getattr(value, "dtype", None)
     if dtype is None or dtype.kind not in "buifU":
-        raise EncodeError(f"{type(value).__name__} is nothing that a message can hold")
+        raise EncodeError(f"{type(value).__name__} is not a type of messages")
     if value.ndim == 0 or dtype.str[1:] not in _TAGS:
         return value.tolist()
     if dtype.byteorder == ">" or byteorder == "big":

@@ -1,8 +1,8 @@
-"""The envelope of a published message: what stands before it, known again when it comes again.
+"""The envelope of a publish operation: the bytes before its message, recognised when they repeat.
 
-Who publishes on a topic says the same before each message: ``{"op":"publish","topic":"/t","msg":``. Once such an
-envelope is proven, whatever begins with it, goes on with one JSON object and ends with a brace is a publish on that
-topic: of all that comes in it, only the message itself must be looked at.
+A publisher writes the same bytes before each message of a topic: `{"op":"publish","topic":"/t","msg":`. Once such
+an envelope is proven, any data that starts with it, continues with one JSON object and ends with a brace is a publish
+operation on that topic, and only the message itself has to be parsed.
 """
 
 from typing import Any, Final
@@ -10,24 +10,24 @@ from typing import Any, Final
 import orjson
 
 _KEY: Final = b'"msg":'
-#: Bytes in which the end of an envelope is looked for.
 LONGEST: Final = 512
-#: What ends an operation.
+"""Bytes in which the end of an envelope is searched."""
 BRACE: Final = ord("}")
+"""The last byte of an operation."""
 
 
 def envelope_of(data: bytes) -> bytes:
-    """What may be the envelope of an operation: all up to its first ``"msg":``, nothing without one."""
+    """Return the candidate envelope of an operation: everything up to its first `"msg":`, or nothing."""
     at = data.find(_KEY, 0, LONGEST)
     return data[: at + len(_KEY)] if at > 0 else b""
 
 
 def topic_of(envelope: bytes) -> str | None:
-    """The topic of an envelope, None if it is none.
+    """Return the topic of an envelope, or None if it is not one.
 
-    It is one if it makes a publish with nothing but a topic and a message out of an empty message and a brace. The
-    brace closes the operation, so what stands before it is the value of its last key. Neither ``op`` nor ``topic``
-    has that value: the key is ``msg``, and another object in its place is the message as well.
+    It is an envelope if an empty message and a brace complete it to a publish operation with nothing but a topic and
+    a message. The brace closes the operation, so the message is the value of its last key. Neither `op` nor `topic`
+    has that value, so this key is `msg`, and any other object in its place is the message as well.
     """
     try:
         operation: Any = orjson.loads(envelope + b"{}}")

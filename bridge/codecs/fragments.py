@@ -1,10 +1,10 @@
-"""Fragments: a message that is too large for one piece, cut into pieces and put together again.
+"""Fragments: cut a message that is too large for one piece, and put the pieces together again.
 
-A fragment is ``{"op": "fragment", "id": ..., "data": ..., "num": ..., "total": ...}``; the ``data`` of a message's
-fragments, one after the other in the order of ``num``, are its JSON. Servers differ (``docs/rosbridge-differences.md``):
-``num`` counts from 0 or from 1, ``total`` may be a float that is no whole number, either may be a string, ids are
-strings or integers and are used again. All that is taken; what no message can come of is refused or forgotten:
-the sets that wait for more are bounded in number, in bytes and in time.
+A fragment is `{"op": "fragment", "id": ..., "data": ..., "num": ..., "total": ...}`; the `data` of a message's
+fragments, concatenated in the order of `num`, is its JSON. Servers differ (`docs/rosbridge-differences.md`): `num`
+counts from 0 or from 1, `total` may be a float with a fraction, either may be a string, ids are strings or integers
+and are reused. All of that is accepted; fragments that cannot become a message are refused, and incomplete
+messages are bounded in number, in bytes and in time.
 """
 
 import math
@@ -18,16 +18,17 @@ import orjson
 from bridge.codecs.json_codec import MAX_SIZE
 from bridge.errors import DecodeError
 
-#: Messages that may be incomplete at once; then the one that began first is given up.
 MAX_SETS: Final = 16
-#: Fragments of one message at most.
+"""Maximum of incomplete messages; the oldest is given up for another."""
 MAX_FRAGMENTS: Final = 1 << 16
-#: Seconds after which a message that no further fragment came of is given up.
+"""Maximum of fragments in one message."""
 MAX_AGE: Final = 10.0
-#: Bytes that keeping a fragment takes beyond its data, at least: empty ones count too.
-_OVERHEAD: Final = 128
-#: Characters of a text that is a number, and of an id.
-_LONGEST: Final = 1024
+"""Seconds without a further fragment after which a message is given up."""
+OVERHEAD: Final = 128
+"""Minimum of bytes that storing a fragment takes beyond its data, so that empty ones count too."""
+_LONGEST_ID: Final = 1024
+_CONTINUATION: Final = 0x80, 0xC0
+"""Value and mask of UTF-8 bytes inside a character."""
 
 _DIGITS = re.compile(r"[0-9]{1,9}(?:\.[0-9]{0,9})?")
 
@@ -36,69 +37,69 @@ FragmentId = str | int
 
 @dataclass(slots=True)
 class _Set:
-    """The fragments of one message so far."""
+    """The fragments of one incomplete message."""
 
     total: int
     touched: float
-    parts: dict[int, str] = field(default_factory=dict)
+    parts: dict[int, bytes] = field(default_factory=dict)
     size: int = 0
-    charged: int = 0
+
+    @property
+    def charged(self) -> int:
+        """Bytes that the fragments occupy."""
+        return self.size + OVERHEAD * len(self.parts)
 
 
 class Reassembler:
-    """Puts messages together, for one connection. It reads no clock: whoever calls it does.
-
-    Attributes:
-        given_up: how many messages were begun and will never be complete.
-    """
+    """Puts one connection's messages together. The caller reads the clock."""
 
     def __init__(
         self, *, max_size: int = MAX_SIZE, max_sets: int = MAX_SETS, max_age: float = MAX_AGE
     ) -> None:
-        """Bound what may wait.
+        """Start without fragments.
 
         Args:
-            max_size: characters of a complete message at most; all incomplete ones together may take four
-                times as many bytes, with what keeping them takes.
-            max_sets: messages that may be incomplete at once.
-            max_age: seconds that a message waits for its next fragment.
+            max_size: Maximum of bytes in a complete message; all incomplete ones together may occupy four times
+                as many, storage overhead included.
+            max_sets: Maximum of incomplete messages.
+            max_age: Seconds that a message waits for its next fragment.
         """
         self.given_up = 0
+        """Messages that were begun and never became complete."""
+        self.waiting_bytes = 0
+        """Bytes that incomplete messages occupy."""
         self._max_size = max_size
         self._max_sets = max_sets
         self._max_age = max_age
         self._sets: dict[FragmentId, _Set] = {}  # in the order in which they began
-        self._charged = 0
 
     def __len__(self) -> int:
-        """How many messages are incomplete."""
+        """Return the number of incomplete messages."""
         return len(self._sets)
 
     @property
-    def waiting_bytes(self) -> int:
-        """Bytes that incomplete messages take."""
-        return self._charged
+    def deadline(self) -> float:
+        """When `expire` is due, infinity for never."""
+        return min((begun.touched for begun in self._sets.values()), default=math.inf) + self._max_age
 
-    def take(self, fragment: Mapping[str, Any], now: float) -> str | None:
+    def take(self, fragment: Mapping[str, Any], now: float) -> bytes | None:
         """Take one fragment.
 
         Args:
-            fragment: the operation.
-            now: seconds of any clock that never goes back.
+            fragment: The operation.
+            now: Seconds of any monotonic clock.
 
         Returns:
-            The message that it completes; None if there is more to come, or the fragment was there before.
+            The message that it completes; None if fragments are missing, or this one is a repetition.
 
         Raises:
-            DecodeError: it is no fragment, or it belongs to a message that is too large or makes no sense,
-                which is given up.
+            DecodeError: It is not a fragment, or its message is too large or inconsistent and was given up.
         """
         key, data, number, total = _read(fragment)
-        self.forget_old(now)
+        self.expire(now)
         begun = self._sets.get(key)
         if begun is not None and (begun.total != total or begun.parts.get(number, data) != data):
-            # Ids are used again: this is another message, and the one before will never be complete.
-            self._give_up(key)
+            self._give_up(key)  # the id was reused: the message before will never be complete
             begun = None
         if begun is None:
             if total == 1:
@@ -106,57 +107,52 @@ class Reassembler:
             while len(self._sets) >= self._max_sets:
                 self._give_up(next(iter(self._sets)))
             begun = self._sets[key] = _Set(total, now)
-        elif number in begun.parts:
-            begun.touched = now
-            return None
         begun.touched = now
+        if number in begun.parts:
+            return None
         begun.parts[number] = data
-        size = len(data)
-        begun.size += size
-        begun.charged += size + _OVERHEAD
-        self._charged += size + _OVERHEAD
+        begun.size += len(data)
+        self.waiting_bytes += len(data) + OVERHEAD
         if begun.size > self._max_size:
             self._give_up(key)
-            raise DecodeError(f"a message in fragments has more than {self._max_size} characters")
+        self._checked(data, begun.size)
         if len(begun.parts) == total:
             return self._join(key, begun)
-        while self._charged > 4 * (self._max_size + _OVERHEAD):
-            first = next(iter(self._sets))
-            self._give_up(first)
-            if first == key:
-                raise DecodeError("a message came in too many small fragments")
+        while self.waiting_bytes > 4 * (self._max_size + OVERHEAD):
+            oldest = next(iter(self._sets))
+            self._give_up(oldest)
+            if oldest == key:
+                raise DecodeError("a message arrived in too many small fragments")
         return None
 
-    def forget_old(self, now: float) -> None:
-        """Give up the messages that no fragment came of for too long."""
-        if self._sets:
-            for key in [key for key, begun in self._sets.items() if now - begun.touched > self._max_age]:
-                self._give_up(key)
+    def expire(self, now: float) -> None:
+        """Give up the messages that have waited too long for a fragment."""
+        for key in [key for key, begun in self._sets.items() if begun.touched + self._max_age <= now]:
+            self._give_up(key)
 
     def clear(self) -> None:
-        """Forget everything: the connection is gone."""
+        """Forget everything: the connection is lost."""
         self._sets.clear()
-        self._charged = 0
+        self.waiting_bytes = 0
 
-    def _join(self, key: FragmentId, begun: _Set) -> str:
+    def _join(self, key: FragmentId, begun: _Set) -> bytes:
         first = 0 if 0 in begun.parts else 1
         self._forget(key)
         try:
-            message = "".join([begun.parts[number] for number in range(first, first + begun.total)])
+            return b"".join([begun.parts[number] for number in range(first, first + begun.total)])
         except KeyError:
             self.given_up += 1
             raise DecodeError(
-                f"the fragments of a message are not numbered from 0 or 1 to {begun.total}"
+                f"fragments arrived that are not numbered from 0 or 1 to {begun.total}"
             ) from None
-        return self._checked(message)
 
-    def _checked(self, message: str) -> str:
-        if len(message) > self._max_size:
-            raise DecodeError(f"a message in fragments has more than {self._max_size} characters")
-        return message
+    def _checked(self, data: bytes, size: int | None = None) -> bytes:
+        if (len(data) if size is None else size) > self._max_size:
+            raise DecodeError(f"a message in fragments has more than {self._max_size} bytes")
+        return data
 
     def _forget(self, key: FragmentId) -> None:
-        self._charged -= self._sets.pop(key).charged
+        self.waiting_bytes -= self._sets.pop(key).charged
 
     def _give_up(self, key: FragmentId) -> None:
         self._forget(key)
@@ -164,44 +160,70 @@ class Reassembler:
 
 
 def split(message: bytes, fragment_size: int, fragment_id: FragmentId) -> Iterator[bytes]:
-    """Cut a message into fragments.
+    """Cut a message into fragments, one at a time.
 
     Args:
-        message: an operation as JSON.
-        fragment_size: characters of the message in one fragment at most.
-        fragment_id: names the message: no other that is on its way may have it.
+        message: An operation as JSON.
+        fragment_size: Maximum of the message's bytes in one fragment, which always holds one character at least.
+        fragment_id: Name of the message, unique among those on the way.
 
     Yields:
-        The message itself if it fits into one, else its fragments as JSON, in order, numbered from 0.
+        The message itself if it fits into one fragment, else its fragments as JSON, in order, numbered from 0.
     """
-    text = message.decode()
-    if len(text) <= fragment_size:
+    if len(message) <= fragment_size:
         yield message
         return
-    total = -(-len(text) // fragment_size)
-    for number in range(total):
-        data = text[number * fragment_size : (number + 1) * fragment_size]
-        yield orjson.dumps({"op": "fragment", "id": fragment_id, "data": data, "num": number, "total": total})
+    ends = list(_ends(message, fragment_size))
+    begin = 0
+    for number, end in enumerate(ends):
+        data = message[begin:end].decode()
+        begin = end
+        yield orjson.dumps(
+            {"op": "fragment", "id": fragment_id, "data": data, "num": number, "total": len(ends)}
+        )
 
 
-def _read(fragment: Mapping[str, Any]) -> tuple[FragmentId, str, int, int]:
-    """Id, data, number and total of a fragment."""
+def _ends(message: bytes, fragment_size: int) -> Iterator[int]:
+    """Find where fragments of whole characters end."""
+    inside, mask = _CONTINUATION
+    begin = 0
+    while begin < len(message):
+        end = min(begin + fragment_size, len(message))
+        while end < len(message) and message[end] & mask == inside:
+            end -= 1
+        if end == begin:  # a character of more bytes than a fragment has
+            end += 1
+            while end < len(message) and message[end] & mask == inside:
+                end += 1
+        yield end
+        begin = end
+
+
+def _read(fragment: Mapping[str, Any]) -> tuple[FragmentId, bytes, int, int]:
+    """Read the id, data, number and total of a fragment."""
     key, data = fragment.get("id"), fragment.get("data")
-    if isinstance(key, bool) or not isinstance(key, str | int) or len(str(key)[: _LONGEST + 1]) > _LONGEST:
-        raise DecodeError("a fragment has an id that is neither a short text nor a whole number")
+    if (
+        isinstance(key, bool)
+        or not isinstance(key, str | int)
+        or len(str(key)[: _LONGEST_ID + 1]) > _LONGEST_ID
+    ):
+        raise DecodeError("a fragment arrived whose id is neither a short string nor an integer")
     if not isinstance(data, str):
-        raise DecodeError("a fragment has data that is no text")
+        raise DecodeError("a fragment arrived whose data is not a string")
     number, total = _number(fragment.get("num")), _number(fragment.get("total"))
-    # The reference server says (length - 1) / size + 1 and forgets to round down: 3.36 are 3 fragments.
+    # The reference server computes (length - 1) / size + 1 without rounding down: 3.36 means 3 fragments.
     whole = math.floor(total) if total is not None else 0
     if number is None or number != math.floor(number) or not 1 <= whole <= MAX_FRAGMENTS or number > whole:
         shown = ", ".join(f"{name} {str(fragment.get(name))[:20]}" for name in ("num", "total"))
-        raise DecodeError(f"a fragment is numbered as none can be ({shown})")
-    return key, data, int(number), whole
+        raise DecodeError(f"a fragment arrived with an impossible number or total ({shown})")
+    try:
+        return key, data.encode(), int(number), whole
+    except UnicodeEncodeError:
+        raise DecodeError("a fragment arrived whose data is not Unicode text") from None
 
 
 def _number(value: object) -> float | None:
-    """A number from 0 up, also one that came as text."""
+    """Read a number from 0 up, also one in a string."""
     if isinstance(value, str) and _DIGITS.fullmatch(value):
         return float(value)
     if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value <= 1e9:

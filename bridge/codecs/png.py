@@ -1,9 +1,9 @@
-"""PNG as rosbridge's compression: a message's JSON as the pixels of a picture, which the wire carries in base64.
+"""PNG as rosbridge's compression: a message's JSON as the pixels of a picture, in base64.
 
-The reference server of ROS 1 answers ``compression: png`` so: the JSON's bytes are the red, green and blue of a
-picture that is about square, the last pixels filled up with newlines (older ones: one line of grey). Only what that
-needs is read: 8 bits a channel, no palette, not interlaced. A picture says how large it is before it is unpacked, so a
-small one that unpacks to much is refused in time.
+The reference server of ROS 1 answers `compression: png` this way: the JSON's bytes are the red, green and blue of a
+nearly square picture whose last pixels are newlines (older servers: one line of grey). Only such pictures are
+read: 8 bits a channel, no palette, not interlaced. The header states the size, so a decompression bomb is refused
+before it is unpacked.
 
 Source: PNG, third edition (https://www.w3.org/TR/png-3/), chapters 5, 7, 9 and 11.
 """
@@ -20,31 +20,31 @@ from bridge.codecs.json_codec import MAX_SIZE
 from bridge.errors import DecodeError
 
 _SIGNATURE: Final = b"\x89PNG\r\n\x1a\n"
-#: Of deflate: the least. A mebibyte of numbers takes 12 ms and not 74, and is a fourteenth longer.
-_EFFORT: Final = 1
-#: Bytes of a pixel by colour type.
+_COMPRESSION_LEVEL: Final = 1
+"""The least: a mebibyte of numbers takes 12 ms instead of 74, and is a fourteenth longer."""
 _CHANNELS: Final = {0: 1, 2: 3, 4: 2, 6: 4}
+"""Bytes of a pixel by colour type."""
 
 
 def decode(data: str, *, max_size: int = MAX_SIZE) -> bytes:
-    """Take a message out of its picture.
+    """Extract a message from its picture.
 
     Args:
-        data: the picture in base64.
-        max_size: bytes of the message at most.
+        data: The picture in base64.
+        max_size: Maximum of bytes in the message.
 
     Returns:
-        The message's JSON, perhaps with newlines after it.
+        The message's JSON, perhaps followed by newlines.
 
     Raises:
-        DecodeError: too large, or no such picture.
+        DecodeError: The picture is too large or not one of a message.
     """
     try:
         picture = base64.b64decode(data, validate=True)
     except (binascii.Error, ValueError):
-        raise DecodeError("a png arrived that is no base64") from None
+        raise DecodeError("a png arrived that is not base64") from None
     if not picture.startswith(_SIGNATURE):
-        raise DecodeError("a png arrived that is no picture")
+        raise DecodeError("a png arrived that is not a picture")
     header, packed = b"", bytearray()
     for kind, content in _chunks(picture):
         if kind == b"IHDR":
@@ -56,10 +56,12 @@ def decode(data: str, *, max_size: int = MAX_SIZE) -> bytes:
     width, height, bits, colour, _method, _filter, interlaced = struct.unpack(">IIBBBBB", header)
     channels = _CHANNELS.get(colour)
     if bits != 8 or channels is None or interlaced or not width or not height:
-        raise DecodeError("a png arrived that is no message: 8 bits a channel, no palette, not interlaced")
+        raise DecodeError(
+            "a png arrived that is not a message: expected 8 bits a channel, no palette, no interlacing"
+        )
     line = width * channels
     if line * height > max_size + 8 * line:
-        raise DecodeError(f"a png arrived with more than {max_size} bytes in it")
+        raise DecodeError(f"a png arrived that holds more than {max_size} bytes")
     wanted = (line + 1) * height
     unpacking = zlib.decompressobj()
     try:
@@ -72,14 +74,7 @@ def decode(data: str, *, max_size: int = MAX_SIZE) -> bytes:
 
 
 def encode(message: bytes) -> str:
-    """Put a message into a picture, as the reference server does.
-
-    Args:
-        message: its JSON.
-
-    Returns:
-        The picture in base64.
-    """
+    """Return a message's JSON as a picture in base64, as the reference server writes it."""
     pixels = -(-len(message) // 3) or 1
     width = math.isqrt(pixels)
     height = -(-pixels // width)
@@ -89,7 +84,11 @@ def encode(message: bytes) -> str:
     header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
     picture = _SIGNATURE + b"".join(
         _chunk(kind, content)
-        for kind, content in ((b"IHDR", header), (b"IDAT", zlib.compress(lines, _EFFORT)), (b"IEND", b""))
+        for kind, content in (
+            (b"IHDR", header),
+            (b"IDAT", zlib.compress(lines, _COMPRESSION_LEVEL)),
+            (b"IEND", b""),
+        )
     )
     return base64.b64encode(picture).decode()
 
@@ -109,7 +108,7 @@ def _chunk(kind: bytes, content: bytes) -> bytes:
 
 
 def _unfiltered(lines: bytes, line: int, channels: int) -> bytes:
-    """Undo the filter of each line, which stands before it."""
+    """Undo the filter of each line, which precedes it."""
     pixels = bytearray()
     above = bytes(line)
     for at in range(0, len(lines), line + 1):
@@ -131,7 +130,7 @@ def _unfiltered(lines: bytes, line: int, channels: int) -> bytes:
                     left, corner = (current[i - channels], above[i - channels]) if i >= channels else (0, 0)
                     current[i] = (current[i] + _paeth(left, above[i], corner)) & 255
             case other:
-                raise DecodeError(f"a png arrived with filter {other}, which does not exist")
+                raise DecodeError(f"a png arrived with the unknown filter {other}")
         pixels += current
         above = bytes(current)
     return bytes(pixels)

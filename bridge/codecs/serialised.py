@@ -1,7 +1,7 @@
-"""Serialised ROS messages read by their type: what ``compression: cbor-raw`` brings, in ROS 1's form or in CDR.
+"""Decoding of serialised ROS messages (`compression: cbor-raw`), in ROS 1's form or in CDR.
 
-The types and the reading are those of `rosbags` (the extra ``messages``), which knows some 160 standard types; others
-are registered by the text of their ``.msg``. It is imported when the first message is read.
+The types and the decoding are those of `rosbags` (the extra `messages`), which knows some 160 standard types; others
+are registered by the text of their `.msg`. It is imported with the first message.
 """
 
 from dataclasses import fields, is_dataclass
@@ -13,13 +13,13 @@ from bridge.names import ros2_type
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
-#: Beginnings of CDR: big and little endian, without options.
 _CDR: Final = (b"\x00\x00\x00\x00", b"\x00\x01\x00\x00")
+"""Headers of CDR: big and little endian, without options."""
 _TIMES: Final = frozenset({"builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration"})
 
 
 class MessageTypes:
-    """The types that serialised messages are read by.
+    """The types by which serialised messages are read.
 
     types = MessageTypes()
     async for message in ros.subscribe("/scan", "sensor_msgs/LaserScan", compression="cbor-raw"):
@@ -27,32 +27,32 @@ class MessageTypes:
     """
 
     def __init__(self, ros_version: Literal[1, 2] | None = None) -> None:
-        """Begin with the standard types.
+        """Start with the standard types.
 
         Args:
-            ros_version: whose bytes are to be read; None finds out by each message.
+            ros_version: The ROS version whose bytes are read; None detects it for each message.
         """
         self._version = ros_version
         self._registered: dict[str, str] = {}
         self._stores: dict[int, Typestore] = {}
 
     def register(self, type_name: str, definition: str) -> None:
-        """Add a type that is no standard one.
+        """Add a type that is not a standard one.
 
         Args:
-            type_name: its name, in the form of either ROS.
-            definition: the text of its ``.msg``; types that it uses may follow, each after a line of ``=`` and
-                one that says ``MSG: package/Type``, as recordings have them.
+            type_name: Its name, in the form of either ROS version.
+            definition: The text of its `.msg`; types that it uses may follow, each after a line of `=` and a
+                line `MSG: package/Type`, as in recordings.
 
         Raises:
-            DefinitionError: the text is no definition, or rosbags is missing.
-            NameFormError: of the name.
+            DefinitionError: The text is not a definition, or rosbags is missing.
+            NameFormError: The name is malformed.
         """
         name = ros2_type(type_name)
         typesys = _rosbags()
         try:
             typesys.get_types_from_msg(definition, name)
-        except Exception as error:  # its parser has errors of several libraries
+        except Exception as error:  # the parser raises errors of several libraries
             reason = " ".join(str(error).split())[:200]
             raise DefinitionError(f"the definition of {type_name} cannot be read: {reason}") from None
         self._registered[name] = definition
@@ -62,43 +62,45 @@ class MessageTypes:
         """Read one message.
 
         Args:
-            data: its bytes.
-            type_name: its type, in the form of either ROS.
+            data: Its bytes.
+            type_name: Its type, in the form of either ROS version.
 
         Returns:
-            Its fields, as JSON would have them, but with arrays of numbers as NumPy arrays of their own type, which
-            share the message's memory.
+            Its fields as in JSON, except that arrays of numbers are NumPy arrays of their own type, which share the
+            message's memory.
 
         Raises:
-            DecodeError: the bytes are no message of that type.
-            DefinitionError: the type is not known here, or is known otherwise, or rosbags is missing.
-            NameFormError: of the type.
+            DecodeError: The bytes are not a message of that type.
+            DefinitionError: The type is unknown or has another definition, or rosbags is missing.
+            NameFormError: The type's name is malformed.
         """
         name = ros2_type(type_name)
         why = ""
         versions = (2, 1) if self._version is None else (self._version,)
         if not any(name in self._store(version).fielddefs for version in versions):
             raise DefinitionError(
-                f"the type {type_name} is not known here: give the text of its .msg to MessageTypes.register"
+                f"the type {type_name} is unknown: give the text of its .msg to MessageTypes.register"
             )
         if self._version is None and data[:4] not in _CDR:
             versions = (1,)
         for version in versions:
             store = self._store(version)
             if name not in store.fielddefs:
-                why = why or f"it is a type of ROS {3 - version} alone"
+                why = why or f"only ROS {3 - version} has this type"
                 continue
             try:
                 message = (store.deserialize_ros1 if version == 1 else store.deserialize_cdr)(data, name)
                 return _as_dict(message, version)
             except KeyError as error:
                 raise DefinitionError(
-                    f"the type {type_name} uses {error}, which is not known here: give its .msg text to "
+                    f"the type {type_name} uses {error}, which is unknown: give the text of its .msg to "
                     "MessageTypes.register"
                 ) from None
-            except Exception as error:  # code that is made for the type meets bytes that may be anything
+            except (
+                Exception
+            ) as error:  # the code generated for the type fails in many ways on arbitrary bytes
                 why = why or str(error)
-        raise DecodeError(f"{len(data)} bytes are no {type_name}: {why[:200]}")
+        raise DecodeError(f"{len(data)} bytes are not a {type_name}: {why[:200]}")
 
     def _store(self, version: int) -> "Typestore":
         store = self._stores.get(version)
@@ -110,9 +112,7 @@ class MessageTypes:
             for name, definition in self._registered.items():
                 types = typesys.get_types_from_msg(definition, name)
                 if store.fielddefs.get(name, types[name]) != types[name]:
-                    raise DefinitionError(
-                        f"{name} is a standard type, with another definition than the one given"
-                    )
+                    raise DefinitionError(f"{name} is a standard type with another definition")
                 store.register({n: t for n, t in types.items() if n not in store.fielddefs})
             self._stores[version] = store
         return store

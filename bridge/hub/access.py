@@ -1,15 +1,15 @@
-"""Who may come in: tokens, origins of web pages, and the certificate that the hub shows.
+"""Access control: tokens, origins of web pages, and the certificate that the hub presents.
 
-A token arrives in the header ``Authorization: Bearer TOKEN``. Browsers cannot set that header: they offer the
-subprotocols ``rosbridge`` and ``bearer.TOKEN``, of which the hub chooses the first, so that the token is not sent back.
-Tokens are compared in constant time, and are in no log, no error and no ``repr``.
+A token arrives in the header `Authorization: Bearer TOKEN`. Browsers cannot set that header: they offer the
+subprotocols `rosbridge` and `bearer.TOKEN`, of which the hub chooses the first, so that the token is not sent back.
+Tokens are compared in constant time, and appear in no log, no error and no `repr`.
 """
 
 import hmac
 import ipaddress
 import re
 import ssl
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from http import HTTPStatus
 from pathlib import Path
@@ -21,25 +21,25 @@ from websockets.typing import Origin, Subprotocol
 
 from bridge.hub.errors import HubError
 
-#: The subprotocol that the hub speaks with clients that ask for one.
 SUBPROTOCOL: Final = Subprotocol("rosbridge")
+"""The hub's subprotocol, for clients that ask for one."""
 _BEARER: Final = "bearer."
-#: Characters that a header and a subprotocol both take.
 _TOKEN: Final = re.compile(r"[A-Za-z0-9._~-]{16,1024}")
-#: Web pages of this machine; pages from elsewhere could speak to a robot through their visitor's browser.
+"""Characters that both a header and a subprotocol accept."""
 LOCAL_ORIGIN: Final = re.compile(r"https?://(localhost|127\.\d+\.\d+\.\d+|\[::1\])(:\d+)?")
+"""Web pages of this machine; pages from elsewhere could control a robot through their visitor's browser."""
 _MAX_TOKENS: Final = 1000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Door:
-    """What a client must show.
+    """The credentials that the hub expects, and those that it presents.
 
     Attributes:
-        tokens: one of them must be shown; none are wanted where there are none.
-        origins: web pages (``https://robot.example``) that may connect, besides those of this machine.
-            Programs that are no browsers send no origin and may always connect.
-        tls: the hub's certificate and key; without it nothing is encrypted.
+        tokens: A client must present one of them; without tokens every client may connect.
+        origins: Web pages (`https://robot.example`) that may connect, besides those of this machine.
+            Programs other than browsers send no origin and may always connect.
+        tls: The hub's certificate and key; without it nothing is encrypted.
     """
 
     tokens: tuple[str, ...] = field(default=(), repr=False)
@@ -47,68 +47,65 @@ class Door:
     tls: ssl.SSLContext | None = None
 
     def __post_init__(self) -> None:
-        """Refuse tokens that cannot be sent, or are guessed.
+        """Refuse tokens that cannot be sent, or could be guessed.
 
         Raises:
-            HubError: a token is too short, or has characters that a header does not take.
+            HubError: A token is too short, or has characters that a header does not accept.
         """
         for number, token in enumerate(self.tokens, 1):
             if _TOKEN.fullmatch(token) is None:
                 raise HubError(
-                    f"token {number} of the hub is none: 16 to 1024 letters, digits, '.', '_', '~' and '-' make one "
-                    "(for example of: python3 -c 'import secrets; print(secrets.token_urlsafe(32))')"
+                    f"token {number} of the hub is malformed: expected 16 to 1024 letters, digits, '.', '_', '~' and '-' "
+                    "(for example from: python3 -c 'import secrets; print(secrets.token_urlsafe(32))')"
                 )
 
     @property
     def allowed_origins(self) -> list[Origin | re.Pattern[str] | None]:
-        """The origins for the WebSocket handshake; None stands for programs, which send none."""
+        """Return the origins for the WebSocket handshake; None stands for programs, which send none."""
         return [None, LOCAL_ORIGIN, *map(Origin, self.origins)]
 
     def refusal(self, request: Request) -> HTTPStatus | None:
-        """Why a request may not come in, None if it may."""
-        if not self.tokens or self._shows_token(_offered(request)):
+        """Return the status that refuses a request, or None to admit it."""
+        if not self.tokens:
             return None
-        return HTTPStatus.UNAUTHORIZED
-
-    def _shows_token(self, offered: Iterable[str]) -> bool:
-        shown = False
-        for one in offered:
-            for token in self.tokens:  # all of them, however early one fits
-                shown |= hmac.compare_digest(one.encode("utf-8", "replace"), token.encode())
-        return shown
+        matches = False
+        for candidate in _presented(request):
+            for token in self.tokens:  # all of them, even after a match: the time must reveal nothing
+                matches |= hmac.compare_digest(candidate.encode("utf-8", "replace"), token.encode())
+        return None if matches else HTTPStatus.UNAUTHORIZED
 
 
-def _offered(request: Request) -> list[str]:
-    """What a request shows as tokens."""
-    offered = []
+def _presented(request: Request) -> list[str]:
+    """Return the tokens in a request."""
+    presented = []
     try:
         scheme, _, token = request.headers.get("Authorization", "").partition(" ")
         if scheme.lower() == "bearer":
-            offered.append(token.strip())
-    except MultipleValuesError:  # two of that header: nobody's client does so
+            presented.append(token.strip())
+    except MultipleValuesError:  # no client sends that header twice
         return []
     for line in request.headers.get_all("Sec-WebSocket-Protocol"):
         names = (name.strip() for name in line.split(","))
-        offered += [name.removeprefix(_BEARER) for name in names if name.startswith(_BEARER)]
-    return offered
+        presented += [name.removeprefix(_BEARER) for name in names if name.startswith(_BEARER)]
+    return presented
 
 
 def choose_subprotocol(offered: Sequence[Subprotocol]) -> Subprotocol | None:
-    """The subprotocol to speak: ours if it is offered, else none, which clients that offered others refuse."""
+    """Choose our subprotocol if it is offered, else none, which clients that offered others refuse."""
     return SUBPROTOCOL if SUBPROTOCOL in offered else None
 
 
 def read_tokens(path: Path) -> tuple[str, ...]:
-    """The tokens in a file: one a line; empty lines and lines that begin with # do not count.
+    """Read a file of tokens, one a line; empty lines and lines that begin with # are ignored.
 
     Raises:
-        HubError: it cannot be read, others than its owner may read it, or there is none in it.
+        HubError: The file cannot be read, other users may read it, or it has no tokens.
     """
     try:
         mode = path.stat().st_mode
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        why = error.strerror if isinstance(error, OSError) else "it is no text"
+        why = error.strerror if isinstance(error, OSError) else "it is not text"
         raise HubError(f"the hub cannot read its tokens in {path}: {why}") from None
     if mode & 0o077:
         raise HubError(f"others may read the hub's tokens in {path}: run chmod 600 {path}")
@@ -121,14 +118,14 @@ def read_tokens(path: Path) -> tuple[str, ...]:
 
 
 def tls_context(certificate: Path, key: Path) -> ssl.SSLContext:
-    """What the hub encrypts with: TLS 1.2 or later.
+    """Make the context for encrypting with TLS 1.2 or later.
 
     Args:
-        certificate: its certificate and those between it and the root, as PEM.
-        key: the certificate's private key, as PEM, without a passphrase.
+        certificate: The hub's certificate and the intermediate ones, as PEM.
+        key: The certificate's private key, as PEM, without a passphrase.
 
     Raises:
-        HubError: a file cannot be read, or the two do not belong together.
+        HubError: A file cannot be read, or the two do not belong together.
     """
     context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
     for path in (certificate, key):
@@ -140,14 +137,14 @@ def tls_context(certificate: Path, key: Path) -> ssl.SSLContext:
         context.load_cert_chain(certificate, key, password=lambda: "")
     except (ssl.SSLError, OSError, ValueError) as error:
         raise HubError(
-            f"{certificate} and {key} are no certificate and its private key without a passphrase (PEM): "
+            f"{certificate} and {key} are not a certificate and its private key without a passphrase (PEM): "
             f"{getattr(error, 'reason', None) or error}"
         ) from None
     return context
 
 
 def is_loopback(host: str) -> bool:
-    """Whether only this machine reaches an address to listen on."""
+    """Return whether only this machine reaches an address to listen on."""
     if host == "localhost":
         return True
     try:

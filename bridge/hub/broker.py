@@ -1,15 +1,15 @@
-"""The rosbridge server without a socket: messages of clients in, messages for clients out.
+"""The rosbridge server without sockets: messages of clients in, messages for clients out.
 
-Whoever owns sockets and clocks calls `Broker.connect`, `Broker.receive`, `Broker.wake` and
-`Broker.disconnect`, then serves the clients that `Broker.take_ready` names from their outboxes. Nothing here
-waits, reads the monotonic clock or raises for what a client sends.
+The owner of sockets and clocks calls `Broker.connect`, `Broker.receive_all`, `Broker.wake` and
+`Broker.disconnect`, then drains the outboxes of the clients that `Broker.take_ready` returns. The broker never waits,
+does not read the monotonic clock, and does not raise for anything that a client sends.
 
-What is wrong is refused as the reference server refuses it: not a word to the client, but for who asked for status
-messages (``set_level``); a line in the log, and on ``/rosout`` for who listens there. Only calls and goals are
-answered, ``result: false`` with a sentence in ``values``. A client is served on, whatever nonsense it sent before.
+Errors are refused as on the reference server: without an answer, unless the client asked for status messages
+(`set_level`); with a line in the log, and on `/rosout` for its subscribers. Only calls and goals are answered,
+with `result: false` and a sentence in `values`. A client continues to be served, whatever it sent before.
 
-Messages are not checked against their types; but what goes out is strict JSON, with ``null`` for every NaN and
-infinity that came in.
+Messages are not checked against their types, but all output is strict JSON, with `null` for every NaN and infinity
+that was received.
 """
 
 import contextlib
@@ -17,42 +17,42 @@ import itertools
 import logging
 import time
 from collections.abc import Callable
+from math import inf
 from typing import Any, Final
 
 import orjson
 
 from bridge.codecs.fragments import Reassembler
-from bridge.codecs.json_codec import could_be_deeper, decode, depth
+from bridge.codecs.json_codec import decode, is_deeper
 from bridge.errors import BridgeError
 from bridge.hub.delivery.definitions import Definitions, RosVersion
-from bridge.hub.delivery.dispatcher import Delivery
+from bridge.hub.delivery.dispatcher import Dispatcher
 from bridge.hub.delivery.outbox import Outbox
+from bridge.hub.errors import DefinitionsPendingError, RefusedError
 from bridge.hub.graph import Client, Graph
 from bridge.hub.handlers.actions import Actions
 from bridge.hub.handlers.calls import Calls
 from bridge.hub.handlers.rosapi import NODE, ROSOUT, Rosapi
 from bridge.hub.handlers.topics import Topics
 from bridge.hub.limits import HubLimits
-from bridge.hub.operations import Operation, RefusedError, is_round, text
+from bridge.hub.operations import Operation, is_logged, text
 from bridge.stamps import stamp
 
 log = logging.getLogger(__name__)
 
-#: Of ``set_level``: which status messages a client wants. All that the hub has to say are errors.
+TURN_WORK: Final = 10_000
+"""Units of work, of about a microsecond each, after which a client's turn ends."""
+_OPERATION_WORK: Final = 20
 _LEVELS: Final = {"info": True, "warning": True, "error": True, "none": False}
-#: ERROR of rosgraph_msgs/Log, and of rcl_interfaces/msg/Log.
+"""Levels of `set_level`, and whether they include the hub's status messages, which are all errors."""
 _LOG_ERROR: Final = {1: 8, 2: 40}
+"""ERROR of rosgraph_msgs/Log, and of rcl_interfaces/msg/Log."""
 
 _Handler = Callable[[Client, Operation, float], None]
 
 
 class Broker:
-    """All clients of one hub, and what they have between them.
-
-    Attributes:
-        limits: what it refuses beyond.
-        graph: clients, topics, services and actions at the moment.
-    """
+    """All clients of one hub, and everything between them."""
 
     def __init__(
         self,
@@ -61,27 +61,29 @@ class Broker:
         ros_version: RosVersion = 1,
         wall_clock: Callable[[], int] = time.time_ns,
     ) -> None:
-        """Start with nobody.
+        """Start without clients.
 
         Args:
-            limits: what is refused beyond.
-            ros_version: which ROS it plays: how types are written, and what rosapi says.
-            wall_clock: nanoseconds since 1970, for ``/rosapi/get_time`` and stamps.
+            limits: Bounds of the hub.
+            ros_version: The emulated ROS version, which decides how types are written and what rosapi answers.
+            wall_clock: Returns nanoseconds since 1970, for `/rosapi/get_time` and stamps.
         """
         self.limits = limits or HubLimits()
         self.graph = Graph()
+        self.definitions = Definitions(ros_version)
         self._wall_clock = wall_clock
         self._ros_version: RosVersion = ros_version
         self._client_numbers = itertools.count(1)
-        definitions = Definitions(ros_version)
-        rosapi = Rosapi(self.graph, self.limits, definitions, wall_clock)
-        self._delivery = Delivery(self.limits)
-        self._topics = Topics(self.graph, self.limits, self._delivery, definitions, self._refuse)
-        self._actions = Actions(self.graph, self.limits, self._delivery)
-        self._calls = Calls(self.graph, self.limits, self._delivery, rosapi, self._actions.cancel_all)
+        rosapi = Rosapi(self.graph, self.limits, self.definitions, wall_clock)
+        self._dispatcher = Dispatcher(self.limits)
+        self._topics = Topics(self.graph, self.limits, self._dispatcher, self.definitions, self._refuse)
+        self._actions = Actions(self.graph, self.limits, self._dispatcher)
+        self._calls = Calls(self.graph, self.limits, self._dispatcher, rosapi, self._actions.cancel_all)
+        self._reassembling: set[Client] = set()
+        self._fragment_deadline = inf
         self._now = 0.0
         self._operation_id: object = None
-        self._telling = False
+        self._logging_to_rosout = False
         self._operations: dict[str, _Handler] = {
             "subscribe": self._topics.subscribe,
             "unsubscribe": self._topics.unsubscribe,
@@ -102,68 +104,87 @@ class Broker:
 
     @property
     def full(self) -> bool:
-        """Whether there are as many clients as may be."""
+        """Return whether the maximum of clients is connected."""
         return len(self.graph.clients) >= self.limits.clients
 
     @property
     def deadline(self) -> float:
-        """When `wake` has something to do (monotonic seconds), infinity for never."""
-        return min(self._calls.deadline, self._delivery.deadline)
+        """When `wake` may have something to do (monotonic seconds), infinity for never."""
+        return min(self._calls.deadline, self._dispatcher.deadline, self._fragment_deadline)
 
     def connect(self, address: str) -> Client:
-        """Take a client in, from ``address``; ask `full` before."""
+        """Admit a client from `address`, after checking `full`."""
         client = Client(next(self._client_numbers), address, Outbox(self.limits.client_bytes))
         self.graph.clients[client.number] = client
         return client
 
     def disconnect(self, client: Client) -> None:
-        """Forget a client. Calls and goals that it has yet to answer fail now. A second time does nothing."""
+        """Forget a client, and fail the calls and goals that it had yet to answer. Repeating it does nothing."""
         if self.graph.clients.pop(client.number, None) is None:
             return
-        lost = sum(subscription.lane.lost for subscription in client.subscriptions.values())
-        if lost or client.refused:
+        dropped = sum(subscription.lane.dropped for subscription in client.subscriptions.values())
+        if dropped or client.refused:
             log.info(
-                "%s of %s is gone: %d of its operations were refused, %d messages dropped as it was too slow",
+                "%s of %s left: %d of its operations were refused, %d messages dropped because it was too slow",
                 client.node,
                 client.address,
                 client.refused,
-                lost,
+                dropped,
             )
         self._topics.leave(client)
         self._calls.leave(client)
         self._actions.leave(client)
-        self._delivery.forget(client)
+        self._dispatcher.forget(client)
+        self._reassembling.discard(client)
 
     def receive(self, client: Client, data: bytes, now: float) -> None:
-        """Do what one message of a client asks for.
+        """Perform one message of a client.
 
         Args:
-            client: who sent it.
-            data: a whole WebSocket message, text or binary, whatever its content.
-            now: monotonic seconds.
+            client: Its sender.
+            data: A whole WebSocket message, text or binary, with any content.
+            now: Monotonic seconds.
+
+        Raises:
+            DefinitionsPendingError: Message definitions are being loaded; nothing was done.
         """
         self._now, self._operation_id = now, None
+        self._dispatcher.work += _OPERATION_WORK + (len(data) >> 7)
         try:
-            self._perform(client, data, now, whole=True)
-        except (RefusedError, BridgeError) as error:
-            self._refuse(client, str(error), self._operation_id, told=client.wants_status)
+            self._perform(client, data, now, is_whole=True)
+        except BridgeError as error:
+            self._refuse(client, str(error), self._operation_id, with_status=client.wants_status)
 
-    def receive_all(self, client: Client, messages: list[bytes], now: float) -> None:
-        """Do what messages of a client ask for, one after the other, as `receive` does for one of them.
+    def receive_all(self, client: Client, messages: list[bytes], now: float) -> int:
+        """Perform messages of a client in order, as many as one turn allows.
 
         Args:
-            client: who sent them.
-            messages: whole WebSocket messages, each of at most ``limits.message_bytes``.
-            now: monotonic seconds.
+            client: Their sender.
+            messages: Whole WebSocket messages of at most `limits.message_bytes`.
+            now: Monotonic seconds.
+
+        Returns:
+            How many were performed. The others need another turn, after the definitions are loaded if
+            `definitions.pending` is true.
         """
         self._now, self._operation_id = now, None
-        publish_again = self._topics.publish_again
-        for data in messages:
-            if not publish_again(client, data, now):
+        dispatcher, publish_again = self._dispatcher, self._topics.publish_again
+        dispatcher.work = 0
+        for number, data in enumerate(messages):
+            if dispatcher.work > TURN_WORK:
+                return number
+            if publish_again(client, data, now):
+                dispatcher.work += _OPERATION_WORK + (len(data) >> 7)
+                continue
+            try:
                 self.receive(client, data, now)
+            except DefinitionsPendingError as error:
+                messages[number] = error.data or data
+                return number
+        return len(messages)
 
-    def _perform(self, client: Client, data: bytes, now: float, *, whole: bool) -> None:
-        """Do what a message asks for, which is no fragment unless it came whole."""
+    def _perform(self, client: Client, data: bytes, now: float, *, is_whole: bool) -> None:
+        """Perform the operation in a message, which may be a fragment only if the message arrived whole."""
         operation: Any = None
         raw: bytes | None = data
         if len(data) <= self.limits.message_bytes:
@@ -171,22 +192,16 @@ class Broker:
                 operation = orjson.loads(data)
             except orjson.JSONDecodeError:
                 operation = None
-        if (
-            type(operation) is not dict
-        ):  # too large, no object, no JSON, or NaN in it: decode knows, and reads NaN
+        if type(operation) is not dict:  # `decode` reads NaN, and raises for everything else
             operation = decode(data, max_size=self.limits.message_bytes, max_depth=self.limits.depth)
             raw = None
-        # No message can be deeper than its opening brackets are many: most need no walk.
-        elif (
-            could_be_deeper(data, self.limits.depth)
-            and depth(operation, self.limits.depth) > self.limits.depth
-        ):
-            raise RefusedError(f"a message nested deeper than {self.limits.depth} levels")
+        elif is_deeper(data, self.limits.depth):
+            raise RefusedError(f"a message is nested deeper than {self.limits.depth} levels")
         name = operation.get("op")
         self._operation_id = operation.get("id")
         if name == "publish":
             self._topics.publish(client, operation, raw, now)
-        elif name == "fragment" and whole:
+        elif name == "fragment" and is_whole:
             self._take_fragment(client, operation, now)
         else:
             handler = self._operations.get(name) if isinstance(name, str) else None
@@ -195,42 +210,62 @@ class Broker:
             handler(client, operation, now)
 
     def wake(self, now: float) -> None:
-        """Do what is due at ``now``: messages whose throttle is over, calls whose time is over."""
-        self._delivery.release(now)
+        """Do what is due at `now`: release throttled messages, fail calls, give up incomplete messages."""
+        self._dispatcher.release(now)
         self._calls.expire(now)
+        if now >= self._fragment_deadline:
+            for client in list(self._reassembling):
+                if client.fragments is not None:
+                    client.fragments.expire(now)
+                self._note_fragments(client)
+            self._fragment_deadline = min(map(_fragment_deadline, self._reassembling), default=inf)
 
     def take_ready(self) -> list[Client]:
-        """The clients that have something to be sent, or are doomed, since this was last asked."""
-        return self._delivery.take_ready()
+        """Return the clients with output or a reason to be closed since the last call."""
+        return self._dispatcher.take_ready()
 
     def _take_fragment(self, client: Client, operation: Operation, now: float) -> None:
         if client.fragments is None:
             client.fragments = Reassembler(max_size=self.limits.message_bytes)
-        message = client.fragments.take(operation, now)
+        try:
+            message = client.fragments.take(operation, now)
+        finally:
+            self._note_fragments(client)
         if message is not None:
-            self._perform(client, message.encode(), now, whole=False)
+            try:
+                self._perform(client, message, now, is_whole=False)
+            except DefinitionsPendingError:
+                raise DefinitionsPendingError(message) from None
+
+    def _note_fragments(self, client: Client) -> None:
+        """Note when a client's incomplete messages expire."""
+        if client.fragments:
+            self._reassembling.add(client)
+            self._fragment_deadline = min(self._fragment_deadline, client.fragments.deadline)
+        else:
+            self._reassembling.discard(client)
 
     def _set_level(self, client: Client, operation: Operation, _now: float) -> None:
         level = text(operation, "level")
         if level not in _LEVELS:
-            raise RefusedError(f"{level[:60]!r} is none of the levels {', '.join(_LEVELS)}")
+            raise RefusedError(f"level {level[:60]!r} is not one of {', '.join(_LEVELS)}")
         client.wants_status = _LEVELS[level]
 
-    # --- what is refused
+    # --- refusals
 
-    def _refuse(self, client: Client, why: str, operation_id: object, *, told: bool = True) -> None:
+    def _refuse(self, client: Client, why: str, operation_id: object, *, with_status: bool = True) -> None:
         client.refused += 1
-        if is_round(client.refused):
+        if is_logged(client.refused):
             log.warning("%s of %s: refused (no. %d): %s", client.node, client.address, client.refused, why)
-        if told:
-            self._delivery.tell(client, "error", why, operation_id, self._now)
+        if with_status:
+            self._dispatcher.send_status(client, why, operation_id, self._now)
         rosout = self.graph.topics.get(ROSOUT)
-        # What cannot be told on /rosout itself is not told there.
-        if rosout is not None and rosout.subscriptions and not self._telling:
-            self._telling = True
+        # A refusal on /rosout itself is not reported there.
+        if rosout is not None and rosout.subscriptions and not self._logging_to_rosout:
+            self._logging_to_rosout = True
             with contextlib.suppress(RefusedError):
                 self._topics.distribute(rosout, self._log_message(f"{client.node}: {why}"), None, self._now)
-            self._telling = False
+            self._logging_to_rosout = False
 
     def _log_message(self, sentence: str) -> dict[str, Any]:
         time_ = stamp(self._wall_clock(), self._ros_version)
@@ -245,3 +280,7 @@ class Broker:
         if self._ros_version == 2:
             return {"stamp": time_, **message}
         return {"header": {"seq": 0, "stamp": time_, "frame_id": ""}, **message, "topics": []}
+
+
+def _fragment_deadline(client: Client) -> float:
+    return client.fragments.deadline if client.fragments is not None else inf

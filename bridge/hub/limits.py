@@ -1,4 +1,4 @@
-"""How much of everything the hub takes: no client can make it grow, or make it slow for the others."""
+"""Bounds on everything that clients can make the hub store or do."""
 
 from dataclasses import dataclass, fields
 from typing import Final
@@ -6,43 +6,41 @@ from typing import Final
 from bridge.codecs.json_codec import MAX_DEPTH, MAX_SIZE
 from bridge.hub.errors import HubError
 
-#: orjson writes at most this depth; one level is the operation around a message.
 _DEEPEST: Final = 250
+"""Maximum depth that orjson writes, less one level for the operation around a message."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HubLimits:
-    """Bounds of one hub. Sizes are bytes, times are seconds; all are at least 1 (times: above 0).
+    """Bounds of one hub, all above 0. Sizes are bytes, times are seconds.
 
-    What comes in fragments may have ``message_bytes`` characters when it is complete, and four times as many while
-    it is not (see `bridge.codecs.fragments.Reassembler`).
-
-    What goes beyond a bound is refused and logged, as the reference server does with everything wrong: the
-    client is not told, but for calls, which are answered ``result: false``. Only what harms others costs the
-    connection: a message that is too large, an answer that is never read, a silent or a stuck socket.
+    An operation beyond a bound is refused and logged without an answer, as the reference server treats all errors;
+    only calls and goals are answered, with `result: false`. A client loses its connection only for what harms others:
+    a message that is too large, answers that it never reads, a silent or a stuck socket.
 
     Attributes:
-        message_bytes: one WebSocket message, in and out. A larger one closes its sender with 1009.
-        depth: objects and arrays within each other in one message.
-        clients: connections at a time; a further one is answered 503.
-        topics: topics at a time, over all clients.
-        advertisements_per_client: advertise operations (topic and id) that one client has open.
-        subscriptions_per_client: subscribe operations (topic and id) that one client has open.
-        services_per_client: services that one client offers, and actions.
-        calls_per_client: calls that one client waits for, and calls that one client has yet to answer.
-        goals_per_client: goals that one client waits for, and goals that one client works on.
-        call_timeout: a call without answer fails after this long; a client may ask for less.
-        queue_length: messages that wait for a slow client per topic, the oldest dropped, if it did not say.
-        longest_queue: the most that a client can ask for with ``queue_length``.
-        client_bytes: all that waits for one client. Topics' oldest messages are dropped beyond; when
-            answers alone are more, the client is closed.
-        latched_bytes: all latched messages together; a message beyond is delivered but not latched.
-        parameters: parameters at a time.
-        parameter_bytes: all parameters' values together, as JSON.
-        handshake_timeout: from the TCP connection to a valid WebSocket request.
-        ping_interval: a client not heard for this long is pinged.
-        ping_timeout: and closed when it is not heard for this long after that.
-        stuck_timeout: a client whose socket takes nothing for this long while data waits is closed.
+        message_bytes: One WebSocket message, in both directions. A larger one closes the connection with 1009.
+            Incomplete messages in fragments may occupy four times as much (`bridge.codecs.fragments.Reassembler`).
+        depth: Nested objects and arrays in one message.
+        clients: Simultaneous connections; a further one is answered 503.
+        topics: Topics of all clients.
+        advertisements_per_client: Open advertise operations (topic and id) of one client.
+        subscriptions_per_client: Open subscribe operations (topic and id) of one client.
+        services_per_client: Services that one client offers, and as many actions.
+        calls_per_client: Calls that one client waits for, and as many that it has yet to answer.
+        goals_per_client: Goals that one client waits for, and as many that it works on.
+        call_timeout: A call without an answer fails after this time; a client may ask for less.
+        queue_length: Messages of a topic queued for a slow client, oldest dropped first, if it asked for no length.
+        longest_queue: Maximum of `queue_length` that a client can ask for.
+        client_bytes: Everything queued for one client. Beyond, the topics' oldest messages are dropped; a client
+            whose answers alone are more is closed.
+        latched_bytes: All latched messages; a message beyond is delivered but not latched.
+        parameters: Number of parameters.
+        parameter_bytes: All parameters' values, as JSON.
+        handshake_timeout: From the TCP connection to a valid WebSocket request.
+        ping_interval: A client silent for this long is pinged.
+        ping_timeout: A pinged client silent for this long is closed.
+        stuck_timeout: A client whose socket accepts nothing for this long while data waits is closed.
     """
 
     message_bytes: int = MAX_SIZE
@@ -70,7 +68,7 @@ class HubLimits:
         """Refuse bounds that contradict each other.
 
         Raises:
-            HubError: a bound is not positive, or two do not fit together; the sentence names them.
+            HubError: A bound is not positive, or two do not fit together.
         """
         for field in fields(self):
             value = getattr(self, field.name)
@@ -81,5 +79,5 @@ class HubLimits:
         if self.client_bytes < self.message_bytes:
             raise HubError(
                 f"limit client_bytes = {self.client_bytes} of the hub: expected at least message_bytes = "
-                f"{self.message_bytes}, or no message of that size could wait for a client"
+                f"{self.message_bytes}, or no message of that size could be queued for a client"
             )

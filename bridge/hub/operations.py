@@ -1,130 +1,99 @@
-"""The fields of an operation that a client sent, each checked when it is read.
+"""Validation of the fields of an operation that a client sent.
 
-What is wrong raises `RefusedError`; the broker makes a line in the log or the answer to a call of it.
+Every function raises `RefusedError` if the field is not what it returns; the broker logs that, or answers a call.
 """
 
 import re
 from typing import Any, Final
 
+from bridge.hub.errors import RefusedError
 from bridge.names import MAX_NAME
 
 Operation = dict[str, Any]
-#: What tells one operation of a client from another: rosbridge's optional ``id``.
 OperationId = str | int | None
+"""rosbridge's optional `id`, which distinguishes operations of one client."""
 
-#: What both ROS 1 and ROS 2 would take, and a little more: parts that start with a digit (``/camera/0``).
 _NAME: Final = re.compile(r"[~/]?[A-Za-z0-9_]+(?:/[A-Za-z0-9_]+)*")
-#: Characters of an operation's id at most: the hub remembers those of what is open.
+"""Names of ROS 1 and ROS 2, and also parts that start with a digit (`/camera/0`)."""
 _LONGEST_ID: Final = 1024
-#: No rate, length or time is as large.
+"""Maximum of characters in an id, because the hub stores those of open operations."""
 _HUGE: Final = 1e12
-#: What ROS 2 knows of quality of service, as the reference server writes it.
+"""No rate, length or time is as large."""
 _POLICIES: Final = {
     "durability": ("volatile", "transient_local"),
     "reliability": ("reliable", "best_effort"),
     "history": ("keep_last", "keep_all"),
 }
+"""ROS 2's quality-of-service policies, as the reference server writes them."""
 _ANY_POLICY: Final = ("system_default", "best_available")
 
 
-class RefusedError(Exception):
-    """What a client asked for is not done. The text is for the log, or for the answer to a call."""
-
-
 def checked_name(name: str) -> str:
-    """Refuse what cannot be the name of a topic, a service or an action.
-
-    Raises:
-        RefusedError: too long, or with characters that no name has.
-    """
+    """Return the name of a topic, a service or an action."""
     if len(name) > MAX_NAME or _NAME.fullmatch(name) is None:
-        raise RefusedError(f"{name[:80]!r} cannot be a name: letters, digits, _ and / make one")
+        raise RefusedError(f"{name[:80]!r} cannot be a name: expected letters, digits, _ and /")
     return name
 
 
 def text(operation: Operation, field: str) -> str:
-    """A string that must be there, and not empty.
-
-    Raises:
-        RefusedError: it is not.
-    """
+    """Return a required string, which must not be empty."""
     value = operation.get(field)
     if not isinstance(value, str) or not value:
-        raise RefusedError(f"{operation['op']} needs a string in {field}")
+        raise RefusedError(f"{field} of {operation['op']} must be a string")
     return value
 
 
 def optional_text(operation: Operation, field: str) -> str | None:
-    """A string, None where it is left out.
-
-    Raises:
-        RefusedError: it is something else.
-    """
+    """Return a string that must not be empty, or None if it is left out."""
     return None if operation.get(field) is None else text(operation, field)
 
 
 def flag(operation: Operation, field: str) -> bool:
-    """True or false, false where it is left out.
-
-    Raises:
-        RefusedError: it is something else.
-    """
+    """Return true or false; false if it is left out."""
     value = operation.get(field)
     if value is not None and not isinstance(value, bool):
-        raise RefusedError(f"{field} of {operation['op']} is neither true nor false")
+        raise RefusedError(f"{field} of {operation['op']} must be true or false")
     return bool(value)
 
 
 def number(operation: Operation, field: str) -> float:
-    """A number that is not negative, 0 when it is not there.
+    """Return a number that is not negative; 0 if it is left out.
 
-    The reference server takes integers alone and ignores the whole operation for ``0.0``; no client relies
-    on that.
-
-    Raises:
-        RefusedError: it is something else.
+    The reference server accepts integers alone and ignores the whole operation for `0.0`; no client relies on that.
     """
     value = operation.get(field)
     if value is None:
         return 0
     if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < _HUGE:
-        raise RefusedError(f"{field} of {operation['op']} is no number from 0 up")
+        raise RefusedError(f"{field} of {operation['op']} must be a number from 0 up")
     return value
 
 
 def operation_id(operation: Operation) -> OperationId:
-    """The operation's id, None where it is left out.
-
-    Raises:
-        RefusedError: neither a string nor an integer, or too long.
-    """
+    """Return the operation's id, or None if it is left out."""
     value = operation.get("id")
     if isinstance(value, bool) or not isinstance(value, str | int | None):
-        raise RefusedError(f"id of {operation['op']} is neither a string nor an integer")
+        raise RefusedError(f"id of {operation['op']} must be a string or an integer")
     if isinstance(value, str) and len(value) > _LONGEST_ID:
         raise RefusedError(f"id of {operation['op']} has more than {_LONGEST_ID} characters")
     return value
 
 
 def quality(operation: Operation) -> Operation:
-    """The quality of service that an operation asks for (``qos``), empty where it is left out.
-
-    Raises:
-        RefusedError: no object, or a policy that ROS 2 does not know.
-    """
+    """Return the requested quality of service (`qos`), empty if it is left out."""
     value = operation.get("qos")
     if value is None:
         return {}
     if not isinstance(value, dict):
-        raise RefusedError(f"qos of {operation['op']} is no JSON object")
+        raise RefusedError(f"qos of {operation['op']} must be a JSON object")
     for policy, known in _POLICIES.items():
         chosen = value.get(policy)
         if chosen is not None and chosen not in known and chosen not in _ANY_POLICY:
-            raise RefusedError(f"{policy} in qos of {operation['op']} is none of {', '.join(known)}")
+            raise RefusedError(f"{policy} in qos of {operation['op']} must be one of {', '.join(known)}")
     number(value | {"op": f"qos of {operation['op']}"}, "depth")
     return value
 
 
-def is_round(count: int) -> bool:
-    """Whether to log it: the 1st, 10th, 100th and so on, so that a flood fills no log."""
+def is_logged(count: int) -> bool:
+    """Return whether to log the occurrence of this number: the 1st, 10th, 100th and so on."""
     return str(count).strip("0") == "1"

@@ -302,13 +302,12 @@ class _Connection(asyncio.Protocol):
         client = self._client
         if client is None or self._protocol.state is not _OPEN or self._transport.is_closing():
             return
-        if client.doomed:
-            self._give_up(client.doomed)
+        if client.close_reason:
+            self._give_up(client.close_reason)
             return
         outbox = client.outbox
         if outbox.wire:
-            payloads, outbox.wire = outbox.wire, []
-            self._transport.write(unmasked(payloads))
+            self._transport.write(unmasked(outbox.take_wire()))
         if outbox.wire is None or not outbox.empty:
             self._flush_waiting(outbox)
 
@@ -384,7 +383,8 @@ class _Connection(asyncio.Protocol):
                 )
                 frames += len(found)
                 if found:
-                    self._hub.broker.receive_all(client, found, now)
+                    while found:
+                        found = found[self._hub.broker.receive_all(client, found, now) :]
                     continue
             end = frame_end(data, at, masked=True, largest=largest)
             if end == UNSOUND:

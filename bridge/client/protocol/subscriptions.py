@@ -13,7 +13,7 @@ from bridge.client.protocol.subscription_options import Delivery
 from bridge.client.protocol.wire import RosVersion, Wire
 from bridge.codecs.arrays import with_arrays, with_lists
 from bridge.codecs.envelope import BRACE, envelope_of, topic_of
-from bridge.codecs.json_codec import could_be_deeper, excerpt
+from bridge.codecs.json_codec import excerpt, is_deeper
 from bridge.errors import OptionError, TypeConflictError
 from bridge.names import absolute, check_name, same_type, split_type
 from bridge.stamps import ros_version_of_message
@@ -245,7 +245,7 @@ class Subscriptions:
             msg = orjson.loads(message)
         except orjson.JSONDecodeError:
             return None
-        if type(msg) is not dict or could_be_deeper(message, self._max_depth - 1):
+        if type(msg) is not dict or is_deeper(message, self._max_depth - 1):
             return None
         if self.numpy and subscribed.delivery.arrays == "numpy":
             msg = with_arrays(msg)

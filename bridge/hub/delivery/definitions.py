@@ -1,16 +1,19 @@
-"""Message definitions, from ``rosbags`` where that is installed: what the fields of a type are.
+"""Message definitions from `rosbags`, where that is installed: the fields of each type.
 
-The hub passes JSON on without them. They are wanted by who asks for a typed form: CBOR with typed arrays, the
-serialised message (cbor-raw), and rosapi's descriptions of types. ``rosbags`` is imported when the first of
-these is asked for, never before; without it CBOR packs floats alone, and the others are refused with a sentence.
+The hub passes JSON on without them. They serve typed encodings: CBOR with typed arrays, the serialised message
+(cbor-raw), and rosapi's descriptions of types. `rosbags` is imported with the first operation that needs it;
+without it CBOR packs floats alone, and the others are refused.
+
+Every conversion checks the type, the range and the number of values before it allocates anything for them.
 """
 
 from base64 import b64decode
 from collections.abc import Callable
+from math import inf, nan
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 from bridge.errors import BridgeError
-from bridge.hub.operations import RefusedError
+from bridge.hub.errors import DefinitionsPendingError, RefusedError
 from bridge.names import ros1_type, ros2_type
 
 if TYPE_CHECKING:
@@ -18,7 +21,6 @@ if TYPE_CHECKING:
 
 RosVersion = Literal[1, 2]
 
-#: rosbags' names of numbers: the elements of a typed array, and an example for descriptions.
 _NUMBERS: Final = {
     "int8": "i1",
     "uint8": "u1",
@@ -32,89 +34,124 @@ _NUMBERS: Final = {
     "float32": "f4",
     "float64": "f8",
 }
+"""Element types of arrays by rosbags' names of numbers."""
+_FLOAT32: Final = 3.4028234663852886e38
+_RANGES: Final = {"f4": (-_FLOAT32, _FLOAT32), "f8": (-inf, inf)} | {
+    f"{sign}{size}": (-(1 << 8 * size - 1), (1 << 8 * size - 1) - 1)
+    if sign == "i"
+    else (0, (1 << 8 * size) - 1)
+    for sign in "iu"
+    for size in (1, 2, 4, 8)
+}
 _DEFAULTS: Final[dict[str, Any]] = {"bool": False, "string": "", "wstring": ""} | {
     name: 0.0 if elements[0] == "f" else 0 for name, elements in _NUMBERS.items()
 }
 _BYTES: Final = frozenset({"uint8", "octet"})
 _TIMES: Final = {"builtin_interfaces/msg/Time": "time", "builtin_interfaces/msg/Duration": "duration"}
-#: What the fields of a time are called in ROS 1, by rosbags' names, which are ROS 2's.
 _ROS1_TIME: Final = {"sec": "secs", "nanosec": "nsecs"}
-#: Types that keep what was made of them: clients can name no more than there are.
+"""Fields of a time in ROS 1, by their names in rosbags, which are ROS 2's."""
+_BYTES_A_VALUE: Final = 16
+"""Bytes of the size limit for each value of a serialised message: `{}` in an array can stand for dozens of them."""
 _MISSING: Final = (
-    "the hub has no message definitions here: install rosbags (pip install rosbags) and start it again"
+    "the hub has no message definitions: install rosbags (pip install rosbags) and start the hub again"
 )
 
 _Convert = Callable[[Any], Any]
 
 
 class Definitions:
-    """What is known of message types, for one ROS version."""
+    """The known message types of one ROS version."""
 
     def __init__(self, ros_version: RosVersion = 1) -> None:
-        """Know nothing until something is asked for."""
+        """Start without definitions."""
         self.ros_version: RosVersion = ros_version
-        self._loaded: Typestore | None = None
+        self.load_in_background: Callable[[], None] | None = None
+        """Starts a thread for `load`; without it, loading blocks the operation that needs definitions."""
+        self.pending = False
+        """Whether an operation waits for `load`."""
+        self._store: Typestore | None = None
         self._missing = False
         self._typed: dict[str, _Convert] = {}
+        self._texts: dict[str, str] = {}
+
+    def load(self) -> None:
+        """Import rosbags and its types, which takes tenths of a second."""
+        try:
+            from rosbags.typesys import Stores, get_typestore
+        except ImportError:
+            self._missing = True
+        else:
+            self._store = get_typestore(Stores.ROS2_JAZZY if self.ros_version == 2 else Stores.ROS1_NOETIC)
+        self.pending = False
+
+    def require(self) -> None:
+        """See that the definitions are loaded before an operation is done that needs them.
+
+        Raises:
+            DefinitionsPendingError: They are being loaded in the background; repeat the operation afterwards.
+        """
+        if self._store is not None or self._missing:
+            return
+        if self.load_in_background is None:
+            self.load()
+        else:
+            if not self.pending:
+                self.pending = True
+                self.load_in_background()
+            raise DefinitionsPendingError
 
     def name(self, type_name: str) -> str:
-        """A message type's name as this ROS version writes it."""
+        """Return a message type's name as this ROS version writes it."""
         return ros2_type(type_name) if self.ros_version == 2 else ros1_type(type_name)
 
     def typed(self, type_name: str, message: dict[str, Any]) -> dict[str, Any] | None:
-        """A message with its arrays of numbers as typed arrays, for CBOR.
+        """Convert a message's arrays of numbers to typed arrays, for CBOR.
 
         Returns:
-            The message; None where its type is not known, or it does not fit its type.
+            The message, or None if its type is unknown or does not fit it.
         """
-        convert = self._typed.get(type_name)
-        if convert is None:
-            try:
-                store, known = self._known(type_name)
-            except RefusedError:
-                return None
-            convert = self._typed[type_name] = _message_to_typed(store, known, {})
         try:
+            convert = self._typed.get(type_name)
+            if convert is None:
+                store, known = self._known(type_name)
+                convert = self._typed[type_name] = _typed_converter(store, known, {})
             converted: dict[str, Any] = convert(message)
-        except (BridgeError, TypeError, ValueError, AttributeError, OverflowError):
+        except (BridgeError, TypeError, ValueError, AttributeError):
             return None
         return converted
 
-    def serialise(self, type_name: str, message: dict[str, Any]) -> bytes:
-        """A message as ROS's own transport would carry it: ROS 1's wire format, or CDR with its header in ROS 2.
+    def serialise(self, type_name: str, message: dict[str, Any], max_size: int) -> bytes:
+        """Serialise a message as ROS 1's transport would, or as CDR with its header in ROS 2.
 
         Raises:
-            RefusedError: the type is not known, or the message does not fit it.
+            RefusedError: The type is unknown or does not fit the message.
         """
         store, known = self._known(type_name)
         try:
-            made = self._made(store, known, message, "")
-            data = (
-                store.serialize_cdr(made, known)
-                if self.ros_version == 2
-                else store.serialize_ros1(made, known)
-            )
-        except (
-            Exception
-        ) as error:  # rosbags, NumPy and struct each say in their own way that a value does not fit
+            built = _Builder(store, max_size // _BYTES_A_VALUE).message(known, message, "")
+            serialise = store.serialize_cdr if self.ros_version == 2 else store.serialize_ros1
+            return bytes(serialise(built, known))
+        except Exception as error:  # rosbags, NumPy and struct raise their own errors for unsuitable values
             raise RefusedError(f"a message does not fit its type {self.name(type_name)}: {error}") from None
-        return bytes(data)
 
     def full_text(self, type_name: str) -> str:
-        """A type's definition and those of all it is made of, as bag files have it.
+        """Return a type's definition followed by those of its parts, as bag files have them.
 
         Raises:
-            RefusedError: the type is not known.
+            RefusedError: The type is unknown.
         """
-        store, known = self._known(type_name)
-        definition, _digest = store.generate_msgdef(known, ros_version=self.ros_version)
-        return definition
+        text = self._texts.get(type_name)
+        if text is None:
+            store, known = self._known(type_name)
+            text, _digest = store.generate_msgdef(known, ros_version=self.ros_version)
+            self._texts[type_name] = text
+        return text
 
     def details(self, type_name: str) -> list[dict[str, Any]]:
-        """A type's fields and those of all it is made of, as ``rosapi_msgs/TypeDef``.
+        """Return a type's fields and those of its parts, as `rosapi_msgs/TypeDef`.
 
         Raises:
-            RefusedError: the type is not known.
+            RefusedError: The type is unknown.
         """
         store, known = self._known(type_name)
         found: dict[str, dict[str, Any]] = {}
@@ -124,24 +161,24 @@ class Definitions:
             if name in found:
                 continue
             constants, fields = store.fielddefs[name]
-            described = found[name] = {
+            elements = [_element(kind, content) for _, (kind, content) in fields]
+            nested = [element in store.fielddefs for element, _ in elements]
+            found[name] = {
                 "type": self._shown(name),
                 "fieldnames": [self._field(name, field) for field, _ in fields],
-                "fieldtypes": [],
-                "fieldarraylen": [],
-                "examples": [],
+                "fieldtypes": [
+                    self._shown(element) if inner else element
+                    for (element, _), inner in zip(elements, nested, strict=True)
+                ],
+                "fieldarraylen": [length for _, length in elements],
+                "examples": [
+                    "[]" if length >= 0 else "{}" if inner else str(_DEFAULTS.get(element, ""))
+                    for (element, length), inner in zip(elements, nested, strict=True)
+                ],
                 "constnames": [constant for constant, _, _ in constants],
                 "constvalues": [str(value) for _, _, value in constants],
             }
-            for _field, (kind, content) in fields:
-                element, length = _element(kind, content)
-                nested = element in store.fielddefs
-                described["fieldtypes"].append(self._shown(element) if nested else element)
-                described["fieldarraylen"].append(length)
-                example = "[]" if length >= 0 else "{}" if nested else str(_DEFAULTS.get(element, ""))
-                described["examples"].append(example)
-                if nested:
-                    waiting.append(element)
+            waiting += [element for (element, _), inner in zip(elements, nested, strict=True) if inner]
         return list(found.values())
 
     def _shown(self, name: str) -> str:
@@ -153,29 +190,29 @@ class Definitions:
         return _ROS1_TIME[field] if self.ros_version == 1 and type_name in _TIMES else field
 
     def _known(self, type_name: str) -> "tuple[Typestore, str]":
-        store = self._store()
+        self.require()
+        if self._store is None:
+            raise RefusedError(_MISSING)
         known = ros2_type(type_name)
-        if known not in store.fielddefs:
+        if known not in self._store.fielddefs:
             raise RefusedError(f"the hub does not know the fields of {type_name}")
-        return store, known
+        return self._store, known
 
-    def _store(self) -> "Typestore":
-        if self._loaded is None:
-            if self._missing:
-                raise RefusedError(_MISSING)
-            try:
-                from rosbags.typesys import Stores, get_typestore
-            except ImportError:
-                self._missing = True
-                raise RefusedError(_MISSING) from None
-            self._loaded = get_typestore(Stores.ROS2_JAZZY if self.ros_version == 2 else Stores.ROS1_NOETIC)
-        return self._loaded
 
-    def _made(self, store: "Typestore", name: str, message: Any, place: str) -> Any:
-        """A message of rosbags' from JSON; what is left out has its default."""
+class _Builder:
+    """Builds rosbags' objects from JSON; fields that are left out have their default."""
+
+    def __init__(self, store: "Typestore", max_values: int) -> None:
+        self._store = store
+        self._max_values = max_values
+        self._values = 0
+
+    def message(self, name: str, message: Any, place: str) -> Any:
+        """Build a message of a known type."""
         if not isinstance(message, dict):
-            raise TypeError(f"{place or 'the message'} is no object")
-        _constants, fields = store.fielddefs[name]
+            raise TypeError(f"{place or 'the message'} is not an object")
+        _constants, fields = self._store.fielddefs[name]
+        self._count(len(fields))
         given = dict(message)
         values = {}
         for field, (kind, content) in fields:
@@ -183,40 +220,44 @@ class Definitions:
             other = _ROS1_TIME.get(field) if name in _TIMES else None
             if other is not None and (alias := given.pop(other, None)) is not None:
                 value = alias
-            values[field] = self._value(store, kind, content, value, f"{place}{field}")
+            values[field] = self._value(kind, content, value, f"{place}{field}")
         if given:
-            raise ValueError(f"it has a field {place}{next(iter(given))}, which the type has not")
-        return store.types[name](**values)
+            raise ValueError(f"the type has no field {place}{next(iter(given))}")
+        return self._store.types[name](**values)
 
-    def _value(self, store: "Typestore", kind: Any, content: Any, value: Any, place: str) -> Any:
+    def _value(self, kind: Any, content: Any, value: Any, place: str) -> Any:
         element, length = _element(kind, content)
         if length < 0:
-            if element in store.fielddefs:
-                return self._made(store, element, {} if value is None else value, f"{place}.")
-            default = _DEFAULTS[element]
-            if value is None:
-                return default
-            if isinstance(default, str) != isinstance(value, str):
-                raise ValueError(f"{place} is no {element}")
-            return float(value) if isinstance(default, float) else type(default)(value)
-        items = [] if value is None else value
+            if element in self._store.fielddefs:
+                return self.message(element, {} if value is None else value, f"{place}.")
+            return _scalar(value, element, place)
+        if value is None:
+            value = [_DEFAULTS.get(element)] * length
         if element in _NUMBERS:
-            return _numbers(items, element, length, place)
-        if not isinstance(items, list):
-            raise TypeError(f"{place} is no array")
-        if length and value is None:
-            items = [None] * length
-        if length and len(items) != length:
-            raise ValueError(f"{place} has {len(items)} elements, not {length}")
+            import numpy as np
+
+            numbers = _numbers(value, element, length, place)
+            if isinstance(numbers, bytes):
+                return np.frombuffer(numbers, np.uint8)
+            return np.array(numbers, _NUMBERS[element])
+        if not isinstance(value, list) or (length and len(value) != length):
+            raise ValueError(f"{place} is not an array of {length or 'any number of'} elements")
+        self._count(len(value))
         inner_kind, inner_content = content[0]
         return [
-            self._value(store, inner_kind, inner_content, item, f"{place}[{index}]")
-            for index, item in enumerate(items)
+            self._value(inner_kind, inner_content, item, f"{place}[{index}]")
+            for index, item in enumerate(value)
         ]
+
+    def _count(self, values: int) -> None:
+        """Refuse a message of too many values before they are built."""
+        self._values += max(values, 1)
+        if self._values > self._max_values:
+            raise ValueError(f"it has more than {self._max_values} values")
 
 
 def _element(kind: Any, content: Any) -> tuple[str, int]:
-    """The type of a field or of its elements, and its length: -1 for none, 0 for any."""
+    """Return the type of a field or of its elements, and its length: -1 for a scalar, 0 for any."""
     name = kind.name
     if name == "BASE":
         return str(content[0]), -1
@@ -227,32 +268,46 @@ def _element(kind: Any, content: Any) -> tuple[str, int]:
     return element, length if name == "ARRAY" else 0
 
 
-def _numbers(items: Any, element: str, length: int, place: str) -> Any:
-    """An array of numbers for rosbags: a NumPy array of their type."""
-    import numpy as np
+def _scalar(value: Any, element: str, place: str) -> Any:
+    default = _DEFAULTS[element]
+    if value is None:
+        return default
+    if element in _NUMBERS:
+        return type(default)(_numbers([value], element, 1, place)[0])
+    if element == "bool" and value in (0, 1):
+        return bool(value)
+    if not isinstance(default, str) or not isinstance(value, str):
+        raise TypeError(f"{place} is not a {element}")
+    return value
 
+
+def _numbers(values: Any, element: str, length: int, place: str) -> list[Any] | bytes:
+    """Return an array's numbers, checked: their types, their range, and their number unless `length` is 0."""
+    if isinstance(values, str) and element in _BYTES:
+        values = b64decode(values, validate=True)
+    if not isinstance(values, list | bytes) or (length and len(values) != length):
+        raise ValueError(f"{place} is not an array of {length or 'any number of'} {element}")
+    if isinstance(values, bytes):
+        return values
     elements = _NUMBERS[element]
-    if isinstance(items, str) and element in _BYTES:
-        array = np.frombuffer(b64decode(items, validate=True), np.uint8)
-    elif isinstance(items, list):
-        if elements[0] == "f":
-            items = [float("nan") if item is None else item for item in items]
-        elif any(type(item) is not int for item in items):
-            raise ValueError(f"{place} has elements that are no integers")
-        array = np.array(items, np.dtype(elements))
-    else:
-        raise ValueError(f"{place} is no array of {element}")
-    if array.ndim != 1:
-        raise ValueError(f"{place} is no array of {element}")
-    if length and not items:
-        array = np.zeros(length, array.dtype)
-    if length and len(array) != length:
-        raise ValueError(f"{place} has {len(array)} elements, not {length}")
-    return array
+    kinds = set(map(type, values))
+    present: list[Any] = values
+    if elements[0] == "f" and type(None) in kinds:
+        present = [value for value in values if value is not None]
+        kinds.discard(type(None))
+    low, high = _RANGES[elements]
+    if not kinds <= ({int, float} if elements[0] == "f" else {int}) or (
+        present and high != inf and not (low <= min(present) and max(present) <= high)
+    ):
+        raise ValueError(f"{place} has values that are not {element}")
+    checked: list[Any] = (
+        values if present is values else [nan if value is None else value for value in values]
+    )
+    return checked
 
 
-def _message_to_typed(store: "Typestore", name: str, made: dict[str, _Convert]) -> _Convert:
-    """What makes typed arrays of a message's arrays of numbers; types without any pass as they are."""
+def _typed_converter(store: "Typestore", name: str, known: dict[str, _Convert]) -> _Convert:
+    """Make the function that converts a message's arrays of numbers; other fields pass unchanged."""
     converts: dict[str, _Convert] = {}
 
     def convert(message: dict[str, Any]) -> dict[str, Any]:
@@ -260,38 +315,32 @@ def _message_to_typed(store: "Typestore", name: str, made: dict[str, _Convert]) 
             field: converts[field](value) if field in converts else value for field, value in message.items()
         }
 
-    made[name] = convert
+    known[name] = convert
     for field, (kind, content) in store.fielddefs[name][1]:
         element, length = _element(kind, content)
         if element in _NUMBERS:
             if length >= 0:
-                converts[field] = _bytes if element in _BYTES else _typed_array(_NUMBERS[element])
+                converts[field] = _array_converter(field, element, length)
         elif element in store.fielddefs:
-            inner = made.get(element) or _message_to_typed(store, element, made)
+            inner = known.get(element) or _typed_converter(store, element, known)
             converts[field] = inner if length < 0 else _each(inner)
     return convert
 
 
 def _each(convert: _Convert) -> _Convert:
-    def each(values: list[Any]) -> list[Any]:
+    def each(values: Any) -> list[Any]:
+        if not isinstance(values, list):
+            raise TypeError
         return [convert(value) for value in values]
 
     return each
 
 
-def _bytes(value: Any) -> bytes:
-    return b64decode(value, validate=True) if isinstance(value, str) else bytes(value)
-
-
-def _typed_array(elements: str) -> _Convert:
+def _array_converter(field: str, element: str, length: int) -> _Convert:
     from bridge.codecs.cbor_codec import typed_array
 
-    nothing = float("nan") if elements[0] == "f" else 0
-
-    def convert(values: list[Any]) -> Any:
-        try:
-            return typed_array(values, elements)
-        except BridgeError:
-            return typed_array([nothing if value is None else value for value in values], elements)
+    def convert(values: Any) -> Any:
+        numbers = _numbers(values, element, length, field)
+        return bytes(numbers) if element in _BYTES else typed_array(numbers, _NUMBERS[element])
 
     return convert

@@ -1,4 +1,4 @@
-"""What goes to clients: into their outboxes, and who has something waiting for its socket or its throttle."""
+"""Dispatch of messages into clients' outboxes, and the clients that have output or a throttle pending."""
 
 from math import inf
 from typing import Final
@@ -7,94 +7,108 @@ import orjson
 
 from bridge.hub.delivery.encodings import as_png
 from bridge.hub.delivery.outbox import Lane
+from bridge.hub.errors import RefusedError
 from bridge.hub.graph import Client
 from bridge.hub.limits import HubLimits
 
-#: Characters of a fragment at least: smaller ones would be little but their own frames.
-SMALLEST_FRAGMENT: Final = 16
-#: Status messages that wait for a client at most.
+SMALLEST_FRAGMENT: Final = 256
+"""Minimum of bytes in a fragment: smaller ones would be little but their own frames."""
 _STATUS_QUEUE: Final = 20
+"""Maximum of status messages queued for a client."""
 
 
-class Delivery:
+class Dispatcher:
     """The way to all clients of one hub."""
 
     def __init__(self, limits: HubLimits) -> None:
-        """Hand out to nobody yet."""
+        """Start without output."""
         self._limits = limits
         self._ready: list[Client] = []
         self.throttled: set[Client] = set()
         self.deadline = inf
+        self.work = 0
+        """Units of work in the current turn (see `bridge.hub.broker.TURN_WORK`)."""
 
-    def announce(self, client: Client) -> None:
-        """Put a client on the list of those to be served."""
-        if not client.has_output:
-            client.has_output = True
+    def mark_ready(self, client: Client) -> None:
+        """Put a client on the list of those with output."""
+        if not client.is_ready:
+            client.is_ready = True
             self._ready.append(client)
 
     def take_ready(self) -> list[Client]:
-        """The clients that have something to be sent, or are doomed, since this was last asked."""
+        """Return the clients with output or a reason to be closed since the last call."""
         ready, self._ready = self._ready, []
         for client in ready:
-            client.has_output = False
+            client.is_ready = False
         return ready
 
+    def checked(self, payload: bytes, what: str) -> bytes:
+        """Return a payload of acceptable size.
+
+        Raises:
+            RefusedError: It exceeds the limit; `what` names it.
+        """
+        if len(payload) > self._limits.message_bytes:
+            raise RefusedError(f"{what} has more than {self._limits.message_bytes} bytes")
+        return payload
+
     def send(self, client: Client, payload: bytes, *, fragment_size: int = 0, png: bool = False) -> None:
-        """Queue what may not be lost; in the form that the operation it answers asked for."""
+        """Queue a message that must not be dropped, in the encoding that was requested."""
+        self.work += len(payload) >> 6
         if png:
             wrapped = as_png(payload)
-            # Hardly ever: what cannot be made smaller goes as it is, as nobody may lose an answer.
+            # A picture beyond the limit, which hardly occurs, is replaced by the plain answer: none may be lost.
             payload = wrapped if len(wrapped) <= self._limits.message_bytes else payload
         client.outbox.put(payload, fragment_size)
         if client.outbox.overflowed:
-            client.doomed = f"it leaves {self._limits.client_bytes} bytes of answers unread"
-        self.announce(client)
+            client.close_reason = f"it leaves {self._limits.client_bytes} bytes of answers unread"
+        self.mark_ready(client)
 
     def offer(self, client: Client, lane: Lane, payload: bytes, now: float) -> None:
-        """Queue what may be lost to newer ones of its lane."""
+        """Queue a message that newer ones of its lane may replace."""
         outbox = client.outbox
         outbox.offer(lane, payload, now)
         if outbox.deadline != inf:
-            self.note_throttle(client)
-        if not client.has_output:
-            self.announce(client)
+            self.schedule_release(client)
+        if not client.is_ready:
+            self.mark_ready(client)
 
-    def note_throttle(self, client: Client) -> None:
-        """See that a client whose throttle holds something back is woken for it."""
+    def schedule_release(self, client: Client) -> None:
+        """Note when a client's throttles admit a held message."""
         deadline = client.outbox.deadline
         if deadline != inf:
             self.throttled.add(client)
             self.deadline = min(self.deadline, deadline)
 
     def release(self, now: float) -> None:
-        """Queue what throttles held until ``now``."""
+        """Queue the messages that throttles admit at `now`."""
         if now < self.deadline:
             return
-        for client in list(self.throttled):
+        for client in [client for client in self.throttled if client.outbox.deadline <= now]:
             client.outbox.release(now)
-            self.announce(client)
+            self.mark_ready(client)
             if client.outbox.deadline == inf:
                 self.throttled.discard(client)
         self.deadline = min((client.outbox.deadline for client in self.throttled), default=inf)
 
-    def tell(self, client: Client, level: str, sentence: str, operation_id: object, now: float) -> None:
-        """Send a status message; a client that does not read loses the oldest of them."""
-        status: dict[str, object] = {"op": "status", "level": level, "msg": sentence}
+    def send_status(self, client: Client, sentence: str, operation_id: object, now: float) -> None:
+        """Send a status message about an error; a client that does not read loses the oldest."""
+        status: dict[str, object] = {"op": "status", "level": "error", "msg": sentence}
         if isinstance(operation_id, str | int) and not isinstance(operation_id, bool):
             status["id"] = operation_id
         if client.status_lane is None:
             client.status_lane = Lane(_STATUS_QUEUE)
         try:
             payload = orjson.dumps(status)
-        except TypeError:  # an id or a name with half a character
+        except TypeError:  # an unpaired surrogate in an id or a name
             return
         self.offer(client, client.status_lane, payload, now)
 
     def forget(self, client: Client) -> None:
-        """A client has gone."""
+        """Forget a client that left."""
         self.throttled.discard(client)
 
 
-def fragment_size_of(asked: float) -> int:
-    """Characters of a fragment for what an operation asks for; 0 is none."""
-    return max(int(asked), SMALLEST_FRAGMENT) if asked else 0
+def fragment_size_of(requested: float) -> int:
+    """Return the size of fragments for the requested one; 0 means whole messages."""
+    return max(int(requested), SMALLEST_FRAGMENT) if requested else 0

@@ -1,54 +1,59 @@
-"""The forms in which subscribers want a message: JSON, a PNG of it, CBOR, or CBOR around the serialised message.
+"""Encodings of a published message for its subscribers: JSON, PNG, CBOR, or CBOR around the serialised message.
 
-A message is written once in each form, however many subscribers want it.
+A message is encoded once in each form, however many subscribers want it.
 """
 
+from enum import StrEnum
 from functools import lru_cache
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import orjson
 
-from bridge.codecs.png import encode as picture
+from bridge.codecs.png import encode as to_picture
+from bridge.errors import BridgeError
 from bridge.hub.delivery.definitions import Definitions
-from bridge.hub.operations import RefusedError
-
-Compression = Literal["none", "png", "cbor", "cbor-raw"]
-
-#: Where one client's subscriptions of a topic differ, the last of these that one of them asks for counts, as on
-#: the reference server.
-COMPRESSIONS: Final[tuple[Compression, ...]] = ("none", "png", "cbor", "cbor-raw")
+from bridge.hub.errors import RefusedError
 
 
-def compression_of(asked: object) -> Compression:
-    """The form that an operation asks for. What nobody knows is plain JSON, as on the reference server."""
-    return next((known for known in COMPRESSIONS if known == asked), "none")
+class Compression(StrEnum):
+    """Encodings, in ascending priority where subscriptions of one client differ, as on the reference server."""
+
+    NONE = "none"
+    PNG = "png"
+    CBOR = "cbor"
+    CBOR_RAW = "cbor-raw"
+
+
+COMPRESSIONS: Final = tuple(Compression)
+TYPED: Final = (Compression.CBOR, Compression.CBOR_RAW)
+"""Encodings that need message definitions."""
+
+
+def compression_of(requested: object) -> Compression:
+    """Return the requested encoding; an unknown one is plain JSON, as on the reference server."""
+    return next((known for known in Compression if known == requested), Compression.NONE)
 
 
 def as_png(payload: bytes) -> bytes:
-    """An operation (its JSON) in an operation ``png``."""
-    return orjson.dumps({"op": "png", "data": picture(payload)})
+    """Wrap an operation (its JSON) in an operation `png`."""
+    return orjson.dumps({"op": "png", "data": to_picture(payload)})
 
 
 def json_prefix(name: str) -> bytes:
-    """The beginning of a message of topic ``name`` on the wire: its JSON and a brace complete it."""
+    """Return the bytes before the JSON of a message of topic `name`; a brace follows it."""
     return b'{"op":"publish","topic":"%b","msg":' % name.encode()
 
 
-#: Objects and arrays within each other in what the hub itself has read: more than it takes.
 _DEEPEST: Final = 256
-#: Bytes around a topic's name and a message's JSON.
+"""Maximum depth of what the hub itself has read."""
 AROUND: Final = len(json_prefix("")) + 1
+"""Bytes around a topic's name and a message's JSON."""
 
 
 class Message:
-    """One published message, written in the forms that are wanted of it.
+    """One published message, encoded on demand."""
 
-    Raises:
-        RefusedError: (from `payload`) the form is not possible, as nobody knows the type.
-        EncodeError: (from `payload`) the form is not possible, or larger than may be.
-    """
-
-    __slots__ = ("_definitions", "_made", "_max_size", "_time_ns", "_type", "data", "parsed")
+    __slots__ = ("_definitions", "_max_size", "_parsed", "_payloads", "_time_ns", "_type", "data")
 
     def __init__(
         self,
@@ -59,65 +64,71 @@ class Message:
         definitions: Definitions,
         max_size: int,
     ) -> None:
-        """Keep what all forms are made of.
+        """Store the sources of all encodings.
 
         Args:
-            data: the message as JSON.
-            parsed: the same, None if nobody has parsed it yet.
-            type_name: its type, or the empty string.
-            time_ns: when it came (cbor-raw says so), nanoseconds since 1970.
-            definitions: what is known of types.
-            max_size: bytes on the wire at most.
+            data: The message as JSON.
+            parsed: The same, or None if it was not parsed yet.
+            type_name: Its type, or the empty string.
+            time_ns: Its receipt in nanoseconds since 1970, for cbor-raw.
+            definitions: The known types.
+            max_size: Maximum of bytes on the wire.
         """
         self.data = data
-        self.parsed = parsed
+        self._parsed = parsed
         self._type = type_name
         self._time_ns = time_ns
         self._definitions = definitions
         self._max_size = max_size
-        self._made: dict[tuple[Compression, str], bytes] = {}
+        self._payloads: dict[tuple[Compression, str], bytes | BridgeError] = {}
 
     def payload(self, compression: Compression, name: str) -> bytes:
-        """The message on the wire in one form, under the name that a client knows its topic by."""
-        made = self._made.get((compression, name))
-        if made is None:
-            made = self._made[compression, name] = self._write(compression, name)
-        return made
+        """Return the message in one encoding, under the topic's name as a client uses it.
 
-    def _write(self, compression: Compression, name: str) -> bytes:
-        if compression == "none":
+        Raises:
+            RefusedError: The encoding needs a definition that is unknown, or is larger than the limit.
+            EncodeError: The message has no such encoding.
+        """
+        payload = self._payloads.get((compression, name))
+        if payload is None:
+            try:
+                payload = self._encode(compression, name)
+                if len(payload) > self._max_size:
+                    raise RefusedError(
+                        f"a message of {name} as {compression} has more than {self._max_size} bytes"
+                    )
+            except BridgeError as error:
+                payload = error
+            self._payloads[compression, name] = payload
+        if isinstance(payload, BridgeError):
+            raise payload
+        return payload
+
+    def _encode(self, compression: Compression, name: str) -> bytes:
+        if compression is Compression.NONE:
             return b"%b%b}" % (json_prefix(name), self.data)
-        if compression == "png":
-            wrapped = as_png(self.payload("none", name))
-            if len(wrapped) > self._max_size:
-                raise RefusedError(f"a message of {name} as PNG has more than {self._max_size} bytes")
-            return wrapped
+        if compression is Compression.PNG:
+            return as_png(self.payload(Compression.NONE, name))
         import cbor2
 
-        if self.parsed is None:
-            self.parsed = orjson.loads(self.data)
-        if compression == "cbor-raw":
+        if self._parsed is None:
+            self._parsed = orjson.loads(self.data)
+        if compression is Compression.CBOR_RAW:
             seconds, nanoseconds = divmod(self._time_ns, 10**9)
-            serialised = self._definitions.serialise(self._type, self.parsed)
+            serialised = self._definitions.serialise(self._type, self._parsed, self._max_size)
             msg = cbor2.dumps({"secs": seconds, "nsecs": nanoseconds, "bytes": serialised})
+        elif (typed := self._definitions.typed(self._type, self._parsed)) is not None:
+            msg = cbor2.dumps(typed)  # of JSON, typed arrays and bytes, so it needs no check
         else:
-            typed = self._definitions.typed(self._type, self.parsed)
-            if typed is None:
-                from bridge.codecs.cbor_codec import encode
+            from bridge.codecs.cbor_codec import encode
 
-                msg = encode(self.parsed, max_size=self._max_size, max_depth=_DEEPEST, pack_floats=True)
-            else:  # of JSON, typed arrays and bytes: nothing that needs a second look
-                msg = cbor2.dumps(typed)
-        payload = _cbor_prefix(name) + msg
-        if len(payload) > self._max_size:
-            raise RefusedError(f"a message of {name} as CBOR has more than {self._max_size} bytes")
-        return payload
+            msg = encode(self._parsed, max_size=self._max_size, max_depth=_DEEPEST, pack_floats=True)
+        return _cbor_prefix(name) + msg
 
 
 @lru_cache(maxsize=1024)
 def _cbor_prefix(name: str) -> bytes:
-    """The beginning of a message of topic ``name`` as CBOR: a map of three, its last value yet to come."""
+    """Return the bytes before the CBOR of a message of topic `name`: a map of three without its last value."""
     import cbor2
 
-    dumps = cbor2.dumps
-    return b"\xa3" + b"".join(map(dumps, ("op", "publish", "topic", name, "msg")))
+    return b"\xa3" + b"".join(map(cbor2.dumps, ("op", "publish", "topic", name, "msg")))

@@ -1,11 +1,11 @@
-"""What waits for one client: in order, bounded, each topic's oldest dropped first, throttled where asked.
+"""The queue of everything that waits for one client: ordered, bounded, throttled where requested.
 
-A hub's outbox is emptied by whoever owns the socket, as fast as the socket takes it. While it takes nothing,
-messages of topics replace their elders here and nothing else in the hub slows down. Answers and requests
-of services are never dropped: a client that lets them pile up beyond the bound has *overflowed*.
+Whoever owns the socket drains the outbox as fast as the socket accepts data. While it accepts none, messages of topics
+replace older ones here and nothing else in the hub slows down. Answers and requests of services are never
+dropped: a client that lets them accumulate beyond the bound has *overflowed*.
 
-A message that is dropped leaves a gap in its place, so that dropping costs as little as sending. What a client
-wants in fragments waits whole, and is cut when its turn has come.
+A dropped message leaves a gap in the order, so that dropping costs as little as sending. A message that a client
+wants in fragments is queued whole, and counts towards the bound until its last fragment has left.
 """
 
 import itertools
@@ -18,18 +18,20 @@ from bridge.codecs.fragments import split
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-#: Gaps in a queue before it is packed, beyond as many as there are messages.
 _GAPS: Final = 64
+"""Gaps in a queue before it is packed, beyond as many as there are messages."""
+_WIRE_BYTES: Final = 64 * 1024
+"""Bytes on the wire list after which payloads are queued, and so counted, until the socket has accepted these."""
 _BRACE: Final = ord("{")
 
 
 def is_text(payload: bytes) -> bool:
-    """Whether a payload is JSON, and not CBOR: its object begins with a brace, as no map of CBOR does."""
+    """Return whether a payload is JSON: its object begins with a brace, as a map of CBOR cannot."""
     return payload[0] == _BRACE
 
 
 class _Entry:
-    """One message in its place in the order, or a gap where one was (``payload`` is None)."""
+    """One message in the order; a `payload` of None is a gap."""
 
     __slots__ = ("fragment_size", "lane", "payload")
 
@@ -40,47 +42,40 @@ class _Entry:
 
 
 class Lane:
-    """The way of one subscription's messages to its client. Only its outbox changes it.
+    """The share of one subscription in its client's outbox, which alone changes it."""
 
-    Attributes:
-        throttle: seconds between two messages at least, 0 for none.
-        queue_length: messages that may wait; with a throttle, 0 means that early ones are dropped.
-        next_time: when the throttle lets the next message through (monotonic seconds).
-        queued: its messages that wait for the socket.
-        held: its messages that wait for its throttle.
-        fragment_size: characters of one fragment of a message, 0 for messages in one piece.
-        lost: messages dropped because the client (or its throttle) was slower than the topic.
-    """
-
-    __slots__ = ("fragment_size", "held", "lost", "next_time", "queue_length", "queued", "throttle")
+    __slots__ = ("dropped", "fragment_size", "held", "next_time", "queue_length", "queued", "throttle")
 
     def __init__(self, queue_length: int = 1) -> None:
         self.throttle = 0.0
+        """Minimum seconds between two messages, 0 for none."""
         self.queue_length = queue_length
+        """Maximum of queued messages; with a throttle, 0 drops those that come too early."""
         self.fragment_size = 0
+        """Maximum bytes of a message in one fragment, 0 for whole messages."""
         self.next_time = -inf
+        """When the throttle admits the next message (monotonic seconds)."""
         self.queued: deque[_Entry] = deque()
+        """Messages that wait for the socket."""
         self.held: deque[bytes] = deque()
-        self.lost = 0
+        """Messages that wait for the throttle."""
+        self.dropped = 0
+        """Messages dropped because the client or its throttle was slower than the topic."""
 
 
 class Outbox:
-    """All that waits for one client.
-
-    Attributes:
-        size: bytes waiting.
-        wire: where a payload goes at once when nothing waits before it; None while the socket takes nothing.
-        overflowed: what cannot be dropped is more than ``max_bytes``: the client does not read its answers.
-        deadline: when `release` has something to do (monotonic seconds), infinity for never.
-    """
+    """Everything that waits for one client."""
 
     __slots__ = (
+        "_cutting",
+        "_droppable",
         "_entries",
         "_fragments",
         "_gaps",
         "_holding",
         "_max_bytes",
         "_numbers",
+        "_wire_bytes",
         "deadline",
         "overflowed",
         "size",
@@ -88,44 +83,55 @@ class Outbox:
     )
 
     def __init__(self, max_bytes: int) -> None:
-        """Bound what may wait to ``max_bytes``."""
+        """Bound the queue to `max_bytes`."""
         self._max_bytes = max_bytes
         self._entries: deque[_Entry] = deque()
+        self._droppable: deque[_Entry] = deque()
         self._gaps = 0
         self._holding: set[Lane] = set()
         self._fragments: Iterator[bytes] | None = None
+        self._cutting = 0
         self._numbers = itertools.count(1)
+        self._wire_bytes = 0
         self.wire: list[bytes] | None = None
+        """Payloads for the socket's next write; None while it accepts nothing, so that everything is queued."""
         self.size = 0
+        """Bytes in the queue."""
         self.overflowed = False
+        """Whether something that cannot be dropped exceeded the bound: the client does not read its answers."""
         self.deadline = inf
+        """When `release` may have something to do (monotonic seconds), infinity for never."""
 
     def __len__(self) -> int:
         return len(self._entries) - self._gaps
 
     @property
     def empty(self) -> bool:
-        """Whether nothing waits to be taken."""
+        """Return whether nothing is queued for the socket."""
         return not self._entries and self._fragments is None
 
+    def take_wire(self) -> list[bytes]:
+        """Return and remove the payloads for the socket's next write."""
+        payloads, self.wire, self._wire_bytes = self.wire or [], [], 0
+        return payloads
+
     def put(self, payload: bytes, fragment_size: int = 0) -> None:
-        """Queue what may not be lost: an answer or a request of a service or an action."""
-        if self.wire is not None and not fragment_size and not self._entries and self._fragments is None:
-            self.wire.append(payload)
+        """Queue an answer or a request of a service or an action, which must not be dropped."""
+        if self._bypass(payload, fragment_size):
             return
-        if not self._make_room(len(payload)):
+        if self._make_room(len(payload)):
+            self._entries.append(_Entry(payload, None, fragment_size))
+            self.size += len(payload)
+        else:
             self.overflowed = True
-            return
-        self._entries.append(_Entry(payload, None, fragment_size))
-        self.size += len(payload)
 
     def offer(self, lane: Lane, payload: bytes, now: float) -> None:
-        """Queue a message of a topic now, hold it until its throttle is over, or drop it.
+        """Queue a topic's message, hold it until its throttle admits it, or drop it.
 
         Args:
-            lane: the subscription's.
-            payload: what goes onto the wire.
-            now: monotonic seconds.
+            lane: The subscription's.
+            payload: The message as it goes onto the wire.
+            now: Monotonic seconds.
         """
         if lane.throttle:
             if now < lane.next_time or lane.held:
@@ -133,86 +139,100 @@ class Outbox:
                     self._hold(lane, payload)
                 return
             lane.next_time = now + lane.throttle
-        # What `_queue` would do first, at once: most messages go this way.
-        if self.wire is None or lane.fragment_size or self._entries or self._fragments is not None:
-            self._queue(lane, payload)
-        else:
-            self.wire.append(payload)
+        self._deliver(lane, payload)
 
     def pop(self) -> bytes | None:
-        """Take the next message or fragment for the wire, None when there is none."""
+        """Take the next message or fragment for the socket, or None."""
         if self._fragments is not None:
             fragment = next(self._fragments, None)
             if fragment is not None:
                 return fragment
             self._fragments = None
-        entries = self._entries
-        while entries:
-            entry = entries.popleft()
+            self.size -= self._cutting
+        while self._entries:
+            entry = self._entries.popleft()
             payload = entry.payload
             if payload is None:
                 self._gaps -= 1
                 continue
             if entry.lane is not None:
-                entry.lane.queued.popleft()  # this very entry: a lane is in order as the outbox is
-            self.size -= len(payload)
+                entry.lane.queued.popleft()  # this very entry: a lane has the outbox's order
+                entry.payload = None
+                while self._droppable and self._droppable[0].payload is None:
+                    self._droppable.popleft()
             if entry.fragment_size:
-                # One by one: a mebibyte in pieces of 16 characters need not be there at once.
                 self._fragments = split(payload, entry.fragment_size, f"hub:{next(self._numbers)}")
+                self._cutting = len(payload)
                 return next(self._fragments)
+            self.size -= len(payload)
             return payload
         return None
 
-    def passes(self, lane: Lane, now: float) -> bool:
-        """Whether `offer` would do anything but drop a message: what would not need not be encoded."""
+    def accepts(self, lane: Lane, now: float) -> bool:
+        """Return whether `offer` would keep a message, so that it is worth encoding."""
         return not lane.throttle or bool(lane.queue_length) or (now >= lane.next_time and not lane.held)
 
     def release(self, now: float) -> None:
-        """Queue what was held until ``now``, one message of each lane at most."""
+        """Queue the messages that throttles admit at `now`, at most one of each lane."""
         for lane in [lane for lane in self._holding if lane.next_time <= now]:
             lane.next_time = now + lane.throttle
-            self._queue(lane, self._take_held(lane))
-        self._find_deadline()
+            self._deliver(lane, self._take_held(lane))
+        self.deadline = min((lane.next_time for lane in self._holding), default=inf)
 
     def adjust(self, lane: Lane, throttle: float, queue_length: int) -> None:
-        """Change a lane's throttle and length. What is held and need not be any more is queued."""
+        """Change a lane's throttle and length, and queue or drop what need not be held any more."""
         lane.next_time += throttle - lane.throttle
         lane.throttle, lane.queue_length = throttle, queue_length
         while lane.held and not throttle:
-            self._queue(lane, self._take_held(lane))
+            self._deliver(lane, self._take_held(lane))
         while len(lane.held) > queue_length:
             self._take_held(lane)
-            lane.lost += 1
+            lane.dropped += 1
         self._shorten(lane, max(queue_length, 1))
-        self._find_deadline()
+        if lane.held:
+            self.deadline = min(self.deadline, lane.next_time)
 
     def forget(self, lane: Lane) -> None:
-        """Drop all of a subscription that is over."""
+        """Drop everything of a subscription that ended."""
         while lane.queued:
             self._drop_queued(lane)
         while lane.held:
             self._take_held(lane)
-        self._find_deadline()
+
+    def _bypass(self, payload: bytes, fragment_size: int) -> bool:
+        """Put a payload on the wire list, if nothing waits before it and the socket accepts data."""
+        if (
+            self.wire is None
+            or fragment_size
+            or self._entries
+            or self._wire_bytes >= _WIRE_BYTES
+            or self._fragments is not None
+        ):
+            return False
+        self.wire.append(payload)
+        self._wire_bytes += len(payload)
+        return True
+
+    def _deliver(self, lane: Lane, payload: bytes) -> None:
+        if not self._bypass(payload, lane.fragment_size):
+            self._queue(lane, payload)
 
     def _queue(self, lane: Lane, payload: bytes) -> None:
-        if self.wire is not None and not lane.fragment_size and self.empty:
-            self.wire.append(payload)
-            return
-        self._shorten(lane, max(lane.queue_length, 1) - 1)  # 0 with a throttle: one under way
+        self._shorten(lane, max(lane.queue_length, 1) - 1)  # with a throttle 0 means: one at a time
         if not self._make_room(len(payload)):
-            lane.lost += 1
+            lane.dropped += 1
             return
         entry = _Entry(payload, lane, lane.fragment_size if is_text(payload) else 0)
-        self._entries.append(entry)
-        lane.queued.append(entry)
+        for queue in (self._entries, self._droppable, lane.queued):
+            queue.append(entry)
         self.size += len(payload)
 
     def _hold(self, lane: Lane, payload: bytes) -> None:
         while len(lane.held) >= lane.queue_length:
             self._take_held(lane)
-            lane.lost += 1
+            lane.dropped += 1
         if not self._make_room(len(payload)):
-            lane.lost += 1
+            lane.dropped += 1
             return
         lane.held.append(payload)
         self.size += len(payload)
@@ -222,16 +242,17 @@ class Outbox:
     def _shorten(self, lane: Lane, length: int) -> None:
         while len(lane.queued) > length:
             self._drop_queued(lane)
-            lane.lost += 1
+            lane.dropped += 1
 
     def _drop_queued(self, lane: Lane) -> None:
-        """Leave a gap where the lane's oldest queued message was."""
+        """Leave a gap in place of the lane's oldest queued message."""
         entry = lane.queued.popleft()
         self.size -= len(entry.payload or b"")
         entry.payload = None
         self._gaps += 1
         if self._gaps > _GAPS + len(self):
             self._entries = deque(entry for entry in self._entries if entry.payload is not None)
+            self._droppable = deque(entry for entry in self._droppable if entry.payload is not None)
             self._gaps = 0
 
     def _take_held(self, lane: Lane) -> bytes:
@@ -242,24 +263,14 @@ class Outbox:
         return payload
 
     def _make_room(self, size: int) -> bool:
-        """Drop topics' oldest messages until ``size`` bytes more fit; False if they never will."""
-        if self.size + size <= self._max_bytes:
-            return True
-        while self._entries and self._entries[0].payload is None:
-            self._entries.popleft()
-            self._gaps -= 1
-        for entry in self._entries:  # packing replaces the queue, it does not change this one
+        """Drop topics' oldest messages until `size` more bytes fit; return False if they never will."""
+        while self.size + size > self._max_bytes and self._droppable:
+            entry = self._droppable.popleft()
             if entry.payload is not None and entry.lane is not None:
                 self._drop_queued(entry.lane)
-                entry.lane.lost += 1
-                if self.size + size <= self._max_bytes:
-                    return True
-        for lane in list(self._holding):
-            while lane.held and self.size + size > self._max_bytes:
-                self._take_held(lane)
-                lane.lost += 1
-        self._find_deadline()
+                entry.lane.dropped += 1
+        while self.size + size > self._max_bytes and self._holding:
+            lane = next(iter(self._holding))
+            self._take_held(lane)
+            lane.dropped += 1
         return self.size + size <= self._max_bytes
-
-    def _find_deadline(self) -> None:
-        self.deadline = min((lane.next_time for lane in self._holding), default=inf)

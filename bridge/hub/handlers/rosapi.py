@@ -1,46 +1,43 @@
-"""The services of ROS's ``rosapi`` node, answered from what the hub knows.
+"""The services of ROS's `rosapi` node, answered from the state of the hub.
 
-Clients ask these for diagnosis (which topics, of which type, who publishes), for parameters and for the fields of
-messages. Names, fields and types are rosapi's of the ROS version that the hub plays (http://wiki.ros.org/rosapi,
-rosapi_msgs); what one version alone has is answered in both. Times carry the fields of both (``secs``, ``nsecs``
-and ``sec``, ``nanosec``).
+Clients call them for diagnosis (topics, their types and publishers), for parameters and for the fields of messages.
+Names, fields and types are those of the ROS version that the hub emulates (http://wiki.ros.org/rosapi, rosapi_msgs);
+services that only one version has are answered in both. Times have the fields of both (`secs`, `nsecs` and `sec`,
+`nanosec`).
 
-Parameters are a flat dictionary of the hub's own: a name is a string, its value is JSON. A failure with one is an
-answer in ROS 2 (``successful``, ``reason``), and a failed call in ROS 1.
+Parameters are a flat dictionary of the hub: a name is a string, its value is JSON. A failure with one is an
+answer in ROS 2 (`successful`, `reason`), and a failed call in ROS 1.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, Final
 
 import orjson
 
-from bridge.codecs.json_codec import depth
-from bridge.errors import BridgeError
+from bridge.codecs.json_codec import is_deeper
+from bridge.errors import NameFormError
 from bridge.hub.delivery.definitions import Definitions
+from bridge.hub.errors import RefusedError
 from bridge.hub.graph import Graph
 from bridge.hub.limits import HubLimits
-from bridge.hub.operations import RefusedError
-from bridge.names import MAX_NAME, absolute, ros1_type, ros2_type, same_type
+from bridge.names import MAX_NAME, absolute, ros1_type, ros2_type
 
-#: The node that offers these services, and the beginning of their names, which no client can take.
 NODE: Final = "/rosapi"
+"""The node that offers these services."""
 PREFIX: Final = NODE + "/"
-#: The topic on which ROS's nodes log: the hub's refusals are told there.
+"""The beginning of their names, which no client can use."""
 ROSOUT: Final = "/rosout"
-#: Topics that a server of ROS 1's actionlib publishes or hears under its name.
+"""The topic of ROS's log, which carries the hub's refusals."""
 _ACTIONLIB: Final = ("goal", "cancel", "status", "feedback", "result")
+"""Topics that a server of ROS 1's actionlib publishes or subscribes to under its name."""
 
 Values = dict[str, Any]
 Answer = Callable[..., Values]
 
 
 def rosout_type(ros_version: int) -> str:
-    """The type of `ROSOUT`."""
+    """Return the type of `ROSOUT`."""
     return "rcl_interfaces/msg/Log" if ros_version == 2 else "rosgraph_msgs/Log"
-
-
-class RosapiError(Exception):
-    """Raised when a call of rosapi fails; its text is the answer's ``values``."""
 
 
 class Rosapi:
@@ -49,7 +46,7 @@ class Rosapi:
     def __init__(
         self, graph: Graph, limits: HubLimits, definitions: Definitions, wall_clock: Callable[[], int]
     ) -> None:
-        """Answer about ``graph``; ``wall_clock`` gives nanoseconds since 1970."""
+        """Answer about `graph`; `wall_clock` returns nanoseconds since 1970."""
         self._graph = graph
         self._limits = limits
         self._definitions = definitions
@@ -57,7 +54,7 @@ class Rosapi:
         self.ros_version = definitions.ros_version
         self._parameters: dict[str, bytes] = {}
         self._parameter_bytes = 0
-        # Short name -> type, arguments (all strings) in their order, what answers.
+        # Short name -> type, arguments (all strings) in their order, function.
         self._services: dict[str, tuple[str, tuple[str, ...], Answer]] = {
             "action_servers": ("GetActionServers", (), self._action_servers),
             "action_type": ("ActionType", ("action",), self._action_type),
@@ -88,44 +85,45 @@ class Rosapi:
         }
 
     def offers(self, service: str) -> bool:
-        """Whether a service (its absolute name) is one of these."""
+        """Return whether a service (its absolute name) is one of these."""
         return service.startswith(PREFIX) and service.removeprefix(PREFIX) in self._services
 
     def call(self, service: str, args: object) -> Values:
         """Answer one call.
 
         Args:
-            service: an absolute name that `offers` knows.
-            args: what the client sent: an object, or a list in the order of the service's fields. A field
+            service: An absolute name for which `offers` returned true.
+            args: The client's arguments: an object, or a list in the order of the service's fields. A field
                 left out is the empty string, as in any ROS request.
 
         Returns:
-            The answer's ``values``.
+            The answer's `values`.
 
         Raises:
-            RosapiError: the arguments are wrong, or a limit is reached.
+            RefusedError: The arguments are wrong, or a limit is reached.
+            DefinitionsPendingError: Message definitions are being loaded.
         """
         _type, names, answer = self._services[service.removeprefix(PREFIX)]
         if isinstance(args, list):
             args = dict(zip(names, args, strict=False))
         if not isinstance(args, dict):
-            raise RosapiError(
+            raise RefusedError(
                 f"{service}: args must be an object with the fields {', '.join(names) or '(none)'}"
             )
         given = [args.get(name, "") for name in names]
         for name, value in zip(names, given, strict=True):
             if not isinstance(value, str):
-                raise RosapiError(f"{service}: field {name} must be a string")
+                raise RefusedError(f"{service}: field {name} must be a string")
         return answer(*given)
 
     def service_type_name(self, type_name: str) -> str:
-        """A service type's name as this ROS version writes it."""
+        """Return a service type's name as this ROS version writes it."""
         return ros2_type(type_name, "srv") if self.ros_version == 2 else ros1_type(type_name)
 
     # --- topics
 
     def _all_topics(self) -> dict[str, str]:
-        """Every topic's type, the hub's own among them."""
+        """Return every topic's type, the hub's own included."""
         topics = {topic.name: topic.type for topic in self._graph.topics.values()}
         return topics | {ROSOUT: rosout_type(self.ros_version)}
 
@@ -134,8 +132,11 @@ class Rosapi:
         return {"topics": list(topics), "types": list(topics.values())}
 
     def _topics_and_raw_types(self) -> Values:
+        self._definitions.require()
         topics = self._all_topics()
         texts = {type_name: self._full_text(type_name) for type_name in set(topics.values())}
+        if sum(len(texts[type_name]) for type_name in topics.values()) > self._limits.message_bytes:
+            raise RefusedError(f"the definitions have more than {self._limits.message_bytes} bytes")
         return {
             "topics": list(topics),
             "types": list(topics.values()),
@@ -149,8 +150,7 @@ class Rosapi:
             return ""
 
     def _topics_for_type(self, type_name: str) -> Values:
-        topics = self._all_topics().items()
-        return {"topics": [name for name, its_type in topics if its_type and same_type(its_type, type_name)]}
+        return {"topics": _of_type(self._all_topics().items(), type_name, self._definitions.name)}
 
     def _topic_type(self, name: str) -> Values:
         return {"type": self._all_topics().get(absolute(name), "")}
@@ -167,10 +167,7 @@ class Rosapi:
         return {"interfaces": sorted(types - {""})}
 
     def _message_details(self, type_name: str) -> Values:
-        try:
-            return {"typedefs": self._definitions.details(type_name)}
-        except (RefusedError, BridgeError) as error:
-            raise RosapiError(str(error)) from None
+        return {"typedefs": self._definitions.details(type_name)}
 
     def _subscribers(self, name: str) -> Values:
         topic = self._graph.topics.get(absolute(name))
@@ -191,8 +188,10 @@ class Rosapi:
         return {"type": service.type if service else self._own_types().get(name, "")}
 
     def _services_for_type(self, type_name: str) -> Values:
-        own = [name for name, its_type in self._own_types().items() if same_type(its_type, type_name)]
-        return {"services": own + [service.name for service in self._graph.services_of_type(type_name)]}
+        services = {name: service.type for name, service in self._graph.services.items()}
+        return {
+            "services": _of_type((self._own_types() | services).items(), type_name, self.service_type_name)
+        }
 
     def _service_node(self, name: str) -> Values:
         service = self._graph.services.get(absolute(name))
@@ -207,9 +206,8 @@ class Rosapi:
         return {"host": "localhost" if self.offers(absolute(name)) else ""}
 
     def _service_providers(self, type_name: str) -> Values:
-        nodes = [service.client.node for service in self._graph.services_of_type(type_name)]
-        if any(same_type(its_type, type_name) for its_type in self._own_types().values()):
-            nodes.insert(0, NODE)
+        names = self._services_for_type(type_name)["services"]
+        nodes = [self._service_node(name)["node"] for name in names]
         return {"providers": list(dict.fromkeys(nodes))}
 
     def _action_servers(self) -> Values:
@@ -231,7 +229,7 @@ class Rosapi:
         node = absolute(node)
         if node == NODE:
             return {"subscribing": [], "publishing": [ROSOUT], "services": list(self._own_types())}
-        client = self._graph.client_of_node(node)
+        client = next((each for each in self._graph.clients.values() if each.node == node), None)
         if client is None:
             return {"subscribing": [], "publishing": [], "services": []}
         return {
@@ -250,11 +248,11 @@ class Rosapi:
     # --- parameters
 
     def _outcome(self, failure: str = "", **values: Any) -> Values:
-        """The answer about a parameter, or its failure, as this ROS version tells it."""
+        """Return the answer about a parameter, or its failure, in this ROS version's form."""
         if self.ros_version == 2:
             return values | {"successful": not failure, "reason": failure}
         if failure:
-            raise RosapiError(failure)
+            raise RefusedError(failure)
         return values
 
     def _get_param(self, name: str, default: str) -> Values:
@@ -283,7 +281,7 @@ class Rosapi:
             parsed = orjson.loads(value)
         except orjson.JSONDecodeError:
             return self._outcome(f"the value of parameter {name} must be JSON text")
-        if depth(parsed, self._limits.depth) > self._limits.depth:
+        if is_deeper(value, self._limits.depth):
             return self._outcome(
                 f"the value of parameter {name} is nested deeper than {self._limits.depth} levels"
             )
@@ -301,3 +299,12 @@ class Rosapi:
     def _delete_param(self, name: str) -> Values:
         self._parameter_bytes -= len(self._parameters.pop(absolute(name), b""))
         return self._outcome()
+
+
+def _of_type(types: Iterable[tuple[str, str]], type_name: str, normalise: Callable[[str], str]) -> list[str]:
+    """Return the names whose type is the one in question, in either form of its name."""
+    try:
+        wanted = normalise(type_name)
+    except NameFormError:
+        return []
+    return [name for name, its_type in types if its_type == wanted]

@@ -122,7 +122,7 @@ def test_limits_of_size_and_depth():
     assert encode(message, max_depth=10) == cbor2.dumps(message)
     with pytest.raises(DecodeError):
         decode(cbor2.dumps(message), max_depth=9)
-    with pytest.raises(EncodeError, match="deeply"):
+    with pytest.raises(EncodeError):
         encode(message, max_depth=9)
     size = len(cbor2.dumps(message))
     assert decode(cbor2.dumps(message), max_size=size)

@@ -178,16 +178,16 @@ def _live(seed: int, steps: int) -> Counter[str]:
         elif step == "wait":
             room.pass_time(rng.choice([0.01, 0.05, 1.0, 30.0]))
         elif step == "reconnect":
-            happened["doomed"] += bool(visitor.guest.client.doomed)
-            happened["lost"] += sum(
-                subscription.lane.lost for subscription in visitor.guest.client.subscriptions.values()
+            happened["doomed"] += bool(visitor.guest.client.close_reason)
+            happened["dropped"] += sum(
+                subscription.lane.dropped for subscription in visitor.guest.client.subscriptions.values()
             )
             visitor.guest.leave()
             visitors[who] = _Visitor(room)
         room.check()
         graph = room.broker.graph
         happened["latched"] += graph.latched_bytes > 0
-        happened["held"] += bool(room.broker._delivery.throttled)
+        happened["held"] += bool(room.broker._dispatcher.throttled)
         ready = room.broker.take_ready()
         assert len(set(ready)) == len(ready)
     _end(room, visitors, happened)
@@ -196,7 +196,9 @@ def _live(seed: int, steps: int) -> Counter[str]:
 
 def _end(room: Room, visitors: list[_Visitor], happened: Counter[str]) -> None:
     for visitor in visitors:
-        if visitor.guest.client.doomed:  # as whoever owns its socket would; goals that it never read fail now
+        if (
+            visitor.guest.client.close_reason
+        ):  # as whoever owns its socket would; goals that it never read fail now
             visitor.guest.leave()
     for _ in range(2):
         for visitor in visitors:
@@ -206,7 +208,7 @@ def _end(room: Room, visitors: list[_Visitor], happened: Counter[str]) -> None:
         room.pass_time(120)
     for visitor in visitors:
         visitor.read(happened)
-        if not visitor.guest.client.doomed:
+        if not visitor.guest.client.close_reason:
             assert visitor.calls == visitor.answered, "a call without an answer"
         visitor.guest.leave()
         room.check()
@@ -215,9 +217,9 @@ def _end(room: Room, visitors: list[_Visitor], happened: Counter[str]) -> None:
     assert not graph.services
     assert not graph.actions
     assert not room.broker._actions.goals
-    assert not room.broker._calls.waiting
+    assert not room.broker._calls.pending
     room.pass_time(120)
-    assert not room.broker._delivery.throttled
+    assert not room.broker._dispatcher.throttled
 
 
 @given(st.integers(0, 2**32))
@@ -231,7 +233,16 @@ def test_in_these_lives_everything_happens() -> None:
     happened: Counter[str] = Counter()
     for seed in range(20):
         happened += _live(seed, 400)
-    expected = {"publish", "call_service", "service_response", "failure", "doomed", "lost", "latched", "held"}
+    expected = {
+        "publish",
+        "call_service",
+        "service_response",
+        "failure",
+        "doomed",
+        "dropped",
+        "latched",
+        "held",
+    }
     expected |= {"send_action_goal", "cancel_action_goal", "action_feedback", "action_result"}
     expected |= {"fragment", "png", "status"}
     assert {what for what in expected if happened[what] >= 5} == expected, happened

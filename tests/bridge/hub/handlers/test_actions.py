@@ -77,7 +77,7 @@ def test_a_goal_is_cancelled_by_its_server() -> None:
     room.check()
 
 
-def test_all_goals_of_an_action_are_cancelled_by_its_service() -> None:
+def test_all_tasks_an_action_are_cancelled_by_its_service() -> None:
     _, server, client = _room()
     for number in range(3):
         _goal(client, number)
@@ -94,7 +94,7 @@ def test_all_goals_of_an_action_are_cancelled_by_its_service() -> None:
         ({"result": False}, GoalStatus.ABORTED, "did not reach"),
         ({"result": False, "values": "stuck", "status": 5}, GoalStatus.CANCELED, "stuck"),
         ({"result": False, "values": {"a": 1}, "status": 99}, GoalStatus.ABORTED, '{"a":1}'),
-        ({"result": True, "values": [1]}, GoalStatus.ABORTED, "no JSON object"),
+        ({"result": True, "values": [1]}, GoalStatus.ABORTED, "/count"),
         ({"result": "yes", "values": "?", "status": True}, GoalStatus.ABORTED, "?"),
     ],
 )
@@ -192,7 +192,7 @@ def test_the_last_who_offers_an_action_works_on_its_goals() -> None:
     room.check()
 
 
-def test_nobody_ends_the_goals_of_others() -> None:
+def test_nobody_ends_the_tasks_others() -> None:
     room, server, client = _room()
     stranger = room.enter()
     _goal(client)

@@ -25,7 +25,7 @@ class Hub:
             self.ask(self.publisher, op="advertise", topic=topic, type="p/T")
             self.ask(self.listener, op="subscribe", topic=topic, queue_length=1000)
         self.say(PUBLISH + b"{}}")
-        assert self.publisher.publishing is not None
+        assert self.publisher.last_published is not None
         self.heard()
 
     def ask(self, client: Client, **operation: Any) -> None:

@@ -391,7 +391,7 @@ def test_a_slow_client_keeps_the_newest_and_costs_the_others_nothing() -> None:
     assert heard == [{"i": index} for index in range(100)]
     assert slow.heard() == [{"i": index} for index in range(90, 100)]
     assert latest.heard() == [{"i": 99}]
-    assert slow.client.subscriptions["/t"].lane.lost == 90
+    assert slow.client.subscriptions["/t"].lane.dropped == 90
 
 
 def test_a_client_cannot_ask_for_a_queue_without_end() -> None:

@@ -1,0 +1,99 @@
+"""Parts that services and actions share: who offers them, who waits for an answer, and in which encoding."""
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Self
+
+from bridge.hub.delivery.dispatcher import Dispatcher, fragment_size_of
+from bridge.hub.delivery.encodings import Compression, compression_of
+from bridge.hub.errors import RefusedError
+from bridge.hub.graph import Client, Offer
+from bridge.hub.operations import Operation, OperationId, checked_name, is_logged, number, operation_id, text
+from bridge.names import absolute
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Caller:
+    """A client that waits for an answer, under which id and name, and in which encoding."""
+
+    client: Client
+    id: OperationId
+    name: str
+    fragment_size: int = 0
+    png: bool = False
+
+    @classmethod
+    def of(cls, client: Client, operation: Operation, field: str) -> Self:
+        """Read the caller of an operation, which names a service or an action in `field`.
+
+        Raises:
+            RefusedError: The operation's name, id or fragment size is malformed.
+        """
+        return cls(
+            client,
+            operation_id(operation),
+            text(operation, field),
+            fragment_size_of(number(operation, "fragment_size")),
+            compression_of(operation.get("compression")) is Compression.PNG,
+        )
+
+    def answer(self, dispatcher: Dispatcher, payload: bytes) -> None:
+        """Send an answer as requested.
+
+        Raises:
+            RefusedError: It is too large.
+        """
+        dispatcher.checked(payload, f"the answer of {self.name}")
+        dispatcher.send(self.client, payload, fragment_size=self.fragment_size, png=self.png)
+
+
+class Offers:
+    """Services or actions by name; the last client to offer one serves it."""
+
+    def __init__(
+        self, offers: dict[str, Offer], names_of: Callable[[Client], set[str]], limit: int, kind: str
+    ) -> None:
+        """Manage a part of the graph.
+
+        Args:
+            offers: The graph's services or actions.
+            names_of: Returns the names that a client offers.
+            limit: Maximum of offers of one client.
+            kind: The name of what is offered, and of the operation's field.
+        """
+        self._offers = offers
+        self._names_of = names_of
+        self._limit = limit
+        self._kind = kind
+
+    def add(self, client: Client, operation: Operation, type_name: str) -> None:
+        """Add an offer, or take it over from another client."""
+        name = checked_name(text(operation, self._kind))
+        key, names = absolute(name), self._names_of(client)
+        if key not in names and len(names) >= self._limit:
+            raise RefusedError(f"this client offers {len(names)} {self._kind}s already")
+        before = self._offers.get(key)
+        if before is not None and before.client is not client:
+            client.takeovers += 1
+            if is_logged(client.takeovers):
+                log.warning("%s took %s over from %s", client.node, key, before.client.node)
+            self._names_of(before.client).discard(key)
+        self._offers[key] = Offer(key, type_name, client)
+        names.add(key)
+
+    def remove(self, client: Client, operation: Operation) -> None:
+        """Withdraw an offer; requests under way may still be answered."""
+        name = text(operation, self._kind)
+        names = self._names_of(client)
+        if absolute(name) not in names:
+            raise RefusedError(f"this client does not offer {name}")
+        names.discard(absolute(name))
+        del self._offers[absolute(name)]
+
+    def leave(self, client: Client) -> None:
+        """Remove the offers of a client that left."""
+        for name in self._names_of(client):
+            self._offers.pop(name, None)
