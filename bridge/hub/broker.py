@@ -155,7 +155,12 @@ class Broker:
         except BridgeError as error:
             self._refuse(client, str(error), self._operation_id, with_status=client.wants_status)
 
-    def receive_all(self, client: Client, messages: list[bytes], now: float) -> int:
+    def receive_all(self, client: Client, messages: list[bytes], now: float) -> None:
+        """Perform messages of a client in order, as `receive` does one."""
+        while messages:
+            messages = messages[self.receive_turn(client, messages, now) :]
+
+    def receive_turn(self, client: Client, messages: list[bytes], now: float) -> int:
         """Perform messages of a client in order, as many as one turn allows.
 
         Args:

@@ -383,8 +383,7 @@ class _Connection(asyncio.Protocol):
                 )
                 frames += len(found)
                 if found:
-                    while found:
-                        found = found[self._hub.broker.receive_all(client, found, now) :]
+                    self._hub.broker.receive_all(client, found, now)
                     continue
             end = frame_end(data, at, masked=True, largest=largest)
             if end == UNSOUND:
