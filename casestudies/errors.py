@@ -11,7 +11,3 @@ class CaseStudyError(Exception):
 
 class DataFileError(CaseStudyError):
     """A file of recorded data that is not there, or is another kind of file."""
-
-
-class OutputError(CaseStudyError):
-    """Pictures or numbers that cannot be written: no matplotlib, or a folder that refuses."""

@@ -16,7 +16,7 @@ from services.errors import StackError
 from services.supervision.child import own_command
 from services.supervision.parent import ask_for_end_with_parent
 from terminal.errors import ExitCode, StoppedError
-from terminal.running import run_async
+from terminal.signals import run_async
 from toolchain.errors import ToolchainError
 
 ROOT = Path(__file__).resolve().parent.parent

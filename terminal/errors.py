@@ -21,10 +21,10 @@ class ExitCode(IntEnum):
 
 
 class StoppedError(BaseException):
-    """A signal asked the process to end; not a failure, but no success either.
+    """A signal asked the process to end.
 
-    Like KeyboardInterrupt it is no `Exception`: it rises wherever the process stands, inside a library's code too,
-    and whoever catches "whatever goes wrong here" must not take it for that.
+    Like KeyboardInterrupt it is not an `Exception`: it is raised wherever the main thread stands, inside a library too,
+    and code that catches `Exception` must not swallow it.
     """
 
     def __init__(self, exit_code: int, sentence: str) -> None:
@@ -32,7 +32,19 @@ class StoppedError(BaseException):
         self.exit_code = exit_code
 
 
+class ReaderGoneError(Exception):
+    """The program that reads standard output has closed it, as `| head` does; not a failure."""
+
+    exit_code = ExitCode.DONE
+
+
+class OutputError(Exception):
+    """A file or folder that a command writes at the user's request cannot be written."""
+
+    exit_code = ExitCode.USAGE
+
+
 def exit_code_of(error: BaseException) -> int:
-    """The exit code of any package's error; a bug (1) for an exception that is none of ours."""
+    """Return the exit code that an error of any package carries; `BUG` for all others."""
     code = getattr(error, "exit_code", ExitCode.BUG)
     return int(code) if isinstance(code, int) else int(ExitCode.BUG)

@@ -153,7 +153,7 @@ def _listening(directory: str | os.PathLike[str] | None, name: str) -> Iterator[
         try:
             listener = _listen(path)
         except OSError as error:
-            from terminal.logs import say
+            from terminal.output import say
 
             reason = "another process listens there" if error.errno == errno.EADDRINUSE else error.strerror
             say(f"{name}: warning: its status can't be shown at {path}: {reason or error}")

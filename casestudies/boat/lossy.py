@@ -5,7 +5,7 @@ from typing import Any
 
 from bridge.client import Publication
 from bridge.errors import DisconnectedError, SlowPeerError
-from casestudies.running import say
+from terminal.output import say
 
 
 class LossyPublication:

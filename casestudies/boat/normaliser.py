@@ -19,8 +19,10 @@ from casestudies.boat.messages import (
     read_raw,
     readings_message,
 )
-from casestudies.running import command, run, say
 from terminal.command_line import CommandLine
+from terminal.connection import report_connection
+from terminal.output import say
+from terminal.signals import run_async
 
 
 def normalise_distance(raw: float) -> int:
@@ -51,12 +53,14 @@ async def serve(uri: str, *, raw_topic: str, sensors_topic: str, array: bool) ->
     """
     from bridge.client import connect
     from casestudies.boat.lossy import LossyPublication
-    from casestudies.connection import told
     from casestudies.readiness import Readiness, readiness_served
 
     said: set[str] = set()
     readiness = Readiness("a reading was normalised")
-    async with readiness_served("boat-normaliser", readiness), connect(uri, on_state=told(uri)) as ros:
+    async with (
+        readiness_served("boat-normaliser", readiness),
+        connect(uri, on_state=report_connection(uri)) as ros,
+    ):
         sensors = LossyPublication(await ros.advertise(sensors_topic, ARRAY_TYPE if array else SENSORS_TYPE))
         raw = ros.subscribe(raw_topic, ARRAY_TYPE if array else RAW_TYPE)
         async for message in raw:
@@ -85,19 +89,14 @@ def boat_normaliser(
     print_msg: Annotated[
         bool, typer.Option("--print-msg", help="Print boat_msgs' two .msg files and end.")
     ] = False,
-) -> None:
+) -> int:
     """Turn the boat's raw readings into whole numbers in range: distances 0..100, bearings 0..359 degrees."""
     if print_msg:
         print(f"{RAW_MSG}\n{SENSORS_MSG}", end="")
-        return
+        return 0
     say(f"boat-normaliser: {raw_topic} to {sensors_topic}, {uri}")
-    run(lambda: serve(uri, raw_topic=raw_topic, sensors_topic=sensors_topic, array=array))
-
-
-def main() -> None:
-    """The command `boat-normaliser`."""
-    command(app)
+    return run_async(serve(uri, raw_topic=raw_topic, sensors_topic=sensors_topic, array=array))
 
 
 if __name__ == "__main__":
-    main()
+    app()

@@ -8,10 +8,10 @@ from typing import Any, Final
 
 from casestudies.boat.geometry import BEACONS, map_grid
 from casestudies.boat.shares import Part, StageShare
-from casestudies.errors import OutputError
 from casestudies.grid import Grid
 from casestudies.truths import Instance, Truth
 from posteriors.results import Posterior
+from terminal.errors import OutputError
 
 POSITIONS_SHOWN: Final = 4
 """As many as the thesis shows."""

@@ -27,8 +27,10 @@ from casestudies.boat.messages import (
     readings_message,
     true_pose,
 )
-from casestudies.running import command, run, say
 from terminal.command_line import CommandLine
+from terminal.connection import report_connection
+from terminal.output import say
+from terminal.signals import run_async
 
 _SHORE = 2.0  # waypoints keep this far from the map's edge
 _SEEDS = 1_000_000
@@ -113,11 +115,13 @@ async def simulate(
     from bridge.client import connect
     from bridge.stamps import header
     from casestudies.boat.lossy import LossyPublication
-    from casestudies.connection import told
     from casestudies.readiness import Readiness, readiness_served
 
     readiness = Readiness("a reading was published")
-    async with readiness_served("boat-simulator", readiness), connect(uri, on_state=told(uri)) as ros:
+    async with (
+        readiness_served("boat-simulator", readiness),
+        connect(uri, on_state=report_connection(uri)) as ros,
+    ):
         ros_version = await ros.detect_ros_version()
         poses = LossyPublication(await ros.advertise(TRUE_POSE_TOPIC, TRUE_POSE_TYPE))
         readings = LossyPublication(await ros.advertise(topic, ARRAY_TYPE if array else RAW_TYPE))
@@ -149,17 +153,14 @@ def boat_simulator(
     array: Annotated[
         bool, typer.Option("--array", help="Publish std_msgs/Float64MultiArray instead of boat_msgs/Raw.")
     ] = False,
-) -> None:
+) -> int:
     """Sail a boat about its map: publish noisy ranges and bearings, and the true pose on /boat/true_pose."""
     chosen = random.SystemRandom().randrange(_SEEDS) if seed is None else seed
     say(f"boat-simulator: seed {chosen}, {rate:g} readings a second on {topic}, {uri}")
-    run(lambda: simulate(uri, boat=Boat(chosen, speed), rate=rate, topic=topic, array=array, count=count))
-
-
-def main() -> None:
-    """The command `boat-simulator`."""
-    command(app)
+    return run_async(
+        simulate(uri, boat=Boat(chosen, speed), rate=rate, topic=topic, array=array, count=count)
+    )
 
 
 if __name__ == "__main__":
-    main()
+    app()

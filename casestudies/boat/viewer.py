@@ -1,7 +1,6 @@
 """Shows the boat's posteriors beside the truth: hears three topics, and knows nothing else of the stack."""
 
 import math
-import signal
 import sys
 from collections import deque
 from dataclasses import dataclass
@@ -13,10 +12,11 @@ import typer
 
 from bridge.errors import NoResultError
 from casestudies.boat.messages import TRUE_POSE_TOPIC
-from casestudies.errors import CaseStudyError
-from casestudies.running import command, fail, run, say
-from casestudies.written import check_writable, write_numbers
 from terminal.command_line import CommandLine
+from terminal.connection import report_connection
+from terminal.errors import ExitCode, StoppedError
+from terminal.output import check_writable, say, write_json
+from terminal.signals import run_async
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
@@ -26,8 +26,6 @@ if TYPE_CHECKING:
 
 POSITIONS_PICTURE: Final = "figure-4.4.png"
 SHARES_PICTURE: Final = "figure-4.5.png"
-_WORTH_DRAWING: Final = (NoResultError.exit_code, 128 + signal.SIGINT)
-"""Exit codes after which the pictures of what has come are drawn all the same."""
 KEPT: Final = 2000
 """Frames kept for pictures and numbers by a viewer that runs without end: a robot's may run for weeks."""
 HEADING: Final = "frame     true cell  estimated mean  distance     cycles   time (ms)"
@@ -141,14 +139,13 @@ class Viewer:
             BridgeError: no rosbridge server answers at the URI.
         """
         from bridge.client import connect
-        from casestudies.connection import told
         from casestudies.listening import listen
         from casestudies.readiness import Readiness, readiness_served
 
         readiness = Readiness("a result was shown")
         async with (
             readiness_served("boat-viewer", readiness),
-            connect(uri, on_state=told(uri)) as ros,
+            connect(uri, on_state=report_connection(uri)) as ros,
             listen(ros, truth_topic=truth_topic, truth_tolerance_s=truth_tolerance_s) as listener,
         ):
             say(f"boat-viewer: listening to {uri}")
@@ -210,7 +207,7 @@ class Viewer:
                 for line, instance in zip(self.lines, self.instances, strict=True)
             ],
         }
-        write_numbers(path, numbers)
+        write_json(path, numbers)
 
 
 class _Shown:
@@ -319,30 +316,26 @@ def boat_viewer(
     from casestudies.boat.pictures import check_pictures_possible
 
     viewer = Viewer(count)
+    if out is not None:
+        check_pictures_possible()
+        check_writable(out)
+    if numbers is not None:
+        check_writable(numbers.parent)
     try:
-        if out is not None:
-            check_pictures_possible()
-            check_writable(out)
-        if numbers is not None:
-            check_writable(numbers.parent)
-        try:
-            run(
-                lambda: viewer.watch(
-                    uri,
-                    truth_topic=truth_topic,
-                    truth_tolerance_s=truth_tolerance,
-                    first_limit_s=first_timeout,
-                    limit_s=timeout,
-                )
+        run_async(
+            viewer.watch(
+                uri,
+                truth_topic=truth_topic,
+                truth_tolerance_s=truth_tolerance,
+                first_limit_s=first_timeout,
+                limit_s=timeout,
             )
-        except typer.Exit as ended:
-            if ended.exit_code not in _WORTH_DRAWING:
-                raise
+        )
+    except (NoResultError, StoppedError) as ended:
+        if isinstance(ended, NoResultError) or ended.exit_code == ExitCode.INTERRUPTED:
             _finish(viewer, out, numbers)
-            raise
-        _finish(viewer, out, numbers)
-    except CaseStudyError as error:
-        fail(error)
+        raise
+    _finish(viewer, out, numbers)
 
 
 def _finish(viewer: Viewer, out: Path | None, numbers: Path | None) -> None:
@@ -366,10 +359,5 @@ def _finish(viewer: Viewer, out: Path | None, numbers: Path | None) -> None:
             print(f"wrote {path}", flush=True)
 
 
-def main() -> None:
-    """The command `boat-viewer`."""
-    command(app)
-
-
 if __name__ == "__main__":
-    main()
+    app()

@@ -17,11 +17,11 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from casestudies.errors import CaseStudyError, DataFileError, OutputError
+from casestudies.errors import DataFileError
 from casestudies.mrclam.recording import LANDMARKS
-from casestudies.running import command, fail, say
-from casestudies.written import check_writable
 from terminal.command_line import CommandLine
+from terminal.errors import OutputError
+from terminal.output import check_writable, say
 
 LARGEST_FILE: Final = 1 << 28
 """Bytes of a file that are read at most; the largest of the collection have some 20 million."""
@@ -342,33 +342,25 @@ def convert(
 
     A line for each second in which a robot moved less than 0.12 m and saw at least three landmarks.
     """
-    try:
-        subjects, positions = read_barcodes(folder), read_positions(folder)
-        robots = robot or robots_in(folder)
-        check_writable(output)
-        write_landmarks(output / "landmarks.csv", positions)
-        print(f"wrote {output / 'landmarks.csv'}: {len(positions)} landmarks", flush=True)
-        for number in robots:
-            measured, misread = read_measured(folder, number, subjects)
-            kept, left_out = windows(read_track(folder, number), measured)
-            reasons = ", ".join(f"{count} {reason}" for reason, count in sorted(left_out.items())) or "none"
-            said = f"{len(kept)} seconds; left out: {reasons}"
-            if misread:
-                said += f"; misread barcodes: {misread}"
-            if not kept:
-                say(f"warning: robot {number}: nothing to write, {said}")
-                continue
-            path = output / f"{prefix_of(folder)}_robot{number}.csv"
-            write_recording(path, kept, sorted(positions))
-            print(f"wrote {path}: {said}", flush=True)
-    except CaseStudyError as error:
-        fail(error)
-
-
-def main() -> None:
-    """The command line of this module."""
-    command(app)
+    subjects, positions = read_barcodes(folder), read_positions(folder)
+    robots = robot or robots_in(folder)
+    check_writable(output)
+    write_landmarks(output / "landmarks.csv", positions)
+    print(f"wrote {output / 'landmarks.csv'}: {len(positions)} landmarks", flush=True)
+    for number in robots:
+        measured, misread = read_measured(folder, number, subjects)
+        kept, left_out = windows(read_track(folder, number), measured)
+        reasons = ", ".join(f"{count} {reason}" for reason, count in sorted(left_out.items())) or "none"
+        said = f"{len(kept)} seconds; left out: {reasons}"
+        if misread:
+            said += f"; misread barcodes: {misread}"
+        if not kept:
+            say(f"warning: robot {number}: nothing to write, {said}")
+            continue
+        path = output / f"{prefix_of(folder)}_robot{number}.csv"
+        write_recording(path, kept, sorted(positions))
+        print(f"wrote {path}: {said}", flush=True)
 
 
 if __name__ == "__main__":
-    main()
+    app()

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 from bridge.errors import BadResultError, NoResultError
-from casestudies.errors import CaseStudyError
 from casestudies.mrclam.recording import (
     MAP_FRAME,
     SIGHTINGS_MSG,
@@ -26,9 +25,10 @@ from casestudies.mrclam.recording import (
     read_recording,
     sightings_message,
 )
-from casestudies.running import command, fail, run, say
-from casestudies.written import check_writable, write_numbers
 from terminal.command_line import CommandLine
+from terminal.connection import report_connection
+from terminal.output import check_writable, say, write_json
+from terminal.signals import run_async
 
 if TYPE_CHECKING:
     from bridge.client import Publication
@@ -111,11 +111,10 @@ async def play(
         BridgeError: no rosbridge server answers at the URI, or it was lost.
     """
     from bridge.client import connect
-    from casestudies.connection import told
     from casestudies.listening import listen
 
     played: list[PlayedFrame] = []
-    async with connect(uri, on_state=told(uri)) as ros, listen(ros) as listener:
+    async with connect(uri, on_state=report_connection(uri)) as ros, listen(ros) as listener:
         version = await ros.detect_ros_version()
         publication = await ros.advertise(topic, SIGHTINGS_TYPE)
         for frame in frames:
@@ -213,7 +212,7 @@ def _write_numbers(path: Path, played: Sequence[PlayedFrame]) -> None:
         "distances_m": [frame.distance() for frame in played],
         "cycles": [frame.cycles for frame in played],
     }
-    write_numbers(path, numbers)
+    write_json(path, numbers)
 
 
 app = CommandLine()
@@ -245,40 +244,30 @@ def player(
         return
     if recording is None:
         raise typer.BadParameter("name a file like ds1_robot3.csv", param_hint="RECORDING")
-    try:
-        frames = read_recording(recording)[:count]
-        if numbers is not None:
-            check_writable(numbers.parent)
-        played: list[PlayedFrame] = []
+    frames = read_recording(recording)[:count]
+    if numbers is not None:
+        check_writable(numbers.parent)
+    played: list[PlayedFrame] = []
 
-        def heard(frame: PlayedFrame) -> None:
-            played.append(frame)
-            print(_line(frame), flush=True)
+    def heard(frame: PlayedFrame) -> None:
+        played.append(frame)
+        print(_line(frame), flush=True)
 
-        async def body() -> None:
-            say(f"player: {len(frames)} frames of {recording} to {topic}, {uri}")
-            print(_HEADING, flush=True)
-            await play(
-                uri, frames, topic=topic, first_timeout_s=first_timeout, timeout_s=timeout, on_frame=heard
-            )
+    async def body() -> None:
+        say(f"player: {len(frames)} frames of {recording} to {topic}, {uri}")
+        print(_HEADING, flush=True)
+        await play(uri, frames, topic=topic, first_timeout_s=first_timeout, timeout_s=timeout, on_frame=heard)
 
-        run(body)
-        without = sum(frame.posterior is None for frame in played)
-        print(
-            f"{len(played)} frames, {without} without a result, median distance "
-            f"{median_distance(played):.3f} m (a frame without a result counts as {LOST_DISTANCE:g} m)",
-            flush=True,
-        )
-        if numbers is not None:
-            _write_numbers(numbers, played)
-    except CaseStudyError as error:
-        fail(error)
-
-
-def main() -> None:
-    """The command line of this module."""
-    command(app)
+    run_async(body())
+    without = sum(frame.posterior is None for frame in played)
+    print(
+        f"{len(played)} frames, {without} without a result, median distance "
+        f"{median_distance(played):.3f} m (a frame without a result counts as {LOST_DISTANCE:g} m)",
+        flush=True,
+    )
+    if numbers is not None:
+        _write_numbers(numbers, played)
 
 
 if __name__ == "__main__":
-    main()
+    app()

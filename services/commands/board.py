@@ -24,11 +24,13 @@ from services.settings import endpoint_in, load_settings
 from services.sockets.serving import endpoint_from
 from services.sockets.status import BoardStatus, ProcessStatus, status_thread
 from services.supervision.child import RESTARTS, RESTARTS_WITHIN, how_it_ended
-from services.supervision.parent import PARENT_VARIABLE, end_with_parent
+from services.supervision.parent import end_with_parent, leave_private_directory
 from services.supervision.private_directory import remove_stale_sockets
-from terminal.errors import exit_code_of
-from terminal.logs import say
-from terminal.running import ends_well, make_app, raise_on_signals, stopped_by
+from terminal.command_line import CommandLine
+from terminal.ending import PARENT_VARIABLE
+from terminal.errors import StoppedError, exit_code_of
+from terminal.output import say
+from terminal.signals import check_signals, stopped_by
 
 
 def serve_one(
@@ -143,6 +145,7 @@ class BoardProcesses:
             for at in range(len(self._endpoints)):
                 self._fork(at)
             while True:
+                check_signals()
                 pid, status = os.wait()
                 at = self._started.pop(pid, -1)
                 if at >= 0:
@@ -170,6 +173,8 @@ class BoardProcesses:
                 on_ready=lambda: self._ready(at),
             )
             code = 128 + ended_by if ended_by else 0
+        except StoppedError as stopped:
+            code = stopped.exit_code
         except BaseException as error:  # the fork must never run on in its parent's code
             code = exit_code_of(error)
             say(f"error: board {at}: {error}")
@@ -230,15 +235,14 @@ class BoardProcesses:
                 Path(each.path).unlink()
 
 
-app = make_app(
-    "Emulate boards of the mini-cluster. They start blank; pcie-app or the loader programs them.\n\n"
+app = CommandLine(
+    help="Emulate boards of the mini-cluster. They start blank; pcie-app or the loader programs them.\n\n"
     "`board --listen unix:/tmp/b/board0.sock` is one board; `board --boards 4 --directory /tmp/b` is four, "
     "each a process of its own."
 )
 
 
 @app.command(help=app.info.help)
-@ends_well
 def board(
     listen: options.Listen = None,
     index: Annotated[int, typer.Option(min=0, help="The board's number, for its messages.")] = 0,
@@ -255,7 +259,6 @@ def board(
 ) -> int:
     """Emulate boards of the mini-cluster."""
     end_with_parent()
-    raise_on_signals()
     run_directory = load_settings().run_directory
     if (listen is None) == (boards is None):
         msg = "give either --listen ENDPOINT for one board, or --boards N --directory DIR for several"
@@ -275,6 +278,7 @@ def board(
     from machines.kernel import warm_up
 
     warm_up()
+    check_signals()
     endpoint = endpoint_from(listen or "", "--listen")
     ended_by = serve_one(
         endpoint,
@@ -294,6 +298,7 @@ def main() -> None:
         app()
     except SystemExit as end:
         # nothing is open any more; to take the compiled kernels down in order would take half a second
+        leave_private_directory()
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(end.code if isinstance(end.code, int) else int(end.code is not None))

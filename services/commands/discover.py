@@ -11,17 +11,17 @@ from rich.markup import escape
 from rich.table import Table
 
 from bridge.discovery import Robot, UnknownRobotError
+from terminal.command_line import CommandLine
 from terminal.one_line import one_line
-from terminal.running import ends_well, make_app, run_async
+from terminal.signals import run_async
 
-app = make_app(
-    "List the rosbridge servers that announce themselves on this network.\n\n`discover`\n\n"
+app = CommandLine(
+    help="List the rosbridge servers that announce themselves on this network.\n\n`discover`\n\n"
     "A name that it lists can be used instead of an address: `--uri robot:NAME`."
 )
 
 
 @app.command(help=app.info.help)
-@ends_well
 def discover(
     timeout: Annotated[
         float,

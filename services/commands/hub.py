@@ -19,19 +19,20 @@ from services.errors import SettingsError
 from services.settings import load_settings
 from services.sockets.status import HubStatus, ProcessStatus, status_served
 from services.supervision.parent import end_with_parent
-from terminal.logs import log_libraries, say
+from terminal.command_line import CommandLine
+from terminal.logs import log_libraries
 from terminal.one_line import shown
-from terminal.running import ends_well, make_app, run_async
+from terminal.output import say
+from terminal.signals import run_async
 
-app = make_app(
-    "Serve rosbridge without ROS: topics, services, actions, parameters and rosapi.\n\n`hub --port 9090`\n\n"
+app = CommandLine(
+    help="Serve rosbridge without ROS: topics, services, actions, parameters and rosapi.\n\n`hub --port 9090`\n\n"
     "On another address than this machine's own it wants TLS and tokens:\n\n"
     "`hub --host 0.0.0.0 --tls-cert cert.pem --tls-key key.pem --token-file tokens.txt`"
 )
 
 
 @app.command(help=app.info.help)
-@ends_well
 def hub(
     host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port; 0 takes any free one.")] = 9090,

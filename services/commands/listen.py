@@ -23,8 +23,9 @@ from services.printed.result_file import ResultFile, open_result_file, record
 from services.printed.result_picture import ROWS, Axis, axes_of, in_colour, picture, printable
 from services.settings import LONGEST_S, Settings, load_settings
 from services.sockets.serving import deployment_for
-from terminal.logs import put_json, say
-from terminal.running import ends_well, make_app, run_async
+from terminal.command_line import CommandLine
+from terminal.output import put_json, say
+from terminal.signals import run_async
 from toolchain.deployment import Deployment
 
 _QUEUE_SIZE: Final = 1024
@@ -208,8 +209,8 @@ def _drawing() -> Iterator[Show]:
                 live.update(drawn(heard, axes), refresh=True)
 
 
-app = make_app(
-    "Print, draw or save the posteriors of a running stack.\n\n"
+app = CommandLine(
+    help="Print, draw or save the posteriors of a running stack.\n\n"
     "`listen --uri ws://robot:9090 --count 10`\n\n"
     "With `-d build/boat` cells have values in their units, and the server is the deployment's. `--plot` draws each "
     "posterior in the terminal; `--save posteriors.jsonl` (or .csv, .npz) saves them."
@@ -217,7 +218,6 @@ app = make_app(
 
 
 @app.command(help=app.info.help)
-@ends_well
 def listen(
     uri: options.Uri = None,
     deployment: options.Deployment = None,

@@ -12,18 +12,17 @@ from services.commands import flags as options
 from services.settings import load_settings
 from services.sockets.serving import endpoint_from
 from services.supervision.parent import end_with_parent
-from terminal.logs import say
-from terminal.running import ends_well, make_app
+from terminal.command_line import CommandLine
+from terminal.output import say
 
-app = make_app(
-    "Program a board with an image that `toolchain build` wrote.\n\n"
+app = CommandLine(
+    help="Program a board with an image that `toolchain build` wrote.\n\n"
     "`loader build/boat/boards/board0.bm unix:/tmp/b/board0.sock`\n\n"
     "It refuses while pcie-app holds the board."
 )
 
 
 @app.command(help=app.info.help)
-@ends_well
 def loader(
     image: Annotated[Path, typer.Argument(help="Programming file (boards/*.bm of a deployment).")],
     endpoint: Annotated[str, typer.Argument(help="The board's endpoint.", metavar="ENDPOINT")],

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Concatenate, ParamSpec
+from typing import Annotated
 
 import orjson
 import typer
@@ -17,15 +15,16 @@ from services.settings import endpoint_in, load_settings
 from services.sockets.control_socket import ReloadOrder, control_socket, give_order
 from services.sockets.serving import deployment_for
 from services.supervision.parent import end_with_parent
+from terminal.command_line import CommandLine
 from terminal.errors import ExitCode
 from terminal.one_line import one_line
-from terminal.running import ends_well, make_app, run_async
+from terminal.signals import run_async
 
 RELOAD_TIME = 600.0
 """Seconds that `master reload` waits for its answer."""
 
-app = make_app(
-    "Move readings to the boards and posteriors back to the robot.\n\n"
+app = CommandLine(
+    help="Move readings to the boards and posteriors back to the robot.\n\n"
     "`master --once -d build/boat --uri ws://robot:9090` computes one frame; `master --loop` goes on until Ctrl-C.\n\n"
     "`master reload -d build/boat2` has a running one take another deployment of the same shape.\n\n"
     "It starts what is not running (subscriber, publisher, pcie-app, emulated boards) and ends it again. "
@@ -33,25 +32,7 @@ app = make_app(
 )
 
 
-Parameters = ParamSpec("Parameters")
-
-
-def _unless_another(
-    command: Callable[Concatenate[typer.Context, Parameters], int],
-) -> Callable[..., None]:
-    """Run a command that has commands of its own, where none of those was given."""
-    run = ends_well(command)
-
-    @functools.wraps(command)
-    def unless(context: typer.Context, *args: Parameters.args, **kwargs: Parameters.kwargs) -> None:
-        if context.invoked_subcommand is None:
-            run(context, *args, **kwargs)
-
-    return unless
-
-
 @app.callback(help=app.info.help, invoke_without_command=True)
-@_unless_another
 def master(
     context: typer.Context,
     once: Annotated[bool, typer.Option("--once", help="Compute the first complete frame, then end.")] = False,
@@ -88,7 +69,8 @@ def master(
     ] = False,
 ) -> int:
     """Move readings to the boards and posteriors back to the robot."""
-    del context  # it says whether there is something to do here at all
+    if context.invoked_subcommand is not None:
+        return ExitCode.DONE
     end_with_parent()
     connected = {}
     if connect is not None:
@@ -127,7 +109,6 @@ def master(
 
 
 @app.command("reload")
-@ends_well
 def reload_(
     deployment: options.Deployment = None,
     directory: Annotated[

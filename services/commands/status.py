@@ -18,9 +18,10 @@ from services.printed.stack_status import SilentProcess, StackStatus, plain, scr
 from services.settings import load_settings
 from services.sockets.status import ProcessStatus, read_process_status
 from services.supervision.private_directory import DIRECTORY_PREFIX
+from terminal.command_line import CommandLine
 from terminal.errors import ExitCode
 from terminal.health import SUFFIX, NoHealthError
-from terminal.running import ends_well, make_app, run_async
+from terminal.signals import run_async
 
 ANSWER_TIME = 1.0
 """Seconds that all processes together have to answer."""
@@ -161,15 +162,14 @@ async def show(directory: Path, *, watch: bool, json: bool) -> int:
     raise SettingsError(msg)
 
 
-app = make_app(
-    "Show the whole stack in one screen: processes, boards and images, last frame, rates, losses by reason.\n\n"
+app = CommandLine(
+    help="Show the whole stack in one screen: processes, boards and images, last frame, rates, losses by reason.\n\n"
     "`status` finds the one run of this user; `status --directory DIR` asks the processes with that BM_RUN_DIRECTORY.\n\n"
     "Exit codes: 0 all is ready, 6 something is not, 2 nothing was found."
 )
 
 
 @app.command(help=app.info.help)
-@ends_well
 def status(
     directory: Annotated[
         Path | None,

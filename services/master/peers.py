@@ -31,7 +31,7 @@ from services.sockets.status import PeerStatus
 from services.supervision.child import RESTARTS, RESTARTS_WITHIN, Child, end_all, own_command
 from services.supervision.private_directory import PrivateDirectory
 from terminal.errors import ExitCode
-from terminal.logs import say
+from terminal.output import say
 
 if TYPE_CHECKING:
     from services.master.fused import FusedEnd  # with all that the three services import

@@ -45,7 +45,8 @@ from services.sockets.records import (
 from services.sockets.status import FrameCounts, ProcessStatus, reasons, seconds_since, status_served
 from services.supervision.child import RESTARTS, RESTARTS_WITHIN
 from terminal.errors import ExitCode
-from terminal.logs import get_logger, say
+from terminal.logs import get_logger
+from terminal.output import say
 from toolchain.deployment import Deployment
 
 RESULTS_UNDER_WAY = 8

@@ -47,9 +47,10 @@ from services.sockets.status import (
     status_thread,
 )
 from services.supervision.parent import end_with_parent
+from terminal.command_line import CommandLine
 from terminal.errors import ExitCode, exit_code_of
 from terminal.logs import get_logger
-from terminal.running import ends_well, make_app, raise_on_signals
+from terminal.signals import check_signals
 from toolchain.deployment import Deployment
 
 ROLE = "pcie-app"
@@ -136,6 +137,7 @@ class PcieApp:
             try:
                 self._progress.ready = Ready(self._boards.open())
                 while True:
+                    check_signals()
                     for key, _ in self._selector.select(TICK):
                         if key.fileobj is listener:
                             self._accept(listener)
@@ -249,8 +251,8 @@ class PcieApp:
             self._send(Notice("info", f"board {board} is back, programmed"))
 
 
-app = make_app(
-    "Drive the boards of a mini-cluster.\n\n"
+app = CommandLine(
+    help="Drive the boards of a mini-cluster.\n\n"
     "Alone it reads readings from standard input (what `subscriber --deployment` prints) and prints counts:\n\n"
     "`echo '{\"addresses\": [71, 50, 50, 45, 18, 72]}' | pcie-app -d build/boat --boards unix:/tmp/b/board0.sock,...`\n\n"
     "With `--listen ENDPOINT` it serves a master."
@@ -258,7 +260,6 @@ app = make_app(
 
 
 @app.command(help=app.info.help)
-@ends_well
 def pcie_app(
     deployment: options.Deployment = None,
     boards: options.Boards = None,
@@ -277,7 +278,6 @@ def pcie_app(
 ) -> int:
     """Drive the boards of a mini-cluster."""
     end_with_parent()
-    raise_on_signals()
     settings = load_settings(
         deployment=deployment,
         boards=boards,

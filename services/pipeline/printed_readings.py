@@ -10,7 +10,7 @@ from bridge.client import Ros, connect
 from bridge.fields import Field
 from services.pipeline.frames import FrameAssembler
 from services.settings import Settings
-from terminal.logs import put_json
+from terminal.output import put_json
 from toolchain.deployment import Deployment, Source
 
 _RECEIVED_QUEUE = 64

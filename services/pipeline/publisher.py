@@ -58,9 +58,11 @@ from services.sockets.status import (
     why_not_connected,
 )
 from services.supervision.parent import end_with_parent
+from terminal.command_line import CommandLine
 from terminal.errors import exit_code_of
-from terminal.logs import get_logger, say
-from terminal.running import ends_well, make_app, run_async
+from terminal.logs import get_logger
+from terminal.output import say
+from terminal.signals import run_async
 from toolchain.deployment import Deployment
 
 ROLE = "publisher"
@@ -477,8 +479,8 @@ async def publish_lines(settings: Settings, deployment: Deployment) -> int:
     return 0
 
 
-app = make_app(
-    "Publish posteriors over rosbridge.\n\n"
+app = CommandLine(
+    help="Publish posteriors over rosbridge.\n\n"
     "Alone it reads results from standard input, one JSON value a line (what `pcie-app` prints, or arrays of probabilities):\n\n"
     "`subscriber -d build/boat | pcie-app -d build/boat --boards ... | publisher -d build/boat --uri ws://robot:9090`\n\n"
     "With `--listen ENDPOINT` it serves a master."
@@ -486,7 +488,6 @@ app = make_app(
 
 
 @app.command(help=app.info.help)
-@ends_well
 def publisher(
     deployment: options.Deployment = None,
     uri: options.Uri = None,

@@ -14,7 +14,7 @@ from services.errors import InputLineError
 from services.pipeline.mini_cluster import Boards
 from services.pipeline.results import REASON_WORDS
 from services.sockets.records import Addresses, Frame
-from terminal.logs import say
+from terminal.output import say
 
 
 class LineReading(msgspec.Struct):

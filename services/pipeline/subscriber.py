@@ -46,9 +46,11 @@ from services.sockets.status import (
     why_not_connected,
 )
 from services.supervision.parent import end_with_parent
+from terminal.command_line import CommandLine
 from terminal.errors import exit_code_of
-from terminal.logs import get_logger, say
-from terminal.running import ends_well, make_app, run_async
+from terminal.logs import get_logger
+from terminal.output import say
+from terminal.signals import run_async
 from toolchain.deployment import Deployment, Source
 
 ROLE = "subscriber"
@@ -294,8 +296,10 @@ class Subscriber:
             )
 
 
-app = make_app(
-    "Take variables out of a ROS topic over rosbridge.\n\n"
+app = CommandLine(
+    help="Take variables out of a ROS topic over rosbridge.
+
+"
     "Alone it prints them, one JSON object a line:\n\n"
     "`subscriber --uri ws://robot:9090 --topic /boat/sensors --type boat_msgs/Sensors --variables D1,B1`\n\n"
     "With `--deployment DIR` it prints addresses as `pcie-app` reads them; "
@@ -304,7 +308,6 @@ app = make_app(
 
 
 @app.command(help=app.info.help)
-@ends_well
 def subscriber(
     deployment: options.Deployment = None,
     uri: options.Uri = None,

@@ -18,7 +18,7 @@ from pcie_shim.errors import PcieShimError
 from services.errors import ControlError, NotReloadedError, ReportedError
 from services.supervision.private_directory import CONTROL_SUFFIX
 from terminal.errors import ExitCode, exit_code_of
-from terminal.logs import say
+from terminal.output import say
 
 ORDER_LIMIT = 1 << 14
 """Bytes of the longest order: a folder's path of 4096 characters, each escaped, fits."""

@@ -14,9 +14,10 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from services.errors import ReportedError, StackError
-from services.supervision.parent import DIRECTORY_VARIABLE, PARENT_VARIABLE
+from services.supervision.parent import DIRECTORY_VARIABLE
+from terminal.ending import PARENT_VARIABLE
 from terminal.errors import ExitCode
-from terminal.logs import say
+from terminal.output import say
 
 RUN_DIRECTORY_VARIABLE = "BM_RUN_DIRECTORY"
 """Environment variable with the folder of status sockets (the setting `run_directory`)."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import ctypes
 import os
@@ -11,10 +12,8 @@ import time
 from pathlib import Path
 
 from services.supervision.private_directory import COPY_PREFIX, has_master, remove_stale_sockets
-from terminal.errors import ExitCode
-
-PARENT_VARIABLE = "ROSBAYES_PARENT"
-"""Environment variable with the process number of the parent; `Child` sets it."""
+from terminal.ending import PARENT_VARIABLE
+from terminal.signals import stopped_by
 
 DIRECTORY_VARIABLE = "ROSBAYES_DIRECTORY"
 """Environment variable with the run's private directory, which the last process to end removes."""
@@ -30,24 +29,21 @@ def ask_for_end_with_parent() -> None:
 
 
 def end_with_parent() -> None:
-    """In a child: have the kernel send SIGTERM when the parent ends, even by SIGKILL.
+    """In a child: end when the parent ends, even by SIGKILL, and remove the run's directory at the end.
 
     Do nothing in a process that has no parent of ours.
+
+    Raises:
+        StoppedError: The parent has already ended.
     """
     parent = os.environ.get(PARENT_VARIABLE)
     if parent is None or not parent.isdigit():
         return
-    # until the command installs its own handlers
-    signal.signal(signal.SIGTERM, _end_early)
+    atexit.register(leave_private_directory)
     ask_for_end_with_parent()
     # the parent may have ended before the kernel was asked
     if os.getppid() != int(parent):
-        _end_early(signal.SIGTERM, None)
-
-
-def _end_early(_number: int, _frame: object) -> None:
-    leave_private_directory()
-    os._exit(ExitCode.TERMINATED)
+        raise stopped_by(signal.SIGTERM)
 
 
 def leave_private_directory() -> None:

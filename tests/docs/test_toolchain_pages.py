@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import typer
 from pydantic import BaseModel
-from typer.testing import CliRunner
 
+from tests.command_runner import invoke
 from toolchain.building.build import assemble
 from toolchain.building.options import BuildOptions
 from toolchain.building.sources_file import read_sources
@@ -100,7 +100,7 @@ def test_the_models_page_works_as_printed(tmp_path, monkeypatch):
     commands = re.findall(r"^    (toolchain .*)$", MODELS, re.MULTILINE)
     assert len(commands) == 7
     for command in commands:
-        result = CliRunner().invoke(app, shlex.split(command)[1:])
+        result = invoke(app, shlex.split(command)[1:])
         assert result.exit_code == 0, f"{command}\n{result.stderr}"
     text = (tmp_path / "mymodel" / "model.py").read_text()
     text = text.replace("    return joint.ask(searched=[place], known=[distance, door])\n", "")
@@ -178,13 +178,13 @@ def test_inspect_explains_such_a_deployment(tmp_path, mode):
     (example,) = re.findall(r"```python\n(# disparity/model\.py.*?)```", page, re.DOTALL)
     (tmp_path / "disparity").mkdir()
     (tmp_path / "disparity/model.py").write_text(example)
-    runner = CliRunner()
+
     flags = ["--uri", "ws://localhost:9090", "--topic", "/costs", "--type", "stereo/Costs"]
     flags += ["--sensor-mode", mode, "--replicas", "3"]
     out = tmp_path / "out"
-    built = runner.invoke(app, ["build", str(tmp_path / "disparity"), "-o", str(out), *flags])
+    built = invoke(app, ["build", str(tmp_path / "disparity"), "-o", str(out), *flags])
     assert built.exit_code == 0, built.output
-    looked = runner.invoke(app, ["inspect", str(out), "--frames", "5"])
+    looked = invoke(app, ["inspect", str(out), "--frames", "5"])
     if mode == "threshold":
         assert looked.exit_code == 2
         assert "--model" in looked.stderr
@@ -193,11 +193,11 @@ def test_inspect_explains_such_a_deployment(tmp_path, mode):
         assert "Each board holds 3 of these machines around the same generators" in looked.stdout
         assert "5 frames of readings for 3 replicas, drawn from" in looked.stdout
         assert "A frame is 3 posteriors and ends with the last of them" in looked.stdout
-    named = runner.invoke(
+    named = invoke(
         app, ["inspect", str(out), "--frames", "5", "--model", str(tmp_path / "disparity"), "--json"]
     )
     assert named.exit_code == 0, named.output
     # lines that all read the same would have nothing to be wrong about
     assert 0.001 < json.loads(named.stdout)["accuracy"]["machine"]["total_variation"]["value"] < 0.1
-    recorded = runner.invoke(app, ["inspect", str(out), "--readings", str(tmp_path / "r.csv")])
+    recorded = invoke(app, ["inspect", str(out), "--readings", str(tmp_path / "r.csv")])
     assert recorded.exit_code == 2

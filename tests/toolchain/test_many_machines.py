@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from typer.testing import CliRunner
 
 from machines.bm1 import Start
 from machines.encode import decode_code
@@ -17,6 +16,7 @@ from machines.kernel import make_kernel
 from machines.parameters import RngKind, SensorMode
 from machines.posterior import posterior
 from pcie_shim.programming_file import read_image
+from tests.command_runner import invoke
 from toolchain.analysis.accuracy.emulation import EmulatedBoards, one_replica
 from toolchain.analysis.accuracy.measurement import measure
 from toolchain.analysis.accuracy.readings import readings_of_lines, sample_readings
@@ -309,12 +309,12 @@ def model():
     (tmp_path / "case/model.py").write_text(source)
     flags = ["--uri", "ws://r:9090", "--topic", "/t", "--type", "a/B"]
     flags += ["--sensor-mode", options.sensor_mode.value, "--replicas", str(options.replicas)]
-    runner = CliRunner()
+
     out = tmp_path / "out"
-    built = runner.invoke(app, ["build", str(tmp_path / "case"), "-o", str(out), *flags])
+    built = invoke(app, ["build", str(tmp_path / "case"), "-o", str(out), *flags])
     assert built.exit_code == 0, built.output
     before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
-    again = runner.invoke(app, ["regenerate", "memories", str(out), "--model", str(tmp_path / "case")])
+    again = invoke(app, ["regenerate", "memories", str(out), "--model", str(tmp_path / "case")])
     assert again.exit_code == 0, again.output
     assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
 

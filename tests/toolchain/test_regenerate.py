@@ -3,9 +3,9 @@
 import shutil
 
 import pytest
-from typer.testing import CliRunner
 
 from pcie_shim.programming_file import read_image
+from tests.command_runner import invoke
 from toolchain.commands.main import app
 from toolchain.deployment import load_deployment
 from toolchain.errors import DamagedDeploymentError
@@ -29,13 +29,13 @@ TARGET = ["--uri", "ws://robot:9090", "--topic", "/readings", "--type", "std_msg
 def built(case):
     out = case.parent / "out"
     options = ["--partitions", "2", "--scale", "column", "--bits", "D1=6", "--prob-bits", "7"]
-    result = CliRunner().invoke(app, ["build", str(case), "-o", str(out), *TARGET, *options])
+    result = invoke(app, ["build", str(case), "-o", str(out), *TARGET, *options])
     assert result.exit_code == 0, result.stderr
     return out
 
 
 def regenerate(part, built, *arguments, code=0):
-    result = CliRunner().invoke(app, ["regenerate", part, str(built), *map(str, arguments)])
+    result = invoke(app, ["regenerate", part, str(built), *map(str, arguments)])
     assert result.exit_code == code, result.output
     return result
 
@@ -93,7 +93,7 @@ def test_memories_from_the_model(case, built):
     assert [variable.bits for variable in deployment.variables] == [6, 4]
     once = case.parent / "once"
     options = ["--partitions", "2", "--scale", "column", "--bits", "D1=6", "--prob-bits", "7"]
-    CliRunner().invoke(app, ["build", str(case), "-o", str(once), *TARGET, *options, "--set", "sigma=0.5"])
+    invoke(app, ["build", str(case), "-o", str(once), *TARGET, *options, "--set", "sigma=0.5"])
     same = contents(once)
     for name in ("deployment.toml", "report.txt"):  # topics and hashes differ, what was lost does not
         del same[name]
@@ -155,7 +155,7 @@ def test_an_edit_by_hand_is_kept_where_the_images_agree(built):
 @pytest.mark.parametrize("options", [(), ("--device", "proce-v-d8")], ids=["boards as said", "on a device"])
 def test_the_same_model_changes_nothing(case, options):
     out = case.parent / "on_device"
-    result = CliRunner().invoke(app, ["build", str(case), "-o", str(out), *TARGET, *options])
+    result = invoke(app, ["build", str(case), "-o", str(out), *TARGET, *options])
     assert result.exit_code == 0, result.stderr
     assert ("lines fit one" in (out / "report.txt").read_text()) == bool(options)
     before = contents(out)
@@ -249,7 +249,7 @@ def test_no_deployment_or_a_damaged_one(built, part):
 
 def test_an_emulated_machine_has_no_project(case):
     out = case.parent / "out"
-    CliRunner().invoke(app, ["build", str(case), "-o", str(out), *TARGET, "--rng", "ideal"])
+    invoke(app, ["build", str(case), "-o", str(out), *TARGET, "--rng", "ideal"])
     result = regenerate("project", out)
     assert result.stdout == ""
     assert "there is no project" in result.stderr

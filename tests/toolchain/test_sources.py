@@ -3,10 +3,10 @@
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from typer.testing import CliRunner
 
 from bridge.errors import PathError
 from bridge.fields import parse_path
+from tests.command_runner import invoke
 from toolchain.building.sources_file import read_sources
 from toolchain.commands.main import app
 from toolchain.deployment import Variable, deployment_hash, load_deployment, write_deployment
@@ -57,7 +57,7 @@ def build(tmp_path, *flags):
     case = tmp_path / "case"
     case.mkdir(exist_ok=True)
     (case / "model.py").write_text(MODEL)
-    return CliRunner().invoke(app, ["build", str(case), "-o", str(tmp_path / "out"), *flags])
+    return invoke(app, ["build", str(case), "-o", str(tmp_path / "out"), *flags])
 
 
 def test_a_build_from_several_topics(tmp_path, written):

@@ -1,9 +1,4 @@
-"""The `toolchain` command (thesis 3.4): its subcommands, and its end on a signal."""
-
-import signal
-from types import FrameType
-
-import typer
+"""The `toolchain` command (thesis 3.4) and its subcommands."""
 
 from terminal.command_line import CommandLine
 from toolchain.commands import regenerate
@@ -25,15 +20,3 @@ add_commands(app, build, check, inspect, explore, fit, new)
 @app.callback()
 def toolchain() -> None:
     """From a model, in Python or in a network's file, to everything a Bayesian machine needs."""
-
-
-def main() -> None:
-    """Run the `toolchain` command; SIGINT ends it with 130 and SIGTERM with 143."""
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, _end)
-    app()
-
-
-def _end(number: int, _frame: FrameType | None) -> None:
-    typer.echo(f"error: ended by {signal.Signals(number).name}; what was asked for is not complete", err=True)
-    raise SystemExit(128 + number)

@@ -7,13 +7,12 @@ from dataclasses import fields, is_dataclass
 from typing import Any, get_type_hints
 
 from terminal.command_line import CommandLine
-from terminal.refusals import one_sentence
 
 
 def add_commands(app: CommandLine, *commands: Callable[..., None]) -> None:
     """Add functions to a command line, each under its own name."""
     for command in commands:
-        app.command()(one_sentence()(expand_flags(command)))
+        app.command()(expand_flags(command))
 
 
 def expand_flags(command: Callable[..., None]) -> Callable[..., None]:

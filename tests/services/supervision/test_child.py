@@ -75,7 +75,7 @@ def test_a_line_is_passed_on_while_the_child_runs(run, capsys):
     async def until_said():
         one = child("import sys, time; print('ready', file=sys.stderr, flush=True); time.sleep(60)")
         await one.start()
-        while capsys.readouterr().err != "ready\n":
+        while "ready\n" not in capsys.readouterr().err:
             await asyncio.sleep(0.01)
         assert await end_all([one], PATIENCE) == []
 

@@ -43,9 +43,10 @@ asyncio.run(main())
         time.sleep(0.02)
 
 
-KILLED_IN_PART = """
+KILLED_IN_PART = '''
 import ctypes, os, platform, socket, subprocess, sys, threading, time
-from services.supervision.parent import DIRECTORY_VARIABLE, PARENT_VARIABLE
+from services.supervision.parent import DIRECTORY_VARIABLE
+from terminal.ending import PARENT_VARIABLE
 from services.supervision.private_directory import COPY_PREFIX, PrivateDirectory
 directory = PrivateDirectory().path
 (directory / f"{COPY_PREFIX}3").mkdir()
@@ -53,14 +54,22 @@ listener = socket.socket(socket.AF_UNIX)
 listener.bind(str(directory / "master.status.sock"))
 listener.listen()
 variables = {PARENT_VARIABLE: str(os.getpid()), DIRECTORY_VARIABLE: str(directory)}
-code = "import time; from services.supervision.parent import end_with_parent; end_with_parent(); print(flush=True); time.sleep(100)"
+code = """
+import time
+from services.supervision.parent import end_with_parent
+from terminal.signals import raise_on_signals
+raise_on_signals()
+end_with_parent()
+print(flush=True)
+time.sleep(100)
+"""
 child = subprocess.Popen([sys.executable, "-c", code], env=os.environ | variables, stdout=subprocess.PIPE)
 child.stdout.readline()
 print(child.pid, directory, flush=True)
 threading.Thread(target=lambda: (time.sleep(1), os._exit(0))).start()
 exit_of_this_thread = {"x86_64": 60, "aarch64": 93}[platform.machine()]
 ctypes.CDLL(None).syscall(exit_of_this_thread, 0)
-"""
+'''
 
 
 def test_a_parent_of_which_a_thread_still_dies_is_waited_for():

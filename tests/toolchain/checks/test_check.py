@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from typer.testing import CliRunner
 
 from machines.bm1 import Start, StopReason
 from machines.parameters import PriorMode, RngKind, RngReset, SensorMode
 from machines.reference import ReferenceBM1
+from tests.command_runner import invoke
 from toolchain.building.build import assemble, build_deployment
 from toolchain.building.options import BuildOptions
 from toolchain.checks.check import check_deployment, check_model
@@ -478,7 +478,7 @@ def test_a_damaged_deployment(deployment):
 
 
 def check(*arguments):
-    return CliRunner().invoke(app, ["check", *map(str, arguments)])
+    return invoke(app, ["check", *map(str, arguments)])
 
 
 @pytest.fixture

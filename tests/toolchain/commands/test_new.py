@@ -9,8 +9,8 @@ import sys
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
+from tests.command_runner import invoke
 from toolchain.commands.main import app
 from toolchain.deployment import load_deployment
 from toolchain.deployment.address import to_address
@@ -34,7 +34,7 @@ runpy.run_path(sys.argv[1])
 
 
 def run(*arguments):
-    return CliRunner().invoke(app, list(arguments))
+    return invoke(app, list(arguments))
 
 
 @pytest.fixture

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from typer.testing import CliRunner
 
+from tests.command_runner import invoke
 from toolchain.commands.main import app
 from toolchain.errors import ModelError
 from toolchain.learning.fit import LEAST_READINGS, fit_model, locate, mixture
@@ -376,7 +376,7 @@ def corridor(tmp_path):
 
 def fit(folder, *arguments):
     command = ["fit", str(folder / "corridor"), str(folder / "learn.csv"), "--truth", "x=true_x", *arguments]
-    return CliRunner().invoke(app, command)
+    return invoke(app, command)
 
 
 def test_the_command_fits_normals_and_a_model_loads_them(corridor):
@@ -470,7 +470,7 @@ def test_fitted_on_robot_3_better_on_robot_5_than_by_hand(tmp_path):
     ]
     command += ["--reading", "range_*=range_*_m", "--reading", "bearing_*=bearing_*_rad"]
     command += ["--pool", "range_*", "--pool", "bearing_*", "--check", str(data / "ds1_robot5.csv")]
-    result = CliRunner().invoke(app, command)
+    result = invoke(app, command)
     assert result.exit_code == 0, result.stderr
     print(result.stdout)
     by_hand, fitted = (

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 import websockets
 
-from terminal.logs import put_json, say, say_lines
 from terminal.one_line import one_line, shown
+from terminal.output import put_json, say, say_lines
 
 HOSTILE = "a\nerror: all is well\r\x1b[2J\x9b31m\x07\x08\x7f\u202eend\ud800"
 HARMLESS = "a\\nerror: all is well\\r\\x1b[2J\\x9b31m\\x07\\x08\\x7f\\u202eend\\ud800"

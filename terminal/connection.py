@@ -1,0 +1,30 @@
+"""Reports of a lost connection and of its return, for the person at the terminal."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from terminal.output import say
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+
+def report_connection(uri: str) -> Callable[[str, str], None]:
+    """Return a callback for a client's `on_state` that reports each loss of the connection once, and its return.
+
+    Args:
+        uri: The server's, for the sentences.
+    """
+    lost = False
+
+    def on_state(state: str, reason: str) -> None:
+        nonlocal lost
+        if state == "reconnecting" and not lost:
+            lost = True
+            say(f"warning: rosbridge at {uri} is gone ({reason}); waiting for it")
+        elif state == "connected" and lost:
+            lost = False
+            say(f"rosbridge at {uri} is connected again")
+
+    return on_state

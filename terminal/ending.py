@@ -1,0 +1,82 @@
+"""The end of a command: every error becomes one sentence and an exit code."""
+
+from __future__ import annotations
+
+import errno
+import os
+import sys
+import traceback
+from typing import TYPE_CHECKING, Final
+
+import typer
+
+from terminal.errors import ExitCode, ReaderGoneError, StoppedError, exit_code_of
+from terminal.output import discard_output, say, say_lines
+from terminal.signals import check_signals, ignore_signals
+from terminal.usage import usage_sentence
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+PARENT_VARIABLE: Final = "ROSBAYES_PARENT"
+"""Environment variable that a process sets for its children; they end with it, and without comment."""
+
+_NO_SPACE: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO})
+_TOO_MANY_FILES: Final = frozenset({errno.EMFILE, errno.ENFILE})
+
+
+def outcome(command: Callable[[], object]) -> int:
+    """Run a command, report its failure on standard error, and return its exit code.
+
+    Only an exception that does not belong to the project (a bug) shows a traceback. Signals are ignored from then on.
+    """
+    try:
+        code = command()
+        check_signals()
+        sys.stdout.flush()  # a failure at exit could no longer be reported
+        result = int(code) if isinstance(code, int) else ExitCode.DONE
+    except BaseException as error:
+        ignore_signals()
+        return report(error)
+    ignore_signals()
+    return result
+
+
+def report(error: BaseException) -> int:
+    """Report the error that ended a command on standard error, and return its exit code."""
+    if isinstance(error, SystemExit):
+        return error.code if isinstance(error.code, int) else ExitCode.DONE
+    if isinstance(error, typer.TyperException):
+        if type(error).__name__ != "NoArgsIsHelpError":  # the help is already on the screen
+            say(f"error: {usage_sentence(error)}")
+        return ExitCode.USAGE
+    if isinstance(error, ReaderGoneError | BrokenPipeError):
+        discard_output()
+        return ExitCode.DONE
+    if isinstance(error, KeyboardInterrupt):
+        error = StoppedError(ExitCode.INTERRUPTED, "interrupted (Ctrl-C)")
+    if isinstance(error, StoppedError):
+        if PARENT_VARIABLE not in os.environ:
+            say(str(error))
+        return error.exit_code
+    if isinstance(error, OSError) and (sentence := _system_sentence(error)) is not None:
+        say(f"error: {sentence}")
+        return ExitCode.USAGE
+    if not hasattr(error, "exit_code"):
+        say_lines("".join(traceback.format_exception(error)).rstrip())
+        say("error: this is a bug in rosbayes; please report it with the lines above")
+        return ExitCode.BUG
+    say(f"error: {error}")
+    return exit_code_of(error)
+
+
+def _system_sentence(error: OSError) -> str | None:
+    """Return the sentence for a limit of the system or a file that it refuses; None if the error is a bug."""
+    if error.filename is not None:
+        return f"{error.filename}: {error.strerror}"
+    if error.errno in _NO_SPACE:
+        discard_output()
+        return f"the output can't be written: {error.strerror}; free some space, or redirect it elsewhere"
+    if error.errno in _TOO_MANY_FILES:
+        return f"this process can't open another file: {error.strerror}; raise the limit (ulimit -n), or end other programs"
+    return None

@@ -1,0 +1,116 @@
+"""Standard output and standard error: lines for people, JSON lines for programs."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import sys
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TextIO
+
+import orjson
+
+from terminal.errors import OutputError
+from terminal.one_line import lines_of, one_line
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+
+class SurvivingStream:
+    """Standard error that may disappear: a closed terminal must not end a robot's run."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        """Write a text if the stream still takes it."""
+        try:
+            return self._stream.write(text)
+        except (OSError, ValueError):
+            return len(text)
+
+    def flush(self) -> None:
+        """Flush the stream if it is still there."""
+        with contextlib.suppress(OSError, ValueError):
+            self._stream.flush()
+
+
+def say(text: str) -> None:
+    """Print one line for the user on standard error, even if that has been closed."""
+    _write(one_line(text))
+
+
+def say_lines(text: str) -> None:
+    """Print a text of several lines, such as a traceback, on standard error."""
+    _write(lines_of(text))
+
+
+def _write(text: str) -> None:
+    stream = SurvivingStream(sys.stderr)
+    stream.write(text + "\n")
+    stream.flush()
+
+
+def put_json(value: Any) -> None:
+    """Print a line of JSON on standard output, free of terminal control characters.
+
+    Raises:
+        OSError: Standard output cannot be written.
+    """
+    line = orjson.dumps(value)
+    if not line.isascii():  # orjson escapes only the control characters of ASCII
+        text = line.decode()
+        line = "".join(each if each.isprintable() else json.dumps(each)[1:-1] for each in text).encode()
+    sys.stdout.buffer.write(line + b"\n")
+    sys.stdout.buffer.flush()
+
+
+def open_standard_streams() -> None:
+    """Open /dev/null in place of a standard stream that is closed (`>&-`), lest an event loop take its number."""
+    for number, (name, mode) in enumerate((("stdin", "r"), ("stdout", "w"), ("stderr", "w"))):
+        try:
+            os.fstat(number)
+        except OSError:
+            null = os.open(os.devnull, os.O_RDWR)
+            if null != number:
+                os.dup2(null, number)
+                os.close(null)
+            setattr(sys, name, os.fdopen(number, mode, closefd=False))
+
+
+def discard_output() -> None:
+    """Redirect standard output to /dev/null, so that flushing it at exit cannot fail again."""
+    with contextlib.suppress(OSError), Path(os.devnull).open("wb") as null:
+        os.dup2(null.fileno(), sys.stdout.fileno())
+
+
+def check_writable(folder: Path) -> None:
+    """Create a folder if necessary, and check before a long run that it can be written to.
+
+    Raises:
+        OutputError: It cannot, or it is not a folder.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise OutputError(
+            f"{folder} cannot be written to: {error.strerror or error}; name another folder"
+        ) from None
+
+
+def write_json(path: Path, values: Mapping[str, object]) -> None:
+    """Write one JSON object to a file.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(values, indent=1) + "\n")
+    except OSError as error:
+        raise OutputError(f"{path} cannot be written: {error.strerror or error}") from None

@@ -1,0 +1,98 @@
+"""How signals end a process: blocking code by an exception, a coroutine by cancellation."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import signal
+from typing import TYPE_CHECKING, Any
+
+import uvloop
+
+from terminal.errors import ExitCode, StoppedError
+
+if TYPE_CHECKING:
+    from collections.abc import Coroutine
+
+_ENDS = {
+    signal.SIGINT: (ExitCode.INTERRUPTED, "interrupted (Ctrl-C)"),
+    signal.SIGTERM: (ExitCode.TERMINATED, "asked to end (SIGTERM)"),
+    signal.SIGHUP: (ExitCode.HANGUP, "the terminal was closed (SIGHUP)"),
+}
+
+_received: list[int] = []
+
+
+def stopped_by(number: int) -> StoppedError:
+    """Return the error, with exit code and sentence, for the signal that ends a process."""
+    return StoppedError(*_ENDS[signal.Signals(number)])
+
+
+def raise_on_signals() -> None:
+    """Make SIGINT, SIGTERM and SIGHUP raise `StoppedError` in the main thread.
+
+    A second signal is ignored, since cleaning up is bounded. Python drops an exception that is raised while the thread
+    runs a callback from C code or a finaliser, so code that blocks calls `check_signals` first.
+    """
+    for number in _ENDS:
+        signal.signal(number, _stop)
+
+
+def _stop(number: int, _frame: object) -> None:
+    _received.append(number)
+    if len(_received) == 1:
+        raise stopped_by(number)
+
+
+def check_signals() -> None:
+    """Raise for a signal that has arrived, before the process waits for something.
+
+    Raises:
+        StoppedError: A signal arrived, and its exception was dropped.
+    """
+    if _received:
+        raise stopped_by(_received[0])
+
+
+def ignore_signals() -> None:
+    """Ignore the signals that end a process, once it has ended its work."""
+    for number in _ENDS:
+        signal.signal(number, signal.SIG_IGN)
+
+
+def run_async(main: Coroutine[Any, Any, int | None]) -> int:
+    """Run a coroutine on uvloop until it ends or a signal cancels it.
+
+    Its `finally` clauses clean up before this function returns.
+
+    Returns:
+        The coroutine's exit code.
+
+    Raises:
+        StoppedError: A signal ended it.
+    """
+
+    async def guarded() -> int:
+        task = asyncio.ensure_future(main)
+        received: list[signal.Signals] = []
+
+        def stop(number: signal.Signals) -> None:
+            if not received:
+                received.append(number)
+                task.cancel()
+
+        loop = asyncio.get_running_loop()
+        for number in _ENDS:
+            loop.add_signal_handler(number, stop, number)
+        try:
+            code = await task
+        except asyncio.CancelledError:
+            if not received:
+                raise
+        else:
+            if not received:
+                return int(code or 0)
+        raise stopped_by(received[0])
+
+    with contextlib.closing(main), asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
+        return runner.run(guarded())

@@ -1,0 +1,95 @@
+"""How a command ends: signals, full disks, too few files."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from terminal.errors import ExitCode
+
+PROGRAM = """
+import os, signal, threading, time
+from rich.console import Console
+from terminal.command_line import CommandLine
+from terminal.output import put_json
+from terminal.signals import check_signals, run_async
+app = CommandLine(help="a command")
+
+async def work():
+    return 0
+
+@app.command()
+def command():
+    {body}
+
+app()
+"""
+
+
+def end_of(body, *, stdout=subprocess.DEVNULL):
+    """Run a command with this body; return its exit code and what it wrote to standard error."""
+    code = PROGRAM.replace("{body}", body.strip().replace("\n", "\n    "))
+    ended = subprocess.run(
+        [sys.executable, "-W", "error", "-c", code],
+        check=False,
+        stdout=stdout,
+        stderr=subprocess.PIPE,
+        text=True,
+        timeout=240,
+    )
+    return ended.returncode, ended.stderr.splitlines()
+
+
+@pytest.mark.parametrize(
+    "place",
+    [
+        "threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGTERM)).start()\ntime.sleep(20)",
+        "try:\n    signal.raise_signal(signal.SIGTERM)\nexcept Exception:\n    pass\ntime.sleep(20)",
+        # Python drops the exception in these two; the next check finds it
+        "import ctypes\nctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(signal.SIGTERM))()\ncheck_signals()\ntime.sleep(20)",
+        "class Held:\n    def __del__(self):\n        signal.raise_signal(signal.SIGTERM)\nHeld()\ncheck_signals()\ntime.sleep(20)",
+        "signal.raise_signal(signal.SIGTERM)\ntime.sleep(20)",
+    ],
+    ids=["waiting", "catching Exception", "in a C callback", "in a finaliser", "at once"],
+)
+def test_a_signal_ends_a_command_wherever_it_is(place):
+    code, lines = end_of(place)
+    assert code == ExitCode.TERMINATED
+    assert lines[-1] == "asked to end (SIGTERM)"
+
+
+def test_a_dropped_signal_counts_at_the_end_of_a_command():
+    body = "import ctypes\nctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(signal.SIGINT))()"
+    assert end_of(body)[0] == ExitCode.INTERRUPTED
+
+
+@pytest.mark.parametrize("printed", ["print(1)", "print(1, flush=True)", "put_json(1)", "Console().print(1)"])
+def test_a_full_disk_behind_standard_output_is_one_sentence(printed):
+    with Path("/dev/full").open("w") as full:
+        code, lines = end_of(printed, stdout=full)
+    assert (code, len(lines)) == (ExitCode.USAGE, 1)
+
+
+def test_too_few_open_files_are_one_sentence():
+    limit = "import resource\nresource.setrlimit(resource.RLIMIT_NOFILE, (3, 3))\n"
+    code, lines = end_of(limit + "run_async(work())")
+    assert code == ExitCode.USAGE
+    assert not any("Traceback" in line for line in lines)
+
+
+def test_a_file_that_the_system_refuses_is_one_sentence():
+    code, lines = end_of("open('/nowhere/at/all')")
+    assert (code, len(lines)) == (ExitCode.USAGE, 1)
+    assert "/nowhere/at/all" in lines[0]
+
+
+def test_a_reader_that_has_enough_is_not_an_error():
+    code, lines = end_of("raise BrokenPipeError")
+    assert (code, lines) == (ExitCode.DONE, [])
+
+
+def test_only_a_bug_shows_a_traceback():
+    code, lines = end_of("raise ZeroDivisionError")
+    assert code == ExitCode.BUG
+    assert any("Traceback" in line for line in lines)
