@@ -297,9 +297,7 @@ class Subscriber:
 
 
 app = CommandLine(
-    help="Take variables out of a ROS topic over rosbridge.
-
-"
+    help="Take variables out of a ROS topic over rosbridge.\n\n"
     "Alone it prints them, one JSON object a line:\n\n"
     "`subscriber --uri ws://robot:9090 --topic /boat/sensors --type boat_msgs/Sensors --variables D1,B1`\n\n"
     "With `--deployment DIR` it prints addresses as `pcie-app` reads them; "
