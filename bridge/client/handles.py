@@ -30,9 +30,6 @@ PUBLISH_QUEUE_SIZE: Final = 100
 #: Seconds that finding out why a topic is silent may take.
 EXPLAIN_TIMEOUT: Final = 0.5
 
-#: Seconds that who waits for one message stays awake, if the one before came within that time.
-_AWAKE: Final = 200e-6
-
 Handler = Callable[[dict[str, Any]], Awaitable[Mapping[str, Any] | None]]
 
 _log = logging.getLogger("bridge")
@@ -112,8 +109,6 @@ class Subscription(_Handle):
         self._size = queue_size
         self._queue: deque[Message] = deque(maxlen=queue_size)
         self._waiter: asyncio.Future[None] | None = None
-        self._asleep = False  # and not woken yet
-        self._answered_at_once = False
         self._deadline = inf  # of who waits
         self._alarm: asyncio.TimerHandle | None = None
         self._rings = inf
@@ -135,7 +130,7 @@ class Subscription(_Handle):
             if queue[0].blind_seconds:
                 message = self._keep_blind(message)
         queue.append(message)
-        if self._asleep:
+        if self._waiter is not None:
             self._wake()
 
     def _note_blind(self, seconds: float) -> None:
@@ -161,29 +156,17 @@ class Subscription(_Handle):
         while not queue:
             if self._closed:
                 raise StopAsyncIteration
-            await self._news()
+            await self._wait()
         return queue.popleft()
 
-    async def _news(self, awake_until: float = 0.0) -> None:
-        """Wait until something has come, the subscription has ended, or the time is over (see `next`).
-
-        Args:
-            awake_until: monotonic seconds up to which the process does not fall asleep over it. Who answers at once
-                is heard sooner so: to fall asleep and be woken takes longer than an answer by way of the hub.
-        """
+    async def _wait(self) -> None:
+        """Wait until a message has arrived, the subscription has ended, or the deadline is over (see `next`)."""
         self._check_alone()
-        waiter = self._waiter = asyncio.get_running_loop().create_future()
+        self._waiter = asyncio.get_running_loop().create_future()
         try:
-            while awake_until:
-                await asyncio.sleep(0)  # the loop looks at its sockets, and other tasks have their turn
-                if self._queue or waiter.done():
-                    return
-                if time.monotonic() >= awake_until:
-                    break
-            self._asleep = True
-            await waiter
+            await self._waiter
         finally:
-            self._waiter, self._asleep = None, False
+            self._waiter = None
 
     def _check_alone(self) -> None:
         if self._waiter is not None:
@@ -193,9 +176,8 @@ class Subscription(_Handle):
             )
 
     def _wake(self) -> None:
-        waiter, self._asleep = self._waiter, False
-        if waiter is not None and not waiter.done():
-            waiter.set_result(None)
+        if self._waiter is not None and not self._waiter.done():
+            self._waiter.set_result(None)
 
     def _set_alarm(self, now: float) -> None:
         """See that whoever waits is woken at the deadline.
@@ -235,21 +217,18 @@ class Subscription(_Handle):
         if queue:
             return queue.popleft()
         self._check_alone()
-        now = begun = time.monotonic()
+        begun = time.monotonic()
         self._deadline = begun + timeout
         self._set_alarm(begun)
         try:
-            while True:
+            while not queue:
                 if self._closed:
                     raise DisconnectedError(f"the subscription of {self.topic} is closed")
-                if now >= self._deadline:
+                if time.monotonic() >= self._deadline:
                     break
-                awake_until = now + _AWAKE
-                await self._news(awake_until if self._answered_at_once else 0.0)
-                now = time.monotonic()
-                if queue:
-                    self._answered_at_once = now < awake_until
-                    return queue.popleft()
+                await self._wait()
+            else:
+                return queue.popleft()
         finally:
             self._deadline = inf
         why = await self._why_silent(begun)

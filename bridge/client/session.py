@@ -230,7 +230,7 @@ class Session:
             try:
                 await websocket.close()
             finally:
-                websocket.abandon()
+                websocket.abort()
         if ending:
             await asyncio.wait(ending, timeout=CLOSE_TIMEOUT)
 
@@ -247,10 +247,10 @@ class Session:
             on_lost=self._lost,
         )
         self._websocket = websocket
-        self._connected_at = websocket.loop.time()
+        self._connected_at = time.monotonic()
         if self.state is State.RECONNECTING:
             self.reconnections += 1
-            self._tell_blind(websocket.loop.time())
+            self._tell_blind(time.monotonic())
         self.core.restore()
         self.flush()
         self.ask_later()
@@ -272,9 +272,9 @@ class Session:
         self._lost_at = time.monotonic()
         _log.warning("the connection to %s is lost: %s", self.uri, reason)
         self._fail_calls(f"the connection to {self.uri} was lost ({reason})")
-        if websocket.loop.time() - self._connected_at >= STEADY:
+        if time.monotonic() - self._connected_at >= STEADY:
             self._delay = FIRST_DELAY
-        self._reconnecting = websocket.loop.create_task(self._reconnect())
+        self._reconnecting = asyncio.get_running_loop().create_task(self._reconnect())
         self._set_state(State.RECONNECTING, reason)
 
     async def _reconnect(self) -> None:
@@ -385,10 +385,12 @@ class Session:
             DisconnectedError: there is no connection.
         """
         websocket = self._websocket
-        if self._wire.fragment_size is not None:
-            self._send_pieces(self._open_websocket(), data)
-        elif websocket is None or not websocket.send_now(data):
-            self._open_websocket()  # which says why there is none
+        if websocket is None or not websocket.is_open:
+            websocket = self._open_websocket()
+        if self._wire.fragment_size is None:
+            websocket.send((data,))
+        else:
+            websocket.send(tuple(self._wire.pieces(data)))
 
     def is_others_turn(self) -> bool:
         """Whether so many messages were sent in a row that other tasks are to get their turn. Ask after each."""
@@ -418,7 +420,7 @@ class Session:
         try:
             async with asyncio.timeout(limit), self._turn:
                 while (websocket := self._open_websocket()).paused:
-                    await _drain(websocket)
+                    await websocket.drain()
         except TimeoutError:
             raise SlowPeerError(f"{self.uri} did not take {what} within {limit:g} s") from None
         finally:
@@ -430,16 +432,12 @@ class Session:
         websocket = self._websocket
         if websocket is not None and websocket.is_open:
             for message in data:
-                self._send_pieces(websocket, message)
-
-    def _send_pieces(self, websocket: WebSocket, data: bytes) -> None:
-        for piece in self._wire.pieces(data):
-            websocket.send_now(piece)
+                websocket.send(tuple(self._wire.pieces(message)))
 
     def ask_later(self) -> None:
         """Ask again in a while for topics of unknown type, as long as they bring nothing."""
         if self._asking is None and self._websocket is not None:
-            self._asking = self._websocket.loop.call_later(ASK_AGAIN, self._ask_again)
+            self._asking = asyncio.get_running_loop().call_later(ASK_AGAIN, self._ask_again)
 
     def _ask_again(self) -> None:
         self._asking = None
@@ -529,12 +527,3 @@ class Session:
                     _log.warning("%s, %d so far: %s", self.uri, self.unusable, event.reason)
             case _:
                 self.flush()  # a request may have been refused on the spot
-
-
-async def _drain(websocket: WebSocket) -> None:
-    """Wait for room in the socket's buffer; a loss shows in the WebSocket's state, whatever the error."""
-    try:
-        await websocket.drain()
-    except Exception:
-        if websocket.is_open:
-            raise

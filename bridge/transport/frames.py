@@ -1,15 +1,14 @@
-"""WebSocket frames at speed: whole messages in and out; everything else is the library's to judge.
+"""Fast reading and writing of WebSocket frames that hold a whole message each.
 
-Nearly all that is said over a rosbridge connection is one unfragmented message after another. `whole_messages` finds
-these in the bytes of a socket; whatever is anything else (control frames, fragments, broken ones) is handed on to the
-sans-I/O protocol of ``websockets`` as it is, which stands between two frames all the time.
+`whole_messages` finds them in the bytes of a socket. All other frames (control frames, fragments, malformed ones) are left
+to the sans-I/O protocol of `websockets`.
 
 Source: RFC 6455, sections 5.2, 5.3 and 10.3.
 """
 
 import os
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
 from functools import lru_cache
 from struct import Struct
 from typing import Final
@@ -24,39 +23,39 @@ _BINARY: Final = 0x82
 _WHOLE: Final = frozenset((_TEXT, _BINARY))
 _MASKED: Final = 0x80
 _BRACE: Final = ord("{")
-#: Payloads from these lengths on have a longer header.
 _MEDIUM: Final = 126
 _LONG: Final = 1 << 16
+"""Payloads from these lengths on have a longer header."""
 _MEDIUM_HEADER: Final = Struct("!BBH").pack
 _LONG_HEADER: Final = Struct("!BBQ").pack
-#: The longest header of the frames that `only_message` takes: less is left to the others.
-_LONGEST_QUICK: Final = 8
-#: First bytes of frames that a peer may send: an end or not, no reserved bit, an opcode that there is.
+_LONGEST_HEADER: Final = 8
+"""Bytes of the longest header that `only_message` reads; it leaves shorter data to the others."""
 _SOUND: Final = frozenset(end | opcode for end in (0, 0x80) for opcode in (0, 1, 2, 8, 9, 10))
-#: Keys that are drawn at once.
+"""First bytes of valid frames: with or without FIN, no reserved bit, a defined opcode."""
 _KEYS: Final = 1024
+"""Masking keys that are drawn at once."""
 
-#: Instead of a frame's end: not enough of its header has come; it is for the library to refuse.
 UNKNOWN: Final = 0
+"""Instead of a frame's end: its header is incomplete."""
 UNSOUND: Final = -1
+"""Instead of a frame's end: the frame is invalid, and the library has to refuse it."""
 
 
 def whole_messages(
     data: bytes, at: int, *, masked: bool, largest: int, count: int = sys.maxsize, until: int = sys.maxsize
 ) -> tuple[list[bytes], int]:
-    """Take the messages that begin at ``at``, each whole in one frame, up to whatever else there is.
+    """Read consecutive messages, each whole in one frame, up to the first other or incomplete frame.
 
     Args:
-        data: what came.
-        at: where a frame begins in it.
+        data: bytes from the socket.
+        at: index in `data` at which a frame begins.
         masked: whether the peer is a client, which masks its frames, or a server, which does not.
-        largest: bytes of one message at most; what is larger is something else.
-        count: messages to take at most.
-        until: where none is to begin any more.
+        largest: largest message in bytes; a larger one ends the reading.
+        count: most messages to read.
+        until: index from which on no message may begin.
 
     Returns:
-        The payloads, and where the first frame begins that is something else (`frame_end` tells more of it), or
-        is not complete yet; the length of ``data`` if there is none.
+        The payloads, and the index at which the reading ended; `frame_end` examines the frame there.
     """
     found: list[bytes] = []
     take, unmask = found.append, apply_mask
@@ -89,15 +88,17 @@ def whole_messages(
 
 
 def only_message(data: bytes, *, masked: bool, largest: int) -> bytes | None:
-    """The payload, if what came is one whole message in one frame and nothing else; it says so quickly.
+    """Return the payload if the data is exactly one whole message in one frame, else None.
+
+    This is `whole_messages` for the most frequent case.
 
     Args:
-        data: what came.
+        data: bytes from the socket, beginning with a frame.
         masked: whether the peer is a client.
-        largest: bytes of the message at most.
+        largest: largest message in bytes.
     """
     size = len(data)
-    if size < _LONGEST_QUICK or data[0] not in _WHOLE:
+    if size < _LONGEST_HEADER or data[0] not in _WHOLE:
         return None
     length, body = data[1] ^ _MASKED if masked else data[1], 2
     if length == _MEDIUM:
@@ -112,11 +113,11 @@ def only_message(data: bytes, *, masked: bool, largest: int) -> bytes | None:
 
 
 def frame_end(data: bytes, at: int, *, masked: bool, largest: int) -> int:
-    """Where the frame ends that begins at ``at``: beyond the end of ``data`` while it is not complete.
+    """Find the end of the frame that begins at `at`.
 
     Returns:
-        The end; `UNKNOWN` while its header is not complete; `UNSOUND` if the peer may send no such frame, or none of
-        more than ``largest`` bytes: then the library must see at once all that has come.
+        The end, which is beyond `data` while the frame is incomplete; `UNKNOWN` while its header is incomplete;
+        `UNSOUND` if it is invalid or has more than `largest` bytes, so that the library has to see it at once.
     """
     size = len(data)
     if size < at + 2:
@@ -135,40 +136,43 @@ def frame_end(data: bytes, at: int, *, masked: bool, largest: int) -> int:
     return body + (4 if masked else 0) + length
 
 
-def unmasked(payloads: Iterable[bytes]) -> bytes:
-    """A server's frames of whole messages: text for JSON, binary for CBOR."""
+def unmasked(payloads: Sequence[bytes]) -> bytes:
+    """Write a server's frames of whole messages: text for JSON objects, binary for CBOR."""
     parts: list[bytes] = []
     for payload in payloads:
-        parts += _header(payload[0] == _BRACE, len(payload)), payload
+        parts += _header(_TEXT if payload[0] == _BRACE else _BINARY, 0, len(payload)), payload
     return b"".join(parts)
 
 
-@lru_cache(maxsize=4096)
-def _header(is_text: bool, length: int) -> bytes:
-    """The beginning of an unmasked frame."""
-    first = _TEXT if is_text else _BINARY
-    if length < _MEDIUM:
-        return bytes((first, length))
-    if length < _LONG:
-        return _MEDIUM_HEADER(first, _MEDIUM, length)
-    return _LONG_HEADER(first, _MEDIUM + 1, length)
+class Masker:
+    """Writes a client's frames of whole text messages, each masked with a key that is used once."""
 
+    def __init__(self) -> None:
+        """Draw the first keys when the first message is written."""
+        self._keys = mask_keys()
 
-def masked_text(payload: bytes, key: bytes) -> bytes:
-    """A client's frame of a whole text message, masked with ``key``."""
-    length = len(payload)
-    if length < _MEDIUM:
-        begin = bytes((_TEXT, _MASKED | length))
-    elif length < _LONG:
-        begin = _MEDIUM_HEADER(_TEXT, _MASKED | _MEDIUM, length)
-    else:
-        begin = _LONG_HEADER(_TEXT, _MASKED | (_MEDIUM + 1), length)
-    return b"".join((begin, key, apply_mask(payload, key)))
+    def __call__(self, payloads: Sequence[bytes]) -> bytes:
+        """Return the frames of the messages."""
+        parts: list[bytes] = []
+        for payload in payloads:
+            key = next(self._keys)
+            parts += _header(_TEXT, _MASKED, len(payload)), key, apply_mask(payload, key)
+        return b"".join(parts)
 
 
 def mask_keys() -> Iterator[bytes]:
-    """Keys for one connection's frames, without end: no one can foresee them, each is used once."""
+    """Yield unpredictable masking keys, without end."""
     while True:
         drawn = os.urandom(4 * _KEYS)
         for at in range(0, len(drawn), 4):
             yield drawn[at : at + 4]
+
+
+@lru_cache(maxsize=4096)
+def _header(first: int, mask_bit: int, length: int) -> bytes:
+    """Return the header of a frame, up to its key where it has one."""
+    if length < _MEDIUM:
+        return bytes((first, mask_bit | length))
+    if length < _LONG:
+        return _MEDIUM_HEADER(first, mask_bit | _MEDIUM, length)
+    return _LONG_HEADER(first, mask_bit | (_MEDIUM + 1), length)

@@ -158,7 +158,7 @@ async def test_an_address_in_use_is_one_sentence() -> None:
     ("host", "port", "said"),
     [
         ("192.0.2.1", 0, "192.0.2.1 port 0"),
-        ("no-such-host.invalid", 0, "no-such-host.invalid: that is no address or name of this machine"),
+        ("no-such-host.invalid", 0, "no-such-host.invalid: that is not an address or name of this machine"),
         ("127.0.0.1", 70000, "127.0.0.1 port 70000"),
     ],
 )

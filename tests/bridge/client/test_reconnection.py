@@ -215,7 +215,7 @@ async def test_a_quiet_server_that_answers_pings_is_kept():
 async def test_a_sleep_of_this_process_is_not_the_servers_silence():
     async with FakeRosbridge() as fake, connect(fake.uri, ping_interval=0.1, ping_timeout=1.0) as ros:
         fake.freeze()
-        while not ros._session._open_websocket()._pinged:
+        while ros._session._open_websocket()._pinged_at is None:
             await asyncio.sleep(0)
         fake.thaw()
         time.sleep(2.5)  # noqa: ASYNC251  # the whole process stands still while the answer is on its way

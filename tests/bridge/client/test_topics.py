@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from bridge import stamps
-from bridge.client import Message, connect, handles
+from bridge.client import Message, connect
 from bridge.errors import (
     ConcurrentReadError,
     DisconnectedError,
@@ -53,7 +53,7 @@ async def test_messages_of_one_moment_leave_in_one_piece():
         subscription = ros.subscribe("/b", "p/T")
         one, two = await ros.advertise("/a", "p/T"), await ros.advertise("/b", "p/T")
         await fake.wait_for_op("advertise", topic="/b")
-        transport = ros._session._websocket.transport
+        transport = ros._session._websocket._transport
         written, write = [], transport.write
 
         class Noting:
@@ -64,7 +64,7 @@ async def test_messages_of_one_moment_leave_in_one_piece():
                 written.append(bytes(data))
                 write(data)
 
-        ros._session._websocket.transport = Noting()
+        ros._session._websocket._transport = Noting()
         with ros.together():
             await one.publish({"n": 1})
             await two.publish({"n": 2})
@@ -245,51 +245,6 @@ async def test_each_wait_ends_at_its_own_time():
         assert not waiting.done()
         await fake.publish("/a", {"n": 4})
         assert (await waiting).msg == {"n": 4}
-
-
-async def test_who_was_answered_at_once_stays_awake_for_the_next_answer(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    async with FakeRosbridge() as fake, connect(fake.uri) as ros, asyncio.timeout(60):
-        subscription = ros.subscribe("/a", "p/T")
-        await fake.wait_for_op("subscribe")
-
-        async def hear(n: int) -> tuple[bool, bool]:
-            """Whether the reader fell asleep over a message, and whether it would over the next."""
-            waiting = asyncio.create_task(subscription.next(50))
-            for _ in range(20):  # turns of the loop: the reader's wait has begun, and goes on
-                await asyncio.sleep(0)
-            assert not waiting.done()
-            asleep = subscription._asleep
-            await fake.publish("/a", {"n": n})
-            assert (await waiting).msg == {"n": n}
-            return asleep, not subscription._answered_at_once
-
-        monkeypatch.setattr(handles, "_AWAKE", 40.0)
-        assert await hear(1) == (True, False)
-        assert await hear(2) == (False, False)
-        waiting = asyncio.create_task(subscription.next(0.2))
-        await asyncio.sleep(0)
-        with pytest.raises(ConcurrentReadError):
-            await subscription.next(30)
-        with pytest.raises(NoMessageError, match="within 0.2 s"):
-            await waiting
-        monkeypatch.setattr(handles, "_AWAKE", 1e-9)
-        assert await hear(3) == (True, True)
-        assert await hear(4) == (True, True)
-
-
-async def test_closing_ends_a_wait_that_is_awake(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(handles, "_AWAKE", 40.0)
-    async with FakeRosbridge() as fake, connect(fake.uri) as ros, asyncio.timeout(60):
-        subscription = ros.subscribe("/a", "p/T")
-        await fake.wait_for_op("subscribe")
-        subscription._answered_at_once = True
-        waiting = asyncio.create_task(subscription.next(50))
-        await asyncio.sleep(0)
-        await subscription.close()
-        with pytest.raises(DisconnectedError):
-            await waiting
 
 
 async def test_who_may_not_wait_does_not_end_anothers_wait():

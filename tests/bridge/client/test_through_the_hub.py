@@ -29,6 +29,8 @@ from bridge.errors import (
 from bridge.qos import Qos
 from tests.bridge.hub.sockets import PATIENCE, running_hub
 
+pytestmark = pytest.mark.usefixtures("either_reader")
+
 SCAN = {
     "header": {"frame_id": "laser"},
     "angle_min": -1.5,
@@ -230,7 +232,7 @@ async def test_the_server_goes_while_a_goal_is_on_its_way():
         await asyncio.sleep(0)
         with pytest.raises(ConcurrentReadError):
             await goal.__anext__()
-        ros._session._websocket.abandon()
+        ros._session._websocket.abort()
         for task in (reading, waiting):
             with pytest.raises(DisconnectedError, match="while /fly had a goal"):
                 await asyncio.wait_for(task, PATIENCE)

@@ -1,126 +1,23 @@
-"""Frames found and written here are the library's: whatever comes, cut wherever, means the same by both ways."""
+"""The transport reads what the library alone reads, whatever the peer sends and however its bytes are cut."""
 
 import asyncio
 from collections.abc import Iterator
-from itertools import islice
 from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from websockets.client import ClientProtocol
-from websockets.frames import DATA_OPCODES, Frame, Opcode
+from websockets.frames import DATA_OPCODES, CloseCode, Frame, Opcode
 from websockets.protocol import State
-from websockets.server import ServerProtocol
 from websockets.uri import parse_uri
 from websockets.utils import accept_key
 
 from bridge.client.websocket import WebSocket
-from bridge.transport import frames
-from bridge.transport.frames import UNKNOWN, UNSOUND
 
-SIZES = [0, 1, 125, 126, 127, 65_535, 65_536]
-#: Bytes of a message at most, in what is generated here.
 LARGEST = 200
+"""Bytes of a message at most, in what is generated here."""
 URI = parse_uri("ws://localhost:9090")
-
-# --- finding and writing
-
-
-@pytest.mark.parametrize("size", SIZES)
-@pytest.mark.parametrize("masked", [True, False])
-@pytest.mark.parametrize("opcode", [Opcode.TEXT, Opcode.BINARY])
-def test_a_message_is_found_wherever_it_begins(size: int, masked: bool, opcode: Opcode) -> None:
-    payload = b"x" * size
-    one = Frame(opcode, payload).serialize(mask=masked)
-    data = b"before" + 3 * one + b"\x81"
-    found, at = frames.whole_messages(data, 6, masked=masked, largest=size)
-    assert (found, at) == ([payload] * 3, len(data) - 1)
-    assert frames.whole_messages(data, 6, masked=masked, largest=size, count=2) == (found[:2], at - len(one))
-    until = 7 + len(one)  # the second begins before it
-    assert frames.whole_messages(data, 6, masked=masked, largest=size, until=until)[0] == found[:2]
-    assert frames.frame_end(data, 6, masked=masked, largest=size) == 6 + len(one)
-    if size:
-        assert frames.whole_messages(data, 6, masked=masked, largest=size - 1) == ([], 6)
-        assert frames.frame_end(data, 6, masked=masked, largest=size - 1) == UNSOUND
-
-
-@pytest.mark.parametrize("size", SIZES)
-@pytest.mark.parametrize("masked", [True, False])
-def test_a_frame_that_is_not_all_there_is_waited_for(size: int, masked: bool) -> None:
-    data = Frame(Opcode.TEXT, b"x" * size).serialize(mask=masked)
-    header = len(data) - size
-    for known in {*range(header + 1), len(data) - 1}:
-        part = data[:known]
-        assert frames.whole_messages(part, 0, masked=masked, largest=1 << 20)[0] == [b""] * (
-            known == len(data)
-        )
-        assert frames.frame_end(part, 0, masked=masked, largest=1 << 20) in {UNKNOWN, len(data)}
-    assert frames.frame_end(data[:header], 0, masked=masked, largest=1 << 20) == len(data)
-
-
-@pytest.mark.parametrize(
-    ("opcode", "size"),
-    [(opcode, size) for opcode in Opcode for size in SIZES if size < 126 or opcode < Opcode.CLOSE],
-)
-@pytest.mark.parametrize("masked", [True, False])
-def test_one_message_alone_is_found_as_among_others(opcode: Opcode, size: int, masked: bool) -> None:
-    one = Frame(opcode, b"x" * size).serialize(mask=masked)
-    found = frames.whole_messages(one, 0, masked=masked, largest=size)[0]
-    alone = frames.only_message(one, masked=masked, largest=size)
-    assert alone is None or [alone] == found
-    assert (alone is None) is (not found or size > 65_535 or len(one) < 8)
-    assert frames.only_message(one, masked=masked, largest=size - 1) is None
-    assert frames.only_message(one, masked=not masked, largest=size) is None
-    for other in (one[:-1], one + b"\x81", 2 * one):
-        assert frames.only_message(other, masked=masked, largest=1 << 20) is None
-
-
-@given(st.binary(max_size=200), st.booleans(), st.integers(0, 200))
-def test_whatever_comes_means_the_same_alone(rest: bytes, masked: bool, length: int) -> None:
-    for data in (rest, b"\x81" + rest, b"\x81" + bytes((length,)) + rest[: length + 4]):
-        alone = frames.only_message(data, masked=masked, largest=100)
-        if alone is not None:
-            assert frames.whole_messages(data, 0, masked=masked, largest=100) == ([alone], len(data))
-
-
-@pytest.mark.parametrize("masked", [True, False])
-def test_what_is_no_whole_message_is_the_librarys(masked: bool) -> None:
-    for opcode in (Opcode.PING, Opcode.PONG, Opcode.CLOSE, Opcode.CONT):
-        data = Frame(opcode, b"xx").serialize(mask=masked)
-        assert frames.whole_messages(data, 0, masked=masked, largest=9) == ([], 0)
-        assert frames.frame_end(data, 0, masked=masked, largest=9) == len(data)
-    text = Frame(Opcode.TEXT, b"xx").serialize(mask=masked)
-    piece = Frame(Opcode.TEXT, b"xx", fin=False).serialize(mask=masked)
-    assert frames.whole_messages(piece, 0, masked=masked, largest=9) == ([], 0)
-    assert frames.frame_end(piece, 0, masked=masked, largest=9) == len(piece)
-    for broken in (
-        b"\xc1" + text[1:],
-        b"\x83" + text[1:],
-        Frame(Opcode.TEXT, b"x").serialize(mask=not masked),
-    ):
-        assert frames.whole_messages(broken, 0, masked=masked, largest=9) == ([], 0)
-        assert frames.frame_end(broken, 0, masked=masked, largest=9) == UNSOUND
-
-
-@pytest.mark.parametrize("size", SIZES)
-def test_a_text_as_a_client_writes_it_is_read_by_the_library(size: int) -> None:
-    payload = bytes(range(256)) * (size // 256 + 1)
-    server = ServerProtocol(state=State.OPEN)
-    keys = frames.mask_keys()
-    for _ in range(2):
-        server.receive_data(frames.masked_text(payload[:size], next(keys)))
-    events = server.events_received()
-    assert events == [Frame(Opcode.TEXT, payload[:size])] * 2
-
-
-def test_keys_are_not_used_twice() -> None:
-    keys = list(islice(frames.mask_keys(), 3000))
-    assert all(len(key) == 4 for key in keys)
-    assert len(set(keys)) > 2990  # of 2**32: two alike would be a surprise
-
-
-# --- the client's connection beside the library alone
 
 
 class Ends(asyncio.Transport):
@@ -251,8 +148,8 @@ cuts = st.lists(st.integers(1, 300) | st.integers(1, 5), max_size=60)
     closed=0,
 )
 @settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-async def test_whatever_comes_cut_anywhere_means_what_it_means_to_the_library(
-    plain: None, stream: bytes, cuts: list[int], idle: int, apart: bool, closed: int
+async def test_client_reads_any_stream_as_the_library_does(
+    plain: None, either_reader: None, stream: bytes, cuts: list[int], idle: int, apart: bool, closed: int
 ) -> None:
     """After every piece: the same messages, the same answers, the same state, the same reason.
 
@@ -262,7 +159,8 @@ async def test_whatever_comes_cut_anywhere_means_what_it_means_to_the_library(
     heard: list[bytes] = []
     lost: list[str] = []
     client = WebSocket(
-        ClientProtocol(URI, max_size=LARGEST),
+        URI,
+        max_size=LARGEST,
         ping_interval=1000,
         ping_timeout=1000,
         on_messages=heard.extend,
@@ -270,12 +168,14 @@ async def test_whatever_comes_cut_anywhere_means_what_it_means_to_the_library(
     )
     ends = Ends()
     client.connection_made(ends)
-    client.protocol.send_request(client.protocol.connect())
-    client.protocol.data_to_send()
-    library = Library(client.protocol.key)
+    ours = client._client_protocol
+    ours.send_request(ours.connect())
+    ours.data_to_send()
+    library = Library(ours.key)
+    theirs = library.protocol
     answer = (
         "HTTP/1.1 101 Switching Protocols\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
-        f"Sec-WebSocket-Accept: {accept_key(client.protocol.key)}\r\n\r\n"
+        f"Sec-WebSocket-Accept: {accept_key(ours.key)}\r\n\r\n"
     )
     pieces_of_it = parts(answer.encode() + stream, [len(answer), *cuts] if apart else cuts)
     for number, part in enumerate(pieces_of_it, start=1):
@@ -286,16 +186,14 @@ async def test_whatever_comes_cut_anywhere_means_what_it_means_to_the_library(
             client.data_received(part)
         else:
             client.eof_received()
-        if not client.opened and client.protocol.state is State.OPEN:
+        if not client.opened and ours.state is State.OPEN:
             if idle == 0 or not part:
                 client.begin()
             idle -= 1
-        elif not client.opened and client.protocol.state is not State.CONNECTING:
+        elif not client.opened and ours.state is not State.CONNECTING:
             break  # it came to its end before anybody took it up
-        theirs, ours = library.protocol, client.protocol
         if number == closed and client.opened and theirs.state is State.OPEN:
-            ours.send_close(1000)
-            client.send_data()
+            client.start_closing(CloseCode.NORMAL_CLOSURE)
             theirs.send_close(1000)
             library.written += b"".join(theirs.data_to_send())
         if client.opened:

@@ -13,7 +13,7 @@ import pytest
 from bridge.client import connect
 from bridge.codecs.serialised import MessageTypes
 from bridge.errors import NoAnswerError, NoMessageError, ServiceError
-from tests.bridge.doubles import DEPTH, Double
+from tests.bridge.client.doubles import DEPTH, Double
 
 PATIENCE = 60.0
 TYPE = "std_msgs/Float64MultiArray"
@@ -164,7 +164,7 @@ async def test_a_server_without_actions_says_so_or_nothing():
 async def test_a_server_that_is_deaf_is_noticed_by_what_was_asked(server, caplog):
     caplog.set_level(logging.CRITICAL)
     async with Double(server) as double, connect(double.uri) as ros:
-        ros._session._websocket.send_now(b"[1,2,3]")  # what other clients do
+        ros._session._websocket.send([b"[1,2,3]"])  # what other clients do
         async with asyncio.timeout(PATIENCE):
             while not any(client.dead for client in double._clients):
                 await asyncio.sleep(0.01)

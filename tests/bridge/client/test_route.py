@@ -214,7 +214,7 @@ async def test_credentials_in_the_uri_are_shown_at_the_door_and_nowhere_else(cap
 async def test_the_token_is_shown_again_after_a_loss():
     async with door(wants=f"Bearer {TOKEN}") as server:
         async with connect(f"ws://127.0.0.1:{server.port}", token=TOKEN) as ros:
-            ros._session._websocket.abandon()
+            ros._session._websocket.abort()
             await ros.wait_for_state(State.RECONNECTING, PATIENCE)
             await ros.wait_for_state(State.CONNECTED, PATIENCE)
         assert len(server.shown) == 2

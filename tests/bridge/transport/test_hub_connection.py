@@ -1,13 +1,16 @@
-"""The hub hears the same messages whatever the frames they come in, however the bytes are cut."""
+"""The hub reads the same messages whatever frames they arrive in, and however their bytes are cut."""
 
 import asyncio
 from typing import Any
 
+import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from websockets.frames import Frame, Opcode
 
 from tests.bridge.hub.sockets import Bare, client, running_hub
+
+pytestmark = pytest.mark.usefixtures("either_reader")
 
 
 @given(
@@ -56,7 +59,7 @@ async def test_messages_in_any_frames_cut_anywhere_arrive_in_order(kinds: list[s
         bare.hang_up()
 
 
-async def test_who_sends_before_the_answer_is_served_too() -> None:
+async def test_frames_sent_before_the_handshakes_answer_are_read() -> None:
     async with running_hub() as port, client(port) as ears:
         await ears.send(op="subscribe", topic="/t", type="a/B")
         await ears.settle()

@@ -16,6 +16,8 @@ import pytest
 
 from bridge.client import State, connect
 
+pytestmark = pytest.mark.usefixtures("either_reader")
+
 PATIENCE = 60.0
 _GUID = b"258EAFA5-E914-47DA-95CA-C5AB0DC85B11"
 

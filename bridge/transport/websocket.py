@@ -1,0 +1,343 @@
+"""One WebSocket on an asyncio transport, for client and hub alike: bytes in, whole messages out.
+
+The sans-I/O protocol of `websockets` handles handshakes, control frames, fragments and everything malformed. Nearly all
+rosbridge traffic is unfragmented messages, which the functions of `bridge.transport.frames` read and write in a fraction of
+the time. The library is given whole frames only, so it always stands between two of them. Once anything is malformed or the
+closing handshake begins, it reads everything.
+"""
+
+import asyncio
+import os
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import ClassVar, Final, cast
+
+from websockets.client import ClientProtocol
+from websockets.frames import CloseCode, Frame, Opcode
+from websockets.http11 import Request, Response
+from websockets.protocol import State
+from websockets.server import ServerProtocol
+
+from bridge.transport import frames
+
+QUICK_FRAMES = os.environ.get("ROSBAYES_QUICK_FRAMES", "1") != "0"
+"""Whether connections opened from now on read and write whole messages without the library; 0 turns it off."""
+
+_OPEN: Final = State.OPEN
+"""A module's name is looked up faster than an enumeration's member."""
+_END_OF_HEADERS: Final = b"\r\n\r\n"
+_FIRST_BYTES: Final = 64
+_DATA_OPCODES: Final = frozenset((Opcode.TEXT, Opcode.BINARY, Opcode.CONT))
+
+
+class WebSocketTransport(asyncio.Protocol):
+    """A WebSocket connection; a subclass handles the handshake, the messages and the end.
+
+    Attributes:
+        last_heard: monotonic seconds at which the peer last sent anything.
+        is_open: whether messages can be sent.
+        first_bytes: the beginning of the peer's answer, for error messages.
+        paused: whether so much waits for the peer that writers should wait too (see `drain`).
+    """
+
+    turn_frames: ClassVar[int] = sys.maxsize
+    """Frames that are handled before other tasks of the event loop get their turn."""
+    turn_bytes: ClassVar[int] = sys.maxsize
+    """Bytes of frames that are handled before other tasks get their turn."""
+    slice_bytes: ClassVar[int] = sys.maxsize
+    """Bytes that the library reads in one turn once it reads everything."""
+
+    def __init__(self, protocol: ClientProtocol | ServerProtocol, *, max_size: int, write_limit: int) -> None:
+        """Prepare the connection; the event loop calls `connection_made` when there is a socket.
+
+        Args:
+            protocol: the library's state machine for this side.
+            max_size: largest incoming message in bytes, as `protocol` has it.
+            write_limit: bytes in the write buffer from which on `paused` holds.
+        """
+        self.last_heard = time.monotonic()
+        self.is_open = False
+        self.first_bytes = b""
+        self.paused = False
+        self._protocol = protocol
+        self._transport: asyncio.Transport | None = None
+        self._write_limit = write_limit
+        self._max_size = max_size
+        self._is_server = isinstance(protocol, ServerProtocol)
+        self._encode = frames.unmasked if self._is_server else frames.Masker()
+        self._in_handshake = True
+        self._handshake_tail = b""
+        self._quick = False
+        self._quick_writes = QUICK_FRAMES
+        self._rest = bytearray()
+        self._wanted = 0
+        self._fragments: bytearray | None = None
+        self._held: list[bytes] | None = None
+        self._ends = False
+        self._writable = asyncio.Event()
+        self._writable.set()
+        self._lost = asyncio.Event()
+
+    # For the subclass to implement
+
+    def handshake_received(self, event: Request | Response) -> None:
+        """Handle the peer's half of the handshake."""
+        raise NotImplementedError
+
+    def messages_received(self, messages: list[bytes]) -> None:
+        """Handle whole messages, in order."""
+        raise NotImplementedError
+
+    def close_expected(self) -> None:
+        """Give the peer a limited time to end the connection."""
+        raise NotImplementedError
+
+    def ended(self, exc: Exception | None) -> None:
+        """Handle the end of the connection."""
+        raise NotImplementedError
+
+    # State
+
+    @property
+    def is_connected(self) -> bool:
+        """Whether there is, or was, a socket."""
+        return self._transport is not None
+
+    @property
+    def is_closing(self) -> bool:
+        """Whether there is no socket, or it is about to close."""
+        return self._transport is None or self._transport.is_closing()
+
+    # Sending
+
+    def send(self, messages: Sequence[bytes]) -> None:
+        """Write messages to an open connection: JSON as text, a server's CBOR as binary."""
+        if self._quick_writes:
+            data = self._encode(messages)
+            if self._held is not None:
+                self._held.append(data)
+            elif self._transport is not None:
+                self._transport.write(data)
+            return
+        for message in messages:
+            if self._is_server and message[:1] != b"{":
+                self._protocol.send_binary(message)
+            else:
+                self._protocol.send_text(message)
+        self._flush()
+
+    def ping(self) -> None:
+        """Ask the peer for a sign of life."""
+        self._protocol.send_ping(b"")
+        self._flush()
+
+    def start_closing(self, code: CloseCode, reason: str = "") -> None:
+        """Begin the closing handshake."""
+        self._protocol.send_close(code, reason)
+        self._flush()
+
+    def abort(self) -> None:
+        """End the connection at once."""
+        if self._transport is not None:
+            self._transport.abort()
+
+    async def drain(self) -> None:
+        """Wait until the write buffer has room, or the connection has ended."""
+        await self._writable.wait()
+
+    async def wait_closed(self) -> None:
+        """Wait until the connection has ended."""
+        await self._lost.wait()
+
+    @contextmanager
+    def together(self) -> Iterator[None]:
+        """Hold back what is sent inside the block, and write it in one piece at its end."""
+        if self._held is not None:
+            yield
+            return
+        self._held = []
+        try:
+            yield
+        finally:
+            held, self._held = self._held, None
+            if held and self._transport is not None and not self._transport.is_closing():
+                self._transport.write(b"".join(held))
+            self._flush()
+
+    def _flush(self) -> None:
+        """Write everything that the library has to send, and take over its state."""
+        self.is_open = self._protocol.state is _OPEN
+        if self._held is not None:
+            return  # the end of `together` does it
+        data = self._protocol.data_to_send()
+        transport = self._transport
+        if data and transport is not None and not transport.is_closing():
+            if whole := b"".join(data):
+                transport.write(whole)
+            if not data[-1]:
+                # Closing both halves could cost the last frame on its way, but TLS has no halves.
+                (transport.write_eof if transport.can_write_eof() else transport.close)()
+
+    # Calls of the event loop
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Take the socket's transport."""
+        self._transport = cast("asyncio.Transport", transport)
+        self._transport.set_write_buffer_limits(high=self._write_limit)
+
+    def data_received(self, data: bytes) -> None:
+        """Handle bytes from the socket, down to the last answer that they cause."""
+        self.last_heard = time.monotonic()
+        at = 0
+        if self._rest:
+            rest, missing = self._rest, self._wanted - len(self._rest)
+            at = missing if 0 < missing < len(data) else len(data)
+            rest += data if at == len(data) else data[:at]
+            if len(rest) < self._wanted:
+                return
+            begun = bytes(rest)
+            rest.clear()
+            if at == len(data):
+                data, at = begun, 0
+            else:
+                self._read(begun, 0)
+        elif self._quick and self._fragments is None:
+            message = frames.only_message(data, masked=self._is_server, largest=self._max_size)
+            if message is not None:  # nearly always, unless messages come in floods
+                self.messages_received([message])
+                return
+        elif self._in_handshake:
+            self._read_handshake(data)
+            return
+        self._read_turn(data, at)
+
+    def eof_received(self) -> None:
+        """End the whole connection when the peer ends its half."""
+        self._receive_eof()
+        self._flush()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Report the end."""
+        self._receive_eof()
+        self.is_open = False
+        self._lost.set()
+        self._writable.set()
+        self.ended(exc)
+
+    def pause_writing(self) -> None:
+        """Have writers wait: the socket takes nothing now."""
+        self.paused = True
+        self._writable.clear()
+
+    def resume_writing(self) -> None:
+        """Let writers go on."""
+        self.paused = False
+        self._writable.set()
+
+    # Reading
+
+    def _read_handshake(self, data: bytes) -> None:
+        """Give the library an HTTP message's headers; frames, or a body, begin after them."""
+        self.first_bytes = (self.first_bytes + data)[:_FIRST_BYTES]
+        before = self._handshake_tail
+        end = (before + data).find(_END_OF_HEADERS)
+        if end < 0:
+            self._handshake_tail = (before + data)[-len(_END_OF_HEADERS) + 1 :]
+            self._give_library(data)
+            return
+        at = end + len(_END_OF_HEADERS) - len(before)
+        self._in_handshake = False
+        self._give_library(data[:at])
+        self._quick = QUICK_FRAMES and self.is_open
+        if at < len(data):
+            self._read_turn(data, at)
+
+    def _read_turn(self, data: bytes, at: int) -> None:
+        """Handle bytes for one turn; the rest is handled after other tasks had theirs."""
+        at = self._read(data, at)
+        transport = self._transport
+        if at < len(data) and transport is not None and not transport.is_closing():
+            transport.pause_reading()
+            asyncio.get_running_loop().call_soon(self._resume, transport, data, at)
+
+    def _resume(self, transport: asyncio.Transport, data: bytes, at: int) -> None:
+        if not transport.is_closing():
+            transport.resume_reading()
+            self._read_turn(data, at)
+
+    def _read(self, data: bytes, at: int) -> int:
+        """Handle a turn's frames and keep an incomplete one; return where the turn ended."""
+        size, count, turn_end, masked = len(data), 0, at + self.turn_bytes, self._is_server
+        while at < size and count < self.turn_frames and at < turn_end:
+            if not self._quick:
+                end = min(at + self.slice_bytes, size)
+                self._give_library(data[at:end])
+                return end
+            if self._fragments is None:
+                messages, at = frames.whole_messages(
+                    data,
+                    at,
+                    masked=masked,
+                    largest=self._max_size,
+                    count=self.turn_frames - count,
+                    until=turn_end,
+                )
+                if messages:
+                    count += len(messages)
+                    self.messages_received(messages)
+                    continue
+            end = frames.frame_end(
+                data, at, masked=masked, largest=self._max_size - len(self._fragments or b"")
+            )
+            if end == frames.UNSOUND:
+                self._quick = False  # the library refuses it before all of it has come
+            elif end == frames.UNKNOWN or end > size:
+                self._rest += data[at:]
+                self._wanted = end - at if end else 0
+                at = size
+            else:
+                count += 1
+                self._give_library(data[at:end])
+                at = end
+        return at
+
+    def _give_library(self, data: bytes) -> None:
+        """Have the library read bytes, and handle the events."""
+        self._protocol.receive_data(data)
+        messages: list[bytes] = []
+        for event in self._protocol.events_received():
+            if not isinstance(event, Frame):
+                self.handshake_received(event)
+            elif event.opcode in _DATA_OPCODES and (message := self._assembled(event)) is not None:
+                messages.append(message)
+        if messages:
+            self.messages_received(messages)
+        self._flush()
+        if not self.is_open:
+            self._quick = False
+        if not self._ends and self._protocol.close_expected():
+            self._ends = True
+            self.close_expected()
+
+    def _assembled(self, frame: Frame) -> bytes | None:
+        """Return a whole message, or None before its last frame; the library limits its size."""
+        data = bytes(frame.data)
+        if self._fragments is None:
+            if frame.fin:
+                return data
+            self._fragments = bytearray()  # not a list: endless empty fragments take no memory
+        self._fragments += data
+        if not frame.fin:
+            return None
+        whole, self._fragments = bytes(self._fragments), None
+        return whole
+
+    def _receive_eof(self) -> None:
+        """Give the library what there is of a frame, and the end of the stream."""
+        self._quick = False
+        if self._rest:
+            self._protocol.receive_data(bytes(self._rest))
+            self._rest.clear()
+        self._protocol.receive_eof()
