@@ -1,4 +1,4 @@
-"""A hub without sockets for tests, its clients, and all that must be true of it at any moment."""
+"""A broker without sockets for tests, its clients, and the invariants that are checked after each of their steps."""
 
 import json
 from dataclasses import dataclass, field
@@ -19,10 +19,10 @@ def _no_constant(name: str) -> Any:
 
 
 @dataclass(eq=False)
-class Guest:
-    """A client of a hub without sockets."""
+class Peer:
+    """A client of a broker without sockets."""
 
-    room: "Room"
+    hub: "Harness"
     client: Client
     arrived: list[dict[str, Any]] = field(default_factory=list)
 
@@ -30,7 +30,8 @@ class Guest:
         self.send_raw(json.dumps(operation).encode())
 
     def send_raw(self, data: bytes) -> None:
-        self.room.broker.receive(self.client, data, self.room.now)
+        self.hub.broker.receive(self.client, data, self.hub.now)
+        self.hub.check()
 
     def advertise(self, topic: str, type_name: str = "a/B", **more: Any) -> None:
         self.send(op="advertise", topic=topic, type=type_name, **more)
@@ -42,25 +43,25 @@ class Guest:
         self.send(op="subscribe", topic=topic, **more)
 
     def read(self) -> list[dict[str, Any]]:
-        """All that waits for it, as a socket that takes everything would have it."""
+        """Drain its outbox, as a socket that accepts everything does."""
         operations = []
         while (payload := self.client.outbox.pop()) is not None:
-            assert len(payload) <= self.room.broker.limits.message_bytes
+            assert len(payload) <= self.hub.broker.limits.message_bytes
             if is_text(payload):
                 operations.append(json.loads(payload, parse_constant=_no_constant))
             else:
                 operations.append(cbor_codec.decode(payload))
         return operations
 
-    def heard(self, topic: str | None = None) -> list[Any]:
-        """The messages among it, of one topic or all; anything else is an error."""
+    def messages(self, topic: str | None = None) -> list[Any]:
+        """Drain its outbox of messages, of one topic or all; anything else is an error."""
         operations = self.read()
         assert all(set(operation) == {"op", "topic", "msg"} for operation in operations), operations
         assert {operation["op"] for operation in operations} <= {"publish"}
         return [operation["msg"] for operation in operations if topic in {None, operation["topic"]}]
 
     def ask(self, service: str, args: Any = None, **more: Any) -> dict[str, Any]:
-        """Call a service that is answered at once, and take the answer."""
+        """Call a service that the broker answers, and return the answer."""
         self.send(op="call_service", service=service, args={} if args is None else args, **more)
         (answer,) = self.read()
         assert answer["op"] == "service_response"
@@ -71,31 +72,33 @@ class Guest:
         assert answer["result"] is True, answer
         return answer["values"]
 
-    def leave(self) -> None:
-        self.room.broker.disconnect(self.client)
+    def disconnect(self) -> None:
+        self.hub.broker.disconnect(self.client)
+        self.hub.check()
 
 
-class Room:
-    """A broker, its guests and the time."""
+class Harness:
+    """A broker, and the time."""
 
     def __init__(self, *, ros_version: Literal[1, 2] = 1, **limits: Any) -> None:
         self.broker = Broker(HubLimits(**limits), ros_version=ros_version, wall_clock=lambda: WALL_CLOCK)
         self.now = 1000.0
 
-    def enter(self, address: str = "127.0.0.1") -> Guest:
-        return Guest(self, self.broker.connect(address))
+    def connect(self, address: str = "127.0.0.1") -> Peer:
+        return Peer(self, self.broker.connect(address))
 
-    def pass_time(self, seconds: float) -> None:
-        """Let time pass, waking the broker whenever it asked for it."""
+    def advance(self, seconds: float) -> None:
+        """Advance the clock, waking the broker at its deadlines."""
         end = self.now + seconds
         while self.broker.deadline <= end:
             self.now = max(self.now, self.broker.deadline)
             self.broker.wake(self.now)
-            assert self.broker.deadline > self.now, "a wake that leaves work undone would spin"
+            assert self.broker.deadline > self.now, "a wake that leaves work undone would busy-wait"
         self.now = end
+        self.check()
 
     def check(self) -> None:
-        """What must hold whatever the clients did."""
+        """Check the invariants."""
         broker, graph, limits = self.broker, self.broker.graph, self.broker.limits
         clients = set(graph.clients.values())
         assert len(graph.topics) <= limits.topics
@@ -146,7 +149,7 @@ class Room:
         assert all(goal.caller.client in clients and goal.server in clients for goal in goals.values())
         deadlines = [call.deadline for call in calls.values()]
         deadlines += [client.outbox.deadline for client in clients]
-        assert broker.deadline <= min(deadlines, default=inf), "it would be woken too late"
+        assert broker.deadline <= min(deadlines, default=inf), "the broker would be woken too late"
 
     def _check_outbox(self, client: Client) -> None:
         outbox = client.outbox

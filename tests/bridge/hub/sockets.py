@@ -1,4 +1,4 @@
-"""A hub on a real socket for tests, WebSocket clients of it, and a bare TCP one that can misbehave."""
+"""A hub on a real socket for tests, WebSocket clients of it, and a raw TCP one that can misbehave."""
 
 import asyncio
 import base64
@@ -21,7 +21,7 @@ from bridge.hub.server import serve_hub
 PATIENCE = 60.0
 
 
-class Ears:
+class Client:
     """A WebSocket client that speaks in operations."""
 
     def __init__(self, websocket: ClientConnection) -> None:
@@ -30,18 +30,18 @@ class Ears:
     async def send(self, **operation: Any) -> None:
         await self.websocket.send(json.dumps(operation))
 
-    async def hear(self) -> dict[str, Any]:
+    async def receive(self) -> dict[str, Any]:
         async with asyncio.timeout(PATIENCE):
             operation: dict[str, Any] = json.loads(await self.websocket.recv())
             return operation
 
     async def ask(self, service: str, **args: Any) -> Any:
         await self.send(op="call_service", service=service, args=args, id="ask")
-        answer = await self.hear()
+        answer = await self.receive()
         assert (answer["op"], answer["id"]) == ("service_response", "ask"), answer
         return answer["values"]
 
-    async def settle(self) -> None:
+    async def sync(self) -> None:
         """Come back when the hub has done all that was sent before."""
         await self.ask("/rosapi/get_time")
 
@@ -85,12 +85,12 @@ async def running_hub(
 
 
 @asynccontextmanager
-async def client(port: int, **options: Any) -> AsyncIterator[Ears]:
+async def client(port: int, **options: Any) -> AsyncIterator[Client]:
     async with connect(f"ws://127.0.0.1:{port}", **options) as websocket:
-        yield Ears(websocket)
+        yield Client(websocket)
 
 
-class Bare:
+class RawClient:
     """A WebSocket client that does nothing by itself: it answers no ping, reads only when told."""
 
     def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -98,17 +98,17 @@ class Bare:
         self.writer = writer
 
     @classmethod
-    async def connect(cls, port: int, *, handshake: bool = True, receive_buffer: int = 0) -> "Bare":
+    async def connect(cls, port: int, *, handshake: bool = True, receive_buffer: int = 0) -> "RawClient":
         sock = socket.socket()
         if receive_buffer:
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, receive_buffer)
         sock.setblocking(False)
         await asyncio.get_running_loop().sock_connect(sock, ("127.0.0.1", port))
         # A small limit keeps the stream from reading ahead of the test.
-        bare = cls(*await asyncio.open_connection(sock=sock, limit=1024))
+        raw = cls(*await asyncio.open_connection(sock=sock, limit=1024))
         if handshake:
-            await bare.request()
-        return bare
+            await raw.request()
+        return raw
 
     async def request(self, *headers: str, path: str = "/") -> str:
         """Ask for a WebSocket; the status line of the answer."""
@@ -160,7 +160,7 @@ class Bare:
                 pass
             return data
 
-    def hang_up(self) -> None:
+    def cut(self) -> None:
         """Leave without a word: TCP reset."""
         sock: socket.socket = self.writer.get_extra_info("socket")
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))

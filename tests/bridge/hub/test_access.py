@@ -10,7 +10,7 @@ from websockets.exceptions import InvalidStatus
 
 from bridge.hub.access import Door, is_loopback, read_tokens, tls_context
 from bridge.hub.errors import HubError
-from tests.bridge.hub.sockets import PATIENCE, Bare, Ears, running_hub
+from tests.bridge.hub.sockets import PATIENCE, Client, RawClient, running_hub
 
 TOKEN = "correct-horse-battery-staple"
 OTHER = "another.token_of~the-same-hub"
@@ -68,10 +68,10 @@ def certificate(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 )
 async def test_a_token_opens_the_door(headers: list[str], status: int) -> None:
     async with running_hub(door=Door(tokens=(TOKEN, OTHER))) as port:
-        bare = await Bare.connect(port, handshake=False)
-        answer = await bare.request(*headers)
+        raw = await RawClient.connect(port, handshake=False)
+        answer = await raw.request(*headers)
         assert f" {status} " in answer
-        bare.hang_up()
+        raw.cut()
 
 
 async def test_a_browsers_token_is_not_sent_back() -> None:
@@ -82,7 +82,7 @@ async def test_a_browsers_token_is_not_sent_back() -> None:
         assert socket.subprotocol == "rosbridge"
         assert socket.response is not None
         assert TOKEN not in str(socket.response.headers)
-        await Ears(socket).settle()
+        await Client(socket).sync()
 
 
 async def test_without_tokens_a_subprotocol_is_nobodys_business() -> None:
@@ -91,7 +91,7 @@ async def test_without_tokens_a_subprotocol_is_nobodys_business() -> None:
         connect(f"ws://127.0.0.1:{port}", subprotocols=["rosbridge"]) as socket,  # type: ignore[list-item]  # NewType of str
     ):
         assert socket.subprotocol == "rosbridge"
-        await Ears(socket).settle()
+        await Client(socket).sync()
 
 
 async def test_tokens_are_in_no_log_and_no_answer(caplog: pytest.LogCaptureFixture) -> None:
@@ -144,14 +144,14 @@ async def test_tls_and_a_token(certificate: tuple[Path, Path]) -> None:
     async with running_hub(door=door) as port:
         headers = {"Authorization": f"Bearer {TOKEN}"}
         async with connect(f"wss://localhost:{port}", ssl=trusting, additional_headers=headers) as socket:
-            ears = Ears(socket)
+            ears = Client(socket)
             await ears.send(op="subscribe", topic="/t", type="a/B")
             for size in (0, 100, 100_000, 1_000_000):
                 await ears.send(op="publish", topic="/t", msg={"data": "x" * size})
-                assert (await ears.hear())["msg"] == {"data": "x" * size}
+                assert (await ears.receive())["msg"] == {"data": "x" * size}
         with pytest.raises(ssl.SSLCertVerificationError):
             await connect(f"wss://localhost:{port}", additional_headers=headers)
-        plain = await Bare.connect(port, handshake=False)
+        plain = await RawClient.connect(port, handshake=False)
         plain.writer.write(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
         assert b"101" not in await plain.ended()
 
@@ -160,8 +160,8 @@ async def test_the_hub_ends_its_tls_connections(certificate: tuple[Path, Path]) 
     trusting = ssl.create_default_context(cafile=str(certificate[0]))
     async with running_hub(door=Door(tls=tls_context(*certificate))) as port:
         socket = await connect(f"wss://localhost:{port}", ssl=trusting)
-        await Ears(socket).settle()
-    assert await Ears(socket).closed() == 1001
+        await Client(socket).sync()
+    assert await Client(socket).closed() == 1001
 
 
 def test_what_is_no_certificate_is_one_sentence(certificate: tuple[Path, Path], tmp_path: Path) -> None:

@@ -19,11 +19,11 @@ from websockets.exceptions import WebSocketException
 from websockets.frames import Opcode
 
 from bridge.hub.limits import HubLimits
-from tests.bridge.hub.sockets import PATIENCE, Bare, Ears, client, running_hub
+from tests.bridge.hub.sockets import PATIENCE, Client, RawClient, client, running_hub
 
 
 @asynccontextmanager
-async def _hub_and_witness(limits: HubLimits | None = None) -> AsyncIterator[tuple[int, Ears]]:
+async def _hub_and_witness(limits: HubLimits | None = None) -> AsyncIterator[tuple[int, Client]]:
     """A hub, and a client of it that hears its own messages before, and must do so after."""
     async with running_hub(limits=limits) as port, client(port) as witness:
         await witness.send(op="advertise", topic="/witness", type="a/B")
@@ -33,9 +33,9 @@ async def _hub_and_witness(limits: HubLimits | None = None) -> AsyncIterator[tup
         await _serves(witness)
 
 
-async def _serves(witness: Ears) -> None:
+async def _serves(witness: Client) -> None:
     await witness.send(op="publish", topic="/witness", msg={"well": True})
-    assert (await witness.hear())["msg"] == {"well": True}
+    assert (await witness.receive())["msg"] == {"well": True}
 
 
 # --- wrong messages
@@ -45,7 +45,7 @@ async def _serves(witness: Ears) -> None:
 async def test_a_message_that_is_too_large_costs_the_connection(fragments: int) -> None:
     limits = HubLimits(message_bytes=10_000)
     async with _hub_and_witness(limits) as (port, _witness), client(port) as greedy:
-        await greedy.settle()
+        await greedy.sync()
         part = "x" * (10_001 // fragments + 1)
         await greedy.websocket.send(part if fragments == 1 else [part] * fragments)
         assert await greedy.closed() == 1009
@@ -53,9 +53,9 @@ async def test_a_message_that_is_too_large_costs_the_connection(fragments: int) 
 
 async def test_a_huge_message_is_refused_before_it_has_come() -> None:
     async with _hub_and_witness() as (port, _witness):
-        bare = await Bare.connect(port)
-        bare.writer.write(b"\x81\xff" + (1 << 62).to_bytes(8, "big") + b"mask" + b"x" * 100)
-        data = await bare.ended()
+        raw = await RawClient.connect(port)
+        raw.writer.write(b"\x81\xff" + (1 << 62).to_bytes(8, "big") + b"mask" + b"x" * 100)
+        data = await raw.ended()
         assert data[:1] == b"\x88"
         assert data[2:4] == (1009).to_bytes(2, "big")
 
@@ -77,11 +77,11 @@ async def test_a_huge_message_is_refused_before_it_has_come() -> None:
 @pytest.mark.parametrize("opcode", [Opcode.TEXT, Opcode.BINARY])
 async def test_nonsense_leaves_no_zombie(data: bytes, opcode: Opcode) -> None:
     async with _hub_and_witness() as (port, _witness):
-        bare = await Bare.connect(port)
-        bare.send(data, opcode=opcode)
-        bare.send_operation(op="call_service", service="/rosapi/get_ros_version", id=1)
-        assert json.loads(await bare.message())["values"]["version"] == 1
-        bare.hang_up()
+        raw = await RawClient.connect(port)
+        raw.send(data, opcode=opcode)
+        raw.send_operation(op="call_service", service="/rosapi/get_ros_version", id=1)
+        assert json.loads(await raw.message())["values"]["version"] == 1
+        raw.cut()
 
 
 @pytest.mark.parametrize(
@@ -98,9 +98,9 @@ async def test_nonsense_leaves_no_zombie(data: bytes, opcode: Opcode) -> None:
 )
 async def test_broken_frames_cost_the_connection(frame: bytes) -> None:
     async with _hub_and_witness() as (port, _witness):
-        bare = await Bare.connect(port)
-        bare.writer.write(frame)
-        data = await bare.ended()
+        raw = await RawClient.connect(port)
+        raw.writer.write(frame)
+        data = await raw.ended()
         assert data[:1] == b"\x88"
         assert data[2:4] == (1002).to_bytes(2, "big")
 
@@ -108,26 +108,26 @@ async def test_broken_frames_cost_the_connection(frame: bytes) -> None:
 async def test_fragments_without_end_and_without_content_take_nothing() -> None:
     limits = HubLimits(message_bytes=1000)
     async with _hub_and_witness(limits) as (port, witness):
-        bare = await Bare.connect(port)
-        bare.send(b"", fin=False)
+        raw = await RawClient.connect(port)
+        raw.send(b"", fin=False)
         for _ in range(20_000):
-            bare.send(b"", opcode=Opcode.CONT, fin=False)
-        await bare.writer.drain()
-        await witness.settle()
-        bare.send(b'{"op":"call_service","service":"/rosapi/get_ros_version"}', opcode=Opcode.CONT)
-        assert json.loads(await bare.message())["result"] is True
-        bare.hang_up()
+            raw.send(b"", opcode=Opcode.CONT, fin=False)
+        await raw.writer.drain()
+        await witness.sync()
+        raw.send(b'{"op":"call_service","service":"/rosapi/get_ros_version"}', opcode=Opcode.CONT)
+        assert json.loads(await raw.message())["result"] is True
+        raw.cut()
 
 
 @given(st.lists(st.binary(max_size=200), max_size=5), st.booleans())
 @settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 async def test_any_bytes_after_the_handshake(chunks: list[bytes], handshake: bool) -> None:
     async with _hub_and_witness() as (port, witness):
-        bare = await Bare.connect(port, handshake=handshake)
+        raw = await RawClient.connect(port, handshake=handshake)
         for chunk in chunks:
-            bare.writer.write(chunk)
-            await witness.settle()
-        bare.hang_up()
+            raw.writer.write(chunk)
+            await witness.sync()
+        raw.cut()
 
 
 # --- floods
@@ -135,36 +135,36 @@ async def test_any_bytes_after_the_handshake(chunks: list[bytes], handshake: boo
 
 async def test_a_flood_of_nonsense_leaves_others_served() -> None:
     async with _hub_and_witness() as (port, witness):
-        bare = await Bare.connect(port)
+        raw = await RawClient.connect(port)
         flood = b"\x81\x82mask\x59\x53" * 20_000  # "42"
-        flooding = asyncio.create_task(_flood(bare, flood))
+        flooding = asyncio.create_task(_flood(raw, flood))
         for _ in range(30):
             await _serves(witness)
         flooding.cancel()
-        bare.hang_up()
+        raw.cut()
 
 
-async def _flood(bare: Bare, data: bytes) -> None:
+async def _flood(raw: RawClient, data: bytes) -> None:
     while True:
-        bare.writer.write(data)
-        await bare.writer.drain()
+        raw.writer.write(data)
+        await raw.writer.drain()
 
 
 async def test_a_flood_of_messages_reaches_its_readers_and_leaves_others_served() -> None:
     async with _hub_and_witness() as (port, witness), client(port) as reader:
         await reader.send(op="subscribe", topic="/flood", type="a/B", queue_length=1)
-        await reader.settle()
-        bare = await Bare.connect(port)
+        await reader.sync()
+        raw = await RawClient.connect(port)
         for index in range(5000):
-            bare.send_operation(op="publish", topic="/flood", msg={"i": index})
+            raw.send_operation(op="publish", topic="/flood", msg={"i": index})
         for _ in range(10):
             await _serves(witness)
         heard = -1
         while heard < 4999:  # some may be dropped, the last never, and none comes out of order
-            index = (await reader.hear())["msg"]["i"]
+            index = (await reader.receive())["msg"]["i"]
             assert index > heard
             heard = index
-        bare.hang_up()
+        raw.cut()
 
 
 async def test_a_flood_of_calls_without_reading_costs_the_connection(quick_sweeps: None) -> None:
@@ -172,11 +172,11 @@ async def test_a_flood_of_calls_without_reading_costs_the_connection(quick_sweep
     async with _hub_and_witness(limits) as (port, witness):
         for index in range(1500):  # so that one answer has 50 kB
             await witness.send(op="subscribe", topic=f"/a/long/name/of/a/topic/{index}")
-        await witness.settle()
-        bare = await Bare.connect(port, receive_buffer=4096)
+        await witness.sync()
+        raw = await RawClient.connect(port, receive_buffer=4096)
         for _ in range(1000):
-            bare.send_operation(op="call_service", service="/rosapi/topics")
-        await _gone(witness, bare)
+            raw.send_operation(op="call_service", service="/rosapi/topics")
+        await _gone(witness, raw)
 
 
 async def test_thousands_of_topics() -> None:
@@ -187,7 +187,7 @@ async def test_thousands_of_topics() -> None:
         for index in range(3000):
             await many.send(op="publish", topic=f"/t{index}", msg={"i": index})
         for index in range(3000):
-            assert (await many.hear())["msg"] == {"i": index}
+            assert (await many.receive())["msg"] == {"i": index}
         assert len((await witness.ask("/rosapi/topics"))["topics"]) == 3002
 
 
@@ -196,12 +196,12 @@ async def test_thousands_of_topics() -> None:
 
 async def test_a_slow_client_misses_the_oldest_and_then_has_the_newest() -> None:
     async with _hub_and_witness() as (port, witness):
-        slow = await Bare.connect(port, receive_buffer=4096)
+        slow = await RawClient.connect(port, receive_buffer=4096)
         slow.send_operation(op="subscribe", topic="/big", type="a/B", queue_length=2)
         await until_subscribed(witness, "/big")
         for count in range(300):  # 15 MB: more than socket buffers take
             await witness.send(op="publish", topic="/big", msg={"i": count, "data": "x" * 50_000})
-        await witness.settle()
+        await witness.sync()
         heard = []
         while not heard or heard[-1] < 299:
             async with asyncio.timeout(PATIENCE):
@@ -209,29 +209,29 @@ async def test_a_slow_client_misses_the_oldest_and_then_has_the_newest() -> None
         assert heard == sorted(set(heard))
         assert len(heard) < 250
         assert heard[-2:] == [298, 299]
-        slow.hang_up()
+        slow.cut()
 
 
-async def until_subscribed(witness: Ears, topic: str) -> None:
+async def until_subscribed(witness: Client, topic: str) -> None:
     async with asyncio.timeout(PATIENCE):
         while not (await witness.ask("/rosapi/subscribers", topic=topic))["subscribers"]:
             await asyncio.sleep(0.01)
 
 
-async def _gone(witness: Ears, bare: Bare) -> None:
+async def _gone(witness: Client, raw: RawClient) -> None:
     """Wait until the hub has forgotten all clients but the witness."""
     async with asyncio.timeout(PATIENCE):
         while len((await witness.ask("/rosapi/nodes"))["nodes"]) > 2:
             await asyncio.sleep(0.01)
-    await bare.ended()
+    await raw.ended()
 
 
 async def test_a_client_that_never_reads_is_closed_and_costs_others_nothing(quick_sweeps: None) -> None:
     limits = HubLimits(stuck_timeout=0.2)
     async with _hub_and_witness(limits) as (port, witness), client(port) as reader:
         await reader.send(op="subscribe", topic="/big", type="a/B")
-        await reader.settle()
-        stuck = await Bare.connect(port, receive_buffer=4096)
+        await reader.sync()
+        stuck = await RawClient.connect(port, receive_buffer=4096)
         stuck.send_operation(op="subscribe", topic="/big")
         async with asyncio.timeout(PATIENCE):
             while len((await witness.ask("/rosapi/subscribers", topic="/big"))["subscribers"]) < 2:
@@ -240,7 +240,7 @@ async def test_a_client_that_never_reads_is_closed_and_costs_others_nothing(quic
         async with asyncio.timeout(PATIENCE):
             while len((await witness.ask("/rosapi/subscribers", topic="/big"))["subscribers"]) == 2:
                 await witness.send(op="publish", topic="/big", msg={"i": count, "data": "x" * 50_000})
-                assert (await reader.hear())["msg"]["i"] == count
+                assert (await reader.receive())["msg"]["i"] == count
                 count += 1
         assert count > 5
         await stuck.ended()
@@ -249,13 +249,13 @@ async def test_a_client_that_never_reads_is_closed_and_costs_others_nothing(quic
 async def test_a_client_that_only_publishes_and_never_reads_may_stay(quick_sweeps: None) -> None:
     limits = HubLimits(ping_interval=0.05, ping_timeout=10.0)
     async with _hub_and_witness(limits) as (port, witness):
-        bare = await Bare.connect(port)
-        bare.send_operation(op="advertise", topic="/t", type="a/B")
+        raw = await RawClient.connect(port)
+        raw.send_operation(op="advertise", topic="/t", type="a/B")
         for _ in range(20):
-            bare.send_operation(op="publish", topic="/t", msg={})
+            raw.send_operation(op="publish", topic="/t", msg={})
             await asyncio.sleep(0.02)
         assert (await witness.ask("/rosapi/publishers", topic="/t"))["publishers"]
-        bare.hang_up()
+        raw.cut()
 
 
 # --- fragments, forms, actions
@@ -264,30 +264,30 @@ async def test_a_client_that_only_publishes_and_never_reads_may_stay(quick_sweep
 async def test_fragments_that_never_end_take_nothing_from_others() -> None:
     limits = HubLimits(message_bytes=20_000)
     async with _hub_and_witness(limits) as (port, witness):
-        bare = await Bare.connect(port)
+        raw = await RawClient.connect(port)
         for index in range(2000):
-            bare.send_operation(op="fragment", id=index % 50, data="x" * 5000, num=index % 60, total=60)
-        bare.send_operation(op="fragment", id="whole", data='{"op":"call_service",', num=0, total=2)
-        bare.send_operation(
+            raw.send_operation(op="fragment", id=index % 50, data="x" * 5000, num=index % 60, total=60)
+        raw.send_operation(op="fragment", id="whole", data='{"op":"call_service",', num=0, total=2)
+        raw.send_operation(
             op="fragment", id="whole", data='"service":"/rosapi/get_ros_version","id":"f"}', num=1, total=2
         )
-        await bare.writer.drain()
-        answer = json.loads(await bare.message())
+        await raw.writer.drain()
+        answer = json.loads(await raw.message())
         assert (answer["id"], answer["result"]) == ("f", True)
         await _serves(witness)
-        bare.hang_up()
+        raw.cut()
 
 
 async def test_fragments_within_fragments_go_nowhere() -> None:
     async with _hub_and_witness() as (port, _witness):
-        bare = await Bare.connect(port)
+        raw = await RawClient.connect(port)
         operation = {"op": "call_service", "service": "/rosapi/get_time"}
         for _ in range(8):  # each one makes the next three times as large
             operation = {"op": "fragment", "id": "f", "data": json.dumps(operation), "num": 0, "total": 1}
-        bare.send_operation(**operation)
-        bare.send_operation(op="call_service", service="/rosapi/get_ros_version", id="after")
-        assert json.loads(await bare.message())["id"] == "after"
-        bare.hang_up()
+        raw.send_operation(**operation)
+        raw.send_operation(op="call_service", service="/rosapi/get_ros_version", id="after")
+        assert json.loads(await raw.message())["id"] == "after"
+        raw.cut()
 
 
 @pytest.mark.parametrize(
@@ -299,7 +299,7 @@ async def test_a_slow_client_that_wants_another_form_costs_others_nothing(
 ) -> None:
     limits = HubLimits(stuck_timeout=0.3)
     async with _hub_and_witness(limits) as (port, witness):
-        stuck = await Bare.connect(port, receive_buffer=4096)
+        stuck = await RawClient.connect(port, receive_buffer=4096)
         stuck.send_operation(op="subscribe", topic="/big", type="std_msgs/String", **wish)
         await until_subscribed(witness, "/big")
         await witness.send(op="advertise", topic="/big", type="std_msgs/String")
@@ -312,7 +312,7 @@ async def test_a_slow_client_that_wants_another_form_costs_others_nothing(
 
 async def test_binary_messages_that_are_no_json_are_refused() -> None:
     async with _hub_and_witness() as (port, _witness):
-        bare = await Bare.connect(port)
+        raw = await RawClient.connect(port)
         deep = b"\x81" * 100_000
         for data in (
             b"\xa1bopgpublish",
@@ -320,57 +320,57 @@ async def test_binary_messages_that_are_no_json_are_refused() -> None:
             b"\xbf" * 1000,
             b"\xd8\x56\x5b\xff\xff\xff\xff\xff\xff\xff\xff",
         ):
-            bare.send(data, opcode=Opcode.BINARY)
-        bare.send_operation(op="call_service", service="/rosapi/get_ros_version", id="after")
-        assert json.loads(await bare.message())["id"] == "after"
-        bare.hang_up()
+            raw.send(data, opcode=Opcode.BINARY)
+        raw.send_operation(op="call_service", service="/rosapi/get_ros_version", id="after")
+        assert json.loads(await raw.message())["id"] == "after"
+        raw.cut()
 
 
 async def test_a_flood_of_goals_is_bounded_and_answered() -> None:
     limits = HubLimits(goals_per_client=10)
     async with _hub_and_witness(limits) as (port, _witness), client(port) as server, client(port) as asker:
         await server.send(op="advertise_action", action="/slow", type="a/action/Slow")
-        await server.settle()
+        await server.sync()
         for number in range(500):
             await asker.send(op="send_action_goal", id=number, action="/slow", feedback=True)
-        answers = [await asker.hear() for _ in range(490)]
+        answers = [await asker.receive() for _ in range(490)]
         assert {answer["result"] for answer in answers} == {False}
         assert {answer["id"] for answer in answers} == set(range(10, 500))
-        keys = [(await server.hear())["id"] for _ in range(10)]
+        keys = [(await server.receive())["id"] for _ in range(10)]
         for index in range(2000):
             await server.send(op="action_feedback", id=keys[0], values={"i": index})
         for key in keys:
             await server.send(op="action_result", id=key, values={})
         ended = 0
         while ended < 10:
-            ended += (await asker.hear())["op"] == "action_result"
+            ended += (await asker.receive())["op"] == "action_result"
 
 
 async def test_a_server_of_actions_that_hangs_up_fails_its_goals() -> None:
     async with _hub_and_witness() as (port, witness):
-        server = await Bare.connect(port)
+        server = await RawClient.connect(port)
         server.send_operation(op="advertise_action", action="/dock", type="a/action/Dock")
         async with asyncio.timeout(PATIENCE):
             while "/dock" not in (await witness.ask("/rosapi/action_servers"))["action_servers"]:
                 await asyncio.sleep(0.01)
         await witness.send(op="send_action_goal", id="x", action="/dock")
         assert json.loads(await server.message())["op"] == "send_action_goal"
-        server.hang_up()
-        answer = await witness.hear()
+        server.cut()
+        answer = await witness.receive()
         assert (answer["op"], answer["id"], answer["result"]) == ("action_result", "x", False)
 
 
 async def test_a_flood_of_refusals_is_told_without_harm() -> None:
     async with _hub_and_witness() as (port, witness), client(port, max_queue=None) as listener:
         await listener.send(op="subscribe", topic="/rosout", queue_length=10)
-        await listener.settle()
-        bare = await Bare.connect(port)
-        bare.send_operation(op="set_level", level="error")
+        await listener.sync()
+        raw = await RawClient.connect(port)
+        raw.send_operation(op="set_level", level="error")
         for _ in range(5000):
-            bare.send(b"42")
-        assert (await listener.hear())["topic"] == "/rosout"
+            raw.send(b"42")
+        assert (await listener.receive())["topic"] == "/rosout"
         await _serves(witness)
-        bare.hang_up()
+        raw.cut()
 
 
 # --- those who vanish
@@ -379,29 +379,29 @@ async def test_a_flood_of_refusals_is_told_without_harm() -> None:
 async def test_a_silent_client_is_pinged_and_then_closed(quick_sweeps: None) -> None:
     limits = HubLimits(ping_interval=0.1, ping_timeout=2.0)
     async with _hub_and_witness(limits) as (port, witness):
-        bare = await Bare.connect(port)
-        assert await bare.frame() == (Opcode.PING, b"")
-        await _gone(witness, bare)
+        raw = await RawClient.connect(port)
+        assert await raw.frame() == (Opcode.PING, b"")
+        await _gone(witness, raw)
 
 
 async def test_a_client_that_answers_pings_may_be_silent(quick_sweeps: None) -> None:
     limits = HubLimits(ping_interval=0.02, ping_timeout=10.0)
     async with _hub_and_witness(limits) as (port, _witness):
-        bare = await Bare.connect(port)
+        raw = await RawClient.connect(port)
         for _ in range(10):
-            assert (await bare.frame())[0] == Opcode.PING
-            bare.send(b"", opcode=Opcode.PONG)
-        bare.send_operation(op="call_service", service="/rosapi/get_ros_version")
-        answer = await bare.message()  # the next sweep's ping may come before it
+            assert (await raw.frame())[0] == Opcode.PING
+            raw.send(b"", opcode=Opcode.PONG)
+        raw.send_operation(op="call_service", service="/rosapi/get_ros_version")
+        answer = await raw.message()  # the next sweep's ping may come before it
         assert json.loads(answer)["result"] is True
-        bare.hang_up()
+        raw.cut()
 
 
 async def test_a_connection_without_a_handshake_is_closed(quick_sweeps: None) -> None:
     async with _hub_and_witness(HubLimits(handshake_timeout=0.5)) as (port, _witness):
-        silent = await Bare.connect(port, handshake=False)
+        silent = await RawClient.connect(port, handshake=False)
         assert await silent.ended() == b""
-        slow = await Bare.connect(port, handshake=False)
+        slow = await RawClient.connect(port, handshake=False)
         slow.writer.write(b"GET / HTTP/1.1\r\n")
         assert await slow.ended() == b""
 
@@ -410,12 +410,12 @@ async def test_connections_without_a_handshake_do_not_fill_the_hub(quick_sweeps:
     limits = HubLimits(clients=3, handshake_timeout=0.5)
     async with _hub_and_witness(limits) as (port, _witness):
         for _ in range(100):
-            await Bare.connect(port, handshake=False)
+            await RawClient.connect(port, handshake=False)
         async with asyncio.timeout(PATIENCE):
             while True:
                 with contextlib.suppress(OSError, WebSocketException):
                     async with client(port) as late:
-                        await late.settle()
+                        await late.sync()
                         break
                 await asyncio.sleep(0.01)
 
@@ -423,43 +423,43 @@ async def test_connections_without_a_handshake_do_not_fill_the_hub(quick_sweeps:
 async def test_connections_without_a_handshake_are_counted() -> None:
     limits = HubLimits(clients=3, handshake_timeout=1000)
     async with _hub_and_witness(limits) as (port, _witness):
-        crowd = [await Bare.connect(port, handshake=False) for _ in range(100)]
-        for bare in crowd[3 + 64 - 1 :]:
-            assert await bare.ended() == b""
+        crowd = [await RawClient.connect(port, handshake=False) for _ in range(100)]
+        for raw in crowd[3 + 64 - 1 :]:
+            assert await raw.ended() == b""
         assert not crowd[0].reader.at_eof()
-        for bare in crowd:
-            bare.hang_up()
+        for raw in crowd:
+            raw.cut()
 
 
 async def test_a_server_that_hangs_up_during_a_call_fails_it() -> None:
     async with _hub_and_witness() as (port, witness):
-        server = await Bare.connect(port)
+        server = await RawClient.connect(port)
         server.send_operation(op="advertise_service", service="/add", type="a/Add")
         async with asyncio.timeout(PATIENCE):
             while "/add" not in (await witness.ask("/rosapi/services"))["services"]:
                 await asyncio.sleep(0.01)
         await witness.send(op="call_service", service="/add", id="x")
         assert json.loads(await server.message())["op"] == "call_service"
-        server.hang_up()
-        answer = await witness.hear()
+        server.cut()
+        answer = await witness.receive()
         assert (answer["id"], answer["result"]) == ("x", False)
 
 
 @pytest.mark.parametrize("how", ["reset", "eof", "mid-message"])
 async def test_whoever_vanishes_leaves_nothing(how: str) -> None:
     async with _hub_and_witness() as (port, witness):
-        bare = await Bare.connect(port)
-        bare.send_operation(op="subscribe", topic="/t", type="a/B")
-        bare.send_operation(op="advertise", topic="/t", type="a/B", latch=True)
-        bare.send_operation(op="publish", topic="/t", msg={})
+        raw = await RawClient.connect(port)
+        raw.send_operation(op="subscribe", topic="/t", type="a/B")
+        raw.send_operation(op="advertise", topic="/t", type="a/B", latch=True)
+        raw.send_operation(op="publish", topic="/t", msg={})
         await until_subscribed(witness, "/t")
         if how == "mid-message":
-            bare.writer.write(b"\x81\xfe\x01\x00maskpart of it")
-            await bare.writer.drain()
+            raw.writer.write(b"\x81\xfe\x01\x00maskpart of it")
+            await raw.writer.drain()
         if how == "eof":
-            bare.writer.write_eof()
+            raw.writer.write_eof()
         else:
-            bare.hang_up()
+            raw.cut()
         async with asyncio.timeout(PATIENCE):
             while "/t" in (await witness.ask("/rosapi/topics"))["topics"]:
                 await asyncio.sleep(0.01)
@@ -468,10 +468,10 @@ async def test_whoever_vanishes_leaves_nothing(how: str) -> None:
 async def test_clients_that_come_and_go_leave_nothing() -> None:
     async with _hub_and_witness() as (port, witness):
         for _ in range(100):
-            bare = await Bare.connect(port)
-            bare.send_operation(op="subscribe", topic="/witness")
+            raw = await RawClient.connect(port)
+            raw.send_operation(op="subscribe", topic="/witness")
             await _serves(witness)
-            bare.hang_up()
+            raw.cut()
         async with asyncio.timeout(PATIENCE):
             while len((await witness.ask("/rosapi/nodes"))["nodes"]) > 2:
                 await asyncio.sleep(0.01)

@@ -11,7 +11,7 @@ from typing import Any
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from tests.bridge.hub.broker_harness import Guest, Room
+from tests.bridge.hub.broker_harness import Harness, Peer
 
 _NAMES = ["/t", "t", "/u", "/u", "/v", "v", "/w", "", "a b"]
 _TYPES = ["a/B", "a/msg/B", "a/B", "a/B", "a/C", "nonsense"]
@@ -80,8 +80,8 @@ def _operation(rng: random.Random) -> dict[str, Any]:
 class _Visitor:
     """A client that remembers what it was asked, and counts its own calls and their answers."""
 
-    def __init__(self, room: Room) -> None:
-        self.guest: Guest = room.enter()
+    def __init__(self, hub: Harness) -> None:
+        self.peer: Peer = hub.connect()
         self.requests: list[str] = []
         self.goals: list[str] = []
         self.calls: set[int] = set()
@@ -94,12 +94,12 @@ class _Visitor:
         goal = operation["op"] == "send_action_goal" and isinstance(action, str) and action
         if call or goal:
             operation["id"] = call_number
-            if len(json.dumps(operation)) <= self.guest.room.broker.limits.message_bytes:
+            if len(json.dumps(operation)) <= self.peer.hub.broker.limits.message_bytes:
                 self.calls.add(call_number)
-        self.guest.send(**operation)
+        self.peer.send(**operation)
 
     def read(self, happened: Counter[str]) -> None:
-        for operation in self.guest.read():
+        for operation in self.peer.read():
             happened[operation["op"]] += 1
             if operation["op"] == "call_service":
                 self.requests.append(operation["id"])
@@ -121,7 +121,7 @@ class _Visitor:
         """Say how far a goal is, or end it."""
         at = rng.randrange(len(self.goals))
         ends = rng.random() < 0.5
-        self.guest.send(
+        self.peer.send(
             op="action_result" if ends else "action_feedback",
             id=self.goals.pop(at) if ends else self.goals[at],
             action=rng.choice(_ACTIONS),
@@ -131,7 +131,7 @@ class _Visitor:
         )
 
     def answer(self, rng: random.Random) -> None:
-        self.guest.send(
+        self.peer.send(
             op="service_response",
             id=self.requests.pop(rng.randrange(len(self.requests))),
             values=rng.choice([{}, {"a": 1}, "no", {"a": "x" * 3400}, None]),
@@ -142,7 +142,7 @@ class _Visitor:
 def _live(seed: int, steps: int) -> Counter[str]:
     """One life of a hub; what happened in it, counted."""
     rng = random.Random(seed)
-    room = Room(
+    hub = Harness(
         topics=3,
         advertisements_per_client=4,
         subscriptions_per_client=4,
@@ -156,7 +156,7 @@ def _live(seed: int, steps: int) -> Counter[str]:
         longest_queue=5,
         parameters=2,
     )
-    visitors = [_Visitor(room) for _ in range(4)]
+    visitors = [_Visitor(hub) for _ in range(4)]
     happened: Counter[str] = Counter()
     for number in range(steps):
         who = rng.randrange(len(visitors))
@@ -176,50 +176,50 @@ def _live(seed: int, steps: int) -> Counter[str]:
             for each in visitors:
                 each.read(happened)
         elif step == "wait":
-            room.pass_time(rng.choice([0.01, 0.05, 1.0, 30.0]))
+            hub.advance(rng.choice([0.01, 0.05, 1.0, 30.0]))
         elif step == "reconnect":
-            happened["doomed"] += bool(visitor.guest.client.close_reason)
+            happened["doomed"] += bool(visitor.peer.client.close_reason)
             happened["dropped"] += sum(
-                subscription.lane.dropped for subscription in visitor.guest.client.subscriptions.values()
+                subscription.lane.dropped for subscription in visitor.peer.client.subscriptions.values()
             )
-            visitor.guest.leave()
-            visitors[who] = _Visitor(room)
-        room.check()
-        graph = room.broker.graph
+            visitor.peer.disconnect()
+            visitors[who] = _Visitor(hub)
+        hub.check()
+        graph = hub.broker.graph
         happened["latched"] += graph.latched_bytes > 0
-        happened["held"] += bool(room.broker._dispatcher.throttled)
-        ready = room.broker.take_ready()
+        happened["held"] += bool(hub.broker._dispatcher.throttled)
+        ready = hub.broker.take_ready()
         assert len(set(ready)) == len(ready)
-    _end(room, visitors, happened)
+    _end(hub, visitors, happened)
     return happened
 
 
-def _end(room: Room, visitors: list[_Visitor], happened: Counter[str]) -> None:
+def _end(hub: Harness, visitors: list[_Visitor], happened: Counter[str]) -> None:
     for visitor in visitors:
         if (
-            visitor.guest.client.close_reason
+            visitor.peer.client.close_reason
         ):  # as whoever owns its socket would; goals that it never read fail now
-            visitor.guest.leave()
+            visitor.peer.disconnect()
     for _ in range(2):
         for visitor in visitors:
             visitor.read(happened)
             for key in visitor.goals:  # a goal has no time limit: who works on it ends it, or goes
-                visitor.guest.send(op="action_result", id=key, values={})
-        room.pass_time(120)
+                visitor.peer.send(op="action_result", id=key, values={})
+        hub.advance(120)
     for visitor in visitors:
         visitor.read(happened)
-        if not visitor.guest.client.close_reason:
+        if not visitor.peer.client.close_reason:
             assert visitor.calls == visitor.answered, "a call without an answer"
-        visitor.guest.leave()
-        room.check()
-    graph = room.broker.graph
+        visitor.peer.disconnect()
+        hub.check()
+    graph = hub.broker.graph
     assert not graph.topics
     assert not graph.services
     assert not graph.actions
-    assert not room.broker._actions.goals
-    assert not room.broker._calls.pending
-    room.pass_time(120)
-    assert not room.broker._dispatcher.throttled
+    assert not hub.broker._actions.goals
+    assert not hub.broker._calls.pending
+    hub.advance(120)
+    assert not hub.broker._dispatcher.throttled
 
 
 @given(st.integers(0, 2**32))

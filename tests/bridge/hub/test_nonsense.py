@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.bridge.hub.broker_harness import Room
+from tests.bridge.hub.broker_harness import Harness
 
 NONSENSE = [
     b"",
@@ -55,41 +55,40 @@ NONSENSE = [
 
 @pytest.mark.parametrize("data", NONSENSE, ids=lambda data: repr(data[:40]))
 def test_nonsense_is_refused_and_its_sender_served_on(data: bytes) -> None:
-    room = Room()
-    sender, other = room.enter(), room.enter()
-    for guest in (sender, other):
-        guest.advertise("/t")
-        guest.subscribe("/t")
+    hub = Harness()
+    sender, other = hub.connect(), hub.connect()
+    for peer in (sender, other):
+        peer.advertise("/t")
+        peer.subscribe("/t")
     sender.send_raw(data)
     assert sender.read() == other.read() == []
     assert sender.client.refused == 1
-    room.check()
     sender.publish("/t", {"a": 1})
-    assert sender.heard() == other.heard() == [{"a": 1}]
+    assert sender.messages() == other.messages() == [{"a": 1}]
 
 
 def test_depth_up_to_the_limit_passes() -> None:
-    room = Room(depth=10)
-    guest = room.enter()
-    guest.advertise("/t")
-    guest.subscribe("/t")
+    hub = Harness(depth=10)
+    peer = hub.connect()
+    peer.advertise("/t")
+    peer.subscribe("/t")
     for levels, passes in ((8, True), (9, False)):  # the operation and its message are two more
-        guest.send_raw(b'{"op":"publish","topic":"/t","msg":{"a":%b%b}}' % (b"[" * levels, b"]" * levels))
-        assert bool(guest.read()) is passes
+        peer.send_raw(b'{"op":"publish","topic":"/t","msg":{"a":%b%b}}' % (b"[" * levels, b"]" * levels))
+        assert bool(peer.read()) is passes
 
 
 def test_what_is_larger_than_the_limit_is_refused() -> None:
-    room = Room(message_bytes=100)
-    guest = room.enter()
-    guest.send_raw(b'{"op":"subscribe","topic":"/t"%b}' % (b" " * 100))
-    assert guest.client.refused == 1
+    hub = Harness(message_bytes=100)
+    peer = hub.connect()
+    peer.send_raw(b'{"op":"subscribe","topic":"/t"%b}' % (b" " * 100))
+    assert peer.client.refused == 1
 
 
 def test_a_flood_of_nonsense_is_no_flood_of_log_lines(caplog: pytest.LogCaptureFixture) -> None:
-    guest = Room().enter("192.0.2.1")
+    peer = Harness().connect("192.0.2.1")
     with caplog.at_level(logging.WARNING, "bridge.hub.broker"):
         for _ in range(1234):
-            guest.send_raw(b"42")
+            peer.send_raw(b"42")
     assert len(caplog.records) == 4  # the 1st, 10th, 100th and 1000th
     assert "192.0.2.1" in caplog.text
 
@@ -99,7 +98,7 @@ _JSON = st.recursive(
     lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner),
 )
 _KNOWN_FIELDS = st.fixed_dictionaries(
-    {"op": st.sampled_from(sorted(Room().broker._operations))},
+    {"op": st.sampled_from(sorted(Harness().broker._operations))},
     optional=dict.fromkeys(["topic", "service", "type", "id", "msg", "args", "values", "result"], _JSON),
 )
 
@@ -107,14 +106,12 @@ _KNOWN_FIELDS = st.fixed_dictionaries(
 @given(st.lists(st.one_of(st.binary(), _JSON, _KNOWN_FIELDS), min_size=1, max_size=5))
 @settings(max_examples=100, deadline=None)
 def test_any_bytes_and_any_json_keep_the_hub_well(contents: list[Any]) -> None:
-    room = Room()
-    sender, other = room.enter(), room.enter()
+    hub = Harness()
+    sender, other = hub.connect(), hub.connect()
     for content in contents:
         sender.send_raw(content if isinstance(content, bytes) else json.dumps(content).encode())
-        room.check()
-    sender.leave()
-    room.check()
+    sender.disconnect()
     other.advertise("/still/there")
     other.subscribe("/still/there")
     other.publish("/still/there", {"a": 1})
-    assert other.heard() == [{"a": 1}]
+    assert other.messages() == [{"a": 1}]

@@ -15,16 +15,16 @@ from bridge.hub.errors import HubError
 from bridge.hub.limits import HubLimits
 from bridge.hub.server import serve_hub
 from bridge.transport import frames
-from tests.bridge.hub.sockets import PATIENCE, Bare, client, running_hub
+from tests.bridge.hub.sockets import PATIENCE, RawClient, client, running_hub
 
 
 async def test_a_message_passes_from_client_to_client() -> None:
     async with running_hub() as port, client(port) as publisher, client(port) as subscriber:
         await subscriber.send(op="subscribe", topic="/t", type="a/B")
-        await subscriber.settle()
+        await subscriber.sync()
         await publisher.send(op="advertise", topic="/t", type="a/B")
         await publisher.send(op="publish", topic="/t", msg={"data": [1.5, None]})
-        assert await subscriber.hear() == {"op": "publish", "topic": "/t", "msg": {"data": [1.5, None]}}
+        assert await subscriber.receive() == {"op": "publish", "topic": "/t", "msg": {"data": [1.5, None]}}
 
 
 @pytest.mark.parametrize("length", [1, 125, 126, 127, 65_535, 65_536, 1 << 20])
@@ -40,8 +40,8 @@ async def test_messages_of_every_length_arrive_whole(size: int) -> None:
         await ears.send(op="subscribe", topic="/t")
         for text in ("x" * size, "y" * size):
             await ears.send(op="publish", topic="/t", msg={"data": text})
-        assert (await ears.hear())["msg"]["data"] == "x" * size
-        assert (await ears.hear())["msg"]["data"] == "y" * size
+        assert (await ears.receive())["msg"]["data"] == "x" * size
+        assert (await ears.receive())["msg"]["data"] == "y" * size
 
 
 async def test_many_messages_arrive_in_order_through_many_clients() -> None:
@@ -49,21 +49,21 @@ async def test_many_messages_arrive_in_order_through_many_clients() -> None:
         clients = [await stack.enter_async_context(client(port)) for _ in range(10)]
         for ears in clients:
             await ears.send(op="subscribe", topic="/t", type="a/B", queue_length=5000)
-            await ears.settle()
+            await ears.sync()
         for index in range(500):
             await clients[0].send(op="publish", topic="/t", msg={"i": index})
         for ears in clients:
-            assert [(await ears.hear())["msg"]["i"] for _ in range(500)] == list(range(500))
+            assert [(await ears.receive())["msg"]["i"] for _ in range(500)] == list(range(500))
 
 
 async def test_a_service_between_clients() -> None:
     async with running_hub() as port, client(port) as offers, client(port) as caller:
         await offers.send(op="advertise_service", service="/add", type="a/Add")
-        await offers.settle()
+        await offers.sync()
         await caller.send(op="call_service", service="/add", args={"a": 1}, id="x")
-        request = await offers.hear()
+        request = await offers.receive()
         await offers.send(op="service_response", id=request["id"], values={"sum": 2}, result=True)
-        assert (await caller.hear())["values"] == {"sum": 2}
+        assert (await caller.receive())["values"] == {"sum": 2}
 
 
 async def test_what_a_throttle_held_comes_later_by_itself() -> None:
@@ -71,17 +71,17 @@ async def test_what_a_throttle_held_comes_later_by_itself() -> None:
         await ears.send(op="subscribe", topic="/t", type="a/B", throttle_rate=30, queue_length=10)
         for index in range(4):
             await ears.send(op="publish", topic="/t", msg={"i": index})
-        assert [(await ears.hear())["msg"]["i"] for _ in range(4)] == [0, 1, 2, 3]
+        assert [(await ears.receive())["msg"]["i"] for _ in range(4)] == [0, 1, 2, 3]
 
 
 async def test_a_call_without_an_answer_fails_by_itself() -> None:
     limits = HubLimits(call_timeout=0.1)
     async with running_hub(limits=limits) as port, client(port) as offers, client(port) as caller:
         await offers.send(op="advertise_service", service="/add", type="a/Add")
-        await offers.settle()
+        await offers.sync()
         for number in range(2):
             await caller.send(op="call_service", service="/add", id=number)
-            answer = await caller.hear()
+            answer = await caller.receive()
             assert (answer["id"], answer["result"]) == (number, False)
             assert "/add" in answer["values"]
 
@@ -91,15 +91,15 @@ async def test_binary_and_fragmented_messages_are_messages() -> None:
         await ears.send(op="subscribe", topic="/t", type="a/B")
         await ears.websocket.send(b'{"op":"publish","topic":"/t","msg":{"a":1}}')
         await ears.websocket.send(['{"op":"publish",', '"topic":"/t","m', "", 'sg":{"a":2}}'])
-        assert [(await ears.hear())["msg"] for _ in range(2)] == [{"a": 1}, {"a": 2}]
+        assert [(await ears.receive())["msg"] for _ in range(2)] == [{"a": 1}, {"a": 2}]
 
 
 @pytest.mark.parametrize("path", ["/", "/rosbridge", "/a/b?c=d"])
 async def test_any_path_will_do(path: str) -> None:
     async with running_hub() as port:
-        bare = await Bare.connect(port, handshake=False)
-        assert " 101 " in await bare.request(path=path)
-        bare.hang_up()
+        raw = await RawClient.connect(port, handshake=False)
+        assert " 101 " in await raw.request(path=path)
+        raw.cut()
 
 
 async def test_nothing_is_compressed() -> None:
@@ -112,7 +112,7 @@ async def test_a_client_can_leave_politely() -> None:
     async with running_hub() as port, client(port) as stays:
         async with client(port) as leaves:
             await leaves.send(op="subscribe", topic="/t", type="a/B")
-            await leaves.settle()
+            await leaves.sync()
         assert await leaves.closed() == 1000
         assert (await stays.ask("/rosapi/topics"))["topics"] == ["/rosout"]
 
@@ -121,7 +121,7 @@ async def test_the_end_of_the_hub_is_told_to_its_clients() -> None:
     async with AsyncExitStack() as clients, AsyncExitStack() as hub:
         port = await hub.enter_async_context(running_hub())
         ears = await clients.enter_async_context(client(port))
-        await ears.settle()
+        await ears.sync()
         await hub.aclose()
         assert await ears.closed() == 1001
         with pytest.raises(OSError):  # noqa: PT011 - refused, by whichever loop's class
@@ -131,8 +131,8 @@ async def test_the_end_of_the_hub_is_told_to_its_clients() -> None:
 async def test_the_hub_ends_although_a_client_does_not(quick_sweeps: None) -> None:
     async with AsyncExitStack() as stack:
         port = await stack.enter_async_context(running_hub())
-        deaf = await Bare.connect(port)
-        half = await Bare.connect(port, handshake=False)
+        deaf = await RawClient.connect(port)
+        half = await RawClient.connect(port, handshake=False)
         await asyncio.wait_for(stack.aclose(), PATIENCE)
         assert await deaf.ended() == b"\x88\x0e\x03\xe9the hub ends"
         assert await half.ended() == b""
@@ -140,7 +140,7 @@ async def test_the_hub_ends_although_a_client_does_not(quick_sweeps: None) -> No
 
 async def test_the_port_can_be_used_again_at_once() -> None:
     async with running_hub() as port, client(port) as ears:
-        await ears.settle()
+        await ears.sync()
     stop = asyncio.Event()
     stop.set()
     await serve_hub("127.0.0.1", port, stop=stop)
@@ -190,10 +190,10 @@ async def test_an_address_that_is_not_ours_is_one_sentence(host: str, port: int,
 )
 async def test_web_pages_from_elsewhere_are_refused(origin: str | None, status: int) -> None:
     async with running_hub(door=Door(origins=("https://robot.example",))) as port:
-        bare = await Bare.connect(port, handshake=False)
+        raw = await RawClient.connect(port, handshake=False)
         headers = [] if origin is None else [f"Origin: {origin}"]
-        assert f" {status} " in await bare.request(*headers)
-        bare.hang_up()
+        assert f" {status} " in await raw.request(*headers)
+        raw.cut()
 
 
 async def test_too_many_clients_are_told_so() -> None:
@@ -202,16 +202,16 @@ async def test_too_many_clients_are_told_so() -> None:
             with pytest.raises(InvalidStatus) as caught:
                 await connect(f"ws://127.0.0.1:{port}")
             assert caught.value.response.status_code == 503
-            await one.settle()
+            await one.sync()
         async with client(port) as late:
-            await late.settle()
+            await late.sync()
 
 
 async def test_a_web_browser_is_told_what_this_is() -> None:
     async with running_hub() as port:
-        bare = await Bare.connect(port, handshake=False)
-        bare.writer.write(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
-        answer = await bare.ended()
+        raw = await RawClient.connect(port, handshake=False)
+        raw.writer.write(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        answer = await raw.ended()
         assert answer.startswith(b"HTTP/1.1 426 ")
         assert b"WebSocket" in answer
 
@@ -221,11 +221,11 @@ async def test_a_web_browser_is_told_what_this_is() -> None:
 )
 async def test_what_is_no_http_is_ended(garbage: bytes) -> None:
     async with running_hub() as port, client(port) as ears:
-        bare = await Bare.connect(port, handshake=False)
-        bare.writer.write(garbage)
-        bare.writer.write_eof()
-        await bare.ended()
-        await ears.settle()
+        raw = await RawClient.connect(port, handshake=False)
+        raw.writer.write(garbage)
+        raw.writer.write_eof()
+        await raw.ended()
+        await ears.sync()
 
 
 def test_the_loop_is_left_as_it_was() -> None:
@@ -236,8 +236,8 @@ def test_the_loop_is_left_as_it_was() -> None:
             await ears.send(op="subscribe", topic="/t", type="a/B", throttle_rate=60_000, queue_length=9)
             for index in range(3):
                 await ears.send(op="publish", topic="/t", msg={"i": index})
-            await ears.hear()
-            await ears.settle()
+            await ears.receive()
+            await ears.sync()
         tasks = asyncio.all_tasks() - {asyncio.current_task()}
         assert not tasks
         return port

@@ -8,7 +8,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from websockets.frames import Frame, Opcode
 
-from tests.bridge.hub.sockets import Bare, client, running_hub
+from tests.bridge.hub.sockets import RawClient, client, running_hub
 
 pytestmark = pytest.mark.usefixtures("either_reader")
 
@@ -46,34 +46,34 @@ async def test_messages_in_any_frames_cut_anywhere_arrive_in_order(kinds: list[s
             data += Frame(opcode, b"z" * 125).serialize(mask=True)
     async with running_hub() as port, client(port) as ears:
         await ears.send(op="subscribe", topic="/t", type="a/B", queue_length=100)
-        await ears.settle()
-        bare = await Bare.connect(port)
+        await ears.sync()
+        raw = await RawClient.connect(port)
         at = 0
         for cut in [*cuts, len(data)]:
-            bare.writer.write(bytes(data[at : at + cut]))
-            await bare.writer.drain()
+            raw.writer.write(bytes(data[at : at + cut]))
+            await raw.writer.drain()
             await asyncio.sleep(0)
             at += cut
-        heard: list[Any] = [(await ears.hear())["msg"]["i"] for _ in expected]
+        heard: list[Any] = [(await ears.receive())["msg"]["i"] for _ in expected]
         assert heard == expected
-        bare.hang_up()
+        raw.cut()
 
 
 async def test_frames_sent_before_the_handshakes_answer_are_read() -> None:
     async with running_hub() as port, client(port) as ears:
         await ears.send(op="subscribe", topic="/t", type="a/B")
-        await ears.settle()
+        await ears.sync()
         for part in (b"", b"\x81"):  # all of the first frame with the request, or its first byte alone
-            bare = await Bare.connect(port, handshake=False)
+            raw = await RawClient.connect(port, handshake=False)
             message = Frame(Opcode.TEXT, b'{"op":"publish","topic":"/t","msg":{}}').serialize(mask=True)
-            bare.writer.write(
+            raw.writer.write(
                 b"GET / HTTP/1.1\r\nHost: localhost\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
                 b"Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\nSec-WebSocket-Version: 13\r\n\r\n"
                 + (part or message)
             )
-            await bare.reader.readuntil(b"\r\n\r\n")
-            bare.writer.write(message[1:] if part else message)
-            bare.writer.write(message)
+            await raw.reader.readuntil(b"\r\n\r\n")
+            raw.writer.write(message[1:] if part else message)
+            raw.writer.write(message)
             for _ in range(2 if part else 3):
-                assert (await ears.hear())["msg"] == {}
-            bare.hang_up()
+                assert (await ears.receive())["msg"] == {}
+            raw.cut()

@@ -15,22 +15,24 @@ from bridge.codecs import cbor_codec, png
 from bridge.codecs.fragments import Reassembler
 from bridge.hub.delivery.encodings import Message
 from bridge.hub.handlers import topics
-from tests.bridge.hub.broker_harness import WALL_CLOCK, Guest, Room
+from tests.bridge.hub.broker_harness import WALL_CLOCK, Harness, Peer
 
 ARRAY = "std_msgs/Float64MultiArray"
 
 
-def _publisher_and_subscriber(type_name: str, ros_version: Any = 1, **wish: Any) -> tuple[Room, Guest, Guest]:
-    room = Room(ros_version=ros_version)
-    publisher, subscriber = room.enter(), room.enter()
+def _publisher_and_subscriber(
+    type_name: str, ros_version: Any = 1, **wish: Any
+) -> tuple[Harness, Peer, Peer]:
+    hub = Harness(ros_version=ros_version)
+    publisher, subscriber = hub.connect(), hub.connect()
     publisher.advertise("/t", type_name)
     subscriber.subscribe("/t", **wish)
-    return room, publisher, subscriber
+    return hub, publisher, subscriber
 
 
-def _raw(guest: Guest) -> list[bytes]:
+def _raw(peer: Peer) -> list[bytes]:
     payloads = []
-    while (payload := guest.client.outbox.pop()) is not None:
+    while (payload := peer.client.outbox.pop()) is not None:
         payloads.append(payload)
     return payloads
 
@@ -47,7 +49,7 @@ def _whole(payloads: list[bytes]) -> bytes:
 
 
 def test_cbor_has_typed_arrays_of_the_types_elements() -> None:
-    room, publisher, subscriber = _publisher_and_subscriber("sensor_msgs/LaserScan", compression="cbor")
+    _hub, publisher, subscriber = _publisher_and_subscriber("sensor_msgs/LaserScan", compression="cbor")
     scan = {"ranges": [1.5, 2, None], "intensities": [], "angle_min": -1.5, "header": {"frame_id": "é"}}
     publisher.publish("/t", scan)
     (payload,) = _raw(subscriber)
@@ -57,7 +59,6 @@ def test_cbor_has_typed_arrays_of_the_types_elements() -> None:
     assert math.isnan(msg["ranges"][2])
     assert msg["intensities"].dtype == "f4"
     assert (msg["angle_min"], msg["header"]) == (-1.5, {"frame_id": "é"})
-    room.check()
 
 
 def test_cbor_has_bytes_and_nested_arrays() -> None:
@@ -104,12 +105,12 @@ def test_without_rosbags_floats_are_packed_and_the_rest_is_refused(monkeypatch: 
 
 
 def test_a_latched_message_comes_in_the_form_asked_for() -> None:
-    room = Room()
-    publisher, late = room.enter(), room.enter()
+    hub = Harness()
+    publisher, late = hub.connect(), hub.connect()
     publisher.advertise("/t", ARRAY, latch=True)
     publisher.publish("/t", {"data": [1.5]})
     late.subscribe("/t", compression="cbor")
-    assert late.heard() == [{"data": [1.5]}]
+    assert late.messages() == [{"data": [1.5]}]
 
 
 # --- serialised
@@ -117,7 +118,7 @@ def test_a_latched_message_comes_in_the_form_asked_for() -> None:
 
 @pytest.mark.parametrize("ros_version", [1, 2])
 def test_cbor_raw_is_what_ros_would_send(ros_version: Any) -> None:
-    room, publisher, subscriber = _publisher_and_subscriber(
+    _hub, publisher, subscriber = _publisher_and_subscriber(
         "geometry_msgs/PoseStamped", ros_version, compression="cbor-raw"
     )
     own, other = (("secs", "nsecs"), ("sec", "nanosec"))[:: 1 if ros_version == 1 else -1]
@@ -136,7 +137,6 @@ def test_cbor_raw_is_what_ros_would_send(ros_version: Any) -> None:
         assert pose.header.frame_id == "map"
         assert (pose.pose.position.x, pose.pose.position.y, pose.pose.position.z) == (1.5, 2.0, 0.0)
     assert len(payloads) == 2
-    room.check()
 
 
 def test_arrays_are_serialised_with_their_type_and_length() -> None:
@@ -166,14 +166,13 @@ def test_arrays_are_serialised_with_their_type_and_length() -> None:
     ],
 )
 def test_what_cannot_be_serialised_is_told_once(type_name: str, message: Any, said: str) -> None:
-    room, publisher, subscriber = _publisher_and_subscriber(type_name, compression="cbor-raw", id="the one")
+    _hub, publisher, subscriber = _publisher_and_subscriber(type_name, compression="cbor-raw", id="the one")
     for _ in range(3):
         publisher.publish("/t", message)
     (status,) = subscriber.read()
     assert (status["op"], status["level"], status["id"]) == ("status", "error", "the one")
     assert said in status["msg"]
     assert publisher.read() == []
-    room.check()
 
 
 # --- PNG
@@ -181,7 +180,7 @@ def test_what_cannot_be_serialised_is_told_once(type_name: str, message: Any, sa
 
 @pytest.mark.parametrize("size", [0, 1, 2, 100, 10_000])
 def test_png_holds_the_operation(size: int) -> None:
-    room, publisher, subscriber = _publisher_and_subscriber("a/B", compression="png")
+    _hub, publisher, subscriber = _publisher_and_subscriber("a/B", compression="png")
     publisher.publish("/t", {"data": "é" * size})
     (operation,) = subscriber.read()
     assert set(operation) == {"op", "data"}
@@ -189,12 +188,11 @@ def test_png_holds_the_operation(size: int) -> None:
     assert base64.b64decode(operation["data"]).startswith(b"\x89PNG")
     inner = json.loads(png.decode(operation["data"]))
     assert inner == {"op": "publish", "topic": "/t", "msg": {"data": "é" * size}}
-    room.check()
 
 
 def test_a_png_that_is_larger_than_may_be_is_refused() -> None:
-    room = Room(message_bytes=400)
-    publisher, subscriber = room.enter(), room.enter()
+    hub = Harness(message_bytes=400)
+    publisher, subscriber = hub.connect(), hub.connect()
     publisher.advertise("/t")
     subscriber.subscribe("/t", compression="png")
     publisher.publish("/t", {"data": base64.b85encode(bytes(range(256))).decode()[:300]})
@@ -208,13 +206,12 @@ def test_a_png_that_is_larger_than_may_be_is_refused() -> None:
 @pytest.mark.parametrize(("asked", "size"), [(1, 256), (256, 256), (300, 300)])
 @pytest.mark.parametrize("compression", ["none", "png"])
 def test_a_message_in_fragments(asked: int, size: int, compression: str) -> None:
-    room, publisher, subscriber = _publisher_and_subscriber(
+    _hub, publisher, subscriber = _publisher_and_subscriber(
         "a/B", fragment_size=asked, compression=compression
     )
     messages = [{"data": os.urandom(600).hex() + letter} for letter in "é☃"]
     for message in messages:
         publisher.publish("/t", message)
-    room.check()
     by_id: dict[str, list[bytes]] = {}
     for payload in _raw(subscriber):
         operation = json.loads(payload)
@@ -232,70 +229,67 @@ def test_a_message_in_fragments(asked: int, size: int, compression: str) -> None
 def test_what_fits_into_one_piece_and_what_is_cbor_comes_whole() -> None:
     _, publisher, subscriber = _publisher_and_subscriber("a/B", fragment_size=60)
     publisher.publish("/t", {"a": 1})
-    assert subscriber.heard() == [{"a": 1}]
+    assert subscriber.messages() == [{"a": 1}]
     _, publisher, subscriber = _publisher_and_subscriber("a/B", fragment_size=256, compression="cbor")
     publisher.publish("/t", {"data": "x" * 1000})
-    assert subscriber.heard() == [{"data": "x" * 1000}]
+    assert subscriber.messages() == [{"data": "x" * 1000}]
 
 
 def test_fragments_are_dropped_as_messages_are() -> None:
-    room = Room(queue_length=2)
-    publisher, slow = room.enter(), room.enter()
+    hub = Harness(queue_length=2)
+    publisher, slow = hub.connect(), hub.connect()
     publisher.advertise("/t")
     slow.subscribe("/t", fragment_size=256)
     for index in range(10):
         publisher.publish("/t", {"i": index, "data": "x" * 1000})
-    room.check()
     payloads = _raw(slow)
     half = len(payloads) // 2
     assert [json.loads(_whole(part))["msg"]["i"] for part in (payloads[:half], payloads[half:])] == [8, 9]
 
 
 def test_the_answer_to_a_call_in_fragments_and_as_png() -> None:
-    guest = Room().enter()
-    guest.send(op="call_service", service="/rosapi/services", id="x", fragment_size=300)
-    assert "/rosapi/topics" in json.loads(_whole(_raw(guest)))["values"]["services"]
-    guest.send(op="call_service", service="/rosapi/services", id="x", compression="png")
-    (operation,) = guest.read()
+    peer = Harness().connect()
+    peer.send(op="call_service", service="/rosapi/services", id="x", fragment_size=300)
+    assert "/rosapi/topics" in json.loads(_whole(_raw(peer)))["values"]["services"]
+    peer.send(op="call_service", service="/rosapi/services", id="x", compression="png")
+    (operation,) = peer.read()
     assert json.loads(png.decode(operation["data"]))["id"] == "x"
 
 
 def test_what_comes_in_fragments_is_one_operation() -> None:
-    room = Room()
-    guest, other = room.enter(), room.enter()
+    hub = Harness()
+    peer, other = hub.connect(), hub.connect()
     other.subscribe("/t", type="a/B")
     whole = json.dumps({"op": "publish", "topic": "/t", "type": "a/B", "msg": {"data": "é" * 30}})
     parts = [whole[at : at + 20] for at in range(0, len(whole), 20)]
     for number in reversed(range(len(parts))):
-        guest.send(op="fragment", id="f", data=parts[number], num=number, total=float(len(parts)))
-        room.check()
-    assert other.heard() == [{"data": "é" * 30}]
-    assert guest.client.refused == 0
+        peer.send(op="fragment", id="f", data=parts[number], num=number, total=float(len(parts)))
+    assert other.messages() == [{"data": "é" * 30}]
+    assert peer.client.refused == 0
 
 
 # --- several wishes, one writing
 
 
 def test_of_several_wishes_the_last_form_and_the_least_size_count() -> None:
-    room, publisher, subscriber = _publisher_and_subscriber("a/B", id=1, fragment_size=640)
+    _hub, publisher, subscriber = _publisher_and_subscriber("a/B", id=1, fragment_size=640)
     subscriber.subscribe("/t", id=2, compression="cbor")
     subscriber.subscribe("/t", id=3, compression="png", fragment_size=320)
     noise = os.urandom(500).hex()
     publisher.publish("/t", {"data": noise})
-    assert subscriber.heard() == [{"data": noise}], "as CBOR"
+    assert subscriber.messages() == [{"data": noise}], "as CBOR"
     subscriber.send(op="unsubscribe", topic="/t", id=2)
     publisher.publish("/t", {"data": noise})
     payloads = _raw(subscriber)
     assert max(len(json.loads(payload)["data"]) for payload in payloads) == 320
     assert json.loads(_whole(payloads))["op"] == "png"
-    room.check()
 
 
 @pytest.mark.parametrize("compression", ["bson", "", None, 7, ["png"], {}])
 def test_what_nobody_knows_is_plain_json(compression: object) -> None:
     _, publisher, subscriber = _publisher_and_subscriber("a/B", compression=compression)
     publisher.publish("/t", {"a": 1})
-    assert subscriber.heard() == [{"a": 1}]
+    assert subscriber.messages() == [{"a": 1}]
 
 
 @pytest.mark.parametrize("compression", ["png", "cbor", "cbor-raw"])
@@ -308,8 +302,8 @@ def test_each_form_is_written_once(compression: str, monkeypatch: pytest.MonkeyP
         return write(message, *form)
 
     monkeypatch.setattr(Message, "_encode", count)
-    room = Room()
-    publisher, *subscribers = (room.enter() for _ in range(4))
+    hub = Harness()
+    publisher, *subscribers = (hub.connect() for _ in range(4))
     publisher.advertise("/t", ARRAY)
     for subscriber in subscribers:
         subscriber.subscribe("/t", compression=compression)
@@ -323,7 +317,7 @@ def test_what_a_throttle_drops_is_not_even_written(monkeypatch: pytest.MonkeyPat
     publisher.publish("/t", {"data": [1.5]})
     monkeypatch.setattr(topics.Message, "payload", None)
     publisher.publish("/t", {"data": [2.5]})
-    assert subscriber.heard() == [{"data": [1.5]}]
+    assert subscriber.messages() == [{"data": [1.5]}]
 
 
 # --- cut out of what came
@@ -350,8 +344,8 @@ def test_what_a_throttle_drops_is_not_even_written(monkeypatch: pytest.MonkeyPat
 @pytest.mark.parametrize("size", [1000, 10_000])  # searched at once, or from quote to quote
 def test_large_messages_are_cut_out_only_where_that_is_sure(raw: bytes, cut: bool, size: int) -> None:
     raw %= b"x" * size
-    room = Room()
-    publisher, subscriber = room.enter(), room.enter()
+    hub = Harness()
+    publisher, subscriber = hub.connect(), hub.connect()
     publisher.advertise("/t")
     subscriber.subscribe("/t")
     publisher.send_raw(raw)
@@ -364,52 +358,50 @@ def test_large_messages_are_cut_out_only_where_that_is_sure(raw: bytes, cut: boo
 
 
 def test_a_message_of_many_quotes_is_written_anew() -> None:
-    guest = Room().enter()
-    guest.advertise("/t")
-    guest.subscribe("/t")
-    guest.publish("/t", {"data": ["word"] * 1000})
-    assert guest.heard() == [{"data": ["word"] * 1000}]
+    peer = Harness().connect()
+    peer.advertise("/t")
+    peer.subscribe("/t")
+    peer.publish("/t", {"data": ["word"] * 1000})
+    assert peer.messages() == [{"data": ["word"] * 1000}]
 
 
 # --- what goes wrong is told to who wants it
 
 
 def test_who_asks_for_them_gets_status_messages() -> None:
-    room = Room()
-    guest = room.enter()
-    guest.send_raw(b"42")
-    guest.send(op="set_level", level="warning")
-    guest.send(op="fly", id="f1")
-    guest.send(op="publish", topic="/t", id=7, msg=1)
-    first, second = guest.read()
+    hub = Harness()
+    peer = hub.connect()
+    peer.send_raw(b"42")
+    peer.send(op="set_level", level="warning")
+    peer.send(op="fly", id="f1")
+    peer.send(op="publish", topic="/t", id=7, msg=1)
+    first, second = peer.read()
     assert (first["op"], first["level"], first["id"]) == ("status", "error", "f1")
     assert "fly" in first["msg"]
     assert second["id"] == 7
-    guest.send(op="set_level", level="none")
-    guest.send(op="fly")
-    assert guest.read() == []
-    assert guest.client.refused == 4
-    room.check()
+    peer.send(op="set_level", level="none")
+    peer.send(op="fly")
+    assert peer.read() == []
+    assert peer.client.refused == 4
 
 
 def test_status_messages_do_not_pile_up() -> None:
-    room = Room()
-    guest = room.enter()
-    guest.send(op="set_level", level="error")
+    hub = Harness()
+    peer = hub.connect()
+    peer.send(op="set_level", level="error")
     for _ in range(1000):
-        guest.send_raw(b"42")
-    room.check()
-    assert len(guest.read()) <= 20
-    assert not guest.client.close_reason
+        peer.send_raw(b"42")
+    assert len(peer.read()) <= 20
+    assert not peer.client.close_reason
 
 
 @pytest.mark.parametrize("ros_version", [1, 2])
 def test_refusals_are_told_on_rosout(ros_version: Any) -> None:
-    room = Room(ros_version=ros_version)
-    guest, listener = room.enter(), room.enter()
+    hub = Harness(ros_version=ros_version)
+    peer, listener = hub.connect(), hub.connect()
     listener.subscribe("/rosout", type="rosgraph_msgs/Log" if ros_version == 1 else "rcl_interfaces/msg/Log")
-    guest.send(op="fly")
-    (log,) = listener.heard("/rosout")
+    peer.send(op="fly")
+    (log,) = listener.messages("/rosout")
     assert "/client_1" in log["msg"]
     assert "fly" in log["msg"]
     stamp = log["stamp"] if ros_version == 2 else log["header"]["stamp"]
@@ -421,35 +413,33 @@ def test_refusals_are_told_on_rosout(ros_version: Any) -> None:
         )
     )
     listener.subscribe("/rosout", id="wrong", type="a/B")
-    assert len(listener.heard("/rosout")) == 1
-    room.check()
+    assert len(listener.messages("/rosout")) == 1
 
 
 def test_what_cannot_be_told_on_rosout_ends_there(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setitem(sys.modules, "rosbags.typesys", None)
-    room = Room()
-    guest = room.enter()
-    guest.subscribe("/rosout", compression="cbor-raw")
+    hub = Harness()
+    peer = hub.connect()
+    peer.subscribe("/rosout", compression="cbor-raw")
     with caplog.at_level(logging.WARNING):
-        guest.send(op="fly")
-    assert [operation["op"] for operation in guest.read()] == ["status"]
-    room.check()
+        peer.send(op="fly")
+    assert [operation["op"] for operation in peer.read()] == ["status"]
 
 
 # --- quality of service
 
 
 def test_a_transient_local_publisher_latches_and_a_volatile_subscriber_is_not_greeted() -> None:
-    room = Room()
-    publisher, late, volatile = room.enter(), room.enter(), room.enter()
+    hub = Harness()
+    publisher, late, volatile = hub.connect(), hub.connect(), hub.connect()
     publisher.advertise("/t", qos={"durability": "transient_local", "depth": 5})
     publisher.publish("/t", {"a": 1})
     late.subscribe("/t", qos={"durability": "transient_local", "reliability": "best_effort"})
     volatile.subscribe("/t", qos={"durability": "volatile"})
-    assert late.heard() == [{"a": 1}]
-    assert volatile.heard() == []
+    assert late.messages() == [{"a": 1}]
+    assert volatile.messages() == []
 
 
 @pytest.mark.parametrize(
@@ -464,13 +454,13 @@ def test_a_transient_local_publisher_latches_and_a_volatile_subscriber_is_not_gr
     ],
 )
 def test_depth_is_the_length_of_the_queue(wish: dict[str, Any], length: int) -> None:
-    room = Room(queue_length=20, longest_queue=40)
-    publisher, slow = room.enter(), room.enter()
+    hub = Harness(queue_length=20, longest_queue=40)
+    publisher, slow = hub.connect(), hub.connect()
     publisher.advertise("/t")
     slow.subscribe("/t", **wish)
     for index in range(100):
         publisher.publish("/t", {"i": index})
-    assert len(slow.heard()) == length
+    assert len(slow.messages()) == length
 
 
 # --- descriptions of types
@@ -478,8 +468,8 @@ def test_depth_is_the_length_of_the_queue(wish: dict[str, Any], length: int) -> 
 
 @pytest.mark.parametrize(("ros_version", "time"), [(1, "time"), (2, "builtin_interfaces/msg/Time")])
 def test_message_details(ros_version: Any, time: str) -> None:
-    guest = Room(ros_version=ros_version).enter()
-    definitions = guest.rosapi("message_details", type="sensor_msgs/LaserScan")["typedefs"]
+    peer = Harness(ros_version=ros_version).connect()
+    definitions = peer.rosapi("message_details", type="sensor_msgs/LaserScan")["typedefs"]
     by_type = {definition["type"]: definition for definition in definitions}
     scan = definitions[0]
     at = scan["fieldnames"].index("ranges")
@@ -491,16 +481,16 @@ def test_message_details(ros_version: Any, time: str) -> None:
     for definition in definitions:
         lengths = {len(definition[f"field{part}"]) for part in ("names", "types", "arraylen")}
         assert lengths == {len(definition["examples"])}
-    array = guest.rosapi("message_details", type="sensor_msgs/Imu")["typedefs"][0]
+    array = peer.rosapi("message_details", type="sensor_msgs/Imu")["typedefs"][0]
     assert 9 in array["fieldarraylen"]
 
 
 def test_topics_and_raw_types() -> None:
-    room = Room()
-    guest = room.enter()
-    guest.advertise("/known", "geometry_msgs/msg/PoseStamped")
-    guest.advertise("/unknown", "boat_msgs/Sensors")
-    answer = guest.rosapi("topics_and_raw_types")
+    hub = Harness()
+    peer = hub.connect()
+    peer.advertise("/known", "geometry_msgs/msg/PoseStamped")
+    peer.advertise("/unknown", "boat_msgs/Sensors")
+    answer = peer.rosapi("topics_and_raw_types")
     texts = dict(zip(answer["topics"], answer["typedefs_full_text"], strict=True))
     assert "MSG: std_msgs/Header" in texts["/known"]
     assert texts["/unknown"] == ""

@@ -314,7 +314,7 @@ def test_the_outbox_is_its_model(
     shapes: list[tuple[float, int]], steps: list[tuple[str, int, int]], max_bytes: int
 ) -> None:
     outbox, model, now = Outbox(max_bytes), _Model(max_bytes), 0.0
-    # Room for held messages is made in no stated order of lanes: one throttled lane keeps the model exact.
+    # Harness for held messages is made in no stated order of lanes: one throttled lane keeps the model exact.
     throttles = [throttle for throttle, _length in shapes]
     first = next((index for index, throttle in enumerate(throttles) if throttle), None)
     lanes = []

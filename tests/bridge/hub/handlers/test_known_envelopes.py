@@ -26,7 +26,7 @@ class Hub:
             self.ask(self.listener, op="subscribe", topic=topic, queue_length=1000)
         self.say(PUBLISH + b"{}}")
         assert self.publisher.last_published is not None
-        self.heard()
+        self.messages()
 
     def ask(self, client: Client, **operation: Any) -> None:
         self.broker.receive(client, json.dumps(operation).encode(), 0.0)
@@ -37,7 +37,7 @@ class Hub:
         else:
             self.broker.receive(self.publisher, data, 0.0)
 
-    def heard(self) -> list[bytes]:
+    def messages(self) -> list[bytes]:
         assert self.listener.outbox.wire is not None
         wire, self.listener.outbox.wire = self.listener.outbox.wire, []
         return wire
@@ -47,7 +47,7 @@ def test_a_message_goes_on_as_it_came() -> None:
     hub = Hub(knowing=True)
     for message in (b'{"a": [1.50, 2e3], "b":"\\u00e9"}', b'{"a":1,"a":2}', b"{ }"):
         hub.say(PUBLISH + message + b"}")
-        assert hub.heard() == [PUBLISH + message + b"}"]
+        assert hub.messages() == [PUBLISH + message + b"}"]
 
 
 @pytest.mark.parametrize(
@@ -82,7 +82,7 @@ def test_whatever_stands_after_it_means_what_it_meant(rest: bytes) -> None:
     knowing, reading = (Hub(knowing=known, depth=5, message_bytes=500) for known in (True, False))
     for hub in (knowing, reading):
         hub.say(PUBLISH + rest)
-    assert list(map(orjson.loads, knowing.heard())) == list(map(orjson.loads, reading.heard()))
+    assert list(map(orjson.loads, knowing.messages())) == list(map(orjson.loads, reading.messages()))
     assert knowing.publisher.refused == reading.publisher.refused
 
 
@@ -102,9 +102,9 @@ def test_what_says_the_rest_after_its_message_has_no_envelope(begun: bytes) -> N
     for key in [key for key in rest if f'"{key}"'.encode() in begun]:
         del rest[key]
     hub.say(begun + b'{"n":1},' + json.dumps(rest).encode()[1:])
-    assert [orjson.loads(payload)["msg"] for payload in hub.heard()] == [{"n": 1}]
+    assert [orjson.loads(payload)["msg"] for payload in hub.messages()] == [{"n": 1}]
     hub.say(begun + b'{"n":2}}')
-    assert hub.heard() == []
+    assert hub.messages() == []
     assert hub.publisher.refused == 1
 
 
@@ -117,7 +117,7 @@ def test_each_topic_has_its_envelope_and_one_alone() -> None:
     ]
     for data in said:
         hub.say(data)
-    assert hub.heard() == said
+    assert hub.messages() == said
     for spaces in range(20):
         hub.say(b'{%b"op":"publish","topic":"/t","msg":{}}' % (b" " * spaces))
     assert len(hub.publisher.envelopes) == 2

@@ -1,0 +1,24 @@
+import pytest
+
+from tests.bridge.hub.broker_harness import Harness, Peer
+
+
+@pytest.fixture
+def hub() -> Harness:
+    return Harness()
+
+
+@pytest.fixture
+def publisher(hub: Harness) -> Peer:
+    """A client that advertises /t as a/B."""
+    peer = hub.connect()
+    peer.advertise("/t")
+    return peer
+
+
+@pytest.fixture
+def subscriber(hub: Harness, publisher: Peer) -> Peer:
+    """A client that is subscribed to /t, after the publisher came."""
+    peer = hub.connect()
+    peer.subscribe("/t")
+    return peer
