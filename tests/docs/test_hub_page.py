@@ -4,7 +4,7 @@ import dataclasses
 from pathlib import Path
 
 from bridge.hub.limits import HubLimits
-from tests.bridge.hub.broker_harness import Room
+from tests.bridge.hub.broker_harness import Harness
 
 PAGE = (Path(__file__).parents[2] / "docs" / "hub.md").read_text()
 
@@ -15,7 +15,7 @@ def test_every_limit_is_described():
 
 
 def test_every_service_is_described():
-    services = Room().enter().rosapi("node_details", node="/rosapi")["services"]
+    services = Harness().connect().rosapi("node_details", node="/rosapi")["services"]
     assert services
     for service in services:
         assert f"`{service.removeprefix('/rosapi/')}`" in PAGE
