@@ -1,1 +1,1 @@
-"""What a machine will do: its accuracy, cycles, resources and energy, and sweeps over possible machines."""
+"""Predictions for a machine before it is built: accuracy, cycles, resources, energy, and sweeps over many."""

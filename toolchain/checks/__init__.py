@@ -1,1 +1,1 @@
-"""What is wrong with a machine, said before anything runs."""
+"""Checks of models and deployments before anything runs."""

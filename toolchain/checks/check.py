@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 
 def check_model(model: Model, options: BuildOptions) -> list[Finding]:
-    """Return what there is to say about a model and the machine that would be built of it, the worst first."""
+    """Return the findings about a model and the machine that would be built of it, the worst first."""
     try:
         built = assemble(model, options)
     except ToolchainError as reason:
@@ -48,7 +48,7 @@ def check_model(model: Model, options: BuildOptions) -> list[Finding]:
 
 
 def check_deployment(directory: Path) -> list[Finding]:
-    """Return what there is to say about a deployment: its files, and the machine that its images hold."""
+    """Return the findings about a deployment's files and the machine in its images, the worst first."""
     try:
         deployment = load_deployment(directory)
         images = read_images(deployment)
@@ -59,12 +59,12 @@ def check_deployment(directory: Path) -> list[Finding]:
 
 
 def refusal(reason: Exception, about: str) -> Finding:
-    """Return what can't be built or read as a finding."""
+    """Return the finding that a model can't be built, or a deployment not read."""
     return error(Check.CANNOT_BE_BUILT, about, str(reason).rstrip("."))
 
 
 def _refusals(model: Model, options: BuildOptions, first: ToolchainError) -> list[Finding]:
-    """Return why a model can't be built: each part is tried by itself, so that one mistake hides no other."""
+    """Return the reasons why a model can't be built; each part is tried by itself, so that no mistake hides another."""
     tries: list[tuple[str, Callable[[], object]]] = [
         ("the partitions", lambda: partition_lines(model.lines, options.partitions)),
         ("the machine", lambda: machine_parameters(model, options)),
@@ -105,11 +105,11 @@ def _check(machine: CheckedMachine) -> Iterator[Finding]:
 
 
 def _files(directory: Path, deployment: Deployment, images: Sequence[Image]) -> Iterator[Finding]:
-    """Files of the hardware project that are not what follows from the images."""
+    """Find files of the hardware project that differ from those that the images imply."""
     words = {
         Change.NEW: "is not there",
-        Change.CHANGED: "says something else than the images and deployment.toml",
-        Change.REMOVED: "is left from before",
+        Change.CHANGED: "differs from the images and deployment.toml",
+        Change.REMOVED: "is stale",
     }
     for part, files in (
         ("memories", memory_files(deployment, images)),

@@ -1,4 +1,4 @@
-"""What is checked: a whole machine, whichever boards hold its lines, and whether it is built or only would be."""
+"""A whole machine to check, from a model or from a deployment's boards."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CheckedMachine:
-    """What is checked: a whole machine, whichever boards hold its lines.
+    """A whole machine to check, whichever boards hold its lines.
 
     Attributes:
         deployment: Its variables, lines and limits.
@@ -41,15 +41,15 @@ class CheckedMachine:
 
     @property
     def names(self) -> list[str]:
-        """What every column is called, the prior first."""
+        """The columns' names, the prior first."""
         return ["the prior", *(variable.name for variable in self.deployment.sensors)]
 
     def served(self, column: int) -> NDArray[np.uint16]:
-        """The rows of a column (from 0) that readings address; the missing reading's too, if one may be missing."""
+        """Return the rows of a column (from 0) that readings address, with the missing reading's if one may be missing."""
         return _served(self.deployment.sensors[column], self.tables[column])
 
     def prior_rows(self) -> NDArray[np.uint16]:
-        """The rows of the prior that can be chosen."""
+        """Return the rows of the prior that can be selected."""
         select = self.deployment.prior_select
         return self.prior if select is None else _served(select, self.prior)
 

@@ -85,7 +85,7 @@ def _alive(machine: CheckedMachine) -> NDArray[np.bool_]:
 
 
 def _lines(machine: CheckedMachine) -> Iterator[Finding]:
-    """Lines that can never count, whatever is read."""
+    """Find lines that can never count, whatever is read."""
     deployment = machine.deployment
     dead = ~_alive(machine)
     if dead.all():
@@ -141,11 +141,11 @@ def _dead_prior(machine: CheckedMachine) -> Iterator[Finding]:
 
 
 def _readings(machine: CheckedMachine) -> Iterator[Finding]:
-    """Readings for which every line has a 0 code: a frame with one ends as `impossible`."""
+    """Find readings with code 0 on every line; a frame with one ends as `impossible`."""
     deployment, model = machine.deployment, machine.model
     alive = _alive(machine)
     if not alive.any() or machine.parameters.sensor_mode is not SensorMode.COLUMN:
-        return  # where each line has a reading of its own, a value says nothing of the other lines
+        return  # where each line has a reading of its own, a value does not concern the other lines
     rows: list[tuple[Variable, NDArray[np.uint16], NDArray[np.float64] | None]] = [
         (variable, table, None if model is None else model.known[column].table @ model.prior_distribution)
         for column, (variable, table) in enumerate(zip(deployment.sensors, machine.tables, strict=True))
@@ -179,7 +179,7 @@ def _readings(machine: CheckedMachine) -> Iterator[Finding]:
 
 
 def _columns(machine: CheckedMachine) -> Iterator[Finding]:
-    """Columns that say nothing, and two that read the same."""
+    """Find columns whose readings change nothing."""
     of_columns = machine.parameters.sensor_mode is SensorMode.COLUMN
     for variable, table in zip(
         machine.deployment.sensors, machine.tables if of_columns else (), strict=of_columns

@@ -1,4 +1,4 @@
-"""What is wrong with a machine's random numbers: their period, their steps, and what columns have in common."""
+"""Findings about random numbers: their period, their steps, and relations between columns."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ _RANDOM_SIGMAS: Final = 5
 
 
 def generator_findings(machine: CheckedMachine) -> Iterator[Finding]:
-    """Numbers that repeat, are shared, or are related from column to column."""
+    """Find numbers that repeat, are shared, or are related from column to column."""
     parameters = machine.parameters
     if parameters.rng is RngKind.IDEAL:
         yield note(
             Check.RNG,
             "rng = ideal",
-            "such generators exist emulated only: no hardware project is made",
+            "such generators exist only emulated, so there is no hardware project",
             "for a board use an LFSR",
         )
         return
@@ -76,14 +76,14 @@ def _period(machine: CheckedMachine, length: int) -> Iterator[Finding]:
             f"rng = {parameters.rng}",
             (
                 f"the random numbers repeat after {period} cycles{shortened}, and a frame may run {limits.max_cycles}: "
-                "the later ones say nothing new"
+                "the later ones bring nothing new"
             ),
             f"use --max-cycles {period}, or {longer}",
         )
 
 
 def _relations(machine: CheckedMachine) -> Iterator[Finding]:
-    """Columns whose bits are related by XOR, in some bank; with a generator a cell, in some line."""
+    """Find columns whose bits are related by XOR, in some bank; with a generator a cell, in some line."""
     parameters, names = machine.parameters, machine.names
     seeds = seed_words(machine.board).reshape(-1, parameters.columns)
     found = relations(parameters.rng, seeds, parameters.prob_bits)
@@ -118,12 +118,12 @@ def _relations(machine: CheckedMachine) -> Iterator[Finding]:
         yield note(
             Check.RNG_RELATION,
             f"rng = {parameters.rng}",
-            f"relations were looked for in {found.groups} of {len(seeds)} {what_groups}, for time's sake",
+            f"relations were looked for in {found.groups} of {len(seeds)} {what_groups}, to save time",
         )
 
 
 def _table_numbers(machine: CheckedMachine) -> Iterator[Finding]:
-    """What a table of random numbers does to probabilities and to pairs of columns."""
+    """Find codes and pairs of columns that a table of random numbers distorts."""
     parameters, names = machine.parameters, machine.names
     numbers = _table(machine.board) & np.uint32(parameters.ones_code)
     codes = 1 << parameters.prob_bits
@@ -159,7 +159,7 @@ def _table_numbers(machine: CheckedMachine) -> Iterator[Finding]:
 def _table_correlation(
     machine: CheckedMachine, numbers: NDArray[np.uint32], starts: NDArray[np.uint64]
 ) -> Iterator[Finding]:
-    """Columns play the ring at fixed distances: at each the numbers should be uncorrelated."""
+    """Find columns whose numbers correlate; they play the ring at fixed distances."""
     length = len(numbers)
     centred = numbers - numbers.mean()
     if not centred.any():

@@ -1,4 +1,4 @@
-"""Relations between the random bits of different columns, which make their AND wrong for ever.
+"""Relations between the random bits of different columns, which make their AND wrong permanently.
 
 A bit of an LFSR's state is a linear function of the state that it started from. Columns play the same sequence at
 different phases, so bits of two to four columns' numbers may XOR to 0 in every cycle: then the columns are not
@@ -35,11 +35,11 @@ class Relation:
 
 @dataclass(frozen=True, slots=True)
 class Relations:
-    """What was found among some groups of generators.
+    """Relations among some groups of generators.
 
     Attributes:
         found: At most one relation for each group, of the fewest bits.
-        groups: How many groups were looked at.
+        groups: Number of groups that were searched.
     """
 
     found: tuple[Relation, ...]
@@ -55,7 +55,7 @@ def relations(kind: RngKind, seeds: NDArray[np.uint64], prob_bits: int) -> Relat
         prob_bits: How many low bits of a state are compared with a code.
 
     Returns:
-        What was found; as many groups are looked at as take a few seconds.
+        The relations; as many groups are searched as a few seconds allow.
     """
     groups, columns = seeds.shape
     bits = columns * prob_bits
@@ -71,9 +71,9 @@ def relations(kind: RngKind, seeds: NDArray[np.uint64], prob_bits: int) -> Relat
 
 
 def _bit_words(kind: RngKind, seeds: NDArray[np.uint64], prob_bits: int) -> NDArray[np.uint64]:
-    """Return what each bit will be in the first steps, as many as the state has bits: uint64[groups, bits].
+    """Return each bit's values in the first steps, as many as the state has bits: uint64[groups, bits].
 
-    Two bits with the same word are the same for ever, since so many steps determine a linear sequence.
+    Two bits with the same word are always the same, since so many steps determine a linear sequence.
     """
     lfsr = LFSR(kind)
     shifts = np.arange(prob_bits, dtype=np.uint64)

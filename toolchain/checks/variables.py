@@ -38,7 +38,7 @@ def _same_readings(deployment: Deployment) -> Iterator[Finding]:
 
 
 def _ranges(deployment: Deployment) -> Iterator[Finding]:
-    """Ranges of readings that don't fit the addresses."""
+    """Find ranges of readings that don't fit the addresses."""
     for variable in deployment.variables:
         needed = variable.values.bit_length()
         if needed < variable.bits:
@@ -47,7 +47,7 @@ def _ranges(deployment: Deployment) -> Iterator[Finding]:
                 variable.name,
                 (
                     f"its {variable.values} values and the missing reading fit {needed} address bits, and it has "
-                    f"{variable.bits}: its memory is {2 ** (variable.bits - needed)} times as deep as need be"
+                    f"{variable.bits}: its memory is {2 ** (variable.bits - needed)} times as deep as needed"
                 ),
                 f"use --bits {variable.name}={needed}",
             )
@@ -56,7 +56,7 @@ def _ranges(deployment: Deployment) -> Iterator[Finding]:
                 Check.RANGE,
                 variable.name,
                 (
-                    f"its readings go round in {variable.period} steps, but only {variable.values} are served: those from "
+                    f"its readings wrap around after {variable.period} steps, but only {variable.values} are served: those from "
                     f"{variable.offset + variable.values * variable.step:g} on are out of range"
                 ),
                 f"give it {variable.period} values, or a period of {variable.values}",
@@ -66,7 +66,7 @@ def _ranges(deployment: Deployment) -> Iterator[Finding]:
                 Check.RANGE,
                 variable.name,
                 (
-                    f"its readings go round in {variable.period} steps, so that the last "
+                    f"its readings wrap around after {variable.period} steps, so that the last "
                     f"{variable.values - variable.period} of its {variable.values} values never occur"
                 ),
                 f"give it {variable.period} values, or a period of {variable.values}",

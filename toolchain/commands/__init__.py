@@ -1,1 +1,1 @@
-"""The subcommands of `toolchain`: their flags, and what they print."""
+"""The `toolchain` command and its subcommands, one file each."""

@@ -38,7 +38,7 @@ def memories(
         ),
     ] = None,
 ) -> None:
-    """The parameters and memory files; with --model also the boards' images, for a model with new numbers.
+    """Write the parameters and memory files again; with --model also the boards' images, for a model with new numbers.
 
     For example `toolchain regenerate memories build/boat --model casestudies/boat`. Topics, endpoints and everything
     else in deployment.toml that says nothing of the tables stays as it is.
@@ -62,7 +62,7 @@ def memories(
 
 
 def project(directory: Directory) -> None:
-    """The Quartus project.
+    """Write the Quartus project again.
 
     For example `toolchain regenerate project build/boat`.
     """
@@ -103,7 +103,7 @@ def deployment(
         float | None, typer.Option(help="Seconds within which readings from several topics belong together.")
     ] = None,
 ) -> None:
-    """deployment.toml: with other topics, or variables in another order; edits by hand are kept too.
+    """Write deployment.toml with other topics, or variables in another order; edits by hand are kept.
 
     For example `toolchain regenerate deployment build/boat --order D2,D1,D3,B1,B2,B3` where the first two readings were
     mixed up. No image, memory or board is touched. What is left out stays as it is.

@@ -40,15 +40,15 @@ def run_fit(
     options: FitOptions,
     checks: Sequence[Path] = (),
 ) -> str:
-    """Learn a model's tables, write them, and return what there is to say about them.
+    """Learn a model's tables, write them, and return a report.
 
     Args:
         case: The folder with model.py.
-        recordings: What is learnt from.
+        recordings: The recordings to learn from.
         output: The file to write.
         settings: `KEY=VALUE`s for the model.
-        options: How it is learnt.
-        checks: Recordings that nothing is learnt from: the model by hand and the fitted one are compared on them.
+        options: The method and its parameters.
+        checks: Recordings to compare the model before and after the fit on; nothing is learnt from them.
 
     Raises:
         ToolchainError: Anything that is wrong with the model, the recordings or the options.
@@ -142,7 +142,7 @@ def _comparison(
     truth_columns: Mapping[str, str],
     reading_columns: Mapping[str, str],
 ) -> str:
-    """Say how far the exact posterior's mean is from the truth, before and after."""
+    """Return the distances of the exact posterior's mean from the truth, before and after the fit."""
     truth = locate(model, _joined([recording], truth_columns), recording.rows)
     readings = _joined([recording], reading_columns)
     if not len(truth.rows):
@@ -203,8 +203,8 @@ def _table(fit: Fit, supports: Sequence[Support], lines: int) -> str:
             row += f"  fewer than {LEAST_READINGS}: as set by hand"
         rows.append(row)
         if each.refused:
-            notes.append(f"  {each.refused} readings of {each.name} are no values of it and were left out")
-    heading = "What each table rests on (readings; cells that have some, share that has none, median in those that have):"
+            notes.append(f"  {each.refused} readings of {each.name} are not values of it and were left out")
+    heading = "Data behind each table (readings; cells that have some, share that has none, median in those that have):"
     return "\n".join([heading, *rows, *notes])
 
 

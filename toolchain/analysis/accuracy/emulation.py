@@ -1,4 +1,4 @@
-"""A deployment's boards in this process, stopped as the host stops them: what a frame costs before anything is built."""
+"""Emulation of a deployment's boards in this process, stopped as the host stops them."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ if TYPE_CHECKING:
 
 
 Inputs: TypeAlias = "tuple[int, ...] | NDArray[np.int64]"
-"""What a frame brings: an address per column, or int64[sensors, all lines] where lines have readings of their own."""
+"""Inputs of a frame: an address per column, or int64[sensors, all lines] where lines have readings of their own."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameRun:
-    """What the boards counted in one frame.
+    """Counts, cycles and stop reasons of one frame.
 
     Attributes:
         counts: uint32[lines] of each board.
         cycles: Of each board.
-        reasons: Why each stopped.
+        reasons: Stop reason of each board.
     """
 
     counts: tuple[NDArray[np.uint32], ...]
@@ -40,7 +40,7 @@ class FrameRun:
 
     @property
     def length(self) -> int:
-        """Cycles of the board that ran longest: what the frame takes."""
+        """Cycles of the frame: those of the board that ran longest."""
         return max(self.cycles)
 
     @property
@@ -82,7 +82,7 @@ class EmulatedBoards:
 
     @property
     def parameters(self) -> BM1Parameters:
-        """Those of the first board: all but the number of lines are the same on every board."""
+        """Parameters of the first board; on the others only the number of lines differs."""
         return self.machines[0].parameters
 
     @property

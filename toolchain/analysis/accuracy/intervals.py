@@ -1,4 +1,4 @@
-"""Confidence intervals: how far a figure over some frames is to be trusted."""
+"""Confidence intervals of figures over frames."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Interval:
 
 
 def bootstrap(values: NDArray[np.float64], statistic: Callable[..., NDArray[np.float64]]) -> Interval:
-    """A statistic over frames (the first axis), and its percentile bootstrap interval: whole frames are drawn."""
+    """Return a statistic over frames (the first axis) with its percentile bootstrap interval; whole frames are drawn."""
     chosen = np.random.default_rng(0).integers(0, len(values), (RESAMPLES, len(values)))
     drawn = np.asarray(values)[chosen].reshape(RESAMPLES, -1)
     low, high = np.quantile(statistic(drawn, axis=1), [(1 - LEVEL) / 2, (1 + LEVEL) / 2]).tolist()
@@ -38,7 +38,7 @@ def bootstrap(values: NDArray[np.float64], statistic: Callable[..., NDArray[np.f
 
 
 def bootstrap_rows(rows: NDArray[np.float64], statistic: Callable[[NDArray[np.float64]], float]) -> Interval:
-    """A statistic of a table's rows, and its percentile bootstrap interval: whole rows are drawn."""
+    """Return a statistic of a table's rows with its percentile bootstrap interval; whole rows are drawn."""
     chosen = np.random.default_rng(0).integers(0, len(rows), (RESAMPLES, len(rows)))
     low, high = np.quantile(
         [statistic(rows[each]) for each in chosen], [(1 - LEVEL) / 2, (1 + LEVEL) / 2]
@@ -47,7 +47,7 @@ def bootstrap_rows(rows: NDArray[np.float64], statistic: Callable[[NDArray[np.fl
 
 
 def share_of_frames(share: float, frames: int) -> Interval:
-    """A share of frames and its Wilson interval, which is right where all of them agree too."""
+    """Return a share of frames with its Wilson interval, which also holds where all frames agree."""
     square = _NORMAL_95**2 / frames
     middle = (share + square / 2) / (1 + square)
     half = _NORMAL_95 / (1 + square) * math.sqrt(share * (1 - share) / frames + square / (4 * frames))

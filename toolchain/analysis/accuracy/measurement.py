@@ -1,7 +1,8 @@
-"""How good a machine's posteriors are: beside exact inference, with the loss by quantising as a part of its own.
+"""Accuracy of a machine's posteriors against exact inference, with the loss by quantising apart.
 
 Three posteriors of each frame are compared: of the model (float64), of the codes (float64 on what quantising left),
-and of the machine (counts). Codes beside model is what quantising loses, machine beside codes what sampling loses.
+and of the machine (counts). The codes against the model show the loss by quantising, the machine against its codes the loss by
+sampling.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ _TIE: Final = 1e-9
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Difference:
-    """How far posteriors are from others, on average over frames.
+    """Distances between posteriors, averaged over frames.
 
     Attributes:
         total_variation: Half the sum of absolute differences, 0 to 1.
@@ -57,9 +58,9 @@ class ZScores:
 
     Attributes:
         cycles: The length c.
-        counts: How many counts were looked at.
-        draws: How many independent draws of random numbers those come from, which the intervals rest on: the banks.
-        rms: Root of the mean square: 1 where streams are as good as independent bits, 1.6 where the variance is 2.6 times that.
+        counts: Number of counts.
+        draws: Independent draws of random numbers behind the counts, on which the intervals rest: the banks.
+        rms: Root mean square: 1 for independent bits, 1.6 where the variance is 2.6 times as large.
         mean: 0 where they are unbiased.
         beyond_three: Share beyond 3 either way; 0.0027 of normal ones.
     """
@@ -83,20 +84,20 @@ class Cycles:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Accuracy:
-    """What a machine does on some readings.
+    """Accuracy and cycles of a machine on some readings.
 
     Attributes:
-        frames: Frames.
-        posteriors: Of all frames: one each, or with replicas as many as there are of them.
+        frames: Number of frames.
+        posteriors: Number of posteriors: one a frame, or one for each replica of a frame.
         banks: Sets of seeds that each was run with.
         impossible: Share of posteriors for which no line can count, although the model has one (or always, without a model).
-        without: Share of runs without a posterior: these, and those that counted nothing in time.
+        without: Share of runs without a posterior, also where nothing was counted in time.
         overflow: Share of runs that a full counter ended.
-        machine: The machine beside the model; None without a model.
-        quantising: Exact inference on the codes beside the model; None without a model.
-        sampling: The machine beside exact inference on its codes.
-        z: Counts beside equation 2.1; None where no line counts often enough.
-        cycles: How long frames take.
+        machine: The machine against the model; None without a model.
+        quantising: Exact inference on the codes against the model; None without a model.
+        sampling: The machine against exact inference on its codes.
+        z: Counts against equation 2.1; None where no line counts often enough.
+        cycles: Cycles of a frame.
     """
 
     frames: int
@@ -113,13 +114,13 @@ class Accuracy:
 
 
 class _Differences:
-    """Collects differences, frame after frame; runs of one frame, and its replicas, are averaged."""
+    """Differences of many frames; the runs of a frame, and its replicas, are averaged."""
 
     def __init__(self) -> None:
         self._frames: dict[int, list[tuple[float, float, float]]] = {}
 
     def add(self, frame: int, ours: list[NDArray[np.float64]], theirs: NDArray[np.float64]) -> None:
-        """Take the posteriors of a frame's runs, or of one replica's."""
+        """Add the posteriors of a frame's runs, or of one replica's."""
         if ours:
             mean = np.mean([_difference(each, theirs) for each in ours], axis=0)
             self._frames.setdefault(frame, []).append(tuple(mean.tolist()))
@@ -145,14 +146,14 @@ def measure(
     replicas: int = 1,
     advance: Callable[[], None] = lambda: None,
 ) -> Accuracy:
-    """Run a machine on readings and compare what comes out with exact inference.
+    """Run a machine on readings and compare its posteriors with exact inference.
 
     A replica counts to the bit what a machine by itself counts with the same bank, so one machine is run for all of them.
 
     Args:
         boards: The machine.
-        readings: The frames; what the model finds impossible on every line is left out.
-        model: The unquantised model, or None where only codes are at hand.
+        readings: The frames; those that are impossible in the model are left out.
+        model: The unquantised model, or None where only its codes are known.
         banks: Sets of seeds to run each frame with; at most as many as the machine has.
         replicas: Machines around the same generators: so many of the readings, one after the other, are one frame, which
             ends with the last of them.
@@ -160,7 +161,7 @@ def measure(
 
     Raises:
         BuildError: Fewer readings than replicas.
-        ModelError: No frame that the model finds possible.
+        ModelError: No frame is possible in the model.
     """
     if len(readings) < replicas:
         raise BuildError(
@@ -168,7 +169,7 @@ def measure(
         )
     parameters = boards.parameters
     banks = max(1, min(banks, parameters.rng_banks if parameters.rng_reset is RngReset.BANK else banks))
-    found = _Findings(boards, readings, banks)
+    found = _Results(boards, readings, banks)
     for place in range(len(readings) // replicas * replicas):
         exact = None
         if model is not None:
@@ -186,8 +187,8 @@ def measure(
 
 
 @dataclass(slots=True)
-class _Findings:
-    """What was found reading after reading.
+class _Results:
+    """Results of the readings that were run so far.
 
     Attributes:
         boards: The machine.
@@ -249,7 +250,7 @@ class _Findings:
     def summary(self) -> Accuracy:
         """Return all of it as shares, averages and intervals."""
         lengths = np.array([np.max(each, axis=0) for each in self.lengths.values()])
-        # replicas that ran for themselves: of the cycles of these a count's z-score is taken
+        # a count's z-score is taken from the cycles of single replicas
         by_themselves = np.array([length for each in self.lengths.values() for length in each])
         runs = self.posteriors * self.banks
         z = None
@@ -280,7 +281,7 @@ def _bank(boards: EmulatedBoards, frame: int, run: int, banks: int) -> int:
 
 
 def _line_probabilities(machine: BM1Machine, addresses: Inputs, prior_address: int) -> NDArray[np.float64]:
-    """The probability that each line counts in a cycle: float64[lines]."""
+    """Return the probability that each line counts in a cycle: float64[lines]."""
     frame = Start(addresses=addresses, prior_address=prior_address, target_count=1, max_cycles=1)
     chances = decode_code(addressed_codes(machine, frame), machine.parameters.prob_bits)
     product: NDArray[np.float64] = np.prod(chances, axis=0)

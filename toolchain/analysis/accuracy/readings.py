@@ -1,4 +1,4 @@
-"""Readings to try a machine on: drawn from a model, or recorded; as addresses of its columns."""
+"""Readings as addresses of a machine's columns, drawn from a model or recorded."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 MISSING: Final = -1
 MOST_FRAMES: Final = 100_000
-"""All are in memory at once, beside a row of each column's table for each."""
+"""All frames are in memory at once, each with a row of every column's table."""
 
 _WEIGHT_STEPS: Final = 500
 
@@ -37,12 +37,12 @@ class Readings:
     """Frames of readings.
 
     Attributes:
-        source: Where they come from, a clause.
+        source: Their origin, a clause.
         addresses: int64[frames, sensors], in the columns' order; `MISSING` for a missing reading. Where lines have
             readings of their own int64[frames, sensors, lines].
-        prior_addresses: int64[frames], what selects the prior; `MISSING` where nothing does.
-        codes: uint16[frames, sensors, lines], what such addresses' likelihoods are to a machine whose cells are given
-            codes (`sensor_mode = threshold`); None for other machines.
+        prior_addresses: int64[frames], the row of the prior; `MISSING` where none is selected.
+        codes: uint16[frames, sensors, lines], the codes of these readings' likelihoods, for a machine with
+            `sensor_mode = threshold`; None for other machines.
         lines: int64[frames], the true line of each; None where it is not known.
     """
 
@@ -84,10 +84,10 @@ class Readings:
 
 
 def check_frames(frames: int) -> None:
-    """Refuse a number of frames that can't be looked at.
+    """Refuse a number of frames out of range.
 
     Raises:
-        BuildError: None, or more than `MOST_FRAMES`.
+        BuildError: Fewer than 1, or more than `MOST_FRAMES`.
     """
     if not 1 <= frames <= MOST_FRAMES:
         raise BuildError(f"--frames is {frames}, expected 1 to {MOST_FRAMES}")
@@ -110,9 +110,9 @@ def sample_readings(model: Model, frames: int, *, seed: int, source: str = "") -
 
     Args:
         model: The model.
-        frames: How many.
-        seed: The same one draws the same readings.
-        source: What they are said to be.
+        frames: Number of frames.
+        seed: The same seed draws the same readings.
+        source: Their origin, as reports name it.
 
     Raises:
         BuildError: No frames, or too many.
@@ -132,8 +132,8 @@ def sample_readings(model: Model, frames: int, *, seed: int, source: str = "") -
         cumulative = np.cumsum(known.table[:, lines], axis=0)
         drawn = random.random(frames) * cumulative[-1]
         addresses[:, column] = (cumulative <= drawn).sum(axis=0)
-    said = source or f"{frames} frames drawn from the model (seed {seed})"
-    return Readings(said, addresses, rows, lines=lines)
+    origin = source or f"{frames} frames drawn from the model (seed {seed})"
+    return Readings(origin, addresses, rows, lines=lines)
 
 
 def readings_of_lines(
@@ -141,15 +141,15 @@ def readings_of_lines(
 ) -> Readings:
     """Return readings that were drawn from a model as a machine's whose lines have readings of their own.
 
-    The true line's cell reads what was drawn. What the others read the model does not say; theirs are drawn from the mean
-    of all lines. A machine with sensor_mode `threshold` is given their likelihoods, as codes.
+    The true line's cell reads the drawn value. The model does not define the others' readings; they are drawn from the mean
+    of all lines. A machine with sensor_mode `threshold` gets their likelihoods, as codes.
 
     Args:
         drawn: As `sample_readings` draws them.
         model: The model that they were drawn from.
         machine: The machine, or one board's.
-        scale: What was divided by its maximum before quantising.
-        seed: The same one draws the same readings of the other lines.
+        scale: The scaling before quantising.
+        seed: The same seed draws the same readings of the other lines.
 
     Raises:
         BuildError: The readings were not drawn, so that their true line is not known.
@@ -177,13 +177,13 @@ def readings_of_lines(
 def model_of_codes(
     name: str, searched: Sequence[Dimension], variables: Sequence[Variable], machine: BM1Machine
 ) -> Model:
-    """Return a model that a whole machine's codes are one of: what readings are drawn from where the model is not at hand.
+    """Return a model that quantises to a whole machine's codes, to draw readings from where the original is not at hand.
 
     Each row of a table was divided by its maximum before it was quantised; the factors are found again as those
     with which every line's column sums to 1, as nearly as possible (expectation maximisation).
 
     Args:
-        name: What it is called.
+        name: The model's name.
         searched: The searched dimensions.
         variables: All known variables, those that are columns in their order.
         machine: The machine with all lines.
@@ -227,7 +227,7 @@ def _distribution(ratios: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _normalised(distribution: NDArray[np.float64]) -> NDArray[np.float64]:
-    """A model's distributions sum to 1 within 1e-6; drawing wants it closer."""
+    """Return a distribution that sums to 1 exactly; a model's do within 1e-6."""
     exact: NDArray[np.float64] = distribution / distribution.sum()
     return exact
 
@@ -245,8 +245,8 @@ def recorded_readings(
     Args:
         path: CSV, MCAP or bag.
         variables: All known variables, those that are columns in their order.
-        given: NAME=COLUMN, where a variable's readings are; `*` stands for the same in both. Default: its name.
-        frames: How many rows at most.
+        given: NAME=COLUMN, the column of a variable's readings; `*` stands for the same in both. Default: its name.
+        frames: Number of rows, at most.
         tolerance_s: In a bag, how far from a row another topic's message may be, seconds.
 
     Raises:
@@ -271,7 +271,7 @@ def recorded_readings(
             continue
         rows.append([MISSING if address is None else address for address in row])
     if not rows:
-        raise ModelError(f"{path} has no row that this machine takes" + (f": {first}" if first else ""))
+        raise ModelError(f"{path} has no row that fits this machine" + (f": {first}" if first else ""))
     addresses = np.array(rows, dtype=np.int64).reshape(len(rows), len(variables))
     sensors = [at for at, variable in enumerate(variables) if variable.kind == "sensor"]
     selects = [at for at, variable in enumerate(variables) if variable.kind == "prior_select"]
@@ -303,7 +303,7 @@ def reading_columns(names: Sequence[str], given: Sequence[str], flag: str = "--r
         ]
         if not fitting:
             raise BuildError(
-                f"{flag} {pattern}: there is no such known variable; there are {', '.join(names[:20])}"
+                f"{flag} {pattern}: not a known variable of the model; expected one of {', '.join(names[:20])}"
             )
         for name in fitting:
             same = name[len(before) : len(name) - len(after)] if star else ""

@@ -1,8 +1,8 @@
-"""The thesis's claims as experiments: what cycles depend on (2.1.2, 4.3), and what flipped bits do (2.1.1).
+"""The thesis's claims as experiments: what cycles depend on (2.1.2, 4.3), and the effect of flipped bits (2.1.1).
 
-The model is one of its own, a boat among beacons of which there may be any number, so that lines, sensors and counters
-can be varied one by one. Bits are flipped in copies of a machine's tables, random numbers and streams, in a machine
-of this module's own that runs as the reference does; nothing in the kernels knows of faults.
+The model is a boat among any number of beacons, so that lines, sensors and counters can be varied one by one. Bits are
+flipped in copies of a machine's tables, random numbers and streams, in a machine of this module that runs as the
+reference does; the kernels know nothing of faults.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ SIDE: Final = 100.0
 SIGMA: Final = 12.0
 """Of a distance, in metres: more than a cell of the coarsest grid, or the grid would decide how well a line fits."""
 STEP: Final = 2.0
-"""Metres between the distances told apart."""
+"""Metres between two distances of a sensor."""
 CODE_BITS: Final = 8
 GRIDS: Final = (8, 12, 16, 24, 32, 48, 64)
 SENSORS: Final = (1, 2, 3, 4, 6, 8, 10, 12)
@@ -78,7 +78,7 @@ class Fault:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Claims:
-    """What came out of all experiments."""
+    """Results of all experiments."""
 
     frames: int
     fault_frames: int
@@ -155,7 +155,7 @@ def run_claims(*, frames: int, seed: int, advance: Callable[[str], None] = lambd
 
 
 def experiments() -> int:
-    """How many times `run_claims` calls `advance`."""
+    """Return how many times `run_claims` calls `advance`."""
     return len(GRIDS) + len(SENSORS) + len(TARGETS) + len(KINDS) * len(RATES)
 
 
@@ -172,10 +172,10 @@ def _course(x: float, model: Model, target: int, frames: int, seed: int) -> Cour
 
 
 class FaultyMachine:
-    """A machine that runs as the reference does, with bits flipped in its random numbers and in its cells' streams.
+    """A reference machine with bits flipped in its random numbers and in its cells' streams.
 
     Args:
-        machine: What runs; LFSRs or a table, shared by columns.
+        machine: The machine; LFSRs or a table, shared by columns.
         seed: Of the flips.
     """
 
@@ -202,7 +202,7 @@ class FaultyMachine:
         """Run a frame and return the counts, int64[lines], and its cycles.
 
         Args:
-            codes: uint16[columns, lines], what the tables answered.
+            codes: uint16[columns, lines], the codes from the tables.
             bank: Set of seeds.
             target_count: The count that stops it.
             max_cycles: The cycle at which it stops anyway.
@@ -221,10 +221,10 @@ class FaultyMachine:
                 shown = shown ^ (flips << np.arange(width)).sum(axis=2).astype(np.uint16)
             bits = np.ones((len(shown), codes.shape[1]), dtype=np.bool_)
             for column, row in enumerate(codes):
-                made = (shown[:, column, np.newaxis] < row) | (row == ones)
+                ones_here = (shown[:, column, np.newaxis] < row) | (row == ones)
                 if stream_rate:
-                    made ^= self._random.random(made.shape) < stream_rate
-                bits &= made
+                    ones_here ^= self._random.random(ones_here.shape) < stream_rate
+                bits &= ones_here
             rising = counts + np.cumsum(bits, axis=0)
             full = np.flatnonzero((rising >= target_count).any(axis=1))
             if full.size:
@@ -233,7 +233,7 @@ class FaultyMachine:
         return counts, begun
 
     def _column_numbers(self, bank: int, cycles: int) -> NDArray[np.uint16]:
-        """What the generators show in a bank's first cycles: uint16[cycles, columns]; kept, since they are always the same."""
+        """Return and cache a bank's first random numbers: uint16[cycles, columns]."""
         kept = self._shown.get(bank)
         if kept is None or len(kept) < cycles:
             length = max(2048, 2 * cycles)
@@ -248,11 +248,11 @@ class FaultyMachine:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
-    """One frame of readings, as the different ways of computing take it.
+    """One frame of readings, for the different ways of computing.
 
     Attributes:
-        codes: uint16[columns, lines], what a machine's tables answer.
-        likelihoods: float64[sensors, lines], what the model's do.
+        codes: uint16[columns, lines], from a machine's tables.
+        likelihoods: float64[sensors, lines], from the model's tables.
         bank: Set of seeds.
     """
 
@@ -287,7 +287,7 @@ class Faults:
         return self._counted(frame, frame.codes, number_rate=rate)
 
     def tables(self, frame: Frame, rate: float) -> NDArray[np.float64] | None:
-        """Flip a bit of a code; it stays so for the frame."""
+        """Flip a bit of a code, for the whole frame."""
         return self._counted(frame, _flipped(frame.codes, CODE_BITS, rate, self._random))
 
     def fixed_point(self, frame: Frame, rate: float) -> NDArray[np.float64] | None:
@@ -312,7 +312,7 @@ class Faults:
                 product = _flipped(words, 32, rate, self._random).view(np.float32)
             weights = np.clip(product.astype(np.float64), 0.0, None)
             posterior: NDArray[np.float64] = weights / weights.sum()
-        # What is infinite or no number says nothing.
+        # an infinite or undefined posterior says nothing
         return posterior if np.isfinite(posterior).all() else None
 
     def _counted(
@@ -337,7 +337,7 @@ KINDS: Final[dict[str, Callable[[Faults, Frame, float], NDArray[np.float64] | No
     "8-bit fixed point": Faults.fixed_point,
     "32-bit floating point": Faults.floating_point,
 }
-"""What is compared, by its name in the picture."""
+"""The ways that are compared, by their names in the picture."""
 
 
 def frames_of(model: Model, machine: BM1Machine, readings: Readings) -> list[Frame]:
@@ -379,7 +379,7 @@ def _all_faults(count: int, seed: int, advance: Callable[[str], None]) -> dict[s
 
 
 def _flipped(words: NDArray[_Word], width: int, rate: float, random: np.random.Generator) -> NDArray[_Word]:
-    """The words with each of their low bits flipped with this probability."""
+    """Return the words with each of their low bits flipped with this probability."""
     flips = random.random((*words.shape, width)) < rate
     mask = (flips.astype(np.uint64) << np.arange(width, dtype=np.uint64)).sum(axis=-1)
     faulty: NDArray[_Word] = words ^ mask.astype(words.dtype)

@@ -19,11 +19,11 @@ _COLOURS: Final = ("#4477aa", "#ee6677", "#228833", "#ccbb44", "#66ccee", "#aa33
 _MARKERS: Final = "osD^v<>P"
 _SUFFIXES: Final = (".png", ".svg", ".pdf")
 _KINDS_INSIDE: Final = 5
-"""More of them would lie on the points: they stand beside the picture."""
+"""A longer legend would cover points, so it stands beside the picture."""
 
 
 def check_pictures_possible(path: Path | None = None) -> None:
-    """Find out before a long run that its picture can't be drawn.
+    """Refuse, before a long run, a picture that can't be drawn.
 
     Raises:
         BuildError: matplotlib is not installed, the file can't be written, or its name is not a picture's.
@@ -35,7 +35,9 @@ def check_pictures_possible(path: Path | None = None) -> None:
     if path is None:
         return
     if path.suffix not in _SUFFIXES:
-        raise BuildError(f"{path} is no picture's name: expected one that ends in {', '.join(_SUFFIXES)}")
+        raise BuildError(
+            f"{path} is not the name of a picture; expected a name that ends in {', '.join(_SUFFIXES)}"
+        )
     there = path.exists()
     try:
         with path.open("ab"):
@@ -95,7 +97,7 @@ def draw_sweep(path: Path, name: str, points: Sequence[Point], front: Sequence[P
 
 
 def _kind(point: Point) -> tuple[str, int, str, str]:
-    """What has a colour of its own."""
+    """Return the properties of machines that share a colour."""
     return point.sensor_mode, point.replicas, point.scale, point.rng
 
 

@@ -1,4 +1,4 @@
-"""What a sweep has measured: a point a machine, kept in a file line by line, and the Pareto front of several."""
+"""Results of a sweep: a point for each machine, a line each in a file, and their Pareto front."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ if TYPE_CHECKING:
 MAX_FILE_BYTES: Final = 1 << 28
 
 _BEGIN: Final = b'{"key":"'
-"""How every line of results begins."""
+"""The first bytes of every line of results."""
 
 
 class Point(BaseModel):
     """One machine of a sweep, measured: a line of the results' file.
 
     Attributes:
-        key: SHA-256 of all that its figures depend on.
-        total_variation: Beside the model, mean over frames; None where no frame had a posterior.
+        key: SHA-256 of everything that its figures depend on.
+        total_variation: Against the model, mean over frames; None where no frame had a posterior.
         total_variation_low: Its 95 % interval's ends.
         total_variation_high: Its 95 % interval's ends.
         quantising: The same of exact inference on the codes.
@@ -65,7 +65,7 @@ class Point(BaseModel):
     alms: float | None
     blocks: int | None
     fits: bool | None
-    # files of older sweeps say nothing of these
+    # files of older sweeps lack these
     sensor_mode: Literal["column", "cell", "threshold"] = "column"
     replicas: int = 1
 
@@ -92,7 +92,7 @@ class Results:
         if path.exists():
             content = read_bounded(path, MAX_FILE_BYTES, BuildError)
         lines = content.split(b"\n")
-        # A power cut in the middle of a line leaves a last line without its end: that point is measured again.
+        # A power cut may leave a torn last line: that point is measured again.
         torn = lines.pop()
         if torn and not torn.startswith(_BEGIN[: len(torn)]):
             lines.append(torn)
@@ -102,12 +102,12 @@ class Results:
                 point = Point.model_validate_json(line)
             except ValidationError:
                 raise BuildError(
-                    f"{path}, line {number}, is no result of a sweep: name another file with -o"
+                    f"{path}, line {number}, is not a result of a sweep; name another file with -o"
                 ) from None
             self.points[point.key] = point
 
     def check_writable(self) -> None:
-        """Find out before a long run that its results can't be kept; makes the file where it is not there.
+        """Refuse, before a long run, a file that can't be written; make it if it is missing.
 
         Raises:
             BuildError: The file can't be written.
@@ -118,7 +118,7 @@ class Results:
             raise self._not_writable(reason) from None
 
     def append(self, point: Point) -> None:
-        """Add a point: one write, and it is on the disk.
+        """Append a point with one write, and wait until it is on the disk.
 
         Raises:
             BuildError: The file can't be written.
@@ -147,7 +147,7 @@ class Results:
 
 
 def pareto(points: Sequence[Point]) -> list[Point]:
-    """Return the points that no other one is better than: in total variation, cycles a posterior, ALMs and runs without one."""
+    """Return the points that no other dominates in total variation, cycles a posterior, ALMs and runs without a posterior."""
     judged = [(point, figures) for point in points if (figures := _figures(point)) is not None]
     return [
         point

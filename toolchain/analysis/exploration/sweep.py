@@ -1,4 +1,4 @@
-"""A sweep over a model's possible machines: accuracy against cycles and ALMs, kept point by point in a file."""
+"""Sweeps over a model's possible machines: accuracy against cycles and ALMs, kept point by point in a file."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ MAX_POINTS: Final = 10_000
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sweep:
-    """What is combined with what.
+    """The lists that a sweep combines.
 
     Attributes:
         prob_bits: Widths of codes.
@@ -48,8 +48,8 @@ class Sweep:
         replicas: Machines on a board.
         steps_per_clock: Steps of a generator in a cycle; 0 for as many as give fresh bits.
         partitions: Boards.
-        stop: When boards stop.
-        max_cycles: After how many cycles a machine stops anyway.
+        stop: When the boards stop.
+        max_cycles: The cycle at which a machine stops anyway.
         banks: Sets of seeds that every frame is run with.
     """
 
@@ -85,7 +85,7 @@ class Sweep:
             raise BuildError(f"these lists combine to {count} machines, expected 1 to {MAX_POINTS}")
         for mode, replicas, scale, rng, steps, prob_bits, target in itertools.product(*lists):
             if target < 1:
-                raise BuildError(f"a target count of {target} stops nothing: expected 1 or more")
+                raise BuildError(f"a target count of {target} stops nothing; expected 1 or more")
             yield BuildOptions(
                 uri="ws://nowhere:9090",  # a sweep has no robot
                 topic="/readings",
@@ -106,20 +106,20 @@ class Sweep:
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """A machine that is to be measured, and the key that its results are kept by."""
+    """A machine to measure, and the key of its results."""
 
     options: BuildOptions
     key: str
 
 
 class Frames:
-    """The readings of a sweep, as its machines take them; the same for all machines that take the same.
+    """The readings of a sweep; machines with inputs of the same kind get the same readings.
 
     Args:
         model: The model.
-        frames: How many of them; of recorded readings at most.
-        seed: Of what is drawn.
-        recorded: Returns so many recorded readings, or None to draw them from the model.
+        frames: Number of frames; of recorded readings at most.
+        seed: Of the readings that are drawn.
+        recorded: A function that returns so many recorded readings, or None to draw them from the model.
     """
 
     def __init__(
@@ -136,7 +136,7 @@ class Frames:
         """Return readings of whole columns: as many frames, each with one for every replica.
 
         Raises:
-            ToolchainError: None can be had.
+            ToolchainError: There are none.
         """
         if replicas not in self._base:
             check_frames(self._frames)
@@ -152,7 +152,7 @@ class Frames:
         """Return the readings of a machine with these options.
 
         Raises:
-            ToolchainError: None can be had.
+            ToolchainError: There are none.
         """
         base = self.columns(options.replicas)
         if options.sensor_mode is SensorMode.COLUMN:
@@ -160,10 +160,10 @@ class Frames:
         return readings_of_lines(base, self._model, machine, scale=options.scaling, seed=self._seed)
 
     def fingerprint(self, options: BuildOptions) -> str:
-        """Return a hash of the model and of all that these machines' readings are made from.
+        """Return a hash of the model and of the origin of these machines' readings.
 
         Raises:
-            ToolchainError: None can be had: recorded readings are those of columns.
+            ToolchainError: There are none; recorded readings are those of columns.
         """
         if self._recorded is not None and options.sensor_mode is not SensorMode.COLUMN:
             raise BuildError(
@@ -188,7 +188,7 @@ class Frames:
 
 
 def tasks(model: Model, sweep: Sweep, frames: Frames, device: Device) -> list[Task]:
-    """Return every machine of a sweep that can be built; what an LFSR is too narrow for is left out.
+    """Return the machines of a sweep that can be built.
 
     Raises:
         BuildError: Nothing is left, or nothing was there.
@@ -268,7 +268,7 @@ def run_task(model: Model, task: Task, frames: Frames, device: Device, banks: in
 
 
 def with_resources(model: Model, task: Task, point: Point, device: Device) -> Point:
-    """Return a point with what its largest board takes, as it is estimated now, whenever the point was measured."""
+    """Return a point with the resources of its largest board, as the present estimator has them."""
     options = task.options
     if options.rng is RngKind.IDEAL:
         return point
@@ -286,7 +286,7 @@ def run_sweep(
     keep: Callable[[Point], None],
     advance: Callable[[Point], None],
 ) -> None:
-    """Measure what is not there yet; every point is kept before the next one begins."""
+    """Measure the machines that are not kept yet, and keep every point before the next one begins."""
     for task in found:
         if task.key not in kept:
             point = measured(task)

@@ -84,7 +84,7 @@ class InspectOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Inspection:
-    """What was found out about a deployment."""
+    """Results of an inspection."""
 
     deployment: Deployment
     machine: BM1Machine
@@ -258,7 +258,7 @@ def _is_slow(machine: BM1Machine) -> bool:
 
 
 def _reported(directory: Path) -> str:
-    """What the build's report says was lost by quantising; nothing where there is no report."""
+    """Return the losses in the build's report; empty where there is no report."""
     try:
         text = (directory / REPORT_NAME).read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError):

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def report(found: Inspection) -> str:
-    """Return what was found, in plain sentences and tables."""
+    """Return the inspection in plain sentences and tables."""
     parts = [
         _machine_part(found),
         _loss_part(found),
@@ -113,13 +113,13 @@ def _time_part(found: Inspection) -> str:
 def _accuracy_part(found: Inspection) -> str:
     accuracy = found.accuracy
     rows = [
-        f"Accuracy over {accuracy.frames} frames (means with 95 % intervals; frames are drawn anew, banks within them not):",
+        f"Accuracy over {accuracy.frames} frames (means with 95 % intervals; frames are resampled, banks within them are not):",
         "                                       total variation               KL, bits             same MAP",
     ]
     for name, difference in (
-        ("the machine beside the model", accuracy.machine),
+        ("the machine against the model", accuracy.machine),
         ("  of that, by quantising alone", accuracy.quantising),
-        ("the machine beside its own codes", accuracy.sampling),
+        ("the machine against its codes", accuracy.sampling),
     ):
         if difference is not None:
             rows.append(f"  {name:34}{_difference(difference)}")
@@ -202,7 +202,7 @@ def _energy_part(found: Inspection) -> str:
 
 
 def as_json(found: Inspection) -> str:
-    """Return what was found as one JSON object."""
+    """Return the inspection as one JSON object."""
     cycles = found.accuracy.cycles.median.value
     dynamic, static = found.energy.frame_j(cycles, found.clock_hz)
     content = {
@@ -234,7 +234,7 @@ def as_json(found: Inspection) -> str:
 
 
 def _unit(value: float, unit: str) -> str:
-    """A value with the SI prefix that leaves 1 to 999 before the point."""
+    """Return a value with the SI prefix that leaves 1 to 999 before the point."""
     if value <= 0:
         return f"0 {unit}"
     prefixes = ("p", "n", "u", "m", "", "k", "M", "G")

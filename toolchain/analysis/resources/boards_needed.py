@@ -1,4 +1,4 @@
-"""How many boards a machine needs: as few as hold its lines, of an FPGA of a kind and of the register map."""
+"""The number of boards that a machine needs, by its FPGA's resources and by the register map."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ def boards_needed(
     pcie: Pcie = Pcie.HARD,
     table_length: int = LENGTH,
 ) -> tuple[int, str]:
-    """Return the fewest boards that hold a machine, and a sentence that says why.
+    """Return the fewest boards that hold a machine, and the reason as a sentence.
 
     Args:
         parameters: The whole machine.
-        device: What a board has.
+        device: The boards' FPGA.
         interface: Inputs and results of a board's registers, at least; a larger machine gets a larger one.
         largest_lines: Lines that the register map has room for on a board.
-        pcie: What the PCIe controllers are made of.
+        pcie: The kind of PCIe controller.
         table_length: Numbers in the table of random numbers, where one is played.
 
     Raises:
@@ -81,7 +81,7 @@ def boards_needed(
 
 
 def _most_lines(fits: Callable[[int], bool], highest: int) -> int:
-    """The most lines that fit, 0 to `highest`: what fits with more fits with fewer."""
+    """Return the most lines that fit, 0 to `highest`, by bisection."""
     low, high = 0, highest + 1
     while high - low > 1:
         middle = (low + high) // 2

@@ -1,4 +1,4 @@
-"""FPGAs that a board can have: what there is of each kind of cell, and how much of it a design can use."""
+"""FPGAs that a board can have, with their cells and the share of them that a design can use."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ class Device:
     """An FPGA, and the board it is on.
 
     Attributes:
-        name: As `--device` takes it.
-        title: As a person says it.
+        name: The value of `--device`.
+        title: The name in reports.
         alms: Adaptive logic modules.
         registers_per_alm: Registers in each of those.
         blocks: M20K memory blocks, 20,480 bits each.
@@ -50,7 +50,7 @@ def device_named(name: str) -> Device:
     """Return a device by its name.
 
     Raises:
-        BuildError: There is none of that name; lists those there are.
+        BuildError: Not the name of a device.
     """
     try:
         return DEVICES[name]

@@ -1,7 +1,7 @@
-"""What a frame costs in energy: a model that counts toggles of nets, with assumptions that are said aloud.
+"""Energy of a frame, by a model that counts toggles of nets and states its assumptions.
 
-Nothing here was measured on a board. Toggles come from the machine's structure and from its codes; what a toggle costs
-is one number for all nets.
+Nothing here was measured on a board. Toggles follow from the machine's structure and from its codes; a toggle costs the same
+on all nets.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def energy(machines: Sequence[BM1Machine], readings: Readings) -> Energy:
 
     Args:
         machines: Each board's machine.
-        readings: What its codes' activity is averaged over; the first 50 frames are enough.
+        readings: The readings that its codes' activity is averaged over; the first 50 frames are used.
     """
     toggles = clocked = 0.0
     ends = np.cumsum([machine.parameters.lines for machine in machines]).tolist()

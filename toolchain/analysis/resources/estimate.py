@@ -1,7 +1,7 @@
-"""What a BM1 takes of a board's FPGA: its logic, its tables, the interface and the PCIe controller.
+"""Resources of a BM1 on a board's FPGA: logic, tables, interface and PCIe controller.
 
-Tables are memories, one a cell as in the thesis's tiles (figure 2.2), since a table's content may be exchanged without a
-new compilation.
+Tables are memories, one a cell as in the thesis's tiles (figure 2.2), so that their content changes without a new
+compilation.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ ELEMENTS_PER_ALM: Final = 2.65
 
 
 class Pcie(StrEnum):
-    """What the PCIe controller is made of."""
+    """The kind of PCIe controller."""
 
     HARD = "hard"
     """A block of the device, as in the thesis: no logic."""
@@ -37,14 +37,14 @@ class Pcie(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Estimate:
-    """What a machine takes of a board's FPGA.
+    """Resources of a machine on a board's FPGA.
 
     Attributes:
-        device: Which one.
+        device: The FPGA.
         logic: Its logic, part by part.
-        memories: What its tables take.
-        pcie: What the PCIe controller is made of.
-        pcie_alms: ALMs that it takes, at least and at most.
+        memories: The memories of its tables.
+        pcie: The kind of PCIe controller.
+        pcie_alms: ALMs of that controller, at least and at most.
     """
 
     device: Device
@@ -55,7 +55,7 @@ class Estimate:
 
     @property
     def alms(self) -> float:
-        """ALMs altogether: of the logic, the registers that have no place beside it, tables and PCIe at its largest."""
+        """All ALMs: logic, registers that don't fit beside it, tables, and the largest PCIe controller."""
         logic = max(self.logic.alms, self.logic.registers / self.device.registers_per_alm)
         return logic + self.memories.alms + self.pcie_alms[1]
 
@@ -81,7 +81,7 @@ class Estimate:
 
     @property
     def why_not(self) -> str:
-        """What there is too little of, as a clause; nothing where it fits."""
+        """The resource that does not suffice, as a clause; empty where the machine fits."""
         usable = self.device.usable
         if self.memories.blocks > usable * self.device.blocks:
             return f"it takes {self.memories.blocks:,} memory blocks, and there are {self.device.blocks:,}"
@@ -102,21 +102,21 @@ def estimate(
     tables: Tables = Tables.CELL,
     table_length: int = LENGTH,
 ) -> Estimate:
-    """Return what a machine takes of a device.
+    """Return the resources that a machine takes of a device.
 
     Args:
         parameters: The machine; of one board.
         device: The FPGA.
         interface: Inputs and results of the interface; each is a register of 32 bits.
-        pcie: What the PCIe controller is made of.
+        pcie: The kind of PCIe controller.
         tables: How tables lie in memory blocks.
         table_length: Numbers in the table of random numbers, where one is played.
 
     Raises:
-        BuildError: Generators that no FPGA has, or a controller that the device has not.
+        BuildError: Generators that no FPGA has, or a controller that the device lacks.
     """
     if pcie is Pcie.HARD and not device.hard_pcie:
-        raise BuildError(f"{device.title} has no hard PCIe controller: use --pcie soft")
+        raise BuildError(f"{device.title} has no hard PCIe controller; use --soft-pcie")
     logic = logic_of(parameters, inputs=interface[0], results=interface[1], table_length=table_length)
     soft = tuple(elements / ELEMENTS_PER_ALM for elements in SOFT_PCIE_ELEMENTS)
     return Estimate(

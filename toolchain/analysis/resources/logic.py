@@ -1,7 +1,7 @@
 """A machine's logic from first principles: comparators, ANDs, counters, generators, inputs, readout, in bits.
 
-What the logic needs of a part is counted by its bits; how much of an FPGA's logic a bit becomes is calibrated on
-yosys's synthesis of small machines (`scripts/verify resources --calibrate`; docs/design-space.md).
+A part's logic is counted by its bits; the FPGA's logic for a bit is calibrated on yosys's synthesis of small machines
+(`scripts/verify resources --calibrate`; docs/design-space.md).
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class Alms:
 
 
 class Of(StrEnum):
-    """What logic is counted by; each costs look-up tables beside the carry chains, and ALMs for those."""
+    """Units that logic is counted by; each costs look-up tables beside the carry chains, and ALMs for those."""
 
     CONTROL = "control"
     """A machine: the frame's sequence and the 64-bit limits."""
@@ -89,7 +89,7 @@ class Of(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Cost:
-    """What a bit of a part becomes in an FPGA: look-up tables beside the carry chains, and ALMs of those."""
+    """Logic of an FPGA for one unit: look-up tables beside the carry chains, and ALMs of those."""
 
     luts: float
     alms: float
@@ -115,11 +115,11 @@ COSTS: Final[Mapping[Of, Cost]] = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Part:
-    """What one part of a machine takes.
+    """Logic of one part of a machine.
 
     Attributes:
-        name: What it is.
-        counts: What its look-up tables are counted by.
+        name: The part's name.
+        counts: Units that its look-up tables are counted by.
         sums: Bits of its carry chains.
         registers: Its flip-flops.
     """
@@ -170,7 +170,7 @@ def logic_of(
     whole_words: bool = True,
     table_length: int = LENGTH,
 ) -> Logic:
-    """Return what a machine's logic takes, its tables left out.
+    """Return a machine's logic, its tables left out.
 
     Args:
         parameters: The machine; of one board.
@@ -231,12 +231,12 @@ def logic_of(
 
 
 def _stops(p: BM1Parameters) -> int:
-    """Registers that say why a machine stopped; of replicas each one's cycles too, and whether it runs and may."""
+    """Return the registers of the stop reason; of replicas also each one's cycles and flags."""
     return _REASON_BITS if p.replicas == 1 else p.replicas * (CYCLE_BITS + _REASON_BITS + _FLAG_BITS)
 
 
 def _inputs(p: BM1Parameters, words: int, whole_words: bool) -> Part:
-    """What the host writes for every frame: readings, the prior's address or its codes, which replicas to halt."""
+    """Return the registers that the host writes for a frame: readings, prior address or codes, replicas to halt."""
     per_column = 1 if p.sensor_mode is SensorMode.COLUMN else p.lines
     own = p.replicas * p.sensors * per_column
     bits = p.replicas * per_column * sum(p.sensor_bits)
@@ -254,7 +254,7 @@ def _inputs(p: BM1Parameters, words: int, whole_words: bool) -> Part:
 
 
 def _readout(p: BM1Parameters, words: int, whole_words: bool) -> Part:
-    """What the host reads: every line's count as it was when the machine stopped, and how each replica did."""
+    """Return the registers that the host reads: every line's final count, and each replica's outcome."""
     results = max(words, p.replicas * p.lines) if whole_words else p.replicas * p.lines
     width = WORD_BITS if whole_words else p.counter_bits
     outcomes = p.replicas * (CYCLE_BITS + _REASON_BITS) if p.replicas > 1 else 0

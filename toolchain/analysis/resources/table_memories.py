@@ -1,4 +1,4 @@
-"""Where a machine's tables lie in an FPGA: in its memory blocks, and in memory LABs where those are all taken."""
+"""Memories of a machine's tables in an FPGA: memory blocks, and memory LABs where those are all taken."""
 
 from __future__ import annotations
 
@@ -25,20 +25,20 @@ BLOCK_SHAPES: Final = ((512, 40), (1024, 20), (2048, 10), (4096, 5), (8192, 2), 
 
 
 class Tables(StrEnum):
-    """How tables lie in memory blocks."""
+    """The layout of tables in memory blocks."""
 
     CELL = "cell"
-    """Every cell has its own memory, as the thesis draws a tile."""
+    """Every cell has its own memory, as in the thesis's tile."""
     COLUMN = "column"
     """A column's tables lie side by side in wide memories: possible where a column shares one address."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Memories:
-    """What a machine's tables take.
+    """The memories that a machine's tables take.
 
     Attributes:
-        tables: How they lie in memory blocks.
+        tables: Their layout in memory blocks.
         table_bits: Bits of all tables.
         blocks: M20Ks that hold tables, of random numbers too.
         logic_tables: Tables for which there was no block left, so that they lie in memory LABs.
@@ -55,7 +55,7 @@ class Memories:
 
 
 def _table_bits(parameters: BM1Parameters) -> list[int]:
-    """The address bits of the columns that have tables: a prior of one row, or a written one, is registers."""
+    """Return the address bits of the columns with tables; a prior of one row, or a written one, is in registers."""
     sensors = parameters.sensor_bits if parameters.has_tables else ()
     return [bits for bits in (parameters.prior_bits, *sensors) if bits]
 
@@ -105,5 +105,5 @@ def place_tables(
 
 
 def _blocks(words: int, width: int) -> int:
-    """M20Ks that hold so many words of so many bits, in the best of their shapes."""
+    """Return the fewest M20Ks that hold so many words of so many bits."""
     return min(math.ceil(words / deep) * math.ceil(width / wide) for deep, wide in BLOCK_SHAPES)
