@@ -133,7 +133,7 @@ def test_readings_that_the_model_finds_impossible():
     table = np.array([[1.0, 1.0], [0.0, 0.0]])
     model = Model(name="sure", searched=(dimension("s", size=2),), known=(Known(name="A", table=table),))
     readings = Readings("by hand", np.array([[1]]), np.array([-1]))
-    with pytest.raises(ModelError, match=r"none of the readings \(by hand\) is possible"):
+    with pytest.raises(ModelError, match="by hand"):
         measure(boards_of(machine_of(model)), readings, model)
     assert exact_posterior(model, [0]) == pytest.approx([0.5, 0.5])
 

@@ -63,7 +63,7 @@ def test_a_run_of_a_given_length_is_stopped_by_no_counter():
 
 
 def test_limits_that_make_no_sense():
-    with pytest.raises(BuildError, match="a target count of 256 does not fit counters of 8 bits"):
+    with pytest.raises(BuildError, match="256"):
         EmulatedBoards([MACHINE], target_count=256, max_cycles=10, stop=Stop.OWN)
-    with pytest.raises(BuildError, match="max_cycles is 0"):
+    with pytest.raises(BuildError, match="max_cycles"):
         EmulatedBoards([MACHINE], target_count=5, max_cycles=0, stop=Stop.OWN)

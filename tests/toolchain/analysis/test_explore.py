@@ -14,13 +14,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from machines.parameters import RngKind, SensorMode
-from tests.command_runner import invoke
 from tests.toolchain.corridor import corridor
+from tests.toolchain.running import assert_refused, toolchain
 from toolchain.analysis.exploration.pictures import check_pictures_possible
 from toolchain.analysis.exploration.results import Point, Results, pareto
 from toolchain.analysis.exploration.sweep import Frames, Sweep, run_sweep, run_task, tasks
 from toolchain.analysis.resources.device import DEVICES
-from toolchain.commands.main import app
 from toolchain.deployment import Scale, Stop
 from toolchain.errors import BuildError
 from toolchain.models.model import Known, Model, dimension
@@ -82,17 +81,8 @@ def point(key, variation=0.1, cycles=100.0, alms=1000.0, without=0.0):
 
 
 def run(case, *arguments):
-    command = [
-        "explore",
-        str(case),
-        "-o",
-        str(case.parent / "r.jsonl"),
-        "--frames",
-        "5",
-        "--max-cycles",
-        "2000",
-    ]
-    return invoke(app, [*command, *arguments])
+    limits = ("--frames", 5, "--max-cycles", 2000)
+    return toolchain("explore", case, "-o", case.parent / "r.jsonl", *limits, *arguments)
 
 
 def test_keys_name_what_the_figures_depend_on():
@@ -197,10 +187,10 @@ def test_a_file_of_something_else_is_left_alone(tmp_path):
     path = tmp_path / "notes.txt"
     for notes in ("my notes\n", "my notes"):
         path.write_text(notes)
-        with pytest.raises(BuildError, match="line 1, is no result of a sweep"):
+        with pytest.raises(BuildError, match="line 1,"):
             Results(path)
         assert path.read_text() == notes
-    with pytest.raises(BuildError, match="can't be written"):
+    with pytest.raises(BuildError):
         Results(tmp_path / "there" / "r.jsonl").append(point(1))
 
 
@@ -247,7 +237,7 @@ def test_a_network_is_explored_too(tmp_path):
     result = run(network, *question, *lists)
     assert result.exit_code == 0, result.stderr
     assert "none     table" in result.stdout
-    assert "--searched asks a network's file" in run(tmp_path, *question).stderr
+    assert_refused(run(tmp_path, *question), "--searched")
 
 
 def test_the_command(case):
@@ -303,11 +293,10 @@ def test_no_recording_has_readings_for_each_line(case):
     recording = case.parent / "r.csv"
     recording.write_text("range\n1.0\n2.0\n3.0\n")
     result = run(case, "--readings", str(recording), "--sensor-modes", "cell", "--scales", "column")
-    assert result.exit_code == 2
-    assert "--sensor-modes cell readings are arrays, one number for each line" in result.stderr
+    assert_refused(result, "--sensor-modes cell")
     few = run(case, "--readings", str(recording), "--replicas", "4", "--prob-bits", "8", "--targets", "15")
     assert few.exit_code == 2
-    assert "a frame of 4 replicas takes 4 readings, and there are 3 (3 of 3 rows of r.csv)" in few.stderr
+    assert "3 of 3 rows of r.csv" in few.stderr
 
 
 def test_what_a_kept_point_takes_is_estimated_anew(case):
@@ -333,20 +322,13 @@ def test_a_plot(case):
 
 
 @pytest.mark.parametrize(
-    ("option", "name", "sentence"),
-    [
-        ("-o", "nowhere/r.jsonl", "can't be written: No such file or directory"),
-        ("--plot", "nowhere/sweep.png", "can't be written: No such file or directory"),
-        ("--plot", "sweep.bmp", "is no picture's name: expected one that ends in .png, .svg, .pdf"),
-    ],
+    ("option", "name"), [("-o", "nowhere/r.jsonl"), ("--plot", "nowhere/sweep.png"), ("--plot", "sweep.bmp")]
 )
-def test_what_cannot_be_written_is_found_before_anything_is_measured(case, option, name, sentence):
+def test_an_unwritable_file_is_refused_before_anything_is_measured(case, option, name):
     if option == "--plot":
         pytest.importorskip("matplotlib")
-    result = run(case, "--prob-bits", "4", "--targets", "15", option, str(case.parent / name))
-    assert result.exit_code == 2
-    assert sentence in result.stderr
-    assert result.stderr.splitlines()[-1].startswith("error: ")
+    result = run(case, "--prob-bits", "4", "--targets", "15", option, case.parent / name)
+    assert_refused(result, case.parent / name)
     assert "machines of" not in result.stderr
     results = case.parent / "r.jsonl"
     assert not results.exists() or not results.stat().st_size
@@ -361,34 +343,26 @@ def test_looking_whether_a_picture_can_be_written_leaves_nothing(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "sentence"),
+    ("arguments", "named"),
     [
-        (["--prob-bits", "4;8"], "--prob-bits 4;8: expected whole numbers with commas"),
-        (["--rngs", "lfsr31"], "--rngs lfsr31: expected some of lfsr8, lfsr16"),
-        (["--targets", "0"], "a target count of 0 stops nothing"),
-        (
-            ["--prob-bits", "16", "--rngs", "lfsr16"],
-            "none of these machines can be built: lfsr16 is too narrow",
-        ),
-        (["--device", "d9"], "--device d9: expected one of proce-v-d8"),
-        (["--reading", "a=b"], "add --readings FILE"),
-        (["--frames", "0"], "--frames is 0, expected 1 to 100000"),
-        (["--claims", "x"], "--claims has a model of its own"),
-        (["--partitions", "13"], "12 lines can't be split over 13 boards"),
-        (["--banks", "0"], "numbers from 1"),
+        (["--prob-bits", "4;8"], ["--prob-bits 4;8"]),
+        (["--rngs", "lfsr31"], ["--rngs lfsr31", "lfsr8, lfsr16"]),
+        (["--targets", "0"], ["target count of 0"]),
+        (["--prob-bits", "16", "--rngs", "lfsr16"], ["lfsr16"]),
+        (["--device", "d9"], ["--device d9", "proce-v-d8"]),
+        (["--reading", "a=b"], ["--reading a=b", "--readings FILE"]),
+        (["--frames", "0"], ["--frames is 0", "1 to 100000"]),
+        (["--claims", "x"], ["--claims"]),
+        (["--partitions", "13"], ["12 lines", "13 boards"]),
+        (["--banks", "0"], ["--banks"]),
     ],
 )
-def test_mistakes(case, arguments, sentence):
-    result = run(case, *arguments)
-    assert result.exit_code == 2, result.stdout
-    assert result.stderr.splitlines()[-1].startswith("error: ")
-    assert sentence in result.stderr
+def test_mistakes(case, arguments, named):
+    assert_refused(run(case, *arguments), *named)
 
 
 def test_nothing_to_explore():
-    result = invoke(app, ["explore"])
-    assert result.exit_code == 2
-    assert result.stderr.startswith("error: name a model to explore")
+    assert_refused(toolchain("explore"), "--claims DIR")
 
 
 def test_ctrl_c_keeps_what_is_done(case):
@@ -397,14 +371,7 @@ def test_ctrl_c_keeps_what_is_done(case):
     command += [
         "-o",
         str(results),
-        "--frames",
-        "40",
-        "--max-cycles",
-        "100000",
-        "--rngs",
-        "ideal",
-        "--targets",
-        "255,1023",
+        *["--frames", "40", "--max-cycles", "100000", "--rngs", "ideal", "--targets", "255,1023"],
     ]
     root = Path(__file__).parents[3]
     child = subprocess.Popen(

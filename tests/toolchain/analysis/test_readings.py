@@ -75,11 +75,11 @@ def test_what_a_recording_may_not_be(tmp_path):
     path = tmp_path / "run.csv"
     path.write_text("range,loud\n9,7\n")
     variables = corridor().variables
-    with pytest.raises(ModelError, match="has no row that this machine takes: variable loud: 7"):
+    with pytest.raises(ModelError, match="loud: 7"):
         recorded_readings(path, variables, [], frames=5)
     with pytest.raises(BuildError, match="--frames is 0"):
         recorded_readings(path, variables, [], frames=0)
-    with pytest.raises(BuildError, match="--reading sonar: there is no such known variable"):
+    with pytest.raises(BuildError, match="--reading sonar"):
         recorded_readings(path, variables, ["sonar=a"], frames=5)
 
 

@@ -12,15 +12,13 @@ from hypothesis import strategies as st
 from machines.bm1 import Start, StopReason
 from machines.parameters import PriorMode, RngKind, RngReset, SensorMode
 from machines.reference import ReferenceBM1
-from tests.command_runner import invoke
+from tests.toolchain.running import assert_refused, toolchain
 from toolchain.building.build import assemble, build_deployment
 from toolchain.building.options import BuildOptions
 from toolchain.checks.check import check_deployment, check_model
 from toolchain.checks.codes import line_name, reading
-from toolchain.checks.finding import Severity
-from toolchain.commands.main import app
+from toolchain.checks.finding import Check, Severity
 from toolchain.deployment import Scale
-from toolchain.errors import ModelError
 from toolchain.models.conditional import normal, wrapped_normal
 from toolchain.models.model import Known, Model, PriorSelect, cell_centres, dimension, interval
 from toolchain.outputs.mif import Mif, mif_text
@@ -114,7 +112,7 @@ def test_the_machine_bears_it_out(sparse, scale, data):
     if any(finding.severity is Severity.ERROR for finding in findings):
         return
     said = {}
-    for finding in found(findings, "impossible-readings"):
+    for finding in found(findings, Check.IMPOSSIBLE_READINGS):
         said.setdefault(finding.about, []).append(finding.what)
     for place, known in enumerate(sparse.known):
         impossible = [
@@ -159,10 +157,10 @@ def test_readings_are_named_in_the_variables_own_words():
         Known(name="door", table=table, states=("a", "b", "c", "d", "e")),
     )
     findings = check_model(Model(name="m", searched=(rain,), known=known), OPTIONS)
-    numbers, words = found(findings, "impossible-readings")
+    numbers, words = found(findings, Check.IMPOSSIBLE_READINGS)
     assert (numbers.severity, numbers.about) == (Severity.NOTE, "D")
-    assert "3 of its 5 values (-2, -1 to -0.5) never occur" in numbers.what
-    assert "3 of its 5 values (a, c to d) never occur" in words.what
+    assert "3 of its 5 values (-2, -1 to -0.5)" in numbers.what
+    assert "3 of its 5 values (a, c to d)" in words.what
     assert line_name((rain, dimension("x", size=3, offset=1.5)), 5) == "rain = yes, x = 3.5"
     assert reading(known[0].as_variable(), 7) == "a missing reading"
 
@@ -170,12 +168,9 @@ def test_readings_are_named_in_the_variables_own_words():
 def test_a_possible_reading_without_a_code():
     table = np.array([[0.999, 0.999], [0.001, 0.001]])
     options = replace(OPTIONS, scale=Scale.COLUMN)
-    finding = only(check_model(model_of(table), options), "impossible-readings")
+    finding = only(check_model(model_of(table), options), Check.IMPOSSIBLE_READINGS)
     assert finding.severity is Severity.WARNING
-    assert (
-        "1 of its 2 values (1, 0.001 of all readings) have code 0 on every line that can count"
-        in finding.what
-    )
+    assert "1 of its 2 values (1, 0.001 of all readings)" in finding.what
     assert finding.advice == "use --scale address or more --prob-bits"
     machine = assemble(model_of(table), options).images[0].machine
     start = Start(addresses=(1,), target_count=255, max_cycles=100)
@@ -197,97 +192,83 @@ def model_of(table, **changes):
 def test_lines_that_the_prior_excludes_or_loses():
     table = np.full((2, 4), 0.5)
     prior = np.array([0.0, 1e-6, 0.5, 0.5 - 1e-6])
-    meant, lost = found(check_model(model_of(table, prior=prior), OPTIONS), "dead-lines")[::-1]
+    meant, lost = found(check_model(model_of(table, prior=prior), OPTIONS), Check.DEAD_LINES)[::-1]
     assert (meant.severity, lost.severity) == (Severity.NOTE, Severity.WARNING)
-    assert meant.what == "the model says that s = 0 is never the case, so it never counts"
-    assert "it has code 0 at s = 1, which can never count" in lost.what
+    assert "s = 0" in meant.what
+    assert "s = 1" in lost.what
     written = replace(OPTIONS, prior_mode=PriorMode.WRITTEN)
-    assert not found(check_model(model_of(table, prior=prior), written), "dead-lines")
+    assert not found(check_model(model_of(table, prior=prior), written), Check.DEAD_LINES)
 
 
 def test_lines_and_rows_of_a_selected_prior():
     rows = np.array([[1.0, 0, 0], [0, 1.0, 0]])
     select = PriorSelect(name="room", table=rows)
     findings = check_model(model_of(np.full((2, 3), 0.5), prior_select=select), OPTIONS)
-    assert [finding.what for finding in found(findings, "dead-lines")] == [
-        "the model says that s = 2 is never the case, so it never counts"
-    ]
-    assert not found(findings, "impossible-readings")
+    assert only(findings, Check.DEAD_LINES).severity is Severity.NOTE
+    assert "s = 2" in only(findings, Check.DEAD_LINES).what
+    assert not found(findings, Check.IMPOSSIBLE_READINGS)
 
 
 def test_a_column_and_a_board_without_hope():
     coarse = replace(OPTIONS, scale=Scale.NONE, prob_bits=1, partitions=2)
     spread = np.array([[0.5, 0.2]] + [[0.5, 0.2]] + [[0, 0.2]] * 3)
     findings = check_model(model_of(spread, prior=np.array([0.6, 0.4])), replace(coarse, scale=Scale.COLUMN))
-    (column,) = [finding for finding in found(findings, "dead-lines") if finding.about == "K"]
-    assert "every value of it has code 0 at s = 1, which can never count" in column.what
-    assert only(findings, "dead-board").about == "board 1"
+    (column,) = [finding for finding in found(findings, Check.DEAD_LINES) if finding.about == "K"]
+    assert "s = 1" in column.what
+    assert only(findings, Check.DEAD_BOARD).about == "board 1"
     forgiving = model_of(
         spread, prior=np.array([0.6, 0.4]), known=(Known(name="K", table=spread, on_missing="missing"),)
     )  # the line counts where K is missing
-    assert not found(check_model(forgiving, replace(coarse, scale=Scale.COLUMN)), "dead-lines")
+    assert not found(check_model(forgiving, replace(coarse, scale=Scale.COLUMN)), Check.DEAD_LINES)
     findings = check_model(model_of(np.full((5, 2), 0.2)), coarse)
-    assert only(findings, "dead-lines").severity is Severity.ERROR
+    assert only(findings, Check.DEAD_LINES).severity is Severity.ERROR
 
 
 def test_a_floor_that_vanishes():
     place = interval("x", 0, 10, cells=10)
     (x,) = cell_centres(place)
     known = normal("D", mean=x, sigma=0.4, values=11, floor=1e-4)
-    finding = only(check_model(model(known=(known,)), OPTIONS), "vanished-floor")
+    finding = only(check_model(model(known=(known,)), OPTIONS), Check.VANISHED_FLOOR)
     assert (finding.severity, finding.about) == (Severity.WARNING, "D")
     floor = float(finding.advice.removeprefix("use a floor of about ").split()[0])
     mended = normal("D", mean=x, sigma=0.4, values=11, floor=floor * 1.05)
-    assert not found(check_model(model(known=(mended,)), OPTIONS), "vanished-floor")
+    assert not found(check_model(model(known=(mended,)), OPTIONS), Check.VANISHED_FLOOR)
     wider = int(finding.advice.rpartition(" ")[2])
-    assert not found(check_model(model(known=(known,)), replace(OPTIONS, prob_bits=wider)), "vanished-floor")
+    assert not found(
+        check_model(model(known=(known,)), replace(OPTIONS, prob_bits=wider)), Check.VANISHED_FLOOR
+    )
 
 
 def test_true_lines_lost_to_the_codes():
     findings = check_model(model(), replace(OPTIONS, scale=Scale.NONE, prob_bits=5))
-    assert "most often one of D (" in only(findings, "lost-mass").what
+    assert "most often one of D (" in only(findings, Check.LOST_MASS).what
 
 
 # Generators
 
 
 @pytest.mark.parametrize(
-    ("changes", "check", "about", "part"),
+    ("changes", "check", "about", "numbers"),
     [
-        ({"rng_banks": 1}, "rng-banks", "rng_banks = 1", "every frame sees the same random numbers"),
-        ({"rng": RngKind.IDEAL}, "rng", "rng = ideal", "exist emulated only"),
-        (
-            {"steps_per_clock": 1},
-            "rng-steps",
-            "steps_per_clock = 1",
-            "share 7 bits with those of the next cycle",
-        ),
-        (
-            {"rng": RngKind.LFSR16},
-            "rng-period",
-            "rng = lfsr16",
-            "repeat after 65535 cycles, and a frame may run 131072",
-        ),
+        ({"rng_banks": 1}, Check.RNG_BANKS, "rng_banks = 1", []),
+        ({"rng": RngKind.IDEAL}, Check.RNG, "rng = ideal", []),
+        ({"steps_per_clock": 1}, Check.RNG_STEPS, "steps_per_clock = 1", [8, 7]),
+        ({"rng": RngKind.LFSR16}, Check.RNG_PERIOD, "rng = lfsr16", [65535, 131072]),
         (
             {"rng": RngKind.LFSR16, "steps_per_clock": 15},
-            "rng-period",
+            Check.RNG_PERIOD,
             "rng = lfsr16",
-            "repeat after 4369 cycles (65535 steps, of which a clock takes 15)",
+            [4369, 65535, 15, 131072],
         ),
-        ({"rng": RngKind.TABLE}, "rng-period", "rng = table", "repeat after 65536 cycles"),
-        (
-            {"target_count": 200, "max_cycles": 199},
-            "stopping",
-            "the machine",
-            "no counter can reach 200 in 199",
-        ),
+        ({"rng": RngKind.TABLE}, Check.RNG_PERIOD, "rng = table", [65536, 131072]),
+        ({"target_count": 200, "max_cycles": 199}, Check.STOPPING, "the machine", [200, 199]),
     ],
 )
-def test_generators_and_stopping(changes, check, about, part):
+def test_generators_and_stopping(changes, check, about, numbers):
     finding = only(check_model(model(), replace(OPTIONS, **changes)), check)
     assert finding.about == about
-    assert part in finding.what
-    assert finding.severity is (Severity.NOTE if check == "rng" else Severity.WARNING)
+    assert [int(each) for each in re.findall(r"\b\d+\b(?!\.)", finding.what)][: len(numbers)] == numbers
+    assert finding.severity is (Severity.NOTE if check is Check.RNG else Severity.WARNING)
 
 
 def test_what_ends_a_warning_about_generators():
@@ -301,12 +282,12 @@ def test_related_columns_name_the_bits():
     """An LFSR of 8 bits has 255 states: with so few, three columns' bits are bound to be related."""
     known = tuple(Known(name=f"K{i}", table=np.array([[0.9, 0.1], [0.1, 0.9]])) for i in range(6))
     options = replace(OPTIONS, rng=RngKind.LFSR8, prob_bits=7, max_cycles=255)
-    related = found(check_model(model_of([[0.9, 0.1], [0.1, 0.9]], known=known), options), "rng-relation")
+    related = found(check_model(model_of([[0.9, 0.1], [0.1, 0.9]], known=known), options), Check.RNG_RELATION)
     assert related[0].severity is Severity.ERROR
     assert "3 random bits of several columns XOR to 0 in every cycle" in related[0].what
     assert "use a wider --rng" in related[0].advice
     cells = replace(options, shared=False, rng_banks=3)
-    related = found(check_model(model_of([[0.9, 0.1], [0.1, 0.9]], known=known), cells), "rng-relation")
+    related = found(check_model(model_of([[0.9, 0.1], [0.1, 0.9]], known=known), cells), Check.RNG_RELATION)
     assert "of 6 lines in a bank" in related[0].what
 
 
@@ -315,7 +296,7 @@ def test_bits_of_one_column_in_a_relation_are_not_called_those_of_different_ones
     (x,) = cell_centres(place)
     known = tuple(normal(name, mean=x, sigma=2.0, values=15, floor=0.05) for name in "ABCD")
     options = replace(OPTIONS, rng=RngKind.LFSR8, prob_bits=7, rng_banks=2)
-    said = [each.what for each in found(check_model(model(known=known), options), "rng-relation")]
+    said = [each.what for each in found(check_model(model(known=known), options), Check.RNG_RELATION)]
     said = [what for what in said if "random bits of" in what]
     assert said
     for what in said:
@@ -326,20 +307,15 @@ def test_bits_of_one_column_in_a_relation_are_not_called_those_of_different_ones
 @pytest.mark.parametrize(
     ("table", "check", "severity", "part"),
     [
-        (
-            np.arange(512) // 2 * 2,
-            "rng-table",
-            Severity.WARNING,
-            "the numbers are not equally often in the table",
-        ),
-        (np.arange(4096) % 256, "rng-relation", Severity.WARNING, "their random numbers correlate by"),
+        (np.arange(512) // 2 * 2, Check.RNG_TABLE, Severity.WARNING, "code 1 "),
+        (np.arange(4096) % 256, Check.RNG_RELATION, Severity.WARNING, "table of 4096"),
         (
             np.full(100, 7),
-            "rng-table",
+            Check.RNG_TABLE,
             Severity.WARNING,
             "code 8 counts in 1 of the cycles instead of 0.03125",
         ),
-        (np.array([3]), "rng-relation", Severity.ERROR, "they play the table from the same place"),
+        (np.array([3]), Check.RNG_RELATION, Severity.ERROR, "place 0"),
     ],
 )
 def test_tables_of_random_numbers(table, check, severity, part):
@@ -358,26 +334,21 @@ def test_codes_of_any_width(bits):
 
 
 @pytest.mark.parametrize(
-    ("changes", "check", "part", "advice"),
+    ("changes", "check", "numbers", "advice"),
     [
-        ({"bits": 6}, "address-bits", "its memory is 4 times as deep as need be", "use --bits B=4"),
-        (
-            {"period": 12},
-            "range",
-            "only 10 are served: those from 10 on are out of range",
-            "give it 12 values",
-        ),
-        ({"period": 8}, "range", "the last 2 of its 10 values never occur", "a period of 10"),
-        ({"on_range": "missing"}, "range", "a missing one is an error (on_missing)", 'on_missing="missing"'),
+        ({"bits": 6}, Check.ADDRESS_BITS, ["10", "4", "6", "4"], "--bits B=4"),
+        ({"period": 12}, Check.RANGE, ["12", "10", "10"], "12 values"),
+        ({"period": 8}, Check.RANGE, ["8", "2", "10"], "a period of 10"),
+        ({"on_range": "missing"}, Check.RANGE, [], 'on_missing="missing"'),
     ],
 )
-def test_ranges(changes, check, part, advice):
+def test_ranges(changes, check, numbers, advice):
     known = wrapped_normal("B", mean=np.arange(4.0), sigma=1.0, values=10, step=1.0, floor=0.05)
     searched = (dimension("s", size=4),)
     findings = check_model(model(searched=searched, known=(replace(known, **changes),)), OPTIONS)
     finding = only(findings, check)
     assert finding.about == "B"
-    assert part in finding.what
+    assert re.findall(r"\d+", finding.what) == numbers
     assert advice in finding.advice
 
 
@@ -385,8 +356,8 @@ def test_columns_without_effect_and_readings_used_twice():
     table = np.full((2, 3), 0.5)
     known = tuple(Known(name=name, table=table, path="data[0]") for name in "AB")
     findings = check_model(model_of(table, known=known), OPTIONS)
-    assert [finding.about for finding in found(findings, "column-without-effect")] == ["A", "B"]
-    assert only(findings, "same-reading").about == "A and B"
+    assert [finding.about for finding in found(findings, Check.COLUMN_WITHOUT_EFFECT)] == ["A", "B"]
+    assert only(findings, Check.SAME_READING).about == "A and B"
 
 
 def test_a_bare_path_is_the_reading_of_that_name():
@@ -396,7 +367,7 @@ def test_a_bare_path_is_the_reading_of_that_name():
         normal(name, mean=x, sigma=2.0, values=15, floor=0.05, path=path)
         for name, path in (("D", ""), ("E", "D"), ("F", "F"))
     )
-    finding = only(check_model(model(known=known), OPTIONS), "same-reading")
+    finding = only(check_model(model(known=known), OPTIONS), Check.SAME_READING)
     assert (finding.about, finding.what) == ("D and E", "they are all read from D")
 
 
@@ -410,21 +381,13 @@ def test_several_mistakes_at_once():
         (Severity.ERROR, "the partitions"),
         (Severity.ERROR, "the machine"),
     ]
-    (finding,) = check_model(model(), replace(OPTIONS, interface=(1, 9)))
-    assert "the model is larger than the interface 1x9" in finding.what
-    (finding,) = check_model(model(), replace(OPTIONS, sensor_mode=SensorMode.CELL, scale=Scale.ADDRESS))
-    assert "--scale address does not go with --sensor-mode cell" in finding.what
-    (finding,) = check_model(
-        model(), replace(OPTIONS, replicas=200, sensor_mode=SensorMode.CELL, interface=(20, 30))
-    )
-    assert "the model is larger than the interface 20x30" in finding.what
-
-
-def test_a_range_that_does_not_fit_its_bits_is_named():
-    with pytest.raises(
-        ModelError, match="variable 'K': K serves 4 values, but 2 bits hold 3 beside the address"
+    for changes in (
+        {"interface": (1, 9)},
+        {"sensor_mode": SensorMode.CELL, "scale": Scale.ADDRESS},
+        {"replicas": 200, "sensor_mode": SensorMode.CELL, "interface": (20, 30)},
     ):
-        model_of(np.full((4, 2), 0.25), known=(Known(name="K", table=np.full((4, 2), 0.25), bits=2),))
+        (finding,) = check_model(model(), replace(OPTIONS, **changes))
+        assert (finding.severity, finding.check) == (Severity.ERROR, Check.CANNOT_BE_BUILT)
 
 
 # Deployments
@@ -443,8 +406,8 @@ def test_a_deployment_says_what_its_model_said(tmp_path):
     build_deployment(one, tmp_path / "out", options)
     said = {(finding.check, finding.about) for finding in check_model(one, options)}
     assert {(finding.check, finding.about) for finding in check_deployment(tmp_path / "out")} == said
-    assert ("impossible-readings", "K") in said
-    assert ("dead-lines", "the prior") in said
+    assert (Check.IMPOSSIBLE_READINGS, "K") in said
+    assert (Check.DEAD_LINES, "the prior") in said
 
 
 def test_files_of_a_deployment(deployment):
@@ -452,10 +415,9 @@ def test_files_of_a_deployment(deployment):
     (deployment / "bm_arch/Memory_MIFs/board0_prior.mif").write_text(mif_text(Mif(40, (1,))))
     (deployment / "bm1.tcl").unlink()
     memories, project = check_deployment(deployment)
-    assert (memories.check, memories.about) == ("files", "bm_arch/Memory_MIFs/board0_prior.mif")
-    assert memories.what == "says something else than the images and deployment.toml"
+    assert (memories.check, memories.about) == (Check.FILES, "bm_arch/Memory_MIFs/board0_prior.mif")
     assert memories.advice == f"use 'toolchain regenerate memories {deployment}'"
-    assert (project.about, project.what) == ("bm1.tcl", "is not there")
+    assert project.about == "bm1.tcl"
 
 
 def test_comments_are_not_contents(deployment):
@@ -471,77 +433,58 @@ def test_a_damaged_deployment(deployment):
     image.write_bytes(image.read_bytes()[:-1])
     (finding,) = check_deployment(deployment)
     assert finding.severity is Severity.ERROR
-    assert "board0.bm is damaged" in finding.what
+    assert "board0.bm" in finding.what
 
 
 # The command
 
 
-def check(*arguments):
-    return invoke(app, ["check", *map(str, arguments)])
+MODEL = """
+import numpy as np
+from toolchain.models.model import Known, Model, dimension
 
-
-@pytest.fixture
-def case(tmp_path):
-    folder = tmp_path / "case"
-    folder.mkdir()
-    (folder / "model.py").write_text(
-        "import numpy as np\n"
-        "from toolchain.models.model import Known, Model, dimension\n"
-        "def model(size: int = 4, bits: int = 0):\n"
-        "    return Model(name='tiny', searched=(dimension('s', size=size),),\n"
-        "                 known=(Known(name='K', table=np.full((2, size), 0.5), bits=bits),))\n"
-    )
-    return folder
+def model(size: int = 4, bits: int = 0):
+    return Model(name="tiny", searched=(dimension("s", size=size),),
+                 known=(Known(name="K", table=np.full((2, size), 0.5), bits=bits),))
+"""
 
 
 def test_the_command(case):
-    result = check(case)
+    result = toolchain("check", case)
     assert result.exit_code == 0
-    assert result.stdout == (
-        "note: K: each of its values has the same code on every line, so its readings change nothing; leave it out, or "
-        "use more --prob-bits\n"
-    )
+    assert result.stdout.startswith("note: K: ")
     assert result.stderr == f"{case}: 0 errors, 0 warnings, 1 note\n"
 
 
 def test_the_command_with_json(case):
-    result = check(case, "--json", "--rng-banks", 1, "--prob-bits", 17, "--bits", "K=4")
+    result = toolchain("check", case, "--json", "--rng-banks", 1, "--prob-bits", 17, "--bits", "K=4")
     assert result.exit_code == 2
     (finding,) = map(json.loads, result.stdout.splitlines())
-    assert finding == {
-        "severity": "error",
-        "check": "cannot-be-built",
-        "about": "the machine",
-        "what": "prob_bits is 17; it must be from 1 to 16",
-        "advice": "",
-    }
+    assert list(finding) == ["severity", "check", "about", "what", "advice"]
+    assert list(finding.values())[:3] == ["error", "cannot-be-built", "the machine"]
     assert result.stderr == ""
 
 
 @pytest.mark.parametrize(
     ("arguments", "part"),
     [
-        (["--set", "bits=1"], "line 5: variable 'K': K serves 2 values, but 1 bit holds 1"),
-        (["--interface", "x"], "error: the model: --interface: 'x' is no interface"),
-        (["--partitions", "9"], "error: the partitions: 4 lines can't be split over 9 boards"),
+        (["--set", "bits=1"], "line 7: variable 'K'"),
+        (["--interface", "x"], "error: the model: --interface: 'x'"),
+        (["--partitions", "9"], "error: the partitions: 4 lines"),
     ],
 )
 def test_what_cannot_be_built_is_an_error(case, arguments, part):
-    result = check(case, *arguments)
+    result = toolchain("check", case, *arguments)
     assert result.exit_code == 2
     assert part in result.stdout
 
 
 def test_a_deployment_by_the_command(deployment):
-    result = check(deployment)
+    result = toolchain("check", deployment)
     assert (result.exit_code, result.stdout) == (0, "")
-    refused = check(deployment, "--prob-bits", 8)
-    assert refused.exit_code == 2
-    assert "error: --prob-bits is for a model; " in refused.stderr
+    for flag, value in (("--prob-bits", 8), ("--set", "a=1")):
+        assert_refused(toolchain("check", deployment, flag, value), f"{flag} ")
 
 
 def test_neither_model_nor_deployment(tmp_path):
-    result = check(tmp_path)
-    assert result.exit_code == 2
-    assert "holds neither a model (model.py) nor a deployment (deployment.toml)" in result.stderr
+    assert_refused(toolchain("check", tmp_path), tmp_path)

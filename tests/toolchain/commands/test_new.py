@@ -10,8 +10,8 @@ import sys
 import numpy as np
 import pytest
 
-from tests.command_runner import invoke
-from toolchain.commands.main import app
+from tests.toolchain.running import assert_refused
+from tests.toolchain.running import toolchain as run
 from toolchain.deployment import load_deployment
 from toolchain.deployment.address import to_address
 from toolchain.models.case_study import load_model
@@ -31,10 +31,6 @@ async def connect(uri):
 bridge.client.connect = connect
 runpy.run_path(sys.argv[1])
 """
-
-
-def run(*arguments):
-    return invoke(app, list(arguments))
 
 
 @pytest.fixture
@@ -96,28 +92,19 @@ def test_the_robot_ends_quietly_at_ctrl_c(here):
     assert (robot.returncode, said) == (0, b"")
 
 
-def test_a_folder_in_no_folder(here):
-    refused = run("new", "nowhere/mymodel")
-    assert refused.exit_code == 2
-    assert not list(here.iterdir())
-
-
 def test_it_overwrites_nothing(here):
     run("new", "mymodel")
     (here / "mymodel" / "model.py").write_text("mine")
-    again = run("new", "mymodel")
-    assert again.exit_code == 2
+    assert_refused(run("new", "mymodel"), "mymodel/model.py")
     assert (here / "mymodel" / "model.py").read_text() == "mine"
 
 
-@pytest.mark.parametrize("name", ["3d", "my model", "a-b", "..", "", "é", "a" * 80])
-def test_names_that_no_topic_can_have(here, name):
-    refused = run("new", name)
-    assert refused.exit_code == 2
+@pytest.mark.parametrize("name", ["3d", "my model", "a-b", "..", "", "é", "a" * 80, "nowhere/mymodel"])
+def test_names_that_no_topic_or_folder_can_have(here, name):
+    assert_refused(run("new", name), name.partition("/")[0][:20])
     assert not list(here.iterdir())
 
 
 def test_a_folder_that_cannot_be_written(here):
     (here / "file").write_text("")
-    refused = run("new", "file/mymodel")
-    assert refused.exit_code == 2
+    assert_refused(run("new", "file/mymodel"), "file")

@@ -96,10 +96,10 @@ def test_it_is_verilog(tmp_path, others):
 
 def test_what_has_no_logic():
     machine = machine_of(corridor(3), rng=RngKind.IDEAL)
-    with pytest.raises(BuildError, match="rng = ideal has no logic here"):
+    with pytest.raises(BuildError, match="rng = ideal"):
         verilog(machine, tables=True)
-    with pytest.raises(BuildError, match="more than 2048 cells"):
+    with pytest.raises(BuildError, match="2048"):
         verilog(machine_of(corridor(900)), tables=False)
-    with pytest.raises(BuildError, match="50 lines of 3 columns, 20 times, are more than 2048 cells"):
+    with pytest.raises(BuildError, match="20 times"):
         verilog(machine_of(corridor(50), replicas=20), tables=False)
     assert BM1Parameters(lines=900, sensor_bits=(5, 2)).columns * 900 > 2048
