@@ -10,6 +10,7 @@ import pytest
 import typer
 
 from terminal.command_line import CommandLine
+from tests.command_runner import invoke
 
 
 class Colour(StrEnum):
@@ -39,12 +40,10 @@ def make_app():
     return app
 
 
-def run(capsys, *arguments):
+def run(*arguments):
     """(exit code, stdout, stderr)"""
-    with pytest.raises(SystemExit) as ended:
-        make_app()(list(arguments))
-    out, err = capsys.readouterr()
-    return ended.value.code, out, err
+    ended = invoke(make_app(), arguments)
+    return ended.exit_code, ended.stdout, ended.stderr
 
 
 @pytest.fixture(autouse=True)
@@ -76,28 +75,28 @@ def called_painter(monkeypatch):
         (["pant"], "painter: no such command 'pant'. Did you mean 'paint'?; painter --help says more"),
     ],
 )
-def test_a_mistake_is_one_sentence(capsys, arguments, sentence):
-    code, out, err = run(capsys, *arguments)
+def test_a_mistake_is_one_sentence(arguments, sentence):
+    code, out, err = run(*arguments)
     assert (code, out) == (2, "")
     assert err.startswith(f"error: {sentence}")
     assert err.endswith(" --help says more\n")
     assert err.count("\n") == 1
 
 
-def test_what_is_right_runs_and_its_exit_code_counts(capsys):
-    assert run(capsys, "paint", "w", "--coats", "2") == (7, "painted w red 2 1.0 False\n", "")
+def test_what_is_right_runs_and_its_exit_code_counts():
+    assert run("paint", "w", "--coats", "2") == (7, "painted w red 2 1.0 False\n", "")
 
 
-def test_help_says_what_flags_take(capsys):
-    code, out, _ = run(capsys, "paint", "-h")
+def test_help_says_what_flags_take():
+    code, out, _ = run("paint", "-h")
     assert code == 0
     assert "red|blue" in out
     assert "NUMBER [1<=x<=9]" in out
     assert "WALL" in out
 
 
-def test_no_command_is_answered_with_help(capsys):
-    code, out, err = run(capsys)
+def test_no_command_is_answered_with_help():
+    code, out, err = run()
     assert code == 2
     assert "paint" in out + err
     assert "error" not in out + err

@@ -8,7 +8,7 @@ TARGET = ("--uri", "ws://robot:9090", "--topic", "/readings", "--type", "std_msg
 
 def toolchain(*arguments):
     """Run the command; the result has `exit_code`, `stdout` and `stderr`."""
-    return invoke(app, list(map(str, arguments)))
+    return invoke(app, arguments)
 
 
 def assert_refused(result, *named):

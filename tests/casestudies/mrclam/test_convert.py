@@ -2,7 +2,6 @@
 
 import math
 import os
-import sys
 
 import pytest
 
@@ -10,6 +9,7 @@ from casestudies.errors import DataFileError
 from casestudies.mrclam.convert import app, read_barcodes
 from casestudies.mrclam.landmarks import read_landmarks
 from casestudies.mrclam.recording import read_recording
+from tests.command_runner import invoke
 
 T0 = 1248272272.0
 POSTS = {6: (5.0, 4.0), 7: (-1.0, 2.0), 8: (3.0, -4.0), 20: (-2.0, -2.0)}
@@ -54,17 +54,14 @@ def data(tmp_path):
     return folder
 
 
-def run(capsys, monkeypatch, *arguments):
-    monkeypatch.setattr(sys, "argv", ["convert"])
-    with pytest.raises(SystemExit) as ended:
-        app([str(each) for each in arguments])
-    out, err = capsys.readouterr()
-    return ended.value.code, out, err
+def run(*arguments):
+    ended = invoke(app, arguments)
+    return ended.exit_code, ended.stdout, ended.stderr
 
 
-def test_seconds_in_which_it_stood(data, tmp_path, capsys, monkeypatch):
+def test_seconds_in_which_it_stood(data, tmp_path):
     out = tmp_path / "out" / "data"
-    code, said, err = run(capsys, monkeypatch, data, "-o", out)
+    code, said, err = run(data, "-o", out)
     assert (code, err) == (0, "")
     assert said == (
         f"wrote {out}/landmarks.csv: 4 landmarks\n"
@@ -85,14 +82,14 @@ def test_seconds_in_which_it_stood(data, tmp_path, capsys, monkeypatch):
             assert abs(each.bearing_rad) <= math.pi + 1e-3
 
 
-def test_bearings_on_both_sides_of_where_a_turn_ends(data, tmp_path, capsys, monkeypatch):
+def test_bearings_on_both_sides_of_where_a_turn_ends(data, tmp_path):
     path = data / "Robot3_Measurement.dat"
     east = [
         f"{T0 + 0.7 + at / 100:.3f} {BARCODE[20]} 5.0 {math.pi - 3.0 + off:.4f}"
         for at, off in enumerate((0.1, -0.2, 0.05))
     ]
     path.write_text(path.read_text() + "\n".join(east) + "\n")
-    assert run(capsys, monkeypatch, data, "-o", tmp_path, "--robot", "3")[0] == 0
+    assert run(data, "-o", tmp_path, "--robot", "3")[0] == 0
     (seen,) = (
         each for each in read_recording(tmp_path / "ds1_robot3.csv")[0].sightings if each.landmark == 20
     )
@@ -126,27 +123,27 @@ def test_bearings_on_both_sides_of_where_a_turn_ends(data, tmp_path, capsys, mon
         ),
     ],
 )
-def test_what_is_damaged_is_named(data, tmp_path, capsys, monkeypatch, file, old, new, sentence):
+def test_what_is_damaged_is_named(data, tmp_path, file, old, new, sentence):
     if old is None:
         (data / file).unlink()
     else:
         text = (data / file).read_text()
         assert old in text
         (data / file).write_text(text.replace(old, new, 1))
-    code, _out, err = run(capsys, monkeypatch, data, "-o", tmp_path / "out", "--robot", "3")
+    code, _out, err = run(data, "-o", tmp_path / "out", "--robot", "3")
     assert code == 2
     assert err.startswith(f"error: {data}")
     assert sentence in err
     assert err.count("\n") == 1
 
 
-def test_no_robot_and_no_window(data, tmp_path, capsys, monkeypatch):
+def test_no_robot_and_no_window(data, tmp_path):
     (data / "Robot3_Measurement.dat").write_text("# nothing was seen\n")
-    code, out, err = run(capsys, monkeypatch, data, "-o", tmp_path)
+    code, out, err = run(data, "-o", tmp_path)
     assert (code, out.count("\n")) == (0, 1)
     assert err.startswith("warning: robot 3: nothing to write")
     (data / "Robot3_Measurement.dat").unlink()
-    code, _out, err = run(capsys, monkeypatch, data, "-o", tmp_path)
+    code, _out, err = run(data, "-o", tmp_path)
     assert code == 2
     assert "holds no RobotN_Measurement.dat" in err
 
@@ -155,19 +152,3 @@ def test_a_pipe_is_not_waited_for(tmp_path):
     os.mkfifo(tmp_path / "Barcodes.dat")
     with pytest.raises(DataFileError, match=r"Barcodes\.dat is a pipe"):
         read_barcodes(tmp_path)
-
-
-def test_what_is_missing_is_said_in_a_whole_sentence(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(sys, "argv", ["convert"])
-    monkeypatch.setattr(sys.modules["__main__"], "__package__", None)
-    for arguments, said in (
-        (
-            [],
-            "FOLDER is missing: the folder that the data set was unpacked into, with Barcodes.dat and all the others; ",
-        ),
-        ([str(tmp_path)], "--output-dir is missing: folder for landmarks.csv, and a file for each robot; "),
-    ):
-        with pytest.raises(SystemExit) as ended:
-            app(arguments)
-        assert ended.value.code == 2
-        assert capsys.readouterr().err == f"error: {said}convert --help says more\n"
