@@ -1,4 +1,4 @@
-"""What the verifications have in common: a check's verdict, the tally of checks, and the servers that are chosen."""
+"""Verdicts, tallies and servers that the verifications share."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ SERVER_LIMIT = 15.0
 
 
 class CheckError(Exception):
-    """Something is not as it must be; says what."""
+    """A check that failed, with the reason."""
 
 
 def expect(condition: bool, otherwise: str) -> None:
-    """Go on if it holds.
+    """Raise an error unless a condition holds.
 
     Raises:
-        CheckError: it does not.
+        CheckError: It does not hold.
     """
     if not condition:
         raise CheckError(otherwise)
@@ -33,7 +33,7 @@ def expect(condition: bool, otherwise: str) -> None:
 
 @dataclass(slots=True)
 class Tally:
-    """How many checks passed and failed."""
+    """Numbers of checks that passed and failed."""
 
     passed: int = 0
     failed: int = 0
@@ -53,7 +53,7 @@ class Tally:
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """A kind of server: how it is started, what it says when it serves, and whether messages of two topics keep their order."""
+    """A kind of server: its command, its line when it is ready, and whether messages of two topics keep their order."""
 
     name: str
     command: tuple[str, ...]
@@ -76,7 +76,7 @@ async def serving(kind: Kind, port: int, log: Path) -> Process:
     """Start a server on a port of loopback, and wait until it serves.
 
     Raises:
-        CheckError: it does not in time.
+        CheckError: It is not ready in time.
     """
     server = Process(kind.name, log)
     try:

@@ -62,7 +62,7 @@ class Stand:
         return self.kind is KINDS["real"]
 
     def topic(self) -> str:
-        """A topic that nobody used before."""
+        """Return the name of a topic that was not used before."""
         self._topics += 1
         return f"/verify/topic_{self._topics}"
 
@@ -86,7 +86,7 @@ class Stand:
 
     @contextlib.asynccontextmanager
     async def clients(self, **options: Any) -> AsyncIterator[tuple[Ros, Ros]]:
-        """A subscriber and a publisher."""
+        """Return a subscriber and a publisher."""
         async with connect(self.uri) as subscriber, connect(self.uri, **options) as publisher:
             yield subscriber, publisher
 
@@ -99,7 +99,7 @@ class Stand:
         fragments_out: int | None = None,
         **options: Any,
     ) -> Message:
-        """What becomes of a message on its way through the server."""
+        """Return a message as it comes through the server."""
         topic = self.topic()
         async with self.clients(fragment_size=fragments_out) as (subscriber, publisher):
             subscription = subscriber.subscribe(topic, type_name, **options)
@@ -112,7 +112,7 @@ class Stand:
 
 
 async def settled(*clients: Ros) -> None:
-    """Wait until the server has done what was asked before, and ROS has told its network."""
+    """Wait until the server has done earlier requests, and ROS has announced them."""
     for ros in clients:
         with contextlib.suppress(ServiceError):
             await ros.call("/rosapi/get_time", timeout=PATIENCE)
@@ -134,7 +134,7 @@ async def check_json(stand: Stand) -> None:
     values = np.random.default_rng(1).normal(size=1024)
     for sent in (values, values[::-1], values.astype(">f8")):
         message = await stand.passed({"data": sent}, arrays="numpy")
-        expect(isinstance(message.msg["data"], np.ndarray), "it is no array")
+        expect(isinstance(message.msg["data"], np.ndarray), "it is not an array")
         same(message.msg["data"], sent)
 
 
@@ -170,7 +170,7 @@ async def check_cbor(stand: Stand) -> None:
 
 
 async def check_raw(stand: Stand) -> None:
-    """The serialised message, read by rosbags."""
+    """Return the serialised message, read by rosbags."""
     types = MessageTypes()
     values = np.random.default_rng(3).normal(size=100)
     message = await stand.passed({"data": values}, compression="cbor-raw")
@@ -208,7 +208,7 @@ async def check_fragments(stand: Stand) -> None:
 
 
 async def check_qos(stand: Stand) -> None:
-    """What is asked is what ROS 2 does: a late reader gets what was kept, and a wish beyond the offer brings nothing."""
+    """Check quality of service: a late reader gets the kept messages, and a request beyond the offer gets none."""
     offer = Qos(reliability="best_effort", depth=5)
     same((await stand.passed({"data": [1.5]}, offer=offer)).msg["data"], [1.5])
     for wish in (
@@ -241,11 +241,11 @@ async def check_qos(stand: Stand) -> None:
                 await strict.next(SILENCE)
             except NoMessageError:
                 return
-            raise CheckError("a reliable reader heard a publisher that is not")
+            raise CheckError("a reliable reader received from a best-effort publisher")
 
 
 async def check_latch(stand: Stand) -> None:
-    """A late reader gets the last message."""
+    """Check that a late reader gets the last message."""
     topic = stand.topic()
     async with stand.clients() as (subscriber, publisher):
         publication = await publisher.advertise(topic, ARRAY, latch=True)
@@ -275,7 +275,7 @@ async def check_throttle(stand: Stand) -> None:
 
 
 async def check_services(stand: Stand) -> None:
-    """Served and called, refused, not there."""
+    """Check services that answer, refuse and are missing."""
     type_name = "rcl_interfaces/srv/ListParameters"
 
     async def serve(args: dict[str, Any]) -> dict[str, Any]:
@@ -311,7 +311,7 @@ async def check_services(stand: Stand) -> None:
 
 
 async def check_goal(stand: Stand) -> None:
-    """A goal for an action that nobody serves ends with a sentence."""
+    """Check that a goal for an action without a server ends with an error."""
     async with connect(stand.uri) as ros:
         goal = await ros.send_goal("/verify/fly", "example_interfaces/action/Fibonacci", {"order": 3})
         try:
@@ -324,7 +324,7 @@ async def check_goal(stand: Stand) -> None:
 
 
 async def check_silence(stand: Stand) -> None:
-    """What the server says of a wrong type is in the error of the wait."""
+    """Check that the error of a wait holds the server's words about a wrong type."""
     topic = stand.topic()
     async with stand.clients() as (subscriber, publisher):
         await publisher.advertise(topic, ARRAY)
@@ -334,13 +334,13 @@ async def check_silence(stand: Stand) -> None:
             await subscription.next(SILENCE)
         except NoMessageError as error:
             stand.notes.append(str(error))
-            expect(not stand.real or "type" in str(error), f"the reason is not told: {error}")
+            expect(not stand.real or "type" in str(error), f"the reason is missing: {error}")
         else:
             raise CheckError("a message of another type came")
 
 
 async def check_nan(stand: Stand) -> None:
-    """What the server would drop without a word is refused here with its place."""
+    """Check that messages which the server would drop silently are refused, with the place."""
     topic = stand.topic()
     async with stand.clients() as (_subscriber, publisher):
         publication = await publisher.advertise(topic, ARRAY)
@@ -353,7 +353,7 @@ async def check_nan(stand: Stand) -> None:
 
 
 async def check_restart(stand: Stand) -> None:
-    """A killed server: everything is restored, and the reader is told how long it was blind."""
+    """Check that everything is restored after a server is killed, and the reader gets the length of the gap."""
     forms: tuple[Compression, ...] = ("none", "cbor", "cbor-raw", "png")
     topics = {form: stand.topic() for form in forms}
     async with stand.clients() as (subscriber, publisher):

@@ -1,4 +1,4 @@
-"""The compose project on an engine of its own, for scripts/verify containers: brought up, asked, heard by a client."""
+"""The compose project on an engine of its own, for scripts/verify containers: brought up, asked, followed by a client."""
 
 from __future__ import annotations
 
@@ -64,9 +64,7 @@ class Engine:
                 self.environment[name] = value
         else:
             code = self._process.wait(60)
-            raise CheckError(
-                f"scripts/container-engine ended with exit code {code}; what it said stands above"
-            )
+            raise CheckError(f"scripts/container-engine ended with exit code {code}; its output is above")
         self.home = Path(self.environment["ROSBAYES_ENGINE_HOME"])
         return self
 
@@ -82,7 +80,7 @@ class Engine:
             self._process.wait(60)
 
     def left_behind(self) -> list[str]:
-        """Processes, mounts and control groups that have not gone with it, not even a while after."""
+        """Return processes, mounts and control groups that are left after a grace period."""
         deadline = time.time() + 30
         while (left := self._left()) and time.time() < deadline:
             time.sleep(0.25)
@@ -114,9 +112,9 @@ class Result:
     wrong: str
 
     @classmethod
-    def of(cls, told: dict[str, Any]) -> Self:
-        """A line, read."""
-        return cls(told["at"], told["cycles"], told.get("tv"), told.get("wrong", ""))
+    def of(cls, fields: dict[str, Any]) -> Self:
+        """Parse a line."""
+        return cls(fields["at"], fields["cycles"], fields.get("tv"), fields.get("wrong", ""))
 
 
 class Client:
@@ -157,11 +155,11 @@ class Client:
     def _read(self, process: subprocess.Popen[str]) -> None:
         assert process.stdout is not None
         for line in process.stdout:
-            told = json.loads(line)
+            fields = json.loads(line)
             self._log.write(line)
-            if "at" in told:
+            if "at" in fields:
                 with self._news:
-                    self.results.append(Result.of(told))
+                    self.results.append(Result.of(fields))
                     self._news.notify_all()
 
     def flowing(self, after: float, count: int = RESULTS_AGAIN, limit: float = FLOW_LIMIT) -> float:
@@ -207,10 +205,10 @@ def check_results(results: list[Result]) -> str:
         CheckError: they are not.
     """
     wrong = [each.wrong for each in results if each.wrong]
-    # who has just connected, or connected again, may have missed a reading whose result it hears
+    # who has just connected, or connected again, may have missed the reading of a result
     others = [each for each in wrong if each != "no reading has its stamp"]
     expect(not others, f"a result is wrong: {others[:1]}")
-    expect(len(wrong) <= len(results) / 2, "of most results no reading was heard")
+    expect(len(wrong) <= len(results) / 2, "most results have no reading")
     variations = [each.tv for each in results if each.tv is not None and each.cycles < MAX_CYCLES]
     if not variations:
         return "only frames that ran out of cycles"
@@ -269,9 +267,9 @@ class Stack:
                 raise CheckError(f"{what} did not end within {limit:g} s") from None
             log.write(done.stderr)
         if check and done.returncode:
-            said = (done.stderr.strip() or done.stdout.strip()).splitlines()[-8:]
+            output = (done.stderr.strip() or done.stdout.strip()).splitlines()[-8:]
             raise CheckError(
-                f"{what} ended with exit code {done.returncode}:\n      " + "\n      ".join(said)
+                f"{what} ended with exit code {done.returncode}:\n      " + "\n      ".join(output)
             )
         return done.stdout
 
@@ -298,7 +296,7 @@ class Stack:
         ]
 
     def bits(self, count: int, *flags: str, folder: Path | None = None) -> list[Result]:
-        """Results that a client container has computed anew, cycles, counts and posterior; by the deployment in a folder.
+        """Results that a client container has recomputed, cycles, counts and posterior; by the deployment in a folder.
 
         Raises:
             CheckError: they don't come.
@@ -318,11 +316,11 @@ class Stack:
         return results
 
     def deployments(self) -> dict[str, str]:
-        """The hash of what each service works by; empty for one that does not answer."""
+        """Return the deployment hash of each service; empty for one that does not answer."""
         # `status` ends with another code while one of them is not ready
-        said = self.docker("exec", self.container("master"), "status", "--json", check=False) or "{}"
-        told = {each["name"]: each.get("deployment", "") for each in json.loads(said).get("processes", [])}
-        return {service: told.get(service, "") for service in CORE}
+        output = self.docker("exec", self.container("master"), "status", "--json", check=False) or "{}"
+        found = {each["name"]: each.get("deployment", "") for each in json.loads(output).get("processes", [])}
+        return {service: found.get(service, "") for service in CORE}
 
     def up(self, services: tuple[str, ...] = SERVICES) -> float:
         """Start it and wait until all of it is healthy; gives the seconds that it took.
@@ -343,13 +341,13 @@ class Stack:
         return took
 
     def last_words(self) -> str:
-        """What the services that do not run, or are not healthy, said last."""
+        """Return the last log lines of services that don't run or are unhealthy."""
         words = []
         for service, state in self.states().items():
             health = state.get("Health", {}).get("Status")
             if state["ExitCode"] or state["Restarting"] or health == "unhealthy":
-                said = self.log(service, 0).strip().splitlines()[-2:]
-                words.append(f"\n      {service}: {' '.join(said)}")
+                output = self.log(service, 0).strip().splitlines()[-2:]
+                words.append(f"\n      {service}: {' '.join(output)}")
         return "".join(words)
 
     def down(self) -> None:
@@ -358,21 +356,21 @@ class Stack:
         self.compose("down", "--volumes", "--remove-orphans", "--timeout", "5")
 
     def container(self, service: str) -> str:
-        """The name of a service's container."""
+        """Return the name of a service's container."""
         return f"rosbayes-{service}-1"
 
     def inspect(self, *services: str) -> list[dict[str, Any]]:
-        """What the engine says of services' containers."""
-        told: list[dict[str, Any]] = json.loads(
+        """Return the engine's state of services' containers."""
+        containers: list[dict[str, Any]] = json.loads(
             self.docker("inspect", *(self.container(each) for each in services))
         )
-        return told
+        return containers
 
     def states(self) -> dict[str, dict[str, Any]]:
         """State of all the project's containers, by service."""
         ids = self.compose("ps", "--all", "--quiet").split()
-        told = json.loads(self.docker("inspect", *ids)) if ids else []
-        return {each["Config"]["Labels"]["com.docker.compose.service"]: each["State"] for each in told}
+        found = json.loads(self.docker("inspect", *ids)) if ids else []
+        return {each["Config"]["Labels"]["com.docker.compose.service"]: each["State"] for each in found}
 
     def healthy(self, limit: float = UP_LIMIT) -> None:
         """Wait until all services are healthy.
@@ -419,7 +417,7 @@ class Stack:
         self.docker("exec", self.container(service), "sh", "-c", f"kill -{name} -1")
 
     def log(self, service: str, since: float) -> str:
-        """What a service, or a container outside the project, has said since a time."""
+        """Return the log of a service, or of a container outside the project, since a time."""
         container = self.container(service) if service in SERVICES else service
         done = subprocess.run(
             ["docker", "logs", "--since", f"{since:.3f}", container],
@@ -433,18 +431,18 @@ class Stack:
         return done.stdout
 
     def restarted(self, service: str, before: int, since: float, limit: float = FLOW_LIMIT) -> float:
-        """Wait until the engine has started a service anew; gives when.
+        """Wait until the engine has restarted a service, and return the time.
 
         Raises:
             CheckError: it does not.
         """
         deadline = time.time() + limit
         while True:
-            (told,) = self.inspect(service)
-            state = told["State"]
+            (container,) = self.inspect(service)
+            state = container["State"]
             # the count rises before the start, and until then the old one's times stand there
             if (
-                told["RestartCount"] > before
+                container["RestartCount"] > before
                 and state["Running"]
                 and not state["Restarting"]
                 and seconds(state["StartedAt"]) > since

@@ -65,7 +65,7 @@ ALWAYS: Final = (BUILT, UP)
 
 
 def check_build(stack: Stack) -> None:
-    """The image is built of a copy of this folder, with the wheels of the lock file."""
+    """Build the image from a copy of this folder, with the wheels of the lock file."""
     stack.compose("config", "--quiet")
     stack.compose("build", limit=BUILD_LIMIT)
     size = int(stack.docker("image", "inspect", "--format", "{{.Size}}", "rosbayes"))
@@ -125,26 +125,28 @@ def start(stack: Stack) -> float:
 
 
 def check_bits(stack: Stack) -> None:
-    """A client container computes results anew: counts and posterior to the bit, and near float64."""
+    """Check that a client container recomputes results: counts and posterior to the bit, and near float64."""
     results = stack.bits(8)
     stack.notes.append(check_results(results))
 
 
 def check_confined(stack: Stack) -> None:
     """Inside: no root, no capabilities, nothing to write to, no way out; outside: the hub's port on loopback only."""
-    said = stack.docker("exec", stack.container("master"), "cat", "/proc/self/status")
-    fields = dict(line.split(":\t", 1) for line in said.splitlines() if ":\t" in line)
+    output = stack.docker("exec", stack.container("master"), "cat", "/proc/self/status")
+    fields = dict(line.split(":\t", 1) for line in output.splitlines() if ":\t" in line)
     expect(fields["Uid"].split() == ["10001"] * 4, f"it runs as {fields['Uid']}")
     for name in ("CapEff", "CapPrm", "CapBnd"):
         expect(int(fields[name], 16) == 0, f"it has capabilities: {name} {fields[name]}")
     expect(fields["NoNewPrivs"] == "1", "it may gain privileges")
     expect(fields["Seccomp"] == "2", "its system calls are not filtered")
-    for told in stack.inspect(*SERVICES):
-        host = told["HostConfig"]
-        expect(host["ReadonlyRootfs"], f"{told['Name']} may write to its root")
-        expect(host["Memory"] > 0 and host["PidsLimit"] > 0, f"{told['Name']} has no limits")
+    for container in stack.inspect(*SERVICES):
+        host = container["HostConfig"]
+        expect(host["ReadonlyRootfs"], f"{container['Name']} may write to its root")
+        expect(host["Memory"] > 0 and host["PidsLimit"] > 0, f"{container['Name']} has no limits")
         for ports in host["PortBindings"].values():
-            expect({each["HostIp"] for each in ports} == {"127.0.0.1"}, f"{told['Name']} publishes {ports}")
+            expect(
+                {each["HostIp"] for each in ports} == {"127.0.0.1"}, f"{container['Name']} publishes {ports}"
+            )
     write = "touch /opt/rosbayes/x /deployment/x /run/x"
     out = "import socket; socket.create_connection(('172.17.0.1', 2375), 2)"
     for service in ("pcie-app", "subscriber", "board0", "boat-simulator"):
@@ -169,17 +171,17 @@ def check_status(stack: Stack) -> None:
     deadline = time.time() + FLOW_LIMIT
     while True:
         # it ends with another code while one of them is not ready
-        said = stack.docker("exec", stack.container("master"), "status", "--json", check=False)
-        told = json.loads(said or "{}")
-        shown = {each["name"] for each in told.get("processes", [])}
-        if shown == set(SERVICES) and told["ready"]:
+        output = stack.docker("exec", stack.container("master"), "status", "--json", check=False)
+        status = json.loads(output or "{}")
+        shown = {each["name"] for each in status.get("processes", [])}
+        if shown == set(SERVICES) and status["ready"]:
             return
-        expect(time.time() < deadline, f"it shows {sorted(shown)}, not ready: {told.get('why')}")
+        expect(time.time() < deadline, f"it shows {sorted(shown)}, not ready: {status.get('why')}")
         time.sleep(0.25)
 
 
 def kill(service: str) -> Callable[[Stack, Client], None]:
-    """A check that kills a service's process."""
+    """Return a check that kills a service's process."""
 
     def check(stack: Stack, client: Client) -> None:
         before = stack.restarts(service)
@@ -210,7 +212,7 @@ def kill_all(stack: Stack, client: Client) -> None:
 
 
 def kill_mid_frame(stack: Stack, client: Client) -> None:
-    """A board is held until a frame waits for it, and killed then: that frame is lost and said so."""
+    """Stop a board until a frame waits for it, then kill it: that frame is lost and reported."""
     before = stack.restarts("board1")
     stack.signal("board1", "STOP")
     client.silent(0.5, FLOW_LIMIT)
@@ -218,12 +220,12 @@ def kill_mid_frame(stack: Stack, client: Client) -> None:
     stack.signal("board1", "KILL")
     back = stack.restarted("board1", before, at)
     again(stack, client, at, back)
-    told = stack.log("master", at)
-    expect("board 1" in told.lower(), f"the master says nothing of board 1: {told[-300:]}")
+    log = stack.log("master", at)
+    expect("board 1" in log.lower(), f"the master does not mention board 1: {log[-300:]}")
 
 
 def cut_off(stack: Stack, client: Client) -> None:
-    """A board loses its network with the link open, and gets it back."""
+    """Take a board's network away with the link open, and give it back."""
     cut = time.time()
     stack.docker("network", "disconnect", "rosbayes_boards", stack.container("board2"))
     client.silent(1.0, FLOW_LIMIT)
@@ -236,12 +238,12 @@ def cut_off(stack: Stack, client: Client) -> None:
     stack.docker("network", "connect", "--alias", "board2", "rosbayes_boards", stack.container("board2"))
     again(stack, client, joined, joined)
     stack.notes.append(
-        f"cut off; the master said so after {noticed - cut:.1f} s; the times are from joining it again"
+        f"cut off; the master reported it after {noticed - cut:.1f} s; the times are from joining it again"
     )
 
 
 def rosbridge_cut_off(stack: Stack, client: Client) -> None:
-    """Subscriber and publisher lose their network with the connections open, as when a robot drives out of reach."""
+    """Take the network of subscriber and publisher away with open connections, as when a robot drives out of reach."""
     lost = ("subscriber", "publisher")
     for service in lost:
         stack.docker("network", "disconnect", "rosbayes_ros", stack.container(service))
@@ -328,19 +330,19 @@ def reload_deployment(stack: Stack, folder: Path) -> None:
     """`master reload` after other tables were built into the folder: results are theirs, and no container is restarted."""
     before = {service: stack.restarts(service) for service in SERVICES}
     correct_tables(folder, 1.1)
-    said = stack.docker("exec", stack.container("master"), "master", "reload").strip()
-    expect(said.startswith("generation 1 is in force"), f"it says {said}")
+    output = stack.docker("exec", stack.container("master"), "master", "reload").strip()
+    expect(output.startswith("generation 1 is in force"), f"it says {output}")
     of_deployment(stack, folder)
     after = {service: stack.restarts(service) for service in SERVICES}
     expect(after == before, f"containers were restarted: {before}, {after}")
-    stack.notes.append(said)
+    stack.notes.append(output)
     hidden = stack.docker("exec", stack.container("hub"), "sh", "-c", "ls /run/rosbayes/*").split()
     expect("hub.status.sock" in hidden, f"the hub sees {hidden}")
     expect("master.control.sock" not in hidden, "the hub can reach the master's control socket")
 
 
 def kill_after_reload(stack: Stack, folder: Path) -> None:
-    """Who is started anew has the deployment in force, which is what the folder holds."""
+    """Check that a restarted service has the deployment in force, which is the folder's."""
     killed_at = time.time()
     for service in ("pcie-app", "board3"):
         before = stack.restarts(service)
@@ -350,7 +352,7 @@ def kill_after_reload(stack: Stack, folder: Path) -> None:
 
 
 def kill_instead_of_reload(stack: Stack, folder: Path) -> None:
-    """The folder was changed and nobody reloads: the first that is started anew has all the others follow, once each."""
+    """Check a changed folder without a reload: after the first restart all others follow, once each."""
     before = {service: stack.restarts(service) for service in SERVICES}
     correct_tables(folder, 1.2)
     at = time.time()
@@ -437,12 +439,10 @@ def check_processor(stack: Stack) -> None:
     expect(
         loaded > 0 and saved == 0, f"{loaded} kernels were loaded and {saved} compiled:\n{with_image[-500:]}"
     )
-    # the same with the image's own kernels, but not told which: shows that the check can fail
+    # the same with the image's own kernels, but without their names, to show that the check can fail
     untold = ["env", "--unset=NUMBA_CPU_NAME", "--unset=NUMBA_CPU_FEATURES", *program]
     compiled = stack.docker("run", "--rm", *settings, "rosbayes", *untold).count("] data saved to ")
-    expect(
-        compiled > 0, "numba compiles nothing although it is not told the baseline: this check shows nothing"
-    )
+    expect(compiled > 0, "numba compiles nothing although the baseline is not set: this check shows nothing")
     stack.notes.append(
         f"{loaded} kernels loaded, none compiled; without the baseline's name {compiled} compiled"
     )
@@ -452,7 +452,7 @@ def check_processor(stack: Stack) -> None:
 
 
 def copy_project(folder: Path, wheels: Path) -> None:
-    """What the image is built of: this folder as git sees it, and the wheels, since builds here have no network."""
+    """Copy the image's sources: this folder as git sees it, and the wheels, since builds here have no network."""
     shutil.rmtree(folder, ignore_errors=True)
     listed = subprocess.run(
         ["git", "ls-files", "--cached", "--others", "--exclude-standard", "-z"],
@@ -469,7 +469,7 @@ def copy_project(folder: Path, wheels: Path) -> None:
 
 
 def fetch_wheels(folder: Path) -> None:
-    """The wheels of the lock file, hashes checked, for the image's Python.
+    """Download the wheels of the lock file, hashes checked, for the image's Python.
 
     Raises:
         CheckError: pip can't get them.
@@ -494,7 +494,7 @@ def fetch_wheels(folder: Path) -> None:
 
 
 def hash_of(folder: Path) -> str:
-    """The hash of the deployment that is in a folder."""
+    """Return the hash of the deployment in a folder."""
     return load_deployment(folder, images=False).hash
 
 
@@ -508,7 +508,7 @@ def toolchain(*arguments: str) -> None:
 
 
 def build_another(folder: Path) -> None:
-    """A deployment of another model for DEPLOYMENT: the boat on 16 x 16 cells."""
+    """Build a deployment of another model for DEPLOYMENT: the boat on 16 x 16 cells."""
     source = ("--uri", "ws://hub:9090", "--topic", "/boat/sensors", "--type", "boat_msgs/Sensors")
     boat = str(ROOT / "casestudies" / "boat")
     toolchain("build", boat, "-o", str(folder), "--partitions", "4", *source, *SIZE)

@@ -1,7 +1,7 @@
 """Runs in a container beside the stack: compares each result with exact float64 fusion of the same readings.
 
 Prints one JSON object a result: `at` (Unix time), `number`, `cycles`, `tv` (total variation to float64, 0..1), or `wrong` with a
-sentence. With --bits N it ends after N results, having computed each anew with the reference kernel: cycles, counts
+sentence. With --bits N it ends after N results, having recomputed each with the reference kernel: cycles, counts
 and posterior must be the same to the bit.
 """
 
@@ -36,19 +36,19 @@ from toolchain.models.fusion import exact_posterior
 KEPT = 512
 """Readings kept until their result comes."""
 BITS_CYCLES = 1 << 13
-"""Longer frames are not computed anew: the reference kernel takes seconds for them, and more results would come meanwhile."""
+"""Longer frames are not recomputed: the reference kernel takes seconds for them, and more results would come meanwhile."""
 PATIENCE_S = 180.0
 """Seconds until the server is there, and until the first result."""
 
 
 class Readings:
-    """The readings heard on /boat/sensors, by their stamp."""
+    """Readings from /boat/sensors, by their stamp."""
 
     def __init__(self) -> None:
         self._heard: OrderedDict[int, tuple[int, ...]] = OrderedDict()
         self._news = asyncio.Event()
 
-    async def hear(self, ros: Ros) -> None:
+    async def receive(self, ros: Ros) -> None:
         """Keep what comes, until cancelled."""
         async for message in ros.subscribe(SENSORS_TOPIC, SENSORS_TYPE, queue_size=KEPT):
             fields: dict[str, Any] = dict(message.msg)
@@ -60,7 +60,7 @@ class Readings:
             self._news.set()
 
     async def of(self, stamp: int) -> tuple[int, ...] | None:
-        """The readings with this stamp; None if they were not heard."""
+        """Return the readings with this stamp; None if they were not received."""
         deadline = time.monotonic() + 1
         while stamp not in self._heard and time.monotonic() < deadline:
             self._news.clear()
@@ -82,28 +82,28 @@ class Bits:
         ]
 
     def wrong(self, instance: Instance, addresses: tuple[int, ...]) -> str:
-        """What differs; nothing if all is the same."""
+        """Return the differences; empty if there are none."""
         report, posterior = instance.report, instance.posterior
         assert report is not None
         assert report.number is not None
         assert posterior is not None
         machine = self._deployment.machine
         counts, cycles = [], []
-        for at, (board, said) in enumerate(zip(self._machines, report.boards, strict=True)):
+        for at, (board, outcome) in enumerate(zip(self._machines, report.boards, strict=True)):
             kernel = ReferenceBM1(board)
-            if said.cycles:
+            if outcome.cycles:
                 # it stopped there: by itself, or because another board had overflowed
                 bank = report.number % machine.rng_banks
                 kernel.start(
                     Start(
                         addresses=addresses,
                         target_count=machine.target_count,
-                        max_cycles=said.cycles,
+                        max_cycles=outcome.cycles,
                         bank=bank,
                     )
                 )
-            if (kernel.cycles, int(kernel.counts.sum())) != (said.cycles, said.counts_total):
-                return f"board {at} says {said.cycles} cycles, counts {said.counts_total}; the reference {kernel.cycles}, {int(kernel.counts.sum())}"
+            if (kernel.cycles, int(kernel.counts.sum())) != (outcome.cycles, outcome.counts_total):
+                return f"board {at} says {outcome.cycles} cycles, counts {outcome.counts_total}; the reference {kernel.cycles}, {int(kernel.counts.sum())}"
             counts.append(kernel.counts)
             cycles.append(kernel.cycles)
         ours = joint_posterior(counts, cycles)
@@ -113,13 +113,13 @@ class Bits:
 
 
 async def check(uri: str, cells: tuple[int, int], bits: int) -> None:
-    """Print a line of each result, for ever or until `bits` of them were computed anew."""
+    """Print a line for each result, until `bits` of them were recomputed if that is not 0."""
     width, height = cells
     boat = model(width, height)
     reference = Bits(Path(os.environ["BM_DEPLOYMENT"])) if bits else None
     readings = Readings()
     async with connect(uri) as ros, listen(ros) as listener:
-        hearing = asyncio.create_task(readings.hear(ros))
+        receiving = asyncio.create_task(readings.receive(ros))
         print(json.dumps({"listening": uri}), flush=True)
         number = 0
         while not bits or number < bits:
@@ -146,7 +146,7 @@ async def check(uri: str, cells: tuple[int, int], bits: int) -> None:
                 if reference is not None and (wrong := reference.wrong(instance, addresses)):
                     line["wrong"] = wrong
             print(json.dumps(line), flush=True)
-        hearing.cancel()
+        receiving.cancel()
 
 
 async def main() -> None:

@@ -17,7 +17,7 @@ _IDENTIFIER = re.compile(r"[A-Za-z]\w*")
 
 
 def load(path: Path) -> pyagrum.BayesNet:
-    """A BIF file's network; pyagrum takes identifiers only, so other labels are written as hexadecimal first."""
+    """Read a BIF file's network; pyagrum takes identifiers only, so other labels are written as hexadecimal first."""
 
     def renamed(match: re.Match[str]) -> str:
         labels = [label.strip() for label in match[2].split(",")]
@@ -33,7 +33,7 @@ def load(path: Path) -> pyagrum.BayesNet:
 
 
 def axes(table: pyagrum.Tensor) -> list[str]:
-    """The names of a table's axes as an array: pyagrum's own order is the other way round."""
+    """Return the names of a table's axes as an array, in the reverse of pyagrum's order."""
     return list(reversed(table.names))
 
 
@@ -67,7 +67,7 @@ def read(folder: Path) -> None:
 
 
 def uai(described: list[dict[str, Any]], arrays: dict[str, np.ndarray]) -> str:
-    """A network as UAI defines it: the child last in its scope, and fastest.
+    """Return a network as UAI defines it: the child last in its scope, and fastest.
 
     pyagrum's own writer has the first parent fastest where the format wants the last.
     """

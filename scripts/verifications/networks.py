@@ -79,7 +79,7 @@ class Checks:
 
 
 def environment() -> tuple[Path, Path]:
-    """The other side's Python and pgmpy's wheel; made first where they are missing.
+    """Return the other side's Python and pgmpy's wheel, and install them first if they are missing.
 
     Raises:
         VerifyError: They can't be downloaded or installed.
@@ -112,12 +112,10 @@ def run(command: list[str]) -> None:
     try:
         subprocess.run(command, check=True, capture_output=True, text=True, timeout=LIMIT)
     except subprocess.TimeoutExpired:
-        msg = f"{' '.join(command[:4])} ... did not end within {LIMIT:.0f} s"
-        raise VerifyError(msg) from None
+        raise VerifyError(f"{' '.join(command[:4])} ... did not end within {LIMIT:.0f} s") from None
     except subprocess.CalledProcessError as error:
-        said = (error.stderr.strip().splitlines() or ["nothing"])[-1]
-        msg = f"{' '.join(command[:4])} ... failed: {said}"
-        raise VerifyError(msg) from None
+        output = (error.stderr.strip().splitlines() or ["nothing"])[-1]
+        raise VerifyError(f"{' '.join(command[:4])} ... failed: {output}") from None
 
 
 def unpack(wheel: Path, folder: Path) -> list[str]:
@@ -155,15 +153,14 @@ def compare(checks: Checks, folder: Path, name: str) -> JointDistribution:
     entries = sum(table.size for table in tables.values())
     checks.check(f"{name} read", held, f"{len(tables)} variables, {entries} entries; " + ", ".join(details))
     if from_bif is None:
-        msg = f"{name}.bif can't be read"
-        raise VerifyError(msg)
+        raise VerifyError(f"{name}.bif can't be read")
     return from_bif
 
 
 def difference(
     joint: JointDistribution, described: list[dict[str, Any]], tables: dict[str, Any], suffix: str
 ) -> float:
-    """The largest difference between our tables and the other side's; infinite where even the shapes differ."""
+    """Return the largest difference between our tables and the other side's; infinite where shapes differ."""
     ours = {each.symbol.name: each for each in joint.factors if isinstance(each, Distribution)}
     if len(ours) != len(described):
         return float("inf")
@@ -189,7 +186,7 @@ def difference(
 
 
 def plain(label: str) -> str:
-    """A label as the other side had to write it."""
+    """Return a label as the other side had to write it."""
     return label if re.fullmatch(r"[A-Za-z]\w*", label) else "x_" + label.encode().hex()
 
 
@@ -237,7 +234,7 @@ def questions(
 
 
 def draw(model: Model, chance: random.Random) -> tuple[int, ...]:
-    """Readings as they come in the model, so that they are possible together."""
+    """Draw readings from the model, so that they are possible together."""
     prior = model.prior_distribution
     line = chance.choices(range(model.lines), weights=prior.tolist())[0]
     return tuple(

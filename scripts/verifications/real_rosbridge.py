@@ -55,7 +55,7 @@ def home() -> Path:
 
 
 def install() -> Path:
-    """The installed server's folder (bin, lib); made first where it is missing.
+    """Return the installed server's folder (bin, lib), and install it first if it is missing.
 
     Raises:
         RealServerError: another kind of machine, nothing to download from, a folder that can't be written.
@@ -78,22 +78,23 @@ def install() -> Path:
                 if not prefix.is_dir():  # else someone else was faster, and theirs is as good
                     raise
     except OSError as error:
-        msg = f"{error.filename or prefix} can't be written: {error.strerror or error}; set {HOME_VARIABLE} to another folder"
-        raise RealServerError(msg) from error
+        raise RealServerError(
+            f"{error.filename or prefix} can't be written: {error.strerror or error}; set {HOME_VARIABLE} to another folder"
+        ) from error
     return prefix
 
 
 def _check_machine() -> None:
     if (sys.platform, platform.machine()) != ("linux", "x86_64"):
-        msg = (
+        raise RealServerError(
             f"ROS 2 comes as wheels for Linux on x86-64 only; this is {sys.platform} on {platform.machine()}"
         )
-        raise RealServerError(msg)
     kind, version = platform.libc_ver()
     if kind != "glibc" or tuple(int(part) for part in version.split(".")[:2]) < GLIBC:
         wanted = ".".join(map(str, GLIBC))
-        msg = f"the rosbridge server's wheel needs glibc {wanted} or later; this is {kind or 'another C library'} {version}"
-        raise RealServerError(msg)
+        raise RealServerError(
+            f"the rosbridge server's wheel needs glibc {wanted} or later; this is {kind or 'another C library'} {version}"
+        )
 
 
 def _download(folder: Path) -> None:
@@ -102,13 +103,15 @@ def _download(folder: Path) -> None:
     try:
         subprocess.run(command, check=True, capture_output=True, text=True, timeout=DOWNLOAD_LIMIT)
     except subprocess.TimeoutExpired as error:
-        msg = f"pip did not download {LOCK.name} within {DOWNLOAD_LIMIT:.0f} s; try again"
-        raise RealServerError(msg) from error
+        raise RealServerError(
+            f"pip did not download {LOCK.name} within {DOWNLOAD_LIMIT:.0f} s; try again"
+        ) from error
     except subprocess.CalledProcessError as error:
         lines = [line for line in error.stderr.splitlines() if line.startswith("ERROR")]
-        said = (lines or error.stderr.splitlines() or [f"exit code {error.returncode}"])[-1]
-        msg = f"pip could not download {LOCK.name}: {said.removeprefix('ERROR: ')}"
-        raise RealServerError(msg) from error
+        output = (lines or error.stderr.splitlines() or [f"exit code {error.returncode}"])[-1]
+        raise RealServerError(
+            f"pip could not download {LOCK.name}: {output.removeprefix('ERROR: ')}"
+        ) from error
 
 
 def _unpack(wheels: list[Path], prefix: Path) -> None:
@@ -152,14 +155,15 @@ def network_is_alone() -> bool:
 
 
 def network_command() -> list[str]:
-    """What to write before a command that is to run in a network of its own, with loopback only.
+    """Return the prefix of a command that runs in a network of its own, with loopback only.
 
     Raises:
         RealServerError: this user, or this container, may not make one.
     """
     if (unshare := shutil.which("unshare")) is None:
-        msg = "`unshare` is not installed, and the real server is to run in a network of its own (Debian: apt-get install util-linux)"
-        raise RealServerError(msg)
+        raise RealServerError(
+            "`unshare` is not installed, and the real server is to run in a network of its own (Debian: apt-get install util-linux)"
+        )
     # a user namespace gives the right to make a network to those who are not root, where the system allows it
     as_user = [] if os.geteuid() == 0 else ["--user", "--map-root-user"]
     command = [unshare, *as_user, "--net", "--"]
@@ -168,15 +172,13 @@ def network_command() -> list[str]:
     except subprocess.CalledProcessError as error:
         who = "not even root may make one here" if os.geteuid() == 0 else "this user may not make one"
         advice = "give the container the capability SYS_ADMIN" if os.geteuid() == 0 else "run this as root"
-        msg = (
+        raise RealServerError(
             f"the real server is to run in a network of its own, and {who} ({error.stderr.strip()}): {advice}"
-        )
-        raise RealServerError(msg) from error
+        ) from error
     except subprocess.TimeoutExpired as error:
-        msg = (
+        raise RealServerError(
             f"`{' '.join(command)} true` did not end within 10 s, so there is no network for the real server"
-        )
-        raise RealServerError(msg) from error
+        ) from error
     return [*command, sys.executable, str(Path(__file__).resolve()), "inside"]
 
 
@@ -192,13 +194,12 @@ def become(command: list[str], environment: dict[str, str] | None = None) -> Non
     """Replace this process by a command.
 
     Raises:
-        RealServerError: there is no such command.
+        RealServerError: There is not such a command.
     """
     try:
         os.execvpe(command[0], command, environment or dict(os.environ))  # noqa: S606 - no shell is wanted
     except OSError as error:
-        msg = f"{command[0]} can't be started: {error.strerror or error}"
-        raise RealServerError(msg) from error
+        raise RealServerError(f"{command[0]} can't be started: {error.strerror or error}") from error
 
 
 def serve(port: int) -> None:
@@ -209,8 +210,9 @@ def serve(port: int) -> None:
     """
     prefix = install()
     if not network_is_alone():
-        msg = "the real server runs only in a network with nothing but loopback: start it with `scripts/real-rosbridge alone ...`"
-        raise RealServerError(msg)
+        raise RealServerError(
+            "the real server runs only in a network with nothing but loopback: start it with `scripts/real-rosbridge alone ...`"
+        )
     # what a user of ROS has set is for another ROS than this
     theirs = {name: value for name, value in os.environ.items() if not name.startswith(_ROS_VARIABLES)}
     environment = theirs | {

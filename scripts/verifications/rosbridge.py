@@ -1,7 +1,7 @@
 """One deployment on two servers, a real ROS 2 rosbridge server and the hub: see scripts/verify.
 
 Readings of known cells go in from a plain client (websockets and json, nothing of bridge/); what a second plain
-client hears on /BMresults and /bm/frame is checked.
+client receives on /BMresults and /bm/frame is checked.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ def true_cell(number: int) -> tuple[int, int]:
 
 
 def readings_of(column: int, row: int) -> list[float]:
-    """What the sensors read in a cell's centre, in the order of the machine's columns, without noise."""
+    """Return the sensors' readings in a cell's centre without noise, in the order of the machine's columns."""
     width = (geometry.MAP_HIGH - geometry.MAP_LOW) / SIZE
     x, y = (geometry.MAP_LOW + width * (index + 0.5) for index in (column, row))
     distances = [
@@ -92,7 +92,7 @@ def readings_of(column: int, row: int) -> list[float]:
 
 
 @dataclass(frozen=True, slots=True)
-class Heard:
+class Received:
     """One message and when it arrived (monotonic, s)."""
 
     topic: str
@@ -101,11 +101,11 @@ class Heard:
 
 
 class PlainClient:
-    """A WebSocket that speaks JSON, and keeps what it hears."""
+    """A WebSocket that speaks JSON, and keeps the messages."""
 
     def __init__(self, socket: ClientConnection) -> None:
         self._socket = socket
-        self.heard: list[Heard] = []
+        self.received: list[Received] = []
         self.refused: list[str] = []
         self._news = asyncio.Event()
 
@@ -119,7 +119,7 @@ class PlainClient:
             async for text in self._socket:
                 operation = json.loads(text)
                 if operation["op"] == "publish":
-                    self.heard.append(Heard(operation["topic"], operation["msg"], time.monotonic()))
+                    self.received.append(Received(operation["topic"], operation["msg"], time.monotonic()))
                 elif operation["op"] == "status":
                     self.refused.append(str(operation["msg"]))
                 self._news.set()
@@ -136,16 +136,20 @@ class PlainClient:
                     self._news.clear()
                     await self._news.wait()
         except TimeoutError:
-            numbers = [values_of(heard.msg)["number"] for heard in self.heard if heard.topic == FRAME_TOPIC]
+            numbers = [
+                values_of(received.msg)["number"]
+                for received in self.received
+                if received.topic == FRAME_TOPIC
+            ]
             raise CheckError(
                 f"{self.count(RESULT_TOPIC)} of {count} results came on {RESULT_TOPIC} within {limit:g} s; "
                 f"frames on {FRAME_TOPIC}: {', '.join(numbers) or 'none'}"
-                + (f"; the server said: {self.refused[-1]}" if self.refused else "")
+                + (f"; the server answered: {self.refused[-1]}" if self.refused else "")
             ) from None
 
     def count(self, topic: str) -> int:
         """How many messages came on a topic."""
-        return sum(1 for heard in self.heard if heard.topic == topic)
+        return sum(1 for received in self.received if received.topic == topic)
 
 
 @contextlib.asynccontextmanager
@@ -174,8 +178,8 @@ async def plain_client(uri: str) -> AsyncIterator[PlainClient]:
 
 
 @contextlib.asynccontextmanager
-async def listener(uri: str, heard: list[Heard]) -> AsyncIterator[PlainClient]:
-    """A client that hears the stack's topics; what it hears is added to a list in the end."""
+async def listener(uri: str, received: list[Received]) -> AsyncIterator[PlainClient]:
+    """Run a client on the stack's topics, and add the received messages to a list at the end."""
     async with plain_client(uri) as client:
         for topic, type_ in ((FRAME_TOPIC, FRAME_TYPE), (RESULT_TOPIC, RESULT_TYPE)):
             # without a queue of its own size a server over DDS keeps ten messages
@@ -183,7 +187,7 @@ async def listener(uri: str, heard: list[Heard]) -> AsyncIterator[PlainClient]:
         try:
             yield client
         finally:
-            heard.extend(client.heard)
+            received.extend(client.received)
 
 
 @contextlib.asynccontextmanager
@@ -220,7 +224,7 @@ class MasterRun:
     log: Path
 
     async def ended(self, code: int) -> str:
-        """Wait until it has ended with this exit code; what it said.
+        """Wait until it has ended with this exit code, and return its output.
 
         Raises:
             CheckError: with another, or not in time.
@@ -230,10 +234,10 @@ class MasterRun:
                 got = await self.process.wait()
         except TimeoutError:
             raise CheckError(f"the master did not end within {MASTER_LIMIT:g} s") from None
-        said = self.log.read_text()
-        expect("Traceback" not in said, "the master shows a traceback")
+        output = self.log.read_text()
+        expect("Traceback" not in output, "the master shows a traceback")
         expect(got == code, f"the master's exit code is {got}, not {code}")
-        return said
+        return output
 
 
 @dataclass(slots=True)
@@ -284,7 +288,7 @@ class Stand:
 
     @contextlib.asynccontextmanager
     async def master(self, check: str, deployment: str, *flags: str) -> AsyncIterator[MasterRun]:
-        """A master while the block runs."""
+        """Run a master during the block."""
         log = self.folder / f"{check.replace(' ', '-')}.log"
         self._logs.append(log)
         process = Process("master", log)
@@ -295,7 +299,7 @@ class Stand:
             await process.end()
 
     def tails(self) -> str:
-        """The last lines of the logs of the current check."""
+        """Return the last log lines of the current check."""
         lines = []
         for log in self._logs:
             if log.exists():
@@ -315,14 +319,14 @@ class Stand:
 
 
 def stamp_ns(header: dict[str, Any]) -> int:
-    """A header's time, in the keys of either ROS."""
+    """Return a header's time, in the keys of either ROS."""
     stamp = header["stamp"]
     seconds, nanoseconds = stamp.get("sec", stamp.get("secs")), stamp.get("nanosec", stamp.get("nsecs"))
     return int(seconds) * 10**9 + int(nanoseconds)
 
 
 def check_result(msg: dict[str, Any], reading: Sent) -> float:
-    """A posterior is as announced, and of this reading; how many cells its mean is off."""
+    """Check a posterior's layout and reading, and return how many cells its mean is off."""
     dimensions = [
         {"label": "y", "size": SIZE, "stride": SIZE * SIZE},
         {"label": "x", "size": SIZE, "stride": SIZE},
@@ -345,7 +349,7 @@ def check_result(msg: dict[str, Any], reading: Sent) -> float:
 
 
 def check_frame(msg: dict[str, Any], after: int, sent: list[Sent]) -> tuple[int, int, Sent]:
-    """A frame's own message is as announced; its number, its stamp, and the reading that the stamp names."""
+    """Check a frame's own message, and return its number, its stamp, and the reading with that stamp."""
     values = values_of(msg)
     expect(values["published"] == "true", f"its {FRAME_TOPIC} says published = {values['published']}")
     number, stamp = int(values["number"]), stamp_ns(msg["header"])
@@ -360,18 +364,18 @@ def check_frame(msg: dict[str, Any], after: int, sent: list[Sent]) -> tuple[int,
 
 
 def values_of(frame: dict[str, Any]) -> dict[str, str]:
-    """What a frame's message says of the whole frame."""
+    """Return the fields of a frame's message about the whole frame."""
     return {pair["key"]: pair["value"] for pair in frame["status"][0]["values"]}
 
 
-def check_heard(stand: Stand, heard: list[Heard], sent: list[Sent], count: int) -> None:
+def check_received(stand: Stand, received: list[Received], sent: list[Sent], count: int) -> None:
     """So many results, each with its own frame (before it, where the server keeps order), each of the reading that its stamp names.
 
     Raises:
         CheckError: what is wrong, with the result's number.
     """
     frames, results = (
-        [each for each in heard if each.topic == topic] for topic in (FRAME_TOPIC, RESULT_TOPIC)
+        [each for each in received if each.topic == topic] for topic in (FRAME_TOPIC, RESULT_TOPIC)
     )
     for topic, messages in ((FRAME_TOPIC, frames), (RESULT_TOPIC, results)):
         expect(len(messages) == count, f"{len(messages)} messages came on {topic}, not {count}")
@@ -379,7 +383,7 @@ def check_heard(stand: Stand, heard: list[Heard], sent: list[Sent], count: int) 
     offs, delays = [], []
     for at, (frame, result) in enumerate(zip(frames, results, strict=True), start=1):
         try:
-            early = heard.index(frame) < heard.index(result)
+            early = received.index(frame) < received.index(result)
             swapped += not early
             expect(early or not stand.kind.keeps_order, f"{FRAME_TOPIC} came after it")
             expect(
@@ -408,70 +412,70 @@ def check_heard(stand: Stand, heard: list[Heard], sent: list[Sent], count: int) 
 
 async def check_once(stand: Stand, form: str) -> None:
     """`--once` computes one frame, sees its result on the wire, and ends with 0."""
-    heard: list[Heard] = []
+    received: list[Received] = []
     sent: list[Sent] = []
     async with (
-        listener(stand.uri, heard) as ears,
+        listener(stand.uri, received) as client,
         stand.master(f"once {form}", form, "--once") as master,
         readings(stand.uri, sent),
     ):
-        said = await master.ended(0)
-        await ears.results(1, LAST_WORDS)
+        output = await master.ended(0)
+        await client.results(1, LAST_WORDS)
         await asyncio.sleep(2 * EVERY)  # a second one would be one too many
-    expect("frame 1: most probable" in said, "the master does not print the frame's most probable cell")
-    expect("not seen on the wire" not in said, "the master did not see its result on the wire")
-    check_heard(stand, heard, sent, 1)
+    expect("frame 1: most probable" in output, "the master does not print the frame's most probable cell")
+    expect("not seen on the wire" not in output, "the master did not see its result on the wire")
+    check_received(stand, received, sent, 1)
 
 
 async def check_loop(stand: Stand, form: str) -> None:
     """`--loop --count N` publishes N results and ends with 0."""
-    heard: list[Heard] = []
+    received: list[Received] = []
     sent: list[Sent] = []
     async with (
-        listener(stand.uri, heard) as ears,
+        listener(stand.uri, received) as client,
         stand.master(f"loop {form}", form, "--loop", "--count", str(COUNT)) as master,
         readings(stand.uri, sent),
     ):
         await master.ended(0)
-        await ears.results(COUNT, LAST_WORDS)
+        await client.results(COUNT, LAST_WORDS)
         await asyncio.sleep(2 * EVERY)
-    check_heard(stand, heard, sent, COUNT)
+    check_received(stand, received, sent, COUNT)
 
 
 async def check_restart(stand: Stand, form: str) -> None:
-    """A server that ends, and one that is killed, is waited for; results flow again in the same run."""
-    heard: list[Heard] = []
+    """Check that a run waits for a server that ends or is killed, and goes on with results."""
+    received: list[Received] = []
     sent: list[Sent] = []
     part = COUNT // 3
     async with stand.master(f"restart {form}", form, "--loop", "--count", str(COUNT)) as master:
         for stop in (stand.stop_server, stand.kill_server):
-            async with listener(stand.uri, heard) as ears:
+            async with listener(stand.uri, received) as client:
                 async with readings(stand.uri, sent):
-                    await ears.results(part)
+                    await client.results(part)
                 await asyncio.sleep(2 * EVERY)  # nothing is under way when the server goes
             await stop()
             await asyncio.sleep(0.5)
             await stand.start_server()
         again = time.monotonic()
-        came = sum(1 for each in heard if each.topic == RESULT_TOPIC)
-        async with listener(stand.uri, heard) as ears, readings(stand.uri, sent):
-            await ears.results(1)
+        came = sum(1 for each in received if each.topic == RESULT_TOPIC)
+        async with listener(stand.uri, received) as client, readings(stand.uri, sent):
+            await client.results(1)
             again = time.monotonic() - again
             await master.ended(0)
-            await ears.results(COUNT - came, LAST_WORDS)
+            await client.results(COUNT - came, LAST_WORDS)
             await asyncio.sleep(2 * EVERY)
-    check_heard(stand, heard, sent, COUNT)
+    check_received(stand, received, sent, COUNT)
     stand.notes.append(f"the first result came {again:.1f} s after the server was back")
 
 
 async def check_silence(stand: Stand, form: str) -> None:
-    """A topic that nobody publishes ends the run in time with exit code 3 and a sentence that names it."""
+    """Check that a topic without a publisher ends the run in time with exit code 3 and its name."""
     started = time.monotonic()
     timeout = ("--first-data-timeout", str(FIRST_DATA_TIMEOUT))
     async with stand.master(f"silence {form}", form, "--once", *timeout) as master:
-        said = await master.ended(3)
+        output = await master.ended(3)
     took = time.monotonic() - started
-    errors = [line for line in said.splitlines() if line.startswith("error: ")]
+    errors = [line for line in output.splitlines() if line.startswith("error: ")]
     expect(len(errors) == 1, f"the master says {len(errors)} errors, not one")
     expect(BOAT_TOPIC in errors[0], f"the error does not name {BOAT_TOPIC}: {errors[0]}")
     expect(took >= FIRST_DATA_TIMEOUT, f"the master ended after {took:.1f} s, before its time-out")
@@ -488,7 +492,7 @@ CHECKS: tuple[tuple[str, Callable[[Stand, str], Awaitable[None]], str], ...] = (
 
 
 def bytes_of(deployments: dict[str, Path]) -> str:
-    """A hash of every file of the deployments."""
+    """Return a hash of every file of the deployments."""
     digest = hashlib.sha256()
     for folder in deployments.values():
         for path in sorted(folder.rglob("*")):
@@ -529,8 +533,7 @@ def only_one() -> Iterator[None]:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            msg = f"another scripts/verify runs, and writes to {OUT}: wait for its end"
-            raise StackError(msg) from None
+            raise StackError(f"another scripts/verify runs, and writes to {OUT}: wait for its end") from None
         yield
 
 

@@ -3,6 +3,7 @@
 import json
 import sys
 import tempfile
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -10,10 +11,39 @@ import numpy as np
 from tests.verification.resources.cases import CALIBRATION, Case, machine_of
 from tests.verification.resources.tools import run
 from tests.verification.resources.verilog import verilog
-from toolchain.analysis.resources.logic import COSTS, Alms, Of, logic_of
+from toolchain.analysis.resources.logic import COSTS, Of, logic_of
 
 FIT_ROUNDS = 20_000
 """Of a descent along one cost after the other; further ones change no third digit."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Alms:
+    """Logic: look-up tables by their inputs, bits of carry chains, registers.
+
+    Attributes:
+        luts: Look-up tables of up to 4 inputs.
+        luts5: Those of 5.
+        luts6: Those of 6.
+        sums: Bits of carry chains.
+        registers: Flip-flops.
+    """
+
+    luts: float = 0.0
+    luts5: float = 0.0
+    luts6: float = 0.0
+    sums: float = 0.0
+    registers: float = 0.0
+
+    @property
+    def aluts(self) -> float:
+        """Look-up tables of all kinds, carry chains among them."""
+        return self.luts + self.luts5 + self.luts6 + self.sums
+
+    @property
+    def alms(self) -> float:
+        """ALMs: one holds a 6-input table, or two of up to 4, or two bits of a carry chain; a 5-input one shares if it can."""
+        return self.luts6 + 0.75 * self.luts5 + 0.5 * (self.luts + self.sums)
 
 
 def synthesised(case: Case, folder: Path) -> Alms:

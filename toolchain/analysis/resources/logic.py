@@ -31,35 +31,6 @@ _FLAG_BITS: Final = 3
 """Of a replica: whether it runs, whether it was halted, whether it is to be."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Alms:
-    """Logic: look-up tables by their inputs, bits of carry chains, registers.
-
-    Attributes:
-        luts: Look-up tables of up to 4 inputs.
-        luts5: Those of 5.
-        luts6: Those of 6.
-        sums: Bits of carry chains.
-        registers: Flip-flops.
-    """
-
-    luts: float = 0.0
-    luts5: float = 0.0
-    luts6: float = 0.0
-    sums: float = 0.0
-    registers: float = 0.0
-
-    @property
-    def aluts(self) -> float:
-        """Look-up tables of all kinds, carry chains among them."""
-        return self.luts + self.luts5 + self.luts6 + self.sums
-
-    @property
-    def alms(self) -> float:
-        """ALMs: one holds a 6-input table, or two of up to 4, or two bits of a carry chain; a 5-input one shares if it can."""
-        return self.luts6 + 0.75 * self.luts5 + 0.5 * (self.luts + self.sums)
-
-
 class Of(StrEnum):
     """Units that logic is counted by; each costs look-up tables beside the carry chains, and ALMs for those."""
 
