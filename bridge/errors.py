@@ -13,8 +13,6 @@ what a command ends with when the error ends it.
     * `DefinitionError` (2: a message's type is not known here, or rosbags is missing)
     * `DecodeError` (3: what arrived is no message)
     * `FieldMissingError`, `FieldAmbiguousError` (4: a variable cannot be found in a message)
-    * `NoResultError` (3: no posterior came in time)
-    * `BadResultError`, `LabelError` (2: what came is no posterior, or not one of the variable asked for)
 """
 
 from typing import ClassVar
@@ -150,19 +148,3 @@ class FieldAmbiguousError(BridgeError):
     """Raised when a bare name occurs more than once in a message; the sentence lists the places."""
 
     exit_code = 4
-
-
-class NoResultError(NoMessageError):
-    """Raised when no posterior came in time."""
-
-
-class BadResultError(BridgeError):
-    """Raised when a message on a topic of results is none of the master's."""
-
-    exit_code = 2
-
-
-class LabelError(BridgeError):
-    """Raised when a posterior has no variable of that name, or no such cell; the sentence says what it has."""
-
-    exit_code = 2

@@ -7,8 +7,9 @@ from collections.abc import AsyncIterator
 from typing import Final
 
 from bridge.client import Ros, Subscription
-from bridge.errors import BadResultError, DisconnectedError
+from bridge.errors import DisconnectedError
 from casestudies.truths import TRUTH_TYPE, Instance, Truth, Truths, read_truth
+from posteriors.errors import BadResultError
 from posteriors.listening import Posteriors, posteriors
 
 _QUEUE_SIZE: Final = 256
@@ -52,7 +53,7 @@ class Listener:
             if self._truths.waits and now() >= min(flushing, end):
                 self._ready.extend(self._truths.flush())
             elif now() >= end:
-                raise self._heard.silence(limit_s)
+                raise self._heard.no_result_error(limit_s)
             else:
                 self._news.clear()
                 with contextlib.suppress(TimeoutError):

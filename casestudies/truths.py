@@ -10,9 +10,11 @@ from typing import Annotated, Any, Final
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, FiniteFloat, ValidationError
 
-from bridge.errors import BadResultError
 from bridge.stamps import stamp_ns
-from posteriors.results import FrameReport, Heard, Posterior
+from posteriors.errors import BadResultError
+from posteriors.frame_report import FrameReport
+from posteriors.pairing import FrameOutcome
+from posteriors.posterior import Posterior
 
 TRUTH_TYPE: Final = "geometry_msgs/PoseStamped"
 
@@ -36,7 +38,7 @@ class Instance:
     the true pose is: 0 where the stamps are equal.
     """
 
-    heard: Heard
+    heard: FrameOutcome
     truth: Truth | None = None
     truth_age_ns: int = 0
 
@@ -107,7 +109,7 @@ class Truths:
         """Whether there is a frame that waits for its truth."""
         return bool(self._untrue)
 
-    def add_frame(self, heard: Heard) -> list[Instance]:
+    def add_frame(self, heard: FrameOutcome) -> list[Instance]:
         """Take what was heard of a frame; returns the instances that are complete now."""
         self._untrue.append(Instance(heard=heard))
         return self._resolve()

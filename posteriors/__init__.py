@@ -1,23 +1,18 @@
-"""Posteriors as ROS messages: written, read, paired with their frames, and listened to."""
+"""Posteriors as ROS messages: written, read, paired with their frames' reports, and received."""
 
-from posteriors.listening import (
-    BadResultError,
-    FrameReport,
-    LabelError,
-    NoResultError,
-    Posterior,
-    Posteriors,
-    StageTimes,
-    listen,
-    posteriors,
-)
+from posteriors.errors import BadResultError, LabelError, NoResultError, PosteriorError
+from posteriors.frame_report import BoardReport, FrameReport, StageTimes
+from posteriors.listening import Posteriors, listen, posteriors
+from posteriors.posterior import Posterior
 
 __all__ = [
     "BadResultError",
+    "BoardReport",
     "FrameReport",
     "LabelError",
     "NoResultError",
     "Posterior",
+    "PosteriorError",
     "Posteriors",
     "StageTimes",
     "listen",

@@ -1,4 +1,4 @@
-"""The posteriors of a running stack, one by one, each as a labelled array with its frame's data.
+"""A subscription to the posteriors of a running stack, each as a labelled array with its frame's report.
 
 With asyncio:
 
@@ -6,11 +6,11 @@ With asyncio:
         async for posterior in posteriors(ros):
             print(posterior.number, posterior.best(), posterior.values.shape)
 
-and without, where a function gets each:
+and without:
 
     listen("ws://robot:9090", lambda posterior: print(posterior.best()))
 
-NumPy is imported when the first array is wanted (``docs/listening.md``).
+NumPy is imported with the first array that is used (docs/listening.md).
 """
 
 import asyncio
@@ -23,69 +23,39 @@ from typing import Any, Final, Protocol, Self, TypeVar
 
 from bridge.client import Message, Ros, State, Subscription, connect
 from bridge.client.protocol import Compression
-from bridge.errors import (
-    BadResultError,
-    ConcurrentReadError,
-    DisconnectedError,
-    LabelError,
-    NoResultError,
-    OptionError,
-)
-from posteriors.results import (
-    FRAME_TOPIC,
-    FRAME_TYPE,
-    MAX_RESULT,
-    RESULTS_TOPIC,
-    RESULTS_TYPE,
-    WAITING,
-    FrameReport,
-    Heard,
-    Pairing,
-    Posterior,
-    StageTimes,
-    read_frame_report,
-    read_posterior,
-)
+from bridge.errors import ConcurrentReadError, DisconnectedError, OptionError
+from posteriors.errors import BadResultError, NoResultError
+from posteriors.frame_report import FRAME_TOPIC, FRAME_TYPE, read_frame_report
+from posteriors.pairing import WAITING, FrameOutcome, Pairing
+from posteriors.posterior import MAX_RESULT, RESULTS_TOPIC, RESULTS_TYPE, Posterior, read_posterior
 
-__all__ = [
-    "BadResultError",
-    "FrameReport",
-    "LabelError",
-    "NoResultError",
-    "Posterior",
-    "Posteriors",
-    "StageTimes",
-    "listen",
-    "posteriors",
-]
-
-#: Posteriors that wait for their reader, unless it says otherwise.
 QUEUE_SIZE: Final = 64
-#: Seconds that the first posterior may take, unless the caller says otherwise.
+"""Posteriors that wait for their reader, by default."""
 FIRST_TIMEOUT: Final = 30.0
-#: So much later than its posterior a server may deliver the report that was published before it.
+"""Seconds until the first posterior, by default."""
 _DISORDER_NS: Final = 50_000_000
-#: Seconds that a posterior waits for a report that does not come.
-_PATIENCE: Final = 1.0
+"""Delay by which a server may deliver a report after the posterior that was published behind it."""
+_REPORT_TIMEOUT: Final = 1.0
+"""Seconds that a posterior waits for its report."""
 
-Outcome = TypeVar("Outcome")
+Result = TypeVar("Result")
 
 
-class _Do(Protocol):
-    """Awaits a coroutine on a loop in another thread."""
+class _RunInLoop(Protocol):
+    """Runs a coroutine on a loop in another thread."""
 
-    def __call__(self, work: Coroutine[Any, Any, Outcome]) -> Outcome:
-        """What came of it."""
+    def __call__(self, work: Coroutine[Any, Any, Result]) -> Result:
+        """Return the coroutine's result."""
 
 
 class Posteriors:
-    """The posteriors of one stack, to be read by one task: ``async for posterior in ...``; `posteriors` makes it.
+    """The posteriors of one stack, read by one task with `async for posterior in ...`; `posteriors` makes it.
 
-    A lost connection does not end the iteration, posteriors go on after the reconnection; closing this or the client
-    does. If the reader is too slow the oldest are dropped, and nothing else slows down.
+    A lost connection does not end the iteration: posteriors go on after the reconnection. Closing this or the client
+    ends it. If the reader is too slow, the oldest posteriors are dropped, and nothing else slows down.
 
     Attributes:
-        without_posterior: frames passed over because they had none: impossible readings, mostly.
+        without_posterior: Frames passed over because they had no posterior, mostly for impossible readings.
     """
 
     def __init__(
@@ -108,11 +78,11 @@ class Posteriors:
         self._deployment = deployment
         self._size = queue_size
         self._lost = 0
-        self._open = 2  # topics
+        self._open_topics = 2
         self._pairing = Pairing(disorder_ns=_DISORDER_NS)
-        self._ready: deque[Heard | BadResultError] = deque()
+        self._ready: deque[FrameOutcome | BadResultError] = deque()
         self._waiter: asyncio.Future[None] | None = None
-        self._patience: asyncio.TimerHandle | None = None
+        self._report_timer: asyncio.TimerHandle | None = None
         reports = ros.subscribe(frame_topic, FRAME_TYPE, queue_size=max(queue_size, WAITING))
         results = ros.subscribe(
             topic, RESULTS_TYPE, queue_size=max(queue_size, WAITING), compression=compression
@@ -130,38 +100,38 @@ class Posteriors:
 
     async def __anext__(self) -> Posterior:
         while True:
-            heard = await self._take()
-            if isinstance(heard, Posterior):
-                return heard
+            frame = await self._take()
+            if isinstance(frame, Posterior):
+                return frame
             self.without_posterior += 1
 
     async def next(self, timeout: float | None) -> Posterior:  # noqa: ASYNC109  # the limit is part of the error
         """Wait for one posterior.
 
         Args:
-            timeout: seconds; None for as long as it takes.
+            timeout: Seconds; None for no limit.
 
         Raises:
-            NoResultError: none came in time.
-            BadResultError: something else than a posterior came on its topic. The next call goes on behind it.
-            DisconnectedError: this or the client are closed.
-            ConcurrentReadError: another task waits here.
+            NoResultError: None came in time.
+            BadResultError: A message on the topic is not a posterior. The next call goes on behind it.
+            DisconnectedError: This or the client is closed.
+            ConcurrentReadError: Another task waits here.
         """
         return await self._within(timeout, self.__anext__)
 
-    async def next_frame(self, timeout: float | None) -> Heard:  # noqa: ASYNC109  # as above
-        """Wait for one frame: its posterior, or the `FrameReport` of a frame that has none, which says why.
+    async def next_frame(self, timeout: float | None) -> FrameOutcome:  # noqa: ASYNC109  # as above
+        """Wait for one frame: its posterior, or the `FrameReport` of a frame without one, which gives the reason.
 
         Raises:
-            NoResultError, BadResultError, DisconnectedError, ConcurrentReadError: as `next`.
+            NoResultError, BadResultError, DisconnectedError, ConcurrentReadError: As for `next`.
         """
         return await self._within(timeout, self._take)
 
     async def _within(
         self,
         timeout: float | None,  # noqa: ASYNC109  # as above
-        wait: Callable[[], Coroutine[Any, Any, Outcome]],
-    ) -> Outcome:
+        wait: Callable[[], Coroutine[Any, Any, Result]],
+    ) -> Result:
         try:
             async with asyncio.timeout(timeout):
                 return await wait()
@@ -169,10 +139,10 @@ class Posteriors:
             raise DisconnectedError(f"the subscription of {self._topic} is closed") from None
         except TimeoutError:
             pass
-        raise self.silence(timeout)
+        raise self.no_result_error(timeout)
 
-    def silence(self, waited: float | None) -> NoResultError:
-        """The error that says that nothing came within so many seconds, and what can be known about it."""
+    def no_result_error(self, waited: float | None) -> NoResultError:
+        """Return the error for a time without a frame, in seconds, with the state of the connection."""
         ros = self._ros
         why = (
             "is the master running, and do readings reach it?"
@@ -184,13 +154,13 @@ class Posteriors:
             f"nothing came on {self._frame_topic} and {self._topic} from {ros.uri}{limit}: {why}"
         )
 
-    async def _take(self) -> Heard:
+    async def _take(self) -> FrameOutcome:
         while not self._ready:
-            if not self._open:
+            if not self._open_topics:
                 raise StopAsyncIteration
             if self._waiter is not None:
                 raise ConcurrentReadError(
-                    f"another task waits for posteriors of {self._topic} already: a second reader needs its own"
+                    f"another task waits for posteriors of {self._topic} already: give each reader its own subscription"
                 )
             self._waiter = asyncio.get_running_loop().create_future()
             try:
@@ -202,27 +172,27 @@ class Posteriors:
             raise first
         return first
 
-    # How it stands
+    # Counters
 
     @property
     def lost(self) -> int:
-        """How many were dropped because the reader was too slow."""
+        """Number of posteriors dropped because the reader was too slow."""
         return self._lost + sum(subscription.lost for subscription in self._subscriptions)
 
     @property
     def announced_only(self) -> int:
-        """How many frames were announced on `/bm/frame` whose posterior never came."""
+        """Number of frames announced on `/bm/frame` whose posterior never came."""
         return self._pairing.announced_only
 
     @property
     def blind_seconds(self) -> float:
-        """How long, all in all, nothing could be heard because the connection was lost."""
+        """Total time without a connection, in seconds."""
         return self._subscriptions[1].blind_seconds
 
     # Closing
 
     async def close(self) -> None:
-        """Tell the server that this is not wanted any more. May be called again."""
+        """Unsubscribe. May be called again."""
         for subscription in self._subscriptions:
             await subscription.close()
         await asyncio.gather(*self._pumps, return_exceptions=True)
@@ -233,43 +203,43 @@ class Posteriors:
     async def __aexit__(self, *_exception: object) -> None:
         await self.close()
 
-    # What arrives
+    # Arrival
 
-    async def _pump(self, subscription: Subscription, take: Callable[[Message], list[Heard]]) -> None:
+    async def _pump(self, subscription: Subscription, take: Callable[[Message], list[FrameOutcome]]) -> None:
         """Hand the messages of one topic to the pairing, until it is closed."""
         async for message in subscription:
             try:
                 self._put(take(message))
             except BadResultError as error:
                 self._put([error])
-        self._open -= 1
+        self._open_topics -= 1
         self._flush()
 
-    def _report(self, message: Message) -> list[Heard]:
+    def _report(self, message: Message) -> list[FrameOutcome]:
         report = read_frame_report(message.msg, message.received_ns)
         if self._deployment is not None and report.deployment != self._deployment:
             return []
         return self._pairing.add_report(report)
 
-    def _result(self, message: Message) -> list[Heard]:
+    def _result(self, message: Message) -> list[FrameOutcome]:
         return self._pairing.add_posterior(read_posterior(message.msg, message.received_ns, self._topic))
 
-    def _put(self, heard: list[Heard] | list[BadResultError]) -> None:
-        self._ready.extend(heard)
+    def _put(self, frames: list[FrameOutcome] | list[BadResultError]) -> None:
+        self._ready.extend(frames)
         while len(self._ready) > self._size:
             self._ready.popleft()
             self._lost += 1
-        if self._pairing.waits != (self._patience is not None):
-            if self._patience is not None:
-                self._patience.cancel()
-                self._patience = None
+        if self._pairing.waits != (self._report_timer is not None):
+            if self._report_timer is not None:
+                self._report_timer.cancel()
+                self._report_timer = None
             else:
-                self._patience = asyncio.get_running_loop().call_later(_PATIENCE, self._flush)
-        if (self._ready or not self._open) and self._waiter is not None and not self._waiter.done():
+                self._report_timer = asyncio.get_running_loop().call_later(_REPORT_TIMEOUT, self._flush)
+        if (self._ready or not self._open_topics) and self._waiter is not None and not self._waiter.done():
             self._waiter.set_result(None)
 
     def _flush(self) -> None:
-        """Hand out what waits for a report that does not come."""
+        """Hand out the posteriors whose reports did not come in time."""
         self._put(self._pairing.flush())
 
 
@@ -285,21 +255,21 @@ def posteriors(
     """Subscribe to the posteriors of a stack that publishes on this server.
 
     Args:
-        ros: the open client.
-        topic: where the posteriors are (`toolchain build --output`).
-        frame_topic: where their frames' data are.
-        deployment: the model's name, where several stacks publish on one server: frames of others are passed over.
-        queue_size: how many wait here for their reader; then the oldest is dropped and counted.
-        compression: ``cbor`` brings large posteriors in less time, from servers that know it.
+        ros: The open client.
+        topic: Topic of the posteriors (`toolchain build --output`).
+        frame_topic: Topic of their frames' reports.
+        deployment: The model's name, to ignore frames of other stacks on the same server.
+        queue_size: Number of posteriors that wait for their reader; beyond it, the oldest is dropped and counted.
+        compression: `cbor` transfers large posteriors faster, from servers that support it.
 
     Returns:
-        The posteriors from now on; ``async with`` closes them before the client is closed.
+        The posteriors from now on; `async with` closes them before the client is closed.
 
     Raises:
-        NameFormError: of a topic.
-        TypeConflictError: this client subscribes to one of them already, in another form.
-        OptionError: the queue has no room.
-        DisconnectedError: the client was closed.
+        NameFormError: A topic's name is malformed.
+        TypeConflictError: This client subscribes to one of them already, with another type.
+        OptionError: The queue has no room.
+        DisconnectedError: The client is closed.
     """
     return Posteriors(
         ros,
@@ -323,30 +293,30 @@ def listen(
     deployment: str | None = None,
     queue_size: int = QUEUE_SIZE,
 ) -> int:
-    """Call a function with each posterior, in this thread, until there is an end; no asyncio needed.
+    """Call a function with each posterior, in this thread; no asyncio needed.
 
     The connection lives in a thread of its own, so a slow function loses the oldest posteriors of its queue and
-    nothing else; a connection that is lost is waited for. Ctrl-C ends it like any other end.
+    nothing else; a lost connection is restored. Ctrl-C is a normal end.
 
     Args:
-        server: a rosbridge server's URI, or ``connect(...)`` with more to say (a token, a proxy), not opened yet.
-        function: is called with each `Posterior`; what it raises ends this and is raised here. Returning False ends
-            it too.
-        count: after so many it ends; None for no number.
-        first_timeout: seconds that the first may take; None for as long as it takes.
-        timeout: seconds between two; None for as long as it takes.
-        topic: as in `posteriors`, like all that follows.
-        frame_topic: as there.
-        deployment: as there.
-        queue_size: as there.
+        server: A rosbridge server's URI, or `connect(...)` with further options (a token, a proxy), not opened yet.
+        function: Called with each `Posterior`. Its exceptions end the loop and are raised here; returning False ends
+            the loop too.
+        count: Number of posteriors after which to return; None for no limit.
+        first_timeout: Seconds until the first; None for no limit.
+        timeout: Seconds between two; None for no limit.
+        topic: As in `posteriors`, like all that follows.
+        frame_topic: As there.
+        deployment: As there.
+        queue_size: As there.
 
     Returns:
-        How many posteriors the function got.
+        The number of posteriors that the function got.
 
     Raises:
-        NoResultError: none came in time.
-        BadResultError: something else than a posterior came on its topic.
-        BridgeError: the server is not there, or is none.
+        NoResultError: None came in time.
+        BadResultError: A message on the topic is not a posterior.
+        BridgeError: The server is not reachable, or is not a rosbridge server.
     """
     ros = connect(server, max_size=MAX_RESULT) if isinstance(server, str) else server
     taken = 0
@@ -356,43 +326,43 @@ def listen(
             ros, topic=topic, frame_topic=frame_topic, deployment=deployment, queue_size=queue_size
         )
 
-    with contextlib.suppress(KeyboardInterrupt), _loop_in_a_thread() as do:
+    with contextlib.suppress(KeyboardInterrupt), _loop_in_a_thread() as run:
         try:
-            do(ros.__aenter__())
-            heard = do(begin())
+            run(ros.__aenter__())
+            subscription = run(begin())
             while count is None or taken < count:
-                posterior = do(heard.next(timeout if taken else first_timeout))
+                posterior = run(subscription.next(timeout if taken else first_timeout))
                 taken += 1
                 if function(posterior) is False:
                     break
         finally:
-            do(ros.close())
+            run(ros.close())
     return taken
 
 
 @contextlib.contextmanager
-def _loop_in_a_thread() -> Iterator[_Do]:
-    """An event loop in a thread of its own, until the block is left."""
+def _loop_in_a_thread() -> Iterator[_RunInLoop]:
+    """Run an event loop in a thread of its own until the block is left."""
     started: Future[tuple[asyncio.AbstractEventLoop, asyncio.Event]] = Future()
 
-    async def live() -> None:
+    async def until_stopped() -> None:
         stop = asyncio.Event()
         started.set_result((asyncio.get_running_loop(), stop))
         await stop.wait()
 
-    def run() -> None:
+    def thread_main() -> None:
         try:
-            asyncio.run(live())
+            asyncio.run(until_stopped())
         except BaseException as error:
             if started.done():
                 raise
-            started.set_exception(error)  # no loop was to be had: who waits for it must not wait on
+            started.set_exception(error)  # else the caller would wait for a loop that never starts
 
-    thread = threading.Thread(target=run, name="posteriors", daemon=True)
+    thread = threading.Thread(target=thread_main, name="posteriors", daemon=True)
     thread.start()
     loop, stop = started.result()
 
-    def do(work: Coroutine[Any, Any, Outcome]) -> Outcome:
+    def run(work: Coroutine[Any, Any, Result]) -> Result:
         future = asyncio.run_coroutine_threadsafe(work, loop)
         try:
             return future.result()
@@ -401,7 +371,7 @@ def _loop_in_a_thread() -> Iterator[_Do]:
             raise
 
     try:
-        yield do
+        yield run
     finally:
         loop.call_soon_threadsafe(stop.set)
         thread.join()

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Final, Self
 
 import typer
 
-from bridge.errors import NoResultError
 from casestudies.boat.messages import TRUE_POSE_TOPIC
+from posteriors.errors import NoResultError
 from terminal.command_line import CommandLine
 from terminal.connection import report_connection
 from terminal.errors import ExitCode, StoppedError

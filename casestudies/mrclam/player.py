@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from bridge.errors import BadResultError, NoResultError
 from casestudies.mrclam.recording import (
     MAP_FRAME,
     SIGHTINGS_MSG,
@@ -25,6 +24,7 @@ from casestudies.mrclam.recording import (
     read_recording,
     sightings_message,
 )
+from posteriors.errors import BadResultError, NoResultError
 from terminal.command_line import CommandLine
 from terminal.connection import report_connection
 from terminal.output import check_writable, say, write_json
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from bridge.client.protocol import RosVersion
     from casestudies.listening import Listener
     from casestudies.truths import Instance
-    from posteriors.results import Posterior
+    from posteriors.posterior import Posterior
 
 LOST_DISTANCE: Final = 9.0
 """What a frame without a result counts as, in metres: the width of the area."""

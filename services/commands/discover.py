@@ -69,8 +69,3 @@ def _table(robots: list[Robot]) -> Table:
             escape(one_line(robot.name)), escape(one_line(robot.uri)), str(robot.ros_version or "?"), token
         )
     return table
-
-
-def main() -> None:
-    """Entry point of the command `discover`."""
-    app()

@@ -174,8 +174,3 @@ def _door(certificate: Path | None, key: Path | None, tokens: Path | None, origi
         tokens=read_tokens(tokens) if tokens is not None else (),
         origins=tuple(origins),
     )
-
-
-def main() -> None:
-    """Entry point of the command `hub`."""
-    app()

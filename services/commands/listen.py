@@ -14,13 +14,14 @@ from rich.live import Live
 from rich.text import Text
 
 from bridge.client import State, connect
-from bridge.errors import BadResultError, LabelError, NoResultError
+from posteriors.errors import BadResultError, LabelError, NoResultError
 from posteriors.listening import posteriors
-from posteriors.results import MAX_RESULT, RESULTS_TOPIC, Heard, Posterior
+from posteriors.pairing import FrameOutcome
+from posteriors.posterior import MAX_RESULT, RESULTS_TOPIC, Posterior
 from services.commands import flags as options
 from services.errors import SettingsError
-from services.printed.result_file import ResultFile, open_result_file, record
-from services.printed.result_picture import ROWS, Axis, axes_of, in_colour, picture, printable
+from services.output.posterior_file import ResultFile, open_result_file, record
+from services.output.posterior_picture import ROWS, Axis, axes_of, in_colour, picture, printable
 from services.settings import LONGEST_S, Settings, load_settings
 from services.sockets.serving import deployment_for
 from terminal.command_line import CommandLine
@@ -36,10 +37,10 @@ _REPLICAS: Final = 4
 _WORDS: Final = 7
 """Lines of a terminal that are left for what is said beside a picture."""
 
-Show = Callable[[Heard, list[Axis]], None]
+Show = Callable[[FrameOutcome, list[Axis]], None]
 
 
-def line(heard: Heard, axes: list[Axis]) -> str:
+def line(heard: FrameOutcome, axes: list[Axis]) -> str:
     """What is said of one frame."""
     number = "-" if heard.number is None else str(heard.number)
     if not isinstance(heard, Posterior):
@@ -166,11 +167,11 @@ async def hear(
     return 0
 
 
-def _print_line(heard: Heard, axes: list[Axis]) -> None:
+def _print_line(heard: FrameOutcome, axes: list[Axis]) -> None:
     print(line(heard, axes), flush=True)
 
 
-def _print_json(heard: Heard, axes: list[Axis]) -> None:
+def _print_json(heard: FrameOutcome, axes: list[Axis]) -> None:
     put_json(record(heard, axes))
 
 
@@ -181,7 +182,7 @@ def _drawing() -> Iterator[Show]:
     colour = in_colour(console)
     rows = max(console.height - _WORDS, 2) if console.is_terminal else ROWS
 
-    def drawn(heard: Heard, axes: list[Axis]) -> Group | Text:
+    def drawn(heard: FrameOutcome, axes: list[Axis]) -> Group | Text:
         words = Text(line(heard, axes))
         if not isinstance(heard, Posterior):
             return words
@@ -190,11 +191,11 @@ def _drawing() -> Iterator[Show]:
     if not console.is_terminal:
         yield lambda heard, axes: console.print(drawn(heard, axes), soft_wrap=True)  # a line stays one
         return
-    newest: list[tuple[Heard, list[Axis]]] = []
+    newest: list[tuple[FrameOutcome, list[Axis]]] = []
     shown = -1.0
     with Live(console=console, auto_refresh=False) as live:
 
-        def show(heard: Heard, axes: list[Axis]) -> None:
+        def show(heard: FrameOutcome, axes: list[Axis]) -> None:
             nonlocal shown
             newest[:] = [(heard, axes)]
             now = time.monotonic()
@@ -284,8 +285,3 @@ def listen(
                 file=file,
             )
         )
-
-
-def main() -> None:
-    """Entry point of the command `listen`."""
-    app()

@@ -34,8 +34,3 @@ def loader(
     image_hash = program(endpoint_from(endpoint, "ENDPOINT"), image, timeout=settings.peer_timeout)
     say(f"{endpoint} holds image {image_hash[:16]} now")
     return 0
-
-
-def main() -> None:
-    """Entry point of the command `loader`."""
-    app()

@@ -138,8 +138,3 @@ def reload_(
         return ExitCode.DONE
 
     return run_async(order())
-
-
-def main() -> None:
-    """Entry point of the command `master`."""
-    app()

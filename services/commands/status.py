@@ -14,7 +14,7 @@ import msgspec
 import typer
 
 from services.errors import SettingsError
-from services.printed.stack_status import SilentProcess, StackStatus, plain, screen
+from services.output.status_screen import SilentProcess, StackStatus, plain, screen
 from services.settings import load_settings
 from services.sockets.status import ProcessStatus, read_process_status
 from services.supervision.private_directory import DIRECTORY_PREFIX
@@ -196,10 +196,5 @@ def status(
     return run_async(run())
 
 
-def main() -> None:
-    """Entry point of the command `status`."""
-    app()
-
-
 if __name__ == "__main__":
-    main()
+    app()

@@ -14,11 +14,12 @@ from types import TracebackType
 from typing import Any, Self, TypeVar, cast
 
 from pcie_shim.errors import BoardError, PcieShimError
-from services.pipeline.mini_cluster import TICK, Boards, frame_failed, result_record
+from services.pipeline.deployed_boards import TICK, DeployedBoards
+from services.pipeline.driver_frames import frame_failed, result_record
 from services.pipeline.pcie_app import ROLE as PCIE_APP
 from services.pipeline.pcie_app import Progress
-from services.pipeline.publisher import ROLE as PUBLISHER
 from services.pipeline.publisher import Publisher
+from services.pipeline.result_topics import ROLE as PUBLISHER
 from services.pipeline.subscriber import ROLE as SUBSCRIBER
 from services.pipeline.subscriber import Subscriber
 from services.settings import Settings
@@ -99,7 +100,7 @@ class FusedBoards:
     What takes long, opening boards, looking for those that are gone, and reloading, is done by a thread; meanwhile no frame is posted.
     """
 
-    def __init__(self, boards: Boards, settings: Settings, link: MakeLink) -> None:
+    def __init__(self, boards: DeployedBoards, settings: Settings, link: MakeLink) -> None:
         self._boards = boards
         self._run_directory = settings.run_directory
         self._progress = Progress(boards, settings.log_level)
@@ -128,7 +129,7 @@ class FusedBoards:
                             self._collect()
                     elif self._boards.gone and self._looking is None:
                         async with self._one_thread:
-                            back = await _in_thread(self._boards.mend)
+                            back = await _in_thread(self._boards.recover)
                         for board in back:
                             self._link.send(Notice("info", f"board {board} is back, programmed"))
             except PcieShimError as error:
@@ -209,7 +210,7 @@ class FusedBoards:
     async def _look(self, number: int, error: BoardError) -> None:
         try:
             async with self._one_thread:
-                await _in_thread(lambda: self._boards.look(error))
+                await _in_thread(lambda: self._boards.find_gone(error))
         finally:
             self._looking = None
         self._link.send(frame_failed(number, error))
@@ -264,7 +265,7 @@ def fused_services(
 
         return make
 
-    boards = Boards(settings, deployment, board_endpoints(settings, deployment))
+    boards = DeployedBoards(settings, deployment, board_endpoints(settings, deployment))
     running = {
         SUBSCRIBER: Subscriber(settings, deployment, link_of(SUBSCRIBER)).run(),
         PUBLISHER: Publisher(settings, deployment, link_of(PUBLISHER)).run(),

@@ -19,9 +19,9 @@ from services.errors import (
 )
 from services.master.peers import ANSWER_TIME, ROLE, Awaited, Peer, Peers
 from services.master.reload import LOST_IN_RELOAD, Reloads, Waits
+from services.output.master_output import print_json, print_sentence
 from services.pipeline.frames import WaitingFrames
 from services.pipeline.generations import InForce
-from services.printed.results import print_json, print_sentence
 from services.settings import Settings
 from services.sockets.control_socket import control_served
 from services.sockets.records import (

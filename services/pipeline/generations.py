@@ -1,6 +1,6 @@
-"""The deployments that a service holds: the one in force, and the one that it was asked to have ready.
+"""The deployments that a service holds: the one in force, and the one that is prepared for a reload.
 
-A run's deployments are numbered; the master counts them, and says its number when it greets (docs/operating.md, Reload).
+The master numbers a run's deployments, and sends the current number in its greeting (docs/operating.md, Reload).
 """
 
 from __future__ import annotations
@@ -15,52 +15,52 @@ from services.sockets.records import Hello, NotReloaded, Prepare, Prepared, Swit
 from terminal.errors import exit_code_of
 from toolchain.deployment import Deployment, load_deployment
 
-Made = TypeVar("Made")
+Derived = TypeVar("Derived")
 
 
-class Generations(Generic[Made]):
-    """What a service works by, under the numbers of the run that it serves.
+class Generations(Generic[Derived]):
+    """A service's deployments by number, each with the data that the service derives from it.
 
     Attributes:
         number: The generation in force.
     """
 
     def __init__(
-        self, deployment: Deployment, make: Callable[[Deployment], Made], *, images: bool = False
+        self, deployment: Deployment, derive: Callable[[Deployment], Derived], *, images: bool = False
     ) -> None:
         """Begin with a deployment.
 
         Args:
             deployment: The first one.
-            make: Makes of a deployment what the service works with; its errors are those of preparing.
-            images: Whether the service reads the boards' images too.
+            derive: Returns the service's data for a deployment; an error refuses the deployment.
+            images: Whether the service also reads the boards' images.
         """
         self.number = 0
-        self._make = make
+        self._derive = derive
         self._images = images
-        self._held: dict[int, tuple[Deployment, Made]] = {0: (deployment, make(deployment))}
+        self._held: dict[int, tuple[Deployment, Derived]] = {0: (deployment, derive(deployment))}
 
     @property
     def deployment(self) -> Deployment:
-        """The deployment in force."""
+        """Deployment in force."""
         return self._held[self.number][0]
 
     @property
-    def made(self) -> Made:
-        """What was made of it."""
+    def derived(self) -> Derived:
+        """Data derived from it."""
         return self._held[self.number][1]
 
-    def greeted(self, hello: Hello) -> None:
-        """A master of this same deployment is there: it says the number."""
+    def adopt(self, hello: Hello) -> None:
+        """Take over the number that a master of the same deployment has sent."""
         self._held = {hello.generation: self._held[self.number]}
         self.number = hello.generation
 
     def prepare(self, record: Prepare) -> Prepared | NotReloaded:
-        """Read and check a deployment, and keep it beside the one in force; gives the answer to the master."""
+        """Read and check a deployment, keep it beside the one in force, and return the answer for the master."""
         try:
             loaded = load_deployment(Path(record.folder), images=self._images)
-            made = self._make(loaded)
-        except Exception as error:  # whatever else it is, the run goes on with what it has
+            derived = self._derive(loaded)
+        except Exception as error:  # even a bug must not end the run, which goes on with what it has
             return NotReloaded(record.generation, exit_code_of(error), str(error))
         if loaded.hash != record.deployment_hash:
             return NotReloaded(
@@ -69,49 +69,44 @@ class Generations(Generic[Made]):
                 f"{loaded.path} is deployment {loaded.hash[:12]} here and {record.deployment_hash[:12]} for the master; "
                 "do both see the same folder? If it was changed just now, reload once more",
             )
-        self._held = {self.number: self._held[self.number], record.generation: (loaded, made)}
+        self._held = {self.number: self._held[self.number], record.generation: (loaded, derived)}
         return Prepared(record.generation)
 
     def switch(self, record: Switch) -> Switched | NotReloaded:
-        """Work by a deployment that is held; gives the answer to the master."""
+        """Put a held deployment into force, and return the answer for the master."""
         try:
-            self.of(record.generation)
+            self.get(record.generation)
         except NotPreparedError as error:
             return NotReloaded(record.generation, error.exit_code, str(error))
         self.number = record.generation
         return Switched(record.generation)
 
-    def of(self, number: int) -> tuple[Deployment, Made]:
-        """What is held under a number.
+    def get(self, number: int) -> tuple[Deployment, Derived]:
+        """Return the deployment with a number, and the data derived from it.
 
         Raises:
-            NotPreparedError: Nothing is.
+            NotPreparedError: There is none.
         """
         try:
             return self._held[number]
         except KeyError:
-            msg = f"generation {number} was not prepared here"
-            raise NotPreparedError(msg) from None
+            raise NotPreparedError(f"generation {number} was not prepared here") from None
 
 
 @dataclass(slots=True)
 class InForce:
-    """The deployment that a run works by, as its master knows it; only a reload changes it.
-
-    Attributes:
-        deployment: The deployment.
-        folder: Where it comes from, as the user named it.
-        generation: How often the run has changed its deployment.
-        former_hash: Of the deployment before it, which a service that starts meanwhile may still have read.
-    """
+    """A run's deployment in force, as the master knows it; only a reload changes it."""
 
     deployment: Deployment
     folder: Path
+    """Its folder, as the user named it."""
     generation: int = 0
+    """Number of reloads so far."""
     former_hash: str = ""
+    """Hash of the deployment before it, which a service that starts during a reload may still have read."""
 
     def replace(self, deployment: Deployment, folder: Path) -> None:
-        """Work by another one from now on."""
+        """Put another deployment into force."""
         self.former_hash = self.deployment.hash
         self.deployment, self.folder = deployment, folder
         self.generation += 1

@@ -1,30 +1,21 @@
 """The PCIe application: the only process that drives boards (thesis 3.2, figure 3.3).
 
-One blocking thread serves the master and all boards: a frame comes in, its readings and the start are
-posted to every board, the counts are collected, and the result goes back.
+One blocking thread serves the master and all boards: it posts a frame's readings and the start to every board, collects
+the counts, and returns the result.
 """
 
 from __future__ import annotations
 
 import selectors
 import socket
-import sys
 import time
-from typing import Annotated
-
-import typer
 
 from pcie_shim.endpoint import Endpoint, listen, remove_listener
-from pcie_shim.errors import (
-    BoardError,
-    PcieShimError,
-)
+from pcie_shim.errors import BoardError, PcieShimError
 from pcie_shim.host.frame import FrameOutput
-from services.commands import flags as options
-from services.errors import LocalSocketError, OtherPeerError, SettingsError
-from services.pipeline.mini_cluster import TICK, Boards, frame_failed, result_record
-from services.pipeline.standard_input import compute_lines
-from services.settings import load_settings
+from services.errors import LocalSocketError, OtherPeerError
+from services.pipeline.deployed_boards import TICK, DeployedBoards
+from services.pipeline.driver_frames import frame_failed, result_record
 from services.sockets.local_socket import BlockingRecordSocket, check_hello, own_hello
 from services.sockets.records import (
     AnyRecord,
@@ -38,16 +29,13 @@ from services.sockets.records import (
     Switch,
     Trouble,
 )
-from services.sockets.serving import board_endpoints, deployment_for, endpoint_from, outdated
+from services.sockets.serving import outdated
 from services.sockets.status import (
     FrameCounts,
     ProcessStatus,
     reasons,
     seconds_since,
-    status_thread,
 )
-from services.supervision.parent import end_with_parent
-from terminal.command_line import CommandLine
 from terminal.errors import ExitCode, exit_code_of
 from terminal.logs import get_logger
 from terminal.signals import check_signals
@@ -57,11 +45,11 @@ ROLE = "pcie-app"
 
 
 class Progress:
-    """What was asked of the boards and what became of it: counts for the status, lines for the log."""
+    """The boards' work so far: counts for the status, lines for the log."""
 
-    def __init__(self, boards: Boards, log_level: str) -> None:
+    def __init__(self, boards: DeployedBoards, log_level: str) -> None:
         self._boards = boards
-        self._follows = log_level == "debug"
+        self._logs_frames = log_level == "debug"
         self._log = get_logger(ROLE, log_level)
         self._computed = 0
         self._last: tuple[int, int, FrameOutput] | None = None
@@ -70,10 +58,10 @@ class Progress:
         self.ready: Ready | None = None
 
     def computed(self, number: int, output: FrameOutput) -> None:
-        """A frame has its result."""
+        """Count and log a frame that has its result."""
         self._computed += 1
         self._last = (number, time.monotonic_ns(), output)
-        if self._follows:
+        if self._logs_frames:
             self._log.debug(
                 "computed",
                 frame=number,
@@ -82,7 +70,7 @@ class Progress:
             )
 
     def status(self) -> ProcessStatus:
-        """What this process knows; may be called by another thread."""
+        """Return this process's status; may be called by another thread."""
         number, tick, output = self._last or (0, 0, None)
         gone = next(iter(dict(self._boards.gone).items()), None)
         if self.ready is None:
@@ -110,7 +98,7 @@ class Progress:
 class PcieApp:
     """Serves one master at a time over a local socket."""
 
-    def __init__(self, boards: Boards, endpoint: Endpoint, log_level: str = "info") -> None:
+    def __init__(self, boards: DeployedBoards, endpoint: Endpoint, log_level: str = "info") -> None:
         self._boards = boards
         self._endpoint = endpoint
         self._where = f"{ROLE} at {endpoint}"
@@ -127,8 +115,8 @@ class PcieApp:
         """Serve until a signal raises in this thread.
 
         Raises:
-            PcieShimError: the boards can't be opened, or one came back as another.
-            OutdatedError: the folder was changed, and a master asks for what is there now.
+            PcieShimError: The boards can't be opened, or one came back with another image.
+            OutdatedError: A master runs the folder's present deployment, and this service a former one.
         """
         listener = listen(self._endpoint)
         listener.setblocking(False)
@@ -138,12 +126,8 @@ class PcieApp:
                 self._progress.ready = Ready(self._boards.open())
                 while True:
                     check_signals()
-                    for key, _ in self._selector.select(TICK):
-                        if key.fileobj is listener:
-                            self._accept(listener)
-                        else:
-                            self._receive()
-                    self._mend_boards()
+                    self._poll(listener, TICK)
+                    self._recover_boards()
             except PcieShimError as error:
                 self._report(listener, Trouble(exit_code_of(error), str(error)))
                 raise
@@ -152,6 +136,13 @@ class PcieApp:
             if self._master is not None:
                 self._master.close()
             remove_listener(self._endpoint, listener)
+
+    def _poll(self, listener: socket.socket, timeout: float) -> None:
+        for key, _ in self._selector.select(timeout):
+            if key.fileobj is listener:
+                self._accept(listener)
+            else:
+                self._receive()
 
     def _accept(self, listener: socket.socket) -> None:
         connection = BlockingRecordSocket(listener.accept()[0], self._where)
@@ -175,14 +166,10 @@ class PcieApp:
             self._drop()
 
     def _report(self, listener: socket.socket, trouble: Trouble) -> None:
-        # a master that started with us may need a moment to connect
+        # a master that started with us may still be connecting
         deadline = time.monotonic() + 2
         while not self._greeted and time.monotonic() < deadline:
-            for key, _ in self._selector.select(0.05):
-                if key.fileobj is listener:
-                    self._accept(listener)
-                else:
-                    self._receive()
+            self._poll(listener, 0.05)
         self._send(trouble)
 
     def _receive(self) -> None:
@@ -207,11 +194,11 @@ class PcieApp:
         try:
             check_hello(record, "master", self._deployment.hash, self._where)
         except OtherPeerError as error:
-            if (why := outdated(self._deployment, record)) is None:
+            if (reason := outdated(self._deployment, record)) is None:
                 raise
             if self._master is not None:
                 self._master.send(Trouble(error.exit_code, str(error)))
-            raise why from error
+            raise reason from error
         self._greeted = True
         self._take(record)
         if self._progress.ready is not None:
@@ -222,16 +209,16 @@ class PcieApp:
             case Frame():
                 self._compute(record)
             case Hello():
-                self._boards.generations.greeted(record)
+                self._boards.generations.adopt(record)
             case Prepare():
                 self._send(self._boards.generations.prepare(record))
             case Switch():
                 self._send(self._boards.switch(record))
             case _:
-                pass  # nothing else is for boards
+                pass  # no other record concerns boards
 
     def status(self) -> ProcessStatus:
-        """What this process knows; called by the status socket's thread."""
+        """Return this process's status; called by the status socket's thread."""
         return self._progress.status()
 
     def _compute(self, frame: Frame) -> None:
@@ -246,58 +233,6 @@ class PcieApp:
             self._send(result_record(frame.number, output))
             progress.computed(frame.number, output)
 
-    def _mend_boards(self) -> None:
-        for board in self._boards.mend():
+    def _recover_boards(self) -> None:
+        for board in self._boards.recover():
             self._send(Notice("info", f"board {board} is back, programmed"))
-
-
-app = CommandLine(
-    help="Drive the boards of a mini-cluster.\n\n"
-    "Alone it reads readings from standard input (what `subscriber --deployment` prints) and prints counts:\n\n"
-    "`echo '{\"addresses\": [71, 50, 50, 45, 18, 72]}' | pcie-app -d build/boat --boards unix:/tmp/b/board0.sock,...`\n\n"
-    "With `--listen ENDPOINT` it serves a master."
-)
-
-
-@app.command(help=app.info.help)
-def pcie_app(
-    deployment: options.Deployment = None,
-    boards: options.Boards = None,
-    listen_at: options.Listen = None,
-    stop: options.Stop = None,
-    peer_timeout: options.PeerTimeout = None,
-    board_timeout: options.BoardTimeout = None,
-    reprogram: Annotated[
-        bool,
-        typer.Option(
-            "--reprogram/--no-reprogram",
-            help="Program boards that hold another image, instead of refusing them.",
-        ),
-    ] = False,
-    log_level: options.LogLevel = None,
-) -> int:
-    """Drive the boards of a mini-cluster."""
-    end_with_parent()
-    settings = load_settings(
-        deployment=deployment,
-        boards=boards,
-        stop=stop,
-        peer_timeout=peer_timeout,
-        board_timeout=board_timeout,
-        log_level=log_level,
-    )
-    loaded = deployment_for(settings, images=True)
-    opened = Boards(settings, loaded, board_endpoints(settings, loaded), reprogram=reprogram)
-    if listen_at is not None:
-        pcie = PcieApp(opened, endpoint_from(listen_at, "--listen"), settings.log_level)
-        with status_thread(settings.run_directory, ROLE, pcie.status):
-            return pcie.serve()
-    if sys.stdin.isatty():
-        msg = "pcie-app reads readings from standard input, which is a terminal: pipe them in, or use --listen (pcie-app --help)"
-        raise SettingsError(msg)
-    return compute_lines(opened, loaded.machine.rng_banks)
-
-
-def main() -> None:
-    """Entry point of the command `pcie-app`."""
-    app()

@@ -13,16 +13,10 @@ import threading
 import pytest
 
 from bridge.client import State, connect
-from bridge.errors import (
-    BadResultError,
-    ConcurrentReadError,
-    DisconnectedError,
-    NoResultError,
-    OptionError,
-    UnreachableError,
-)
+from bridge.errors import ConcurrentReadError, DisconnectedError, OptionError, UnreachableError
+from posteriors.errors import BadResultError, NoResultError
+from posteriors.frame_report import FrameReport
 from posteriors.listening import listen, posteriors
-from posteriors.results import FrameReport
 from tests.fake_rosbridge import FakeRosbridge
 
 PATIENCE = 60.0

@@ -12,16 +12,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from bridge.errors import BadResultError, LabelError
-from posteriors.results import (
-    WAITING,
-    FrameReport,
-    Pairing,
-    Posterior,
-    StageTimes,
-    read_frame_report,
-    read_posterior,
-)
+from posteriors.errors import BadResultError, LabelError
+from posteriors.frame_report import FrameReport, StageTimes, read_frame_report
+from posteriors.pairing import WAITING, Pairing
+from posteriors.posterior import Posterior, read_posterior
 
 
 def status(name, message="", hardware="", **values):
@@ -394,5 +388,5 @@ def test_one_replica_by_itself():
     assert first.replica(0) is first
     with pytest.raises(LabelError, match="replica 1 has no posterior in this frame"):
         both.replica(1)
-    with pytest.raises(LabelError, match="replica 3 was asked for: there are 0 to 2"):
+    with pytest.raises(LabelError, match="there is no replica 3: expected 0 to 2"):
         both.replica(3)

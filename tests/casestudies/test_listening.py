@@ -5,8 +5,8 @@ import asyncio
 import pytest
 
 from bridge.client import connect
-from bridge.errors import BadResultError, NoResultError
 from casestudies.listening import listen
+from posteriors.errors import BadResultError, NoResultError
 from tests.casestudies.pretend_stack import certain, frame_message, posterior_message
 from tests.fake_rosbridge import FakeRosbridge
 

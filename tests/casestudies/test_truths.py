@@ -4,9 +4,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bridge.errors import BadResultError
 from casestudies.truths import Truth, Truths, read_truth
-from posteriors.results import FrameReport, Posterior
+from posteriors.errors import BadResultError
+from posteriors.frame_report import FrameReport
+from posteriors.posterior import Posterior
 
 
 def test_a_truth():

@@ -104,7 +104,7 @@ async def test_a_belief_that_is_none_is_said_and_skipped(stage, tmp_path):
 
 
 def test_alone_the_boards_take_what_the_subscriber_prints(tmp_path):
-    from services.pipeline.standard_input import reading_from_line
+    from services.pipes.pcie_app import reading_from_line
 
     line = json.dumps({"addresses": [1], "stamp_ns": 5, "prior_codes": [9, 2]}).encode()
     assert reading_from_line(line, 1).prior_codes == [9, 2]

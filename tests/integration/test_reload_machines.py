@@ -13,7 +13,7 @@ import pytest
 import websockets
 
 from machines.posterior import joint_posterior
-from posteriors.results import read_posterior
+from posteriors.posterior import read_posterior
 from tests.integration import test_prior, test_replicas
 from tests.integration.conftest import PATIENCE, READING, Robot, status_of
 from tests.integration.test_reload import LOOP, looping, other_boat, regenerate, reload_, until

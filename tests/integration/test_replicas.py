@@ -16,7 +16,8 @@ from machines.posterior import joint_posterior
 from machines.reference import ReferenceBM1
 from pcie_shim.host.frame import FrameInput
 from pcie_shim.programming_file import read_image
-from posteriors.results import read_frame_report, read_posterior
+from posteriors.frame_report import read_frame_report
+from posteriors.posterior import read_posterior
 from tests.integration.conftest import BIN, Robot
 from tests.pcie_shim.boards import expected_of_replicas
 from toolchain.deployment import load_deployment

@@ -5,7 +5,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from services.errors import OverflowedQueueError, VariableError
-from services.pipeline.frames import QUEUE_ALL_DEPTH, TELLING, UNPAIRED_DEPTH, FrameAssembler, WaitingFrames
+from services.pipeline.frames import (
+    QUEUE_ALL_DEPTH,
+    UNPAIRED_DEPTH,
+    UNPAIRED_WARNING,
+    FrameAssembler,
+    WaitingFrames,
+)
 from toolchain.deployment import Board, Deployment, Dimension, MachineSection, Source, Variable
 
 HASH = "0" * 64
@@ -89,7 +95,7 @@ def test_an_endless_topic_without_partner_stays_bounded():
     assert frames.unpaired == 10
 
 
-def far_apart(ms, count=TELLING, **second):
+def far_apart(ms, count=UNPAIRED_WARNING, **second):
     frames = FrameAssembler(deployment(variable("D1"), variable("D2", source=1), sources=2))
     for at in range(count):
         frames.take(0, stamped(10 * at, D1=1), 1, 1)
@@ -98,31 +104,31 @@ def far_apart(ms, count=TELLING, **second):
 
 
 def test_stamps_that_never_meet_are_said():
-    assert not far_apart(2000, TELLING - 1).too_far_apart()
+    assert not far_apart(2000, UNPAIRED_WARNING - 1).stamp_gap()
     frames = far_apart(2000)
-    assert frames.too_far_apart() == (
+    assert str(frames.stamp_gap()) == (
         "messages come on all topics but make no frame: the newest of /t1 is 2 s older than that of /t0, "
         "and the tolerance is 0.05 s; set the clocks, or build with a larger --tolerance"
     )
-    assert frames.take(1, stamped(10 * TELLING, D2=1), 1, 1) is not None
-    assert not frames.too_far_apart()
+    assert frames.take(1, stamped(10 * UNPAIRED_WARNING, D2=1), 1, 1) is not None
+    assert not frames.stamp_gap()
 
 
 def test_who_has_no_header_is_said_too():
-    assert "(/t1 without a header, so by receipt)" in far_apart(0, header={}).too_far_apart()
+    assert "(/t1 without a header, so by receipt)" in str(far_apart(0, header={}).stamp_gap())
 
 
 def test_a_topic_that_is_silent_is_not_said_to_be_apart():
     frames = FrameAssembler(deployment(variable("D1"), variable("D2", source=1), sources=2))
     for at in range(100):
         frames.take(0, stamped(10 * at, D1=1), 1, 1)
-    assert not frames.too_far_apart()
+    assert not frames.stamp_gap()
 
 
 def test_topics_that_all_may_be_missing_wait_for_nothing():
     optional = [variable(f"D{at}", source=at, on_missing="missing") for at in range(2)]
     frames = FrameAssembler(deployment(*optional, sources=2))
-    assert frames.too_far_apart() == ""
+    assert frames.stamp_gap() is None
     assert frames.take(1, stamped(0, D1=3), 1, 1).addresses == [None, 3]
 
 

@@ -93,8 +93,8 @@ async def found(timeout):
     return {robots}
 bridge.discovery.discover = found
 sys.argv = ["discover", *{arguments!r}]
-from services.commands.discover import main
-main()
+from services.commands.discover import app
+app()
 """
     return _run(sys.executable, "-c", code)
 

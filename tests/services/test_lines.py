@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from services.errors import InputLineError
-from services.pipeline.publisher import result_from_line
-from services.pipeline.results import Inferred
-from services.pipeline.standard_input import reading_from_line
+from services.pipeline.inference import Inference
+from services.pipes.pcie_app import reading_from_line
+from services.pipes.publisher import result_from_line
 
 BIN = Path(sys.executable).parent
 
@@ -33,7 +33,7 @@ def test_a_reading():
     ],
 )
 def test_no_reading(line):
-    with pytest.raises(InputLineError, match="line 7 of standard input is no reading .*expected"):
+    with pytest.raises(InputLineError, match="line 7 of standard input cannot be used .*expected"):
         reading_from_line(line, 7)
 
 
@@ -41,7 +41,7 @@ def test_a_result_and_an_array():
     counted, stamp = result_from_line(
         b'{"number": 1, "boards": [{"counts": [1, 258], "cycles": 5, "reason": 1}]}', 1, 2
     )
-    (board,) = Inferred(counted).boards
+    (board,) = Inference(counted).boards
     assert (board.words, board.cycles, stamp) == (b"\1\0\0\0\2\1\0\0", 5, None)
     assert result_from_line(b"[0.25, 0.75]", 1, 2) == [0.25, 0.75]
 
@@ -49,12 +49,15 @@ def test_a_result_and_an_array():
 @pytest.mark.parametrize(
     ("line", "said"),
     [
-        (b"[1, -1]", "is no result"),
-        (b"[1e999, 1]", "is no result"),
+        (b"[1, -1]", "cannot be used"),
+        (b"[1e999, 1]", "cannot be used"),
         (b"[1]", "has 1 values"),
-        (b'{"number": 1, "boards": [{"counts": [1, true], "cycles": 5, "reason": 1}]}', "is no result"),
-        (b'{"number": 1, "boards": [{"counts": [1, 4294967296], "cycles": 5, "reason": 1}]}', "is no result"),
-        (b'{"number": 1, "boards": [{"counts": [1, 2], "cycles": 5, "reason": 9}]}', "is no result"),
+        (b'{"number": 1, "boards": [{"counts": [1, true], "cycles": 5, "reason": 1}]}', "cannot be used"),
+        (
+            b'{"number": 1, "boards": [{"counts": [1, 4294967296], "cycles": 5, "reason": 1}]}',
+            "cannot be used",
+        ),
+        (b'{"number": 1, "boards": [{"counts": [1, 2], "cycles": 5, "reason": 9}]}', "cannot be used"),
         (b'{"number": 1, "boards": [{"counts": [1], "cycles": 5, "reason": 1}]}', "has 1 values"),
     ],
 )
@@ -137,8 +140,8 @@ OF_REPLICAS = {
 def test_a_result_of_replicas():
     line = json.dumps({"number": 1, "boards": [OF_REPLICAS]}).encode()
     counted, _ = result_from_line(line, 1, 4, 2)
-    assert Inferred(counted).boards[0].replica_cycles == (9, 5)
-    assert Inferred(counted).posterior == pytest.approx([1 / 3, 2 / 3, 3 / 7, 4 / 7])
+    assert Inference(counted).boards[0].replica_cycles == (9, 5)
+    assert Inference(counted).posterior == pytest.approx([1 / 3, 2 / 3, 3 / 7, 4 / 7])
 
 
 @pytest.mark.parametrize(
@@ -146,8 +149,8 @@ def test_a_result_of_replicas():
     [
         ({}, 1, "has 2 replicas' cycles on a board; expected a result of 1 replica$"),
         ({"replica_cycles": [1]}, 2, "has 1 replicas' cycles on a board; expected a result of 2 replicas"),
-        ({"replica_reasons": [1, 9]}, 2, "is no result"),
-        ({"replica_cycles": [1, -1]}, 2, "is no result"),
+        ({"replica_reasons": [1, 9]}, 2, "cannot be used"),
+        ({"replica_cycles": [1, -1]}, 2, "cannot be used"),
         (
             {"replica_cycles": [1, 1, 1], "replica_reasons": [1, 1, 1]},
             3,

@@ -13,12 +13,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from posteriors.results import FrameReport, Posterior
+from posteriors.frame_report import FrameReport
+from posteriors.posterior import Posterior
 from services.commands.listen import line
 from services.errors import SettingsError
-from services.printed import result_file
-from services.printed.result_file import open_result_file, record
-from services.printed.result_picture import ROWS, Axis, axes_of, in_colour, picture
+from services.output import posterior_file as result_file
+from services.output.posterior_file import open_result_file, record
+from services.output.posterior_picture import ROWS, Axis, axes_of, in_colour, picture
 from toolchain.deployment import Board, Deployment, Dimension, MachineSection, Source
 
 HASH = "0" * 64

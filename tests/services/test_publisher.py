@@ -8,8 +8,8 @@ import pytest
 
 from bridge.client import State
 from pcie_shim.host.frame import BoardResult
-from services.pipeline.publisher import ResultTopics
-from services.pipeline.results import encode_boards
+from services.pipeline.driver_frames import encode_boards
+from services.pipeline.result_topics import ResultTopics
 from services.settings import Settings
 from services.sockets.records import FrameResult, Publish
 from tests.fake_rosbridge import FakeRosbridge

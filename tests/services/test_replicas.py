@@ -10,12 +10,13 @@ from machines.bm1 import StopReason
 from machines.parameters import SensorMode
 from pcie_shim.errors import FrameInputError
 from pcie_shim.host.frame import BoardResult
-from posteriors.results import read_frame_report, read_posterior
+from posteriors.frame_report import read_frame_report, write_frame_report
+from posteriors.posterior import posterior_layout, read_posterior
 from services.errors import VariableError
+from services.output.posterior_picture import axes_of
+from services.pipeline.driver_frames import encode_boards, machine_inputs
 from services.pipeline.frames import FrameAssembler
-from services.pipeline.mini_cluster import machine_inputs
-from services.pipeline.results import FrameReport, Inferred, encode_boards, posterior_layout, times_of
-from services.printed.result_picture import axes_of
+from services.pipeline.inference import Inference, report_of
 from services.sockets.records import FrameResult, Publish
 from toolchain.building.build import assemble
 from toolchain.building.options import BuildOptions
@@ -112,16 +113,16 @@ def test_posteriors_are_normalised_over_boards_and_by_replica():
         board([[10, 30], [4, 4], [0, 0]], [100, 8, 0], [OVERFLOW, OVERFLOW, IMPOSSIBLE]),
         board([[100], [8], [0]], [1000, 16, 0], [SLICE, SLICE, IMPOSSIBLE]),
     )
-    inferred = Inferred(counted)
+    inferred = Inference(counted)
     assert inferred.posterior == pytest.approx([0.2, 0.6, 0.2, 1 / 3, 1 / 3, 1 / 3, 0, 0, 0])
     assert (inferred.totals, inferred.best) == ([48, 108], 1)
-    nothing = Inferred(result(board([[0], [0]], [0, 0], [IMPOSSIBLE] * 2)))
+    nothing = Inference(result(board([[0], [0]], [0, 0], [IMPOSSIBLE] * 2)))
     assert (nothing.posterior, nothing.best, nothing.totals) == (None, -1, [0])
 
 
 def test_what_is_published_is_read_back():
     counted = result(board([[1, 3], [0, 0], [2, 2]], [100, 0, 40], [OVERFLOW, IMPOSSIBLE, SLICE]))
-    inferred = Inferred(counted)
+    inferred = Inference(counted)
     message = {"layout": posterior_layout(CELLS), "data": inferred.posterior.tolist()}
     assert message["layout"]["dim"] == [
         {"label": "replica", "size": 3, "stride": 6},
@@ -131,7 +132,7 @@ def test_what_is_published_is_read_back():
     assert posterior.values.tolist() == [[0.25, 0.75], [0, 0], [0.5, 0.5]]
     assert [axis.label for axis in axes_of(posterior, CELLS)] == ["replica", "s"]
     publish = Publish(counted, 1, 2, 3, 4, 5)
-    said = FrameReport(CELLS, 2).message(publish, inferred, times_of(publish, 9, 0), 10)
+    said = write_frame_report(report_of(publish, inferred, CELLS, 0, now=(10, 9), previous_out_ns=0), 2)
     (of_board,) = read_frame_report(json.loads(orjson.dumps(said)), 0).boards
     assert of_board.replica_cycles == (100, 0, 40)
     assert of_board.replica_stopped == ("overflow", "impossible", "slice")

@@ -15,7 +15,7 @@ from rich.console import Console
 
 from services.commands import status
 from services.errors import SettingsError
-from services.printed.stack_status import screen
+from services.output.status_screen import screen
 from services.sockets.status import (
     BoardStatus,
     ConnectionStatus,

@@ -10,10 +10,11 @@ import sys
 
 import pytest
 
-from bridge.errors import BadResultError, BridgeError, NoResultError
+from bridge.errors import BridgeError
 from casestudies.mrclam.player import LOST_DISTANCE, PlayedFrame, median_distance, play
 from casestudies.mrclam.recording import SIGHTINGS_TOPIC, RecordedFrame, Sighting, area_grid
-from posteriors.results import Posterior
+from posteriors.errors import BadResultError, NoResultError
+from posteriors.posterior import Posterior
 from tests.casestudies.pretend_stack import PretendStack, certain
 from tests.fake_rosbridge import FakeRosbridge
 

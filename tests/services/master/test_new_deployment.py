@@ -11,8 +11,8 @@ import pytest
 from pcie_shim.endpoint import Endpoint
 from services.errors import NotReloadedError, SettingsError, ShapeError
 from services.master.new_deployment import forget, keep, read_new
+from services.pipeline.deployed_boards import DeployedBoards
 from services.pipeline.generations import Generations
-from services.pipeline.mini_cluster import Boards
 from services.settings import Settings
 from services.sockets.records import Hello, NotReloaded, Prepare, Prepared, Switch, Switched
 from services.supervision.parent import DIRECTORY_VARIABLE
@@ -103,14 +103,14 @@ def test_a_signal_that_comes_while_a_service_reads_ends_it(boat):
     def stopped(_):
         raise StoppedError(143, "terminated")
 
-    held._make = stopped
+    held._derive = stopped
     with pytest.raises(StoppedError):
         held.prepare(Prepare(1, str(boat), loaded.hash))
 
 
 def test_a_signal_that_comes_while_boards_are_programmed_ends_their_process(boat, monkeypatch):
     loaded = load_deployment(boat)
-    boards = Boards(Settings(), loaded, [Endpoint(path="/nowhere")] * len(loaded.boards))
+    boards = DeployedBoards(Settings(), loaded, [Endpoint(path="/nowhere")] * len(loaded.boards))
 
     def stopped():
         raise StoppedError(143, "terminated")
@@ -123,8 +123,8 @@ def test_a_signal_that_comes_while_boards_are_programmed_ends_their_process(boat
 def test_a_service_switches_to_what_it_has_prepared(boat):
     before = edited(boat, target_count=99)
     held = Generations(before, lambda deployment: deployment.machine.target_count)
-    held.greeted(Hello("master", "", before.hash, 4))
-    assert (held.number, held.made) == (4, 255)
+    held.adopt(Hello("master", "", before.hash, 4))
+    assert (held.number, held.derived) == (4, 255)
     refused = held.switch(Switch(5))
     assert isinstance(refused, NotReloaded)
     assert refused.sentence == "generation 5 was not prepared here"
@@ -135,11 +135,11 @@ def test_a_service_switches_to_what_it_has_prepared(boat):
     assert isinstance(missing, NotReloaded)
     assert (missing.exit_code, held.number) == (2, 4)
     assert held.prepare(Prepare(5, str(boat), load_deployment(boat).hash)) == Prepared(5)
-    assert held.made == 255
+    assert held.derived == 255
     assert held.switch(Switch(5)) == Switched(5)
-    assert held.made == 99
+    assert held.derived == 99
     assert held.switch(Switch(4)) == Switched(4)  # there is a way back
-    assert (held.deployment.hash, held.made) == (before.hash, 255)
+    assert (held.deployment.hash, held.derived) == (before.hash, 255)
 
 
 def test_a_damaged_image_is_for_those_who_read_images(boat):

@@ -1,4 +1,4 @@
-"""What `subscriber` prints when it serves no master: variables, or addresses, one JSON object a line."""
+"""`subscriber` without a master: prints variables, or addresses."""
 
 from __future__ import annotations
 
@@ -6,32 +6,31 @@ import asyncio
 import contextlib
 from typing import Any
 
-from bridge.client import Ros, connect
+from bridge.client import connect
 from bridge.fields import Field
+from services.pipeline.connections import connect_all
 from services.pipeline.frames import FrameAssembler
+from services.pipeline.subscriber import RECEIVED_QUEUE
 from services.settings import Settings
 from terminal.output import put_json
 from toolchain.deployment import Deployment, Source
 
-_RECEIVED_QUEUE = 64
 
-
-async def print_readings(settings: Settings, source: Source, names: list[str], count: int | None) -> int:
-    """Alone, without a deployment: print the named variables of each message, one JSON object a line.
+async def print_variables(settings: Settings, source: Source, names: list[str], count: int | None) -> int:
+    """Print the named variables of each message of a topic; without names, whole messages.
 
     Raises:
-        NoMessageError: no message in time.
-        BridgeError: a variable is not there, or the server is not.
+        NoMessageError: No message came in time.
+        BridgeError: A message has no such variable, or the server is not reachable.
     """
     fields = [Field(name) for name in names]
     async with connect(
         source.uri, connect_timeout=settings.connect_timeout, ros_version=settings.ros_version
     ) as ros:
-        subscription = ros.subscribe(source.topic, source.type, queue_size=_RECEIVED_QUEUE)
+        subscription = ros.subscribe(source.topic, source.type, queue_size=RECEIVED_QUEUE)
         printed = 0
-        timeout: float = settings.first_data_timeout
         while count is None or printed < count:
-            message = await subscription.next(timeout=timeout)
+            message = await subscription.next(timeout=settings.first_data_timeout)
             values: dict[str, Any] = {}
             for field in fields:
                 present, value = field.value(message.msg)
@@ -44,35 +43,31 @@ async def print_readings(settings: Settings, source: Source, names: list[str], c
 
 
 async def print_addresses(settings: Settings, deployment: Deployment, count: int | None) -> int:
-    """Alone, with a deployment: print each complete reading as `pcie-app` reads it, one JSON object a line.
+    """Print each complete reading of a deployment in the form that `pcie-app` reads.
 
     Raises:
-        NoMessageError: no message in time.
-        VariableError: a variable is missing or unusable.
+        NoMessageError: No message came in time.
+        VariableError: A variable is missing or unusable.
     """
     assembler = FrameAssembler(deployment)
     printed = 0
     async with contextlib.AsyncExitStack() as stack:
-        by_uri: dict[str, Ros] = {}
-        for uri in {settings.uri or source.uri: None for source in deployment.sources}:
-            by_uri[uri] = await stack.enter_async_context(
-                connect(uri, connect_timeout=settings.connect_timeout, ros_version=settings.ros_version)
-            )
+        by_uri = await connect_all(stack, settings, [source.uri for source in deployment.sources])
 
         async def follow(at: int, source: Source) -> None:
             nonlocal printed
             subscription = by_uri[settings.uri or source.uri].subscribe(
-                source.topic, source.type, queue_size=_RECEIVED_QUEUE, compression=source.compression
+                source.topic, source.type, queue_size=RECEIVED_QUEUE, compression=source.compression
             )
             while count is None or printed < count:
                 message = await subscription.next(timeout=settings.first_data_timeout)
                 reading = assembler.take(at, message.msg, message.received_ns, message.received_monotonic_ns)
                 if reading is not None and (count is None or printed < count):
                     printed += 1
-                    printed_prior = list(memoryview(reading.prior_codes).cast("H"))
+                    codes = list(memoryview(reading.prior_codes).cast("H"))
                     put_json(
                         {"stamp_ns": reading.stamp_ns, "addresses": reading.addresses}
-                        | ({"prior_codes": printed_prior} if printed_prior else {})
+                        | ({"prior_codes": codes} if codes else {})
                     )
 
         followers = [

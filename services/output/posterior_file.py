@@ -13,9 +13,10 @@ from typing import Any, Final, Protocol
 
 import orjson
 
-from posteriors.results import Heard, Posterior
+from posteriors.pairing import FrameOutcome
+from posteriors.posterior import Posterior
 from services.errors import SettingsError
-from services.printed.result_picture import Axis
+from services.output.posterior_picture import Axis
 
 MOST_NUMBERS: Final = 1 << 26
 """Probabilities that an archive may hold (512 MiB): it is in memory until it is written."""
@@ -29,7 +30,7 @@ _NOT_KNOWN: Final = -1
 class ResultFile(Protocol):
     """Where posteriors are saved."""
 
-    def add(self, heard: Heard, axes: list[Axis]) -> None:
+    def add(self, heard: FrameOutcome, axes: list[Axis]) -> None:
         """Save one frame.
 
         Raises:
@@ -58,7 +59,7 @@ def open_result_file(path: Path) -> ResultFile:
     return kind(path)
 
 
-def record(heard: Heard, axes: list[Axis]) -> dict[str, Any]:
+def record(heard: FrameOutcome, axes: list[Axis]) -> dict[str, Any]:
     """A frame as a JSON object: what `--json` prints and a `.jsonl` file holds.
 
     Indices count from 0; `best_value` and `mean_value` are there where a deployment says what they stand for.
@@ -129,7 +130,7 @@ class _Lines:
 
 
 class _JsonLines(_Lines):
-    def add(self, heard: Heard, axes: list[Axis]) -> None:
+    def add(self, heard: FrameOutcome, axes: list[Axis]) -> None:
         """Append one object."""
         self._write(orjson.dumps(record(heard, axes)) + b"\n")
 
@@ -141,7 +142,7 @@ class _CsvLines(_Lines):
         super().__init__(path)
         self._columns: list[str] | None = None
 
-    def add(self, heard: Heard, axes: list[Axis]) -> None:
+    def add(self, heard: FrameOutcome, axes: list[Axis]) -> None:
         """Append one row; a frame without a posterior has none."""
         if not isinstance(heard, Posterior):
             return
@@ -195,7 +196,7 @@ class _Archive:
         if not os.access(path.parent, os.W_OK):
             raise _not_writable(path, FileNotFoundError(2, "no folder there that can be written"))
 
-    def add(self, heard: Heard, axes: list[Axis]) -> None:
+    def add(self, heard: FrameOutcome, axes: list[Axis]) -> None:
         """Keep one; a frame without a posterior has none."""
         if not isinstance(heard, Posterior):
             return

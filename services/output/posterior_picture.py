@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 from rich.console import Console
 from rich.text import Text
 
-from posteriors.results import Posterior
+from posteriors.posterior import Posterior
 from toolchain.deployment import Deployment, Dimension
 
 if TYPE_CHECKING:

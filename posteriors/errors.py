@@ -1,0 +1,23 @@
+"""Errors of reading posteriors; like all errors of a connection they are `BridgeError`s with an exit code."""
+
+from bridge.errors import BridgeError, NoMessageError
+
+
+class PosteriorError(BridgeError):
+    """Root of the errors of `posteriors`."""
+
+    exit_code = 2
+
+
+class NoResultError(PosteriorError, NoMessageError):
+    """Raised when no posterior arrived in time."""
+
+    exit_code = NoMessageError.exit_code
+
+
+class BadResultError(PosteriorError):
+    """Raised when a message on a result topic was not published by a master."""
+
+
+class LabelError(PosteriorError):
+    """Raised when a posterior has no such variable or cell; the sentence lists those it has."""

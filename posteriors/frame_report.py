@@ -1,0 +1,184 @@
+"""`/bm/frame`: a report about each frame, written and read with the same keys."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from operator import attrgetter
+from typing import Annotated, Any, Final, Literal
+
+import orjson
+from pydantic import BeforeValidator, Field, FiniteFloat, TypeAdapter
+
+from bridge.stamps import header, stamp_ns
+from posteriors.messages import Part, validated
+
+FRAME_TOPIC: Final = "/bm/frame"
+FRAME_TYPE: Final = "diagnostic_msgs/DiagnosticArray"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StageTimes:
+    """Where a frame's time went, each in microseconds (thesis figure 4.5); None where the stack did not report it."""
+
+    rosbridge_in: FiniteFloat | None = None
+    local_hops: FiniteFloat | None = None
+    waited: FiniteFloat | None = None
+    register_writes: FiniteFloat | None = None
+    compute: FiniteFloat | None = None
+    reads: FiniteFloat | None = None
+    boards_compute: FiniteFloat | None = None
+    rosbridge_out: FiniteFloat | None = None
+    """Of the frame before: this one is not sent yet."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BoardReport:
+    """How one board computed a frame; with replicas, also how each of its machines did."""
+
+    name: str
+    stopped: str
+    cycles: int | None = None
+    counts_total: int | None = None
+    replica_cycles: tuple[int, ...] = ()
+    replica_stopped: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FrameReport:
+    """A `/bm/frame` message; times called `_ns` are Unix times in nanoseconds."""
+
+    stamp_ns: int
+    """Time of the reading."""
+    heard_ns: int = 0
+    """Arrival of this message here."""
+    outcome: str
+    deployment: str = ""
+    published: bool = True
+    number: int | None = None
+    cycles: int | None = None
+    counts_total: int | None = None
+    generation: int | None = None
+    received_ns: int | None = None
+    """Receipt of the reading by the subscriber."""
+    sent_ns: int | None = None
+    """Sending of the posterior."""
+    stages: StageTimes = StageTimes()
+    boards: tuple[BoardReport, ...] = ()
+
+
+# Keys of the message's values and their formats; a report's number has the key of its field, a stage's time `_us` behind it.
+_STAGES: Final = tuple(field.name for field in fields(StageTimes))
+_FRAME_KEYS: Final = {
+    "number": "%d",
+    "published": "%s",
+    "cycles": "%d",
+    "counts_total": "%d",
+    "generation": "%d",
+    "received_ns": "%d",
+    "sent_ns": "%d",
+    **{f"{stage}_us": "%.1f" for stage in _STAGES},
+}
+_BOARD_KEYS: Final = {"cycles": "%d", "counts_total": "%d", "reason": "%s"}
+_REPLICA_KEYS: Final = {"replica_cycles": "%s", "replica_reasons": "%s"}
+
+
+def _template(level: str, name: str, keys: Mapping[str, str]) -> str:
+    """Return a DiagnosticStatus as JSON, in which `%` fills in the message, the hardware and the values."""
+    pairs = ",".join(f'{{"key":"{key}","value":"{form}"}}' for key, form in keys.items())
+    return f'{{"level":{level},"name":"rosbayes: {name}","message":%s,"hardware_id":%s,"values":[{pairs}]}}'
+
+
+# Every result is preceded by a report, so the text is formatted once and filled in for each frame.
+_FRAME: Final = _template("%d", "frame", _FRAME_KEYS)
+_BOARD: Final = _template("0", "board %d", _BOARD_KEYS)
+_BOARD_OF_REPLICAS: Final = _template("0", "board %d", _BOARD_KEYS | _REPLICA_KEYS)
+_numbers: Final = attrgetter("cycles", "counts_total", "generation", "received_ns", "sent_ns")
+_times: Final = attrgetter(*_STAGES)
+
+
+def write_frame_report(report: FrameReport, ros_version: Literal[1, 2]) -> dict[str, Any]:
+    """Return the diagnostic_msgs/DiagnosticArray of a report, none of whose numbers may be None."""
+    published = "true" if report.published else "false"
+    statuses = [
+        _FRAME
+        % (
+            *(not report.published, _quoted(report.outcome), _quoted(report.deployment)),
+            *(report.number, published, *_numbers(report), *_times(report.stages)),
+        )
+    ]
+    for index, board in enumerate(report.boards):
+        reason = _quoted(board.stopped)
+        values = (index, reason, _quoted(board.name), board.cycles, board.counts_total, reason[1:-1])
+        if board.replica_cycles:
+            cycles, reasons = map(str, board.replica_cycles), ",".join(board.replica_stopped)
+            statuses.append(_BOARD_OF_REPLICAS % (*values, ",".join(cycles), _quoted(reasons)[1:-1]))
+        else:
+            statuses.append(_BOARD % values)
+    return {
+        "header": header(report.stamp_ns, "bm", ros_version),
+        "status": orjson.Fragment(f"[{','.join(statuses)}]"),
+    }
+
+
+def _quoted(text: str) -> str:
+    return orjson.dumps(text).decode()
+
+
+class _Header(Part):
+    stamp: Annotated[int, BeforeValidator(stamp_ns)]
+
+
+class _KeyValue(Part):
+    key: str
+    value: str
+
+
+class _Status(Part):
+    name: str = ""
+    message: str = ""
+    hardware_id: str = ""
+    values: tuple[_KeyValue, ...] = ()
+
+    def by_key(self) -> dict[str, str]:
+        return {pair.key: pair.value for pair in self.values}
+
+
+class _DiagnosticArray(Part):
+    header: _Header
+    status: Annotated[tuple[_Status, ...], Field(min_length=1)]
+
+
+_ARRAY: Final = TypeAdapter(_DiagnosticArray)
+_REPORT: Final = TypeAdapter(FrameReport)
+
+
+def read_frame_report(message: dict[str, Any], heard_ns: int) -> FrameReport:
+    """Return the report of a diagnostic_msgs/DiagnosticArray; keys may be absent.
+
+    Raises:
+        BadResultError: It has no stamp or no status, or one of its values is not a number.
+    """
+    array = validated(_ARRAY, message, FRAME_TOPIC, FRAME_TYPE)
+    first, *others = array.status
+    values = first.by_key()
+    report = {
+        **values,
+        "stamp_ns": array.header.stamp,
+        "heard_ns": heard_ns,
+        "outcome": first.message,
+        "deployment": first.hardware_id,
+        "stages": {stage: values[key] for stage in _STAGES if (key := f"{stage}_us") in values},
+        "boards": [_board(each) for each in others],
+    }
+    return validated(_REPORT, report, FRAME_TOPIC, FRAME_TYPE)
+
+
+def _board(status: _Status) -> dict[str, Any]:
+    values = status.by_key()
+    cycles, reasons = (values.get(key, "") for key in _REPLICA_KEYS)
+    return {
+        **values,
+        "name": status.hardware_id or status.name,
+        "stopped": status.message,
+        "replica_cycles": cycles.split(",") if cycles else (),
+        "replica_stopped": reasons.split(",") if reasons else (),
+    }

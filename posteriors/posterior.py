@@ -1,0 +1,238 @@
+"""`/BMresults`: posteriors as arrays with labels, written and read."""
+
+import difflib
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Annotated, Any, Final
+
+from pydantic import Field, FiniteFloat, NonNegativeInt, TypeAdapter
+
+from posteriors.errors import BadResultError, LabelError
+from posteriors.frame_report import FrameReport, StageTimes
+from posteriors.messages import Part, validated
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from toolchain.deployment import Deployment
+
+RESULTS_TOPIC: Final = "/BMresults"
+RESULTS_TYPE: Final = "std_msgs/Float64MultiArray"
+MAX_RESULT: Final = 1 << 23
+"""Largest posterior as JSON, in bytes: 64 boards of 4096 lines, 26 bytes a number, and room for the rest."""
+REPLICA: Final = "replica"
+"""Label of the first dimension of the posteriors of several replicas."""
+
+_MAX_DIMENSIONS: Final = 32
+"""NumPy's own limit."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Posterior:
+    """A posterior: a probability for each cell of the searched variables' grid, with its frame's data."""
+
+    probabilities: tuple[float, ...]
+    """Row-major over the labelled dimensions, the first slowest; they sum to 1. If the first label is `replica`, there are
+    as many posteriors, one after the other; each sums to 1, or to 0 if no line of the replica counted."""
+    labels: tuple[str, ...]
+    """The searched variables' names, in the order of the dimensions."""
+    sizes: tuple[int, ...]
+    """The number of values of each."""
+    heard_ns: int
+    """Arrival here, Unix time in nanoseconds."""
+    report: FrameReport | None = None
+    """Its `/bm/frame`; None if that was lost."""
+
+    @cached_property
+    def values(self) -> "NDArray[np.float64]":
+        """Probabilities as a read-only float64 array of shape `sizes`."""
+        import numpy as np
+
+        values = np.array(self.probabilities, np.float64).reshape(self.sizes)
+        values.flags.writeable = False
+        return values
+
+    @property
+    def replicas(self) -> int:
+        """Number of posteriors: one for each of the deployment's replicas, or 1."""
+        return self.sizes[0] if self.labels[0] == REPLICA else 1
+
+    def replica(self, at: int) -> "Posterior":
+        """Return one replica's posterior, without the dimension of replicas.
+
+        Raises:
+            LabelError: There is no such replica, or it has no posterior because no line of it counted.
+        """
+        if not 0 <= at < self.replicas:
+            raise LabelError(f"there is no replica {at}: expected 0 to {self.replicas - 1}")
+        if self.labels[0] != REPLICA:
+            return self
+        each = len(self.probabilities) // self.replicas
+        own = self.probabilities[at * each : (at + 1) * each]
+        if not any(own):
+            raise LabelError(f"replica {at} has no posterior in this frame: no line of it counted")
+        return replace(self, probabilities=own, labels=self.labels[1:], sizes=self.sizes[1:])
+
+    @property
+    def number(self) -> int | None:
+        """The frame's number, rising from 1 per master; None if it is not known."""
+        return self.report.number if self.report else None
+
+    @property
+    def stamp_ns(self) -> int | None:
+        """Time of the reading, Unix time in nanoseconds; None if it is not known."""
+        return self.report.stamp_ns if self.report else None
+
+    @property
+    def cycles(self) -> int | None:
+        """Most cycles that any board ran; None if it is not known."""
+        return self.report.cycles if self.report else None
+
+    @property
+    def stages(self) -> StageTimes:
+        """Where the frame's time went, in microseconds."""
+        return self.report.stages if self.report else StageTimes()
+
+    @property
+    def latency_us(self) -> float | None:
+        """Microseconds from the receipt of the reading by the subscriber to the arrival here.
+
+        None if it is not known, or if the clocks of the two computers disagree.
+        """
+        return self._since(self.report.received_ns if self.report else None)
+
+    @property
+    def rosbridge_out_us(self) -> float | None:
+        """Microseconds from the sending of the posterior to its arrival here; None as for `latency_us`."""
+        return self._since(self.report.sent_ns if self.report else None)
+
+    def _since(self, begin_ns: int | None) -> float | None:
+        return None if begin_ns is None or self.heard_ns < begin_ns else (self.heard_ns - begin_ns) / 1000
+
+    @property
+    def probability(self) -> float:
+        """Probability of the most probable cell."""
+        return max(self.probabilities)
+
+    def best(self) -> dict[str, int]:
+        """Return the most probable cell as an index from 0 for each label; the first of equal ones."""
+        line = self.probabilities.index(self.probability)
+        indices: list[int] = []
+        for size in reversed(self.sizes):
+            line, index = divmod(line, size)
+            indices.append(index)
+        return dict(zip(self.labels, reversed(indices), strict=True))
+
+    def mean(self) -> dict[str, float]:
+        """Return the mean index of each label, from 0.
+
+        `deployment.toml` maps an index to its value by `offset + index * step`, which is linear, so the mean index
+        maps to the mean value. The mean of a periodic variable (a heading) has no meaning.
+        """
+        means: dict[str, float] = {}
+        for label, size in zip(self.labels, self.sizes, strict=True):
+            marginal = self.marginal(label)
+            means[label] = float(marginal / marginal.sum() @ range(size))
+        return means
+
+    def marginal(self, *labels: str) -> "NDArray[np.float64]":
+        """Return the posterior of some of the searched variables, with the others summed out.
+
+        Args:
+            labels: The variables, each once.
+
+        Returns:
+            A float64 array with one dimension for each label, in the order given.
+
+        Raises:
+            LabelError: No such variable is searched; the sentence has the nearest right name.
+        """
+        kept = [self._dimension(label) for label in labels]
+        if len(set(kept)) != len(kept):
+            raise LabelError(f"marginal() takes each label once, but got {', '.join(labels)}")
+        others = tuple(at for at in range(len(self.sizes)) if at not in kept)
+        in_order = sorted(kept)
+        summed: NDArray[np.float64] = self.values.sum(axis=others)
+        return summed.transpose([in_order.index(at) for at in kept])
+
+    def at(self, indices: Mapping[str, int] | None = None, /, **by_label: int) -> float:
+        """Return the probability of one cell: `posterior.at(y=3, x=4)`, or a mapping such as `best` returns.
+
+        Raises:
+            LabelError: A label is unknown or missing, or an index is outside of the grid.
+        """
+        wanted = dict(indices or {}) | by_label
+        for label in wanted:
+            self._dimension(label)
+        line = 0
+        for label, size in zip(self.labels, self.sizes, strict=True):
+            index = wanted.get(label, -1)
+            if not 0 <= index < size:
+                given = f"{label} = {index}" if label in wanted else f"no {label}"
+                raise LabelError(f"there is no cell with {given}: {label} goes from 0 to {size - 1}")
+            line = line * size + index
+        return self.probabilities[line]
+
+    def _dimension(self, label: str) -> int:
+        if label in self.labels:
+            return self.labels.index(label)
+        near = difflib.get_close_matches(label, self.labels, 1, 0.5)
+        hint = f"did you mean {near[0]!r}?" if near else f"there are {', '.join(self.labels)}"
+        raise LabelError(f"the posterior has no variable {label!r}; {hint}")
+
+
+def posterior_layout(deployment: "Deployment") -> dict[str, Any]:
+    """Return the `layout` of a deployment's posteriors: dimensions with labels, row-major strides.
+
+    With replicas, they are the first dimension, labelled `replica`.
+    """
+    dimensions = []
+    stride = deployment.machine.results
+    for dimension in deployment.result_dimensions:
+        dimensions.append({"label": dimension.label, "size": dimension.size, "stride": stride})
+        stride //= dimension.size
+    return {"dim": dimensions, "data_offset": 0}
+
+
+class _Dimension(Part):
+    label: str = ""
+    size: NonNegativeInt
+
+
+class _Layout(Part):
+    dim: Annotated[tuple[_Dimension, ...], Field(max_length=_MAX_DIMENSIONS)] = ()
+    data_offset: NonNegativeInt = 0
+
+
+class _Float64MultiArray(Part):
+    layout: _Layout = _Layout()
+    data: tuple[Annotated[FiniteFloat, Field(ge=0)], ...]
+
+
+_ARRAY: Final = TypeAdapter(_Float64MultiArray)
+
+
+def read_posterior(message: dict[str, Any], heard_ns: int, topic: str = RESULTS_TOPIC) -> Posterior:
+    """Return the posterior of a std_msgs/Float64MultiArray; without a layout its only label is `cell`.
+
+    Raises:
+        BadResultError: A value is not a probability, or the layout does not describe the data.
+    """
+    array = validated(_ARRAY, message, topic, RESULTS_TYPE)
+    values = array.data[array.layout.data_offset :]
+    dimensions = array.layout.dim or (_Dimension(label="cell", size=len(values)),)
+    sizes = tuple(dimension.size for dimension in dimensions)
+    labels = tuple(dimension.label for dimension in dimensions)
+    if math.prod(sizes) != len(values) or not values:
+        raise BadResultError(
+            f"a message on {topic} has {len(values)} values, but its layout says "
+            f"{' x '.join(map(str, sizes))}: another program publishes there"
+        )
+    if len(set(labels)) != len(labels):
+        raise BadResultError(f"a message on {topic} has two dimensions of one name among {', '.join(labels)}")
+    if not 0 < sum(values) < math.inf:
+        raise BadResultError(f"a message on {topic} has no probability in any of its {len(values)} values")
+    return Posterior(probabilities=values, labels=labels, sizes=sizes, heard_ns=heard_ns)

@@ -1,0 +1,62 @@
+"""The command `pcie-app`."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from services.commands import flags as options
+from services.pipeline.deployed_boards import DeployedBoards
+from services.pipeline.pcie_app import ROLE, PcieApp
+from services.pipes.lines import require_pipe
+from services.pipes.pcie_app import compute_lines
+from services.settings import load_settings
+from services.sockets.serving import board_endpoints, deployment_for, endpoint_from
+from services.sockets.status import status_thread
+from services.supervision.parent import end_with_parent
+from terminal.command_line import CommandLine
+
+app = CommandLine(
+    help="Drive the boards of a mini-cluster.\n\n"
+    "Alone it reads readings from standard input (what `subscriber --deployment` prints) and prints counts:\n\n"
+    "`echo '{\"addresses\": [71, 50, 50, 45, 18, 72]}' | pcie-app -d build/boat --boards unix:/tmp/b/board0.sock,...`\n\n"
+    "With `--listen ENDPOINT` it serves a master."
+)
+
+
+@app.command(help=app.info.help)
+def pcie_app(
+    deployment: options.Deployment = None,
+    boards: options.Boards = None,
+    listen: options.Listen = None,
+    stop: options.Stop = None,
+    peer_timeout: options.PeerTimeout = None,
+    board_timeout: options.BoardTimeout = None,
+    reprogram: Annotated[
+        bool,
+        typer.Option(
+            "--reprogram/--no-reprogram",
+            help="Program boards that hold another image, instead of refusing them.",
+        ),
+    ] = False,
+    log_level: options.LogLevel = None,
+) -> int:
+    """Drive the boards of a mini-cluster."""
+    end_with_parent()
+    settings = load_settings(
+        deployment=deployment,
+        boards=boards,
+        stop=stop,
+        peer_timeout=peer_timeout,
+        board_timeout=board_timeout,
+        log_level=log_level,
+    )
+    loaded = deployment_for(settings, images=True)
+    deployed = DeployedBoards(settings, loaded, board_endpoints(settings, loaded), reprogram=reprogram)
+    if listen is not None:
+        pcie = PcieApp(deployed, endpoint_from(listen, "--listen"), settings.log_level)
+        with status_thread(settings.run_directory, ROLE, pcie.status):
+            return pcie.serve()
+    require_pipe(ROLE, "readings")
+    return compute_lines(deployed, loaded.machine.rng_banks)

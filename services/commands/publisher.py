@@ -1,0 +1,55 @@
+"""The command `publisher`."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from services.commands import flags as options
+from services.pipeline.publisher import Publisher
+from services.pipeline.result_topics import ROLE
+from services.pipes.lines import require_pipe
+from services.pipes.publisher import publish_lines
+from services.settings import load_settings
+from services.sockets.serving import deployment_for, endpoint_from, listening
+from services.supervision.parent import end_with_parent
+from terminal.command_line import CommandLine
+from terminal.signals import run_async
+
+app = CommandLine(
+    help="Publish posteriors over rosbridge.\n\n"
+    "Alone it reads results from standard input, one JSON value a line (what `pcie-app` prints, or arrays of probabilities):\n\n"
+    "`subscriber -d build/boat | pcie-app -d build/boat --boards ... | publisher -d build/boat --uri ws://robot:9090`\n\n"
+    "With `--listen ENDPOINT` it serves a master."
+)
+
+
+@app.command(help=app.info.help)
+def publisher(
+    deployment: options.Deployment = None,
+    uri: options.Uri = None,
+    listen: options.Listen = None,
+    ros_version: options.RosVersion = None,
+    connect_timeout: options.ConnectTimeout = None,
+    seen_timeout: Annotated[
+        float | None, typer.Option(help="Seconds until a result is seen on the wire (2).")
+    ] = None,
+    log_level: options.LogLevel = None,
+) -> int:
+    """Publish posteriors over rosbridge."""
+    end_with_parent()
+    settings = load_settings(
+        deployment=deployment,
+        uri=uri,
+        ros_version=ros_version,
+        connect_timeout=connect_timeout,
+        seen_timeout=seen_timeout,
+        log_level=log_level,
+    )
+    loaded = deployment_for(settings)
+    if listen is not None:
+        link = listening(endpoint_from(listen, "--listen"), ROLE, loaded)
+        return run_async(Publisher(settings, loaded, link).run())
+    require_pipe(ROLE, "results")
+    return run_async(publish_lines(settings, loaded))

@@ -1,0 +1,86 @@
+"""The command `subscriber`."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+from pydantic import ValidationError
+
+from services.commands import flags as options
+from services.errors import SettingsError
+from services.pipeline.subscriber import ROLE, Subscriber
+from services.pipes.subscriber import print_addresses, print_variables
+from services.settings import load_settings
+from services.sockets.serving import deployment_for, endpoint_from, listening
+from services.supervision.parent import end_with_parent
+from terminal.output import say
+from terminal.command_line import CommandLine
+from terminal.signals import run_async
+from toolchain.deployment import Source
+
+app = CommandLine(
+    help="Take variables out of a ROS topic over rosbridge.\n\n"
+    "Alone it prints them, one JSON object a line:\n\n"
+    "`subscriber --uri ws://robot:9090 --topic /boat/sensors --type boat_msgs/Sensors --variables D1,B1`\n\n"
+    "With `--deployment DIR` it prints addresses as `pcie-app` reads them; "
+    "with `--listen ENDPOINT` too, it serves a master."
+)
+
+
+@app.command(help=app.info.help)
+def subscriber(
+    deployment: options.Deployment = None,
+    uri: options.Uri = None,
+    topic: Annotated[str | None, typer.Option(help="Topic to subscribe to (without a deployment).")] = None,
+    type_: Annotated[str | None, typer.Option("--type", help="Its message type.")] = None,
+    variables: Annotated[
+        str, typer.Option(help="Names or paths, comma-separated; none prints whole messages.")
+    ] = "",
+    count: options.Count = None,
+    listen: options.Listen = None,
+    queue: options.Queue = None,
+    ros_version: options.RosVersion = None,
+    connect_timeout: options.ConnectTimeout = None,
+    first_data_timeout: options.FirstDataTimeout = None,
+    log_level: options.LogLevel = None,
+) -> int:
+    """Take variables out of a ROS topic over rosbridge."""
+    end_with_parent()
+    settings = load_settings(
+        deployment=deployment,
+        uri=uri,
+        queue=queue,
+        ros_version=ros_version,
+        connect_timeout=connect_timeout,
+        first_data_timeout=first_data_timeout,
+        log_level=log_level,
+    )
+    if settings.deployment is not None and (value := topic or type_ or variables):
+        flag = "--topic" if topic else "--type" if type_ else "--variables"
+        raise SettingsError(
+            f"{flag} {value} is for use without a deployment; {settings.deployment} has its own: leave one of them out"
+        )
+    if listen is not None:
+        loaded = deployment_for(settings)
+        link = listening(endpoint_from(listen, "--listen"), ROLE, loaded)
+        return run_async(Subscriber(settings, loaded, link).run())
+    if settings.deployment is not None:
+        loaded = deployment_for(settings)
+        for each in loaded.sources:
+            say(f"listening on {each.topic} at {settings.uri or each.uri}")
+        return run_async(print_addresses(settings, loaded, count))
+    if settings.uri is None or topic is None or type_ is None:
+        raise SettingsError(
+            "give --uri, --topic and --type, or --deployment DIR (subscriber --help shows examples)"
+        )
+    names = [name.strip() for name in variables.split(",") if name.strip()]
+    try:
+        source = Source(uri=settings.uri, topic=topic, type=type_)
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise SettingsError(
+            f"--{first['loc'][0]}: {str(first['msg']).removeprefix('Value error, ')}"
+        ) from error
+    say(f"listening on {topic} at {settings.uri}")
+    return run_async(print_variables(settings, source, names, count))

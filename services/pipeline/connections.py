@@ -1,0 +1,69 @@
+"""Connections to the rosbridge servers of a deployment, and reports of failures to the master."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import Callable, Iterable
+from functools import partial
+from typing import Any
+
+from bridge.client import Ros, State, connect
+from services.settings import Settings
+from services.sockets.records import Trouble
+from services.sockets.serving import Link
+from terminal.errors import ExitCode, exit_code_of
+
+_REPORT_ATTEMPTS = 100
+_REPORT_INTERVAL = 0.02
+
+OnState = Callable[[str, State, str], None]
+"""Called with a server's URI, its connection's new state, and the reason."""
+
+
+async def connect_all(
+    stack: contextlib.AsyncExitStack,
+    settings: Settings,
+    uris: Iterable[str],
+    by_uri: dict[str, Ros] | None = None,
+    *,
+    on_state: OnState | None = None,
+    **options: Any,
+) -> dict[str, Ros]:
+    """Connect to each of several servers once, and return the connections by URI.
+
+    Args:
+        stack: Closes the connections.
+        settings: The settings; their URI replaces all others.
+        uris: The servers.
+        by_uri: Filled with the connections as they are made, and returned.
+        on_state: Called when a connection changes its state.
+        options: Further options of `connect`.
+
+    Raises:
+        BridgeError: A server is not reachable, or is not a rosbridge server.
+    """
+    by_uri = {} if by_uri is None else by_uri
+    for uri in uris:
+        if (used := settings.uri or uri) not in by_uri:
+            by_uri[used] = await stack.enter_async_context(
+                connect(
+                    used,
+                    connect_timeout=settings.connect_timeout,
+                    ros_version=settings.ros_version,
+                    on_state=None if on_state is None else partial(on_state, used),
+                    **options,
+                )
+            )
+    return by_uri
+
+
+async def report_failure(link: Link, error: BaseException) -> None:
+    """Send the error that ends a service to its master; a bug is not sent but printed by the service itself."""
+    code = exit_code_of(error)
+    if code == ExitCode.BUG or not isinstance(error, Exception):
+        return
+    for _ in range(_REPORT_ATTEMPTS):  # a master that started with us may still be connecting
+        if link.send(Trouble(code, str(error))):
+            return
+        await asyncio.sleep(_REPORT_INTERVAL)

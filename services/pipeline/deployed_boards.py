@@ -1,0 +1,280 @@
+"""A deployment's boards: programmed, opened, given frames, recovered after restarts, switched to another deployment."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+
+from pcie_shim.endpoint import Endpoint
+from pcie_shim.errors import (
+    BoardError,
+    BoardHeldError,
+    BoardLinkError,
+    BoardMismatchError,
+    GreetingMismatchError,
+    HeldError,
+    ImageError,
+    PcieShimError,
+)
+from pcie_shim.host.frame import FrameInput, FrameOutput
+from pcie_shim.host.loader import program
+from pcie_shim.host.mini_cluster import PROGRAMMING_S, MiniCluster
+from pcie_shim.programming_file import Image, read_image
+from services.errors import StackError
+from services.pipeline.driver_frames import BoardAwayError, driver_input
+from services.pipeline.generations import Generations
+from services.settings import Settings
+from services.sockets.records import Frame, NotReloaded, Switch, Switched
+from services.sockets.status import BoardStatus
+from terminal.errors import exit_code_of
+from toolchain.deployment import Deployment
+
+TICK = 0.2
+"""Seconds between attempts to reopen a board, and for each of them."""
+
+
+class DeployedBoards:
+    """The boards of the deployment in force; a board that restarts is opened and programmed again.
+
+    Attributes:
+        generations: The deployments that the boards can be switched to, with their images.
+        gone: Reasons why boards can't be used, by board number.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        deployment: Deployment,
+        endpoints: Sequence[Endpoint],
+        *,
+        reprogram: bool = False,
+    ) -> None:
+        """Read the images.
+
+        Args:
+            settings: The settings.
+            deployment: The deployment.
+            endpoints: The boards' endpoints.
+            reprogram: Whether to program a board that holds another image, instead of refusing it.
+        """
+        self._settings = settings
+        self.generations = Generations(deployment, _images_of, images=True)
+        self._reprogram = reprogram
+        self._endpoints = list(endpoints)
+        self._cluster: MiniCluster | None = None
+        self.gone: dict[int, str] = {}
+        self._times_gone = [0] * len(self._endpoints)
+
+    def open(self) -> str:
+        """Open all boards, programming blank ones, and return a sentence for the user.
+
+        Raises:
+            PcieShimError: A board is not reachable, holds another image, or misbehaves.
+        """
+        programmed: set[int] = set()
+        while self._cluster is None:
+            try:
+                self._cluster = self._opened(self._images)
+            except BoardMismatchError as error:
+                if not self._reprogram or error.board in programmed:
+                    raise
+                programmed.add(error.board)
+                self._program(error.board, self._images[error.board])
+        count = len(self._endpoints)
+        return f"{count} {'board' if count == 1 else 'boards'} programmed and open"
+
+    def _opened(self, images: Sequence[Image]) -> MiniCluster:
+        return MiniCluster.open(
+            self._endpoints,
+            images,
+            timeout=self._settings.peer_timeout,
+            slack=self._settings.board_timeout,
+        )
+
+    @property
+    def _images(self) -> list[Image]:
+        return self.generations.derived
+
+    # --- another deployment --------------------------------------------------------------------
+
+    def switch(self, record: Switch) -> Switched | NotReloaded:
+        """Program all boards with the images of another generation, or restore all of them after a failure.
+
+        No frame may be under way. It takes as long as programming does; boards that hold the right image already
+        are left alone.
+        """
+        try:
+            _, images = self.generations.get(record.generation)
+            cluster = self._whole_cluster()
+            self._reprogram = True  # from here on a board may hold either image
+            try:
+                self._cluster = self._programmed(cluster, images)
+            except PcieShimError:
+                self._restore(cluster)
+                raise
+        except (PcieShimError, StackError) as error:
+            return NotReloaded(record.generation, exit_code_of(error), str(error))
+        return self.generations.switch(record)
+
+    def _programmed(self, cluster: MiniCluster, images: Sequence[Image]) -> MiniCluster:
+        """Return the boards, open, with these images."""
+        cluster.close()
+        for board, (held, wanted) in enumerate(zip(self._images, images, strict=True)):
+            if held.image_hash != wanted.image_hash:
+                self._program(board, wanted)
+        return self._opened(images)
+
+    def _restore(self, cluster: MiniCluster) -> None:
+        """Use the boards as before; those that do not come back in time stay in `gone`, to be recovered later."""
+        self._cluster = cluster
+        cluster.close()
+        self.gone = dict.fromkeys(range(len(self._endpoints)), "its former image is being restored")
+        deadline = time.monotonic() + self._settings.peer_timeout
+        while self.gone and time.monotonic() < deadline:
+            self.recover()
+            time.sleep(TICK / 4 if self.gone else 0)
+
+    def _program(self, board: int, image: Image) -> None:
+        """Program a board that this process does not have open.
+
+        Raises:
+            BoardError: Programming failed.
+        """
+        deadline = time.monotonic() + self._settings.peer_timeout
+        while True:
+            try:
+                program(
+                    self._endpoints[board], image, timeout=max(self._settings.peer_timeout, PROGRAMMING_S)
+                )
+            except HeldError as error:
+                # over TCP, the end of our own link may reach the board after the loader does
+                if time.monotonic() > deadline:
+                    raise BoardHeldError(f"Board {board}: {error}", board=board) from error
+                time.sleep(TICK / 4)
+            except (GreetingMismatchError, ImageError) as error:
+                raise BoardMismatchError(f"Board {board}: {error}", board=board) from error
+            except PcieShimError as error:
+                raise BoardLinkError(f"Board {board}: {error}", board=board) from error
+            else:
+                return
+
+    def status(self, output: FrameOutput | None) -> list[BoardStatus]:
+        """Return the state of each board, with its part of the last output; may be called by another thread."""
+        gone = dict(self.gone)
+        return [
+            BoardStatus(
+                index=at,
+                endpoint=str(endpoint),
+                state="not opened yet" if self._cluster is None else "gone" if at in gone else "programmed",
+                image=image.image_hash,
+                restarts=self._times_gone[at],
+                last_cycles=None if output is None else output.boards[at].cycles,
+                why=gone.get(at, ""),
+            )
+            for at, (endpoint, image) in enumerate(zip(self._endpoints, self._images, strict=True))
+        ]
+
+    def run(self, frame: Frame) -> FrameOutput:
+        """Compute one frame.
+
+        Raises:
+            BoardError: A board failed; it is in `gone` until `recover` has reopened it.
+        """
+        cluster = self._whole_cluster()
+        try:
+            return cluster.run(self._input(frame))
+        except BoardError as error:
+            self.find_gone(error)
+            raise
+
+    def post(self, frame: Frame) -> None:
+        """Start a frame without waiting for it: `collect` returns its result.
+
+        Raises:
+            BoardError: A board failed, or is still gone; call `find_gone` then.
+        """
+        self._whole_cluster().post(self._input(frame))
+
+    def collect(self) -> FrameOutput | None:
+        """Return the posted frame's result, or None while boards still run.
+
+        Raises:
+            BoardError: A board failed, or exceeded its deadline; call `find_gone` then.
+        """
+        return self._whole_cluster().collect(0)
+
+    @property
+    def awaited(self) -> int | None:
+        """File descriptor to watch until the next `collect`."""
+        return None if self._cluster is None else self._cluster.awaited
+
+    @property
+    def is_late(self) -> bool:
+        """Whether a board of the posted frame exceeded its deadline; `collect` raises an error that names it."""
+        return self._cluster is not None and not self._cluster.seconds_left
+
+    def _whole_cluster(self) -> MiniCluster:
+        if self._cluster is None or self.gone:
+            board, why = next(iter(self.gone.items()), (0, "it was not opened"))
+            raise BoardAwayError(f"board {board} is not back yet ({why})", board=board)
+        return self._cluster
+
+    def _input(self, frame: Frame) -> FrameInput:
+        deployment = self.generations.deployment
+        return driver_input(deployment, frame, self._settings.stop or deployment.machine.stop)
+
+    def find_gone(self, error: BoardError) -> None:
+        """Find all boards that are gone after a failure, so that several deaths at once fail one frame."""
+        if self._cluster is None:
+            return
+        if not self._cluster.is_open(error.board):
+            self._is_gone(error.board, error)
+        for board in range(len(self._endpoints)):
+            if board != error.board and board not in self.gone:
+                try:
+                    self._cluster.reopen(board, timeout=TICK)
+                except BoardError as other:
+                    self._is_gone(board, other)
+
+    def _is_gone(self, board: int, error: BoardError) -> None:
+        self.gone[board] = str(error)
+        self._times_gone[board] += 1
+
+    def recover(self) -> list[int]:
+        """Try once to reopen the boards that are gone, and return the numbers of those that are back.
+
+        Raises:
+            BoardMismatchError: A board is back with another image, so that waiting would not help.
+        """
+        back = []
+        for board in list(self.gone):
+            if self._cluster is None:
+                break
+            try:
+                self._reopen(self._cluster, board)
+            except BoardMismatchError:
+                raise
+            except BoardError as error:
+                self.gone[board] = str(error)
+            else:
+                del self.gone[board]
+                back.append(board)
+        return back
+
+    def _reopen(self, cluster: MiniCluster, board: int) -> None:
+        try:
+            cluster.reopen(board, timeout=TICK)
+        except BoardMismatchError:
+            if not self._reprogram:
+                raise
+            self._program(board, self._images[board])
+            cluster.reopen(board, timeout=TICK)
+
+    def close(self) -> None:
+        """Close the links to all boards."""
+        if self._cluster is not None:
+            self._cluster.close()
+
+
+def _images_of(deployment: Deployment) -> list[Image]:
+    return [read_image(deployment.image_path(at)) for at in range(len(deployment.boards))]

@@ -1,0 +1,152 @@
+"""Frames as the driver takes them, and its results as records."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from machines.parameters import SensorMode
+from pcie_shim.errors import BoardError, FrameInputError
+from pcie_shim.host.frame import BoardResult, FrameInput, FrameOutput
+from services.sockets.records import Addresses, FailureReason, Frame, FrameFailed, FrameResult
+from terminal.errors import exit_code_of
+from toolchain.deployment import Deployment, Variable
+
+_encoder = msgspec.msgpack.Encoder()
+_decoder = msgspec.msgpack.Decoder(list[BoardResult])
+
+PriorRow = int | tuple[int, ...]
+"""Row of the prior's table; with replicas one for each."""
+
+
+class BoardAwayError(BoardError):
+    """A board that failed an earlier frame is not back yet."""
+
+
+def driver_input(deployment: Deployment, frame: Frame, stop: str) -> FrameInput:
+    """Return a frame as the driver takes it.
+
+    Args:
+        deployment: The deployment in force.
+        frame: The master's record.
+        stop: When boards stop: `slices` or `own`.
+
+    Raises:
+        FrameInputError: The frame's addresses do not fit the deployment.
+    """
+    machine = deployment.machine
+    prior = np.frombuffer(frame.prior_codes, "<u2") if frame.prior_codes else None
+    addresses: tuple[int | None, ...] | npt.NDArray[np.int64]
+    row: PriorRow = 0
+    if machine.is_plain:
+        addresses = tuple(_one(address) for address in frame.addresses)
+        if deployment.prior_select is not None and len(addresses) == len(deployment.variables):
+            addresses, row = deployment.machine_addresses(addresses)
+    else:
+        addresses, row = machine_inputs(deployment, frame.addresses)
+        if prior is not None and prior.size == machine.results and machine.replicas > 1:
+            prior = prior.reshape(-1, machine.lines)
+    return FrameInput(
+        addresses=addresses,
+        prior_address=row,
+        prior_codes=prior,
+        target_count=machine.target_count,
+        max_cycles=machine.max_cycles,
+        bank=frame.bank,
+        stop="own" if stop == "own" else "slices",
+    )
+
+
+def _one(address: int | list[int] | None) -> int | None:
+    if isinstance(address, list):
+        raise FrameInputError(
+            f"The frame has {len(address)} readings of one variable; this machine takes one of each"
+        )
+    return address
+
+
+def machine_inputs(deployment: Deployment, addresses: Addresses) -> tuple[npt.NDArray[np.int64], PriorRow]:
+    """Return a frame's inputs where replicas or lines have readings of their own.
+
+    Args:
+        deployment: The deployment, which defines the shapes.
+        addresses: A row for each variable, in their order; None for one that is missing everywhere.
+
+    Returns:
+        The sensors' inputs, -1 for a missing one, and the row of the prior's table.
+
+    Raises:
+        FrameInputError: There are too few or too many variables, or a row has another length than expected.
+    """
+    variables = deployment.variables
+    if len(addresses) != len(variables):
+        raise FrameInputError(
+            f"The frame has {len(addresses)} readings; this deployment has {len(variables)} variables"
+        )
+    machine = deployment.machine
+    replicas = machine.replicas
+    sensors: list[npt.NDArray[np.int64]] = []
+    row: PriorRow = 0
+    for variable, given in zip(variables, addresses, strict=True):
+        array = _row(deployment, variable, given)
+        if variable.kind == "sensor":
+            sensors.append(array.reshape(replicas, -1))
+        else:
+            rows = np.where(array == -1, 2**variable.bits - 1, array)
+            row = tuple(rows.tolist()) if rows.ndim else int(rows)
+    per_line = (machine.lines,) if machine.sensor_mode is not SensorMode.COLUMN else ()
+    stacked = np.stack(sensors, axis=1) if sensors else np.empty((replicas, 0, *per_line), dtype=np.int64)
+    shape = (len(sensors), *per_line)
+    return stacked.reshape((replicas, *shape) if replicas > 1 else shape), row
+
+
+def _row(deployment: Deployment, variable: Variable, given: int | list[int] | None) -> npt.NDArray[np.int64]:
+    shape = deployment.reading_shape(variable)
+    if given is None:
+        return np.full(shape, -1, dtype=np.int64)
+    try:
+        array = np.array(given, dtype=np.int64)
+    except OverflowError:
+        raise FrameInputError(
+            f"The reading of {variable.name} has an address beyond all that a machine has"
+        ) from None
+    expected = math.prod(shape)
+    if array.size != expected or (array.ndim == 0 and shape):
+        found = array.size if array.ndim else "one"
+        noun = "address" if array.size == 1 else "addresses"
+        raise FrameInputError(
+            f"The reading of {variable.name} has {found} {noun}; this deployment takes {expected} of it"
+        )
+    return array.reshape(shape)
+
+
+def encode_boards(boards: Sequence[BoardResult]) -> msgspec.Raw:
+    """Return the boards' part of a `FrameResult`, which the master forwards without decoding it."""
+    return msgspec.Raw(_encoder.encode(boards))
+
+
+def decode_boards(result: FrameResult) -> list[BoardResult]:
+    """Return the boards' results of a record."""
+    return _decoder.decode(result.boards)
+
+
+def result_record(number: int, output: FrameOutput) -> FrameResult:
+    """Return the boards' results as a record."""
+    return FrameResult(
+        number=number,
+        boards=encode_boards(output.boards),
+        register_writes_ns=output.register_writes_ns,
+        compute_ns=output.compute_ns,
+        reads_ns=output.reads_ns,
+        boards_compute_ns=output.boards_compute_ns,
+    )
+
+
+def frame_failed(number: int, error: BoardError) -> FrameFailed:
+    """Return a board's error as the record of a frame that failed."""
+    reason = FailureReason.AWAY if isinstance(error, BoardAwayError) else FailureReason.FAILED
+    return FrameFailed(number, error.board, exit_code_of(error), str(error), reason)

@@ -1,0 +1,196 @@
+"""The topics that results are published on, and what becomes of each result."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import math
+import time
+from collections.abc import AsyncIterator
+from typing import Any, Literal
+
+import msgspec
+
+from bridge.client import Publication, Ros, State, Subscription
+from bridge.errors import BridgeError, DisconnectedError, NoMessageError, SlowPeerError
+from posteriors.frame_report import FRAME_TOPIC, FRAME_TYPE, write_frame_report
+from posteriors.posterior import MAX_RESULT, posterior_layout
+from services.pipeline.connections import OnState, connect_all
+from services.pipeline.inference import Inference, report_of
+from services.settings import Settings
+from services.sockets.records import Outcome, Publish, Published
+from terminal.logs import get_logger
+from toolchain.deployment import Deployment
+
+ROLE = "publisher"
+RESULTS_DEPTH = 64
+"""Results that may wait for the rosbridge server; the master keeps fewer than that in flight."""
+
+
+def same_numbers(received: Any, sent: list[float]) -> bool:
+    """Return whether an array is the one that was sent; some servers lose a double's last bit."""
+    return (
+        isinstance(received, list)
+        and len(received) == len(sent)
+        and all(
+            isinstance(one, int | float) and math.isclose(one, other, rel_tol=1e-12)
+            for one, other in zip(received, sent, strict=True)
+        )
+    )
+
+
+class ResultTopics:
+    """The deployment's output topics on their servers, advertised.
+
+    Attributes:
+        rosbridges: The connections by URI.
+    """
+
+    def __init__(self, settings: Settings, deployment: Deployment) -> None:
+        self._settings = settings
+        self._ros_version: Literal[1, 2] = 2
+        self.use(deployment, 0)
+        self._outputs: list[tuple[Ros, Publication]] = []
+        self._frames: Publication | None = None
+        self._watched: Subscription | None = None
+        self._previous_out_ns = 0
+        self.rosbridges: dict[str, Ros] = {}
+
+    def use(self, deployment: Deployment, generation: int) -> None:
+        """Publish results of another deployment from now on, on the same topics."""
+        self._deployment = deployment
+        self._generation = generation
+        self._layout = posterior_layout(deployment)
+
+    @contextlib.asynccontextmanager
+    async def opened(self, on_state: OnState | None = None) -> AsyncIterator[str]:
+        """Connect and advertise, and yield a sentence that names topics and servers.
+
+        Raises:
+            BridgeError: A server is not reachable, or is not a rosbridge server.
+        """
+        settings, deployment = self._settings, self._deployment
+        by_uri = self.rosbridges
+        async with contextlib.AsyncExitStack() as stack:
+            uris = [settings.uri or deployment.output_uri(output) for output in deployment.outputs]
+            await connect_all(stack, settings, uris, by_uri, on_state=on_state, max_size=MAX_RESULT)
+            for uri, output in zip(uris, deployment.outputs, strict=True):
+                self._outputs.append((by_uri[uri], await by_uri[uri].advertise(output.topic, output.type)))
+            first = by_uri[uris[0]]
+            self._frames = await first.advertise(FRAME_TOPIC, FRAME_TYPE)
+            if settings.ros_version == "auto":
+                self._ros_version = await first.detect_ros_version() or 2
+            else:
+                self._ros_version = 1 if settings.ros_version == "1" else 2
+            topics = ", ".join(output.topic for output in deployment.outputs)
+            yield f"publishing on {topics} at {', '.join(by_uri)}"
+
+    def served_by(self, uri: str) -> tuple[str, str]:
+        """Return how a sentence names a server's topics and the server; the only server is just `rosbridge`."""
+        if len(self.rosbridges) == 1:
+            return "", "rosbridge"
+        topics = [publication.topic for ros, publication in self._outputs if ros is self.rosbridges.get(uri)]
+        which = f" for {' and '.join(topics)}" if topics else ""
+        return which, f"rosbridge at {uri}"
+
+    def watch(self) -> None:
+        """Subscribe to the first output, so that a result can be seen on the wire."""
+        if self._watched is None:
+            output = self._deployment.outputs[0]
+            self._watched = self._outputs[0][0].subscribe(output.topic, output.type, queue_size=RESULTS_DEPTH)
+
+    async def _seen(self, data: list[float], timeout: float) -> bool:
+        if self._watched is None:
+            return False
+        deadline = time.monotonic() + timeout
+        while (left := deadline - time.monotonic()) > 0:
+            try:
+                message = await self._watched.next(timeout=left)
+            except NoMessageError:
+                return False
+            if same_numbers(message.msg.get("data"), data):
+                return True
+        return False
+
+    @property
+    def must_wait(self) -> bool:
+        """Whether no server is connected, or a connected one still has to take earlier messages."""
+        connected = self._connected()
+        return not connected or any(publication.must_wait for publication in connected)
+
+    def _connected(self) -> list[Publication]:
+        return [publication for ros, publication in self._outputs if ros.state is State.CONNECTED]
+
+    async def publish(self, publish: Publish, *, look: bool) -> Published:
+        """Publish a frame's report and then its posterior, if it has one, once the servers take them.
+
+        Args:
+            publish: The result and its frame's times.
+            look: Whether to wait until the result was seen on the wire, or until the settings' timeout.
+        """
+        inference = Inference(publish.result)
+        ready = [publication.ready() for publication in self._connected()]
+        for error in await asyncio.gather(*ready, return_exceptions=True):
+            if isinstance(error, BridgeError):
+                get_logger(ROLE).warning(str(error), frame=publish.result.number)
+            elif error is not None:
+                raise error
+        published = self.publish_now(publish, inference)
+        if look and published.outcome is Outcome.PUBLISHED and inference.posterior is not None:
+            seen = await self._seen(inference.posterior.tolist(), self._settings.seen_timeout)
+            published = msgspec.structs.replace(published, seen=seen)
+        return published
+
+    def publish_now(self, publish: Publish, inference: Inference | None = None) -> Published:
+        """Publish a frame's report and its posterior at once, wherever a server takes them, and return the outcome.
+
+        The report goes to the first output's server. A result is published if it went to at least one output.
+        """
+        started = time.monotonic_ns()
+        inference = inference or Inference(publish.result)
+        report = report_of(
+            publish,
+            inference,
+            self._deployment,
+            self._generation,
+            now=(time.time_ns(), started),
+            previous_out_ns=self._previous_out_ns,
+        )
+        posterior = inference.posterior
+        missed = 0
+        with self._outputs[0][0].together():
+            reported = self._frames is not None and _sent(
+                self._frames, write_frame_report(report, self._ros_version)
+            )
+            if posterior is not None:
+                for _, publication in self._outputs:
+                    missed += not _sent(publication, {"layout": self._layout, "data": posterior})
+        now = time.monotonic_ns()
+        self._previous_out_ns = now - started
+        outcome = Outcome.PUBLISHED if posterior is not None else Outcome.NO_POSTERIOR
+        if missed == len(self._outputs) or (posterior is None and not reported):
+            outcome, missed = Outcome.ROSBRIDGE_AWAY, 0
+        return Published(
+            number=publish.result.number,
+            outcome=outcome,
+            seen=None,
+            best_line=inference.best,
+            best_probability=0.0 if posterior is None else float(posterior[inference.best]),
+            cycles=report.cycles or 0,
+            total_ns=now - publish.received_tick,
+            missed=missed,
+        )
+
+    async def publish_array(self, values: Any) -> None:
+        """Publish probabilities (float64, one per line) on every output."""
+        for _, publication in self._outputs:
+            await publication.publish({"layout": self._layout, "data": values})
+
+
+def _sent(publication: Publication, message: dict[str, Any]) -> bool:
+    """Send a message if its server takes it at once, and return whether it does."""
+    try:
+        publication.publish_nowait(message)
+    except (DisconnectedError, SlowPeerError):
+        return False
+    return True

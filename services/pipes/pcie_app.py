@@ -1,0 +1,79 @@
+"""`pcie-app` without a master: computes the readings of standard input and prints their counts."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import msgspec
+import numpy as np
+
+from pcie_shim.errors import FrameInputError
+from pcie_shim.host.frame import FrameOutput
+from services.errors import InputLineError
+from services.pipeline.deployed_boards import DeployedBoards
+from services.pipeline.inference import REASON_WORDS
+from services.pipes.lines import blocking_lines, decoded
+from services.sockets.records import Addresses, Frame
+from terminal.output import put_json, say
+
+
+class LineReading(msgspec.Struct):
+    """A reading as `subscriber --deployment` prints it."""
+
+    addresses: Addresses
+    stamp_ns: int | None = None
+    prior_codes: list[Annotated[int, msgspec.Meta(ge=0, lt=1 << 16)]] = []
+
+
+def reading_from_line(line: bytes, number: int) -> LineReading:
+    """Return the reading of one line of standard input.
+
+    Raises:
+        InputLineError: It is not a reading.
+    """
+    reading: LineReading = decoded(
+        line, number, LineReading, 'a reading such as {"addresses": [12, null, 7]}'
+    )
+    return reading
+
+
+def compute_lines(boards: DeployedBoards, banks: int) -> int:
+    """Compute the readings that come on standard input.
+
+    Args:
+        boards: The boards, not open yet.
+        banks: Number of the boards' banks of generators, which frames take in turn.
+
+    Raises:
+        InputLineError: A line is not a reading, or not one for this deployment.
+        BoardError: A board failed.
+    """
+    say(boards.open())
+    try:
+        for number, line in blocking_lines():
+            reading = reading_from_line(line, number)
+            codes = np.array(reading.prior_codes, "<u2").tobytes()
+            frame = Frame(number, reading.addresses, number % banks, codes)
+            try:
+                output = boards.run(frame)
+            except FrameInputError as error:
+                raise InputLineError(f"line {number} of standard input: {error}") from error
+            put_json(_line(number, output, reading.stamp_ns))
+    finally:
+        boards.close()
+    return 0
+
+
+def _line(number: int, output: FrameOutput, stamp_ns: int | None) -> dict[str, Any]:
+    boards = []
+    for board in output.boards:
+        values: dict[str, Any] = {
+            "counts": np.frombuffer(board.words, "<u4").tolist(),
+            "cycles": board.cycles,
+            "reason": board.reason,
+            "why": REASON_WORDS[board.reason],
+        }
+        if board.replica_cycles:
+            values |= {"replica_cycles": board.replica_cycles, "replica_reasons": board.replica_reasons}
+        boards.append(values)
+    return {"number": number, "stamp_ns": stamp_ns, "boards": boards}

@@ -1,0 +1,112 @@
+"""`publisher` without a master: publishes the results of standard input."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from typing import Annotated
+
+import msgspec
+import numpy as np
+
+from machines.bm1 import StopReason
+from pcie_shim.host.frame import BoardResult
+from services.errors import InputLineError
+from services.pipeline.driver_frames import encode_boards
+from services.pipeline.result_topics import ResultTopics
+from services.pipes.lines import decoded, lines
+from services.settings import Settings
+from services.sockets.records import FrameResult, Outcome, Publish
+from terminal.output import say
+from toolchain.deployment import Deployment
+
+Unsigned = Annotated[int, msgspec.Meta(ge=0)]
+
+
+class _LineBoard(msgspec.Struct):
+    counts: list[Annotated[int, msgspec.Meta(ge=0, lt=1 << 32)]]
+    cycles: Unsigned
+    reason: StopReason
+    replica_cycles: list[Unsigned] = []
+    replica_reasons: list[StopReason] = []
+
+
+class _LineResult(msgspec.Struct):
+    number: int
+    boards: list[_LineBoard]
+    stamp_ns: int | None = None
+
+
+_Line = _LineResult | list[Annotated[float, msgspec.Meta(ge=0)]]  # JSON has no infinity
+
+
+def result_from_line(
+    line: bytes, number: int, count: int, replicas: int = 1
+) -> tuple[FrameResult, int | None] | list[float]:
+    """Return the value of one line: a result of `pcie-app` with its reading's stamp, or an array of probabilities.
+
+    Args:
+        line: The line.
+        number: Its number, from 1.
+        count: Number of counts or probabilities in a result of this deployment.
+        replicas: Number of the deployment's replicas.
+
+    Raises:
+        InputLineError: It is neither.
+    """
+    where = f"line {number} of standard input"
+    expected = f"a result of pcie-app or an array of {count} probabilities"
+    value = decoded(line, number, _Line, expected)
+    found = len(value) if isinstance(value, list) else sum(len(board.counts) for board in value.boards)
+    if found != count:
+        raise InputLineError(f"{where} has {found} values; expected {expected}")
+    if isinstance(value, list):
+        return value
+    each = replicas if replicas > 1 else 0
+    for board in value.boards:
+        if not len(board.replica_cycles) == len(board.replica_reasons) == each:
+            raise InputLineError(
+                f"{where} has {len(board.replica_cycles)} replicas' cycles on a board; expected a result of "
+                f"{replicas} replica{'s' if replicas > 1 else ''}"
+            )
+        if each and len(board.counts) % each:
+            raise InputLineError(f"{where} has {len(board.counts)} counts on a board of {each} replicas")
+    boards = [
+        BoardResult(
+            np.array(board.counts, dtype="<u4").tobytes(),
+            board.cycles,
+            board.reason,
+            tuple(board.replica_cycles),
+            tuple(board.replica_reasons),
+        )
+        for board in value.boards
+    ]
+    return FrameResult(value.number, encode_boards(boards), 0, 0, 0, 0), value.stamp_ns
+
+
+async def publish_lines(settings: Settings, deployment: Deployment) -> int:
+    """Publish the results that come on standard input, until it ends.
+
+    Raises:
+        InputLineError: A line is not a result of this deployment.
+        BridgeError: A server is not reachable.
+    """
+    topics = ResultTopics(settings, deployment)
+    machine = deployment.machine
+    async with topics.opened() as where:
+        say(where)
+        outcomes: Counter[Outcome] = Counter()
+        async for number, line in lines():
+            value = result_from_line(line, number, machine.results, machine.replicas)
+            if isinstance(value, list):
+                await topics.publish_array(value)
+                outcomes[Outcome.PUBLISHED] += 1
+                continue
+            result, stamp_ns = value
+            now, tick = time.time_ns(), time.monotonic_ns()
+            published = await topics.publish(Publish(result, stamp_ns or now, now, tick, tick, 0), look=False)
+            outcomes[published.outcome] += 1
+    published_count = outcomes.pop(Outcome.PUBLISHED, 0)
+    others = ", ".join(f"{count} {outcome}" for outcome, count in outcomes.items())
+    say(f"{published_count} published{f'; not published: {others}' if others else ''}")
+    return 0
