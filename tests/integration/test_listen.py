@@ -30,7 +30,7 @@ PATIENCE = 180
 def programs(page: str) -> list[str]:
     """The page's Python that hears posteriors."""
     blocks = re.findall(r"^```python\n(.*?)^```", (ROOT / page).read_text(), re.MULTILINE | re.DOTALL)
-    return [block for block in blocks if "from posteriors.listening import" in block]
+    return [block for block in blocks if "from posteriors import" in block]
 
 
 GUIDE = programs("docs/listening.md")
