@@ -10,8 +10,8 @@ from casestudies.boat.geometry import BEACONS, map_grid
 from casestudies.boat.shares import Part, StageShare
 from casestudies.grid import Grid
 from casestudies.truths import Instance, Truth
-from terminal.errors import OutputError
 from posteriors.posterior import Posterior
+from terminal.errors import OutputError
 
 POSITIONS_SHOWN: Final = 4
 """As many as the thesis shows."""

@@ -14,8 +14,8 @@ from services.pipes.subscriber import print_addresses, print_variables
 from services.settings import load_settings
 from services.sockets.serving import deployment_for, endpoint_from, listening
 from services.supervision.parent import end_with_parent
-from terminal.output import say
 from terminal.command_line import CommandLine
+from terminal.output import say
 from terminal.signals import run_async
 from toolchain.deployment import Source
 

@@ -9,9 +9,9 @@ from matplotlib.image import imread
 from casestudies.boat.pictures import draw_positions, draw_shares, far_apart, posterior_grid
 from casestudies.boat.shares import Part, stage_shares
 from casestudies.truths import Instance, Truth
-from terminal.errors import OutputError
 from posteriors.frame_report import FrameReport, StageTimes
 from posteriors.posterior import Posterior
+from terminal.errors import OutputError
 
 VIRIDIS_LOW, VIRIDIS_HIGH = (0.267, 0.005, 0.329), (0.993, 0.906, 0.144)
 TRUTH_COLOUR = (1.0, 0.302, 0.302)
