@@ -1,6 +1,6 @@
 # One image for every service: the commands, the boat's deployment, and the kernels' machine code.
 #   docker compose build
-# Where RUN steps have no network, lay the wheels of requirements.lock into wheelhouse/ first (docs/operating.md).
+# Where RUN steps have no network, lay the wheels of requirements.lock into wheelhouse/ first (docs/how-to/operating.md).
 ARG PYTHON_IMAGE=python:3.11-slim-bookworm
 
 FROM ${PYTHON_IMAGE} AS build

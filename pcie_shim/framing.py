@@ -1,4 +1,4 @@
-"""The link's frames, without sockets: bytes to frames and back (docs/boards.md has the wire format).
+"""The link's frames, without sockets: bytes to frames and back (docs/reference/boards.md has the wire format).
 
 A frame is a header of 20 bytes (operation, flags, sequence, address, count, CRC-32) and 32-bit words,
 all little-endian: thesis 2.3, where the data link layer adds sequence numbers and CRCs to requests

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 ROOT: Final = Path(__file__).resolve().parent.parent
 SOURCE: Final = ROOT / "hdl" / "bm_registers.rdl"
 MODULE: Final = ROOT / "pcie_shim" / "register_map.py"
-DOCUMENT: Final = ROOT / "docs" / "registers.md"
+DOCUMENT: Final = ROOT / "docs" / "reference" / "registers.md"
 PACKAGE: Final = ROOT / "hdl" / "bm_register_map.vhd"
 REGISTER_BLOCK: Final = ROOT / "hdl" / "bm_register_block.vhd"
 HEADER: Final = ROOT / "hdl" / "bm_registers.h"
@@ -182,7 +182,7 @@ def module_text(register_map: RegisterMap) -> str:
         '"""The boards\' register map as constants: offsets in bytes, masks, shifts, encodings.',
         "",
         "Generated from hdl/bm_registers.rdl by scripts/registers: change that file, not this one. What",
-        "each register means is in docs/registers.md.",
+        "each register means is in docs/reference/registers.md.",
         '"""',
         "",
         "from enum import IntEnum",

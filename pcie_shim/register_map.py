@@ -1,7 +1,7 @@
 """The boards' register map as constants: offsets in bytes, masks, shifts, encodings.
 
 Generated from hdl/bm_registers.rdl by scripts/registers: change that file, not this one. What
-each register means is in docs/registers.md.
+each register means is in docs/reference/registers.md.
 """
 
 from enum import IntEnum

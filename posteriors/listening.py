@@ -10,7 +10,7 @@ and without:
 
     listen("ws://robot:9090", lambda posterior: print(posterior.best()))
 
-NumPy is imported with the first array that is used (docs/listening.md).
+NumPy is imported with the first array that is used (docs/how-to/listening.md).
 """
 
 import asyncio

@@ -6,7 +6,7 @@ from enum import IntEnum
 
 
 class ExitCode(IntEnum):
-    """Exit codes of every command (see docs/commands.md)."""
+    """Exit codes of every command (see docs/reference/commands.md)."""
 
     DONE = 0
     BUG = 1

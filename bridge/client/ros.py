@@ -5,7 +5,7 @@
             print(message.msg)
 
 Everything that waits has a limit, everything that queues has a size, and what is lost is counted
-(``docs/bridge.md``).
+(``docs/how-to/bridge.md``).
 """
 
 import asyncio

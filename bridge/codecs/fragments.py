@@ -1,7 +1,7 @@
 """Fragments: cut a message that is too large for one piece, and put the pieces together again.
 
 A fragment is `{"op": "fragment", "id": ..., "data": ..., "num": ..., "total": ...}`; the `data` of a message's
-fragments, concatenated in the order of `num`, is its JSON. Servers differ (`docs/rosbridge-differences.md`): `num`
+fragments, concatenated in the order of `num`, is its JSON. Servers differ (`docs/reference/rosbridge-differences.md`): `num`
 counts from 0 or from 1, `total` may be a float with a fraction, either may be a string, ids are strings or integers
 and are reused. All of that is accepted; fragments that cannot become a message are refused, and incomplete
 messages are bounded in number, in bytes and in time.

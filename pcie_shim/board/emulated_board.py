@@ -60,7 +60,7 @@ class RefusedError(PcieShimError):
 
 
 class EmulatedBoard:
-    """A board: blank until an image is loaded, then a BM1 behind registers (docs/registers.md).
+    """A board: blank until an image is loaded, then a BM1 behind registers (docs/reference/registers.md).
 
     Attributes:
         programmed: Images loaded so far.

@@ -254,7 +254,7 @@ def board(
         int, typer.Option(min=0, help="Restarts of boards within 60 s before it gives up.")
     ] = RESTARTS,
     misbehave: Annotated[
-        str, typer.Option(help="For tests: one of the misbehaviours listed in docs/boards.md.")
+        str, typer.Option(help="For tests: one of the misbehaviours listed in docs/reference/boards.md.")
     ] = "",
 ) -> int:
     """Emulate boards of the mini-cluster."""

@@ -1,11 +1,11 @@
-# docs/boards.md says what is: every error, misbehaviour and operation, and bytes that are the encoder's.
+# docs/reference/boards.md says what is: every error, misbehaviour and operation, and bytes that are the encoder's.
 import inspect
 from pathlib import Path
 
 from pcie_shim import errors, framing
 from pcie_shim.board.misbehaviour import MisbehaviourKind
 
-TEXT = (Path(__file__).parents[2] / "docs" / "boards.md").read_text()
+TEXT = (Path(__file__).parents[2] / "docs/reference/boards.md").read_text()
 
 
 def test_every_error_of_a_board_or_image_is_documented_with_its_exit_code() -> None:

@@ -23,7 +23,7 @@ from bridge.codecs import fragments, json_codec
 from bridge.hub.access import Door
 from tests.bridge.hub.sockets import running_hub
 
-GUIDE = Path(__file__).parents[2] / "docs" / "bridge.md"
+GUIDE = Path(__file__).parents[2] / "docs/how-to/bridge.md"
 EXAMPLES = dict(
     re.findall(
         r"^## ([^\n]+)\n(?:(?!^## ).)*?^```python\n(.*?)^```", GUIDE.read_text(), re.MULTILINE | re.DOTALL

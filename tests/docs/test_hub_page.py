@@ -1,4 +1,4 @@
-"""docs/hub.md: every limit and every service of rosapi is described."""
+"""docs/how-to/hub.md: every limit and every service of rosapi is described."""
 
 import dataclasses
 from pathlib import Path
@@ -6,7 +6,7 @@ from pathlib import Path
 from bridge.hub.limits import HubLimits
 from tests.bridge.hub.broker_harness import Harness
 
-PAGE = (Path(__file__).parents[2] / "docs" / "hub.md").read_text()
+PAGE = (Path(__file__).parents[2] / "docs/how-to/hub.md").read_text()
 
 
 def test_every_limit_is_described():

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from machines.parameters import BM1Parameters
 
-PAGE = Path(__file__).parents[2] / "docs" / "machines.md"
+PAGE = Path(__file__).parents[2] / "docs/reference/machines.md"
 
 
 def test_examples():

@@ -1,4 +1,4 @@
-"""docs/operating.md: alarms are those of the sources, and units are ones that systemd takes."""
+"""docs/how-to/operating.md: alarms are those of the sources, and units are ones that systemd takes."""
 
 import ast
 import re
@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-PAGE = (ROOT / "docs/operating.md").read_text()
+PAGE = (ROOT / "docs/how-to/operating.md").read_text()
 PACKAGES = ("services", "terminal", "posteriors", "bridge", "pcie_shim")
 
 

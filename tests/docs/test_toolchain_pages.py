@@ -51,7 +51,7 @@ def sections():
 
 @pytest.mark.parametrize(("heading", "keys"), list(sections()))
 def test_every_key_of_the_deployment(heading, keys):
-    assert sorted(documented((DOCS / "deployment.md").read_text(), heading)) == sorted(keys)
+    assert sorted(documented((DOCS / "reference/deployment.md").read_text(), heading)) == sorted(keys)
 
 
 def test_every_option_of_the_build():
@@ -62,19 +62,19 @@ def test_every_option_of_the_build():
         for name in (*each.opts, *each.secondary_opts)
         if name.startswith("-") and each.name != "help"
     }
-    described = documented((DOCS / "toolchain.md").read_text(), "Options")
+    described = documented((DOCS / "reference/toolchain.md").read_text(), "Options")
     assert {key.split(" ")[0] for key in described} == options
 
 
 def test_the_example_is_a_model(tmp_path):
-    example = re.search(r"```python\n(.*?)```", (DOCS / "toolchain.md").read_text(), re.DOTALL)[1]
+    example = re.search(r"```python\n(.*?)```", (DOCS / "reference/toolchain.md").read_text(), re.DOTALL)[1]
     (tmp_path / "model.py").write_text(example)
     model = load_model(tmp_path, {"cells": "7"})
     assert model.lines == 7
     assert [known.name for known in model.known] == ["range", "door"]
 
 
-MODELS = (DOCS / "models.md").read_text()
+MODELS = (DOCS / "how-to/models.md").read_text()
 
 
 def test_every_option_of_the_fit():
@@ -125,14 +125,14 @@ def test_the_boiler_is_a_question_and_the_printed_refusal_is_said(tmp_path):
 
 
 def test_every_check_is_described():
-    described = documented((DOCS / "toolchain.md").read_text(), "What is wrong, before anything runs")
+    described = documented((DOCS / "reference/toolchain.md").read_text(), "What is wrong, before anything runs")
     assert set(described) == set(Check) - {Check.RNG}
 
 
 def test_every_constant_of_the_parameters():
     text = parameters_vhd(*built_for_the_documentation())
     constants = set(re.findall(r"^  constant (\w+)", text, re.MULTILINE))
-    assert set(documented((DOCS / "outputs.md").read_text(), "bm1_parameters.vhd")) == constants
+    assert set(documented((DOCS / "reference/outputs.md").read_text(), "bm1_parameters.vhd")) == constants
 
 
 def built_for_the_documentation():
@@ -147,7 +147,7 @@ def built_for_the_documentation():
 
 @pytest.mark.parametrize("part", ["memories", "project", "deployment"])
 def test_every_option_of_regenerate(part):
-    text = (DOCS / "toolchain.md").read_text()
+    text = (DOCS / "reference/toolchain.md").read_text()
     section = text.split("\n## One part again", 1)[1].split("\n## ", 1)[0]
     question = {"--set", "--searched", "--known", "--given", "--prior-select", "--on-missing", "--help", "-h"}
     command = typer.main.get_command(app).commands["regenerate"].commands[part]
@@ -156,7 +156,7 @@ def test_every_option_of_regenerate(part):
 
 
 def test_the_sources_of_the_deployment_page(tmp_path):
-    page = (DOCS / "deployment.md").read_text()
+    page = (DOCS / "reference/deployment.md").read_text()
     (example,) = re.findall(r"^```toml\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
     (tmp_path / "sources.toml").write_text(example)
     file = read_sources(tmp_path / "sources.toml", "ws://robot:9090")
@@ -174,7 +174,7 @@ def test_the_sources_of_the_deployment_page(tmp_path):
 
 @pytest.mark.parametrize("mode", ["cell", "threshold"])
 def test_inspect_explains_such_a_deployment(tmp_path, mode):
-    page = (DOCS / "toolchain.md").read_text()
+    page = (DOCS / "reference/toolchain.md").read_text()
     (example,) = re.findall(r"```python\n(# disparity/model\.py.*?)```", page, re.DOTALL)
     (tmp_path / "disparity").mkdir()
     (tmp_path / "disparity/model.py").write_text(example)

@@ -33,7 +33,7 @@ def programs(page: str) -> list[str]:
     return [block for block in blocks if "from posteriors import" in block]
 
 
-GUIDE = programs("docs/listening.md")
+GUIDE = programs("docs/how-to/listening.md")
 
 
 def result(number: int) -> dict:
@@ -292,7 +292,7 @@ async def test_the_guides_programs(stage, text):
 
 
 def test_every_program_of_the_guide_is_run():
-    assert len(GUIDE) == (ROOT / "docs/listening.md").read_text().count("```python") == 2
+    assert len(GUIDE) == (ROOT / "docs/how-to/listening.md").read_text().count("```python") == 2
 
 
 async def test_a_posterior_larger_than_most_messages(stage):

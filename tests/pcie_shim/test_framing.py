@@ -100,7 +100,7 @@ def test_a_wrong_crc_and_a_boundless_length_are_told_apart() -> None:
 
 
 def test_the_wire_format_is_the_documented_one() -> None:
-    # a posted write of 7 to 0x0104 as request number 2: docs/boards.md shows the same bytes
+    # a posted write of 7 to 0x0104 as request number 2: docs/reference/boards.md shows the same bytes
     assert encode(framing.WRITE, framing.POSTED, 2, 0x104, 1, b"\7\0\0\0").hex(" ", 4) == (
         "424d0302 02000000 04010000 01000000 5e852fa0 07000000"
     )

@@ -31,12 +31,12 @@ def test_every_generated_file_is_up_to_date(generated: map_generator.RegisterMap
 def test_check_says_what_is_out_of_date(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (tmp_path / "docs").mkdir()
+    (tmp_path / "docs/reference").mkdir(parents=True)
     monkeypatch.setattr(map_generator, "ROOT", tmp_path)
     for name in ("PACKAGE", "REGISTER_BLOCK", "HEADER"):
         monkeypatch.setattr(map_generator, name, tmp_path / name)
     monkeypatch.setattr(map_generator, "MODULE", tmp_path / "register_map.py")
-    monkeypatch.setattr(map_generator, "DOCUMENT", tmp_path / "docs" / "registers.md")
+    monkeypatch.setattr(map_generator, "DOCUMENT", tmp_path / "docs/reference/registers.md")
     with pytest.raises(SystemExit, match="1"):
         map_generator.main(["--check"])
     assert "register_map.py is out of date: run scripts/registers" in capsys.readouterr().err

@@ -20,7 +20,7 @@ class Severity(StrEnum):
 
 
 class Check(StrEnum):
-    """The checks, as `toolchain check --json` names them; docs/toolchain.md describes each."""
+    """The checks, as `toolchain check --json` names them; docs/reference/toolchain.md describes each."""
 
     CANNOT_BE_BUILT = "cannot-be-built"
     DEAD_LINES = "dead-lines"

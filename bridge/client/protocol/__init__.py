@@ -4,7 +4,7 @@ What a client wants (advertisements, subscriptions, served services) is kept her
 say it all again to a server that has forgotten it.
 
 Source: the rosbridge protocol, version 2 (https://github.com/RobotWebTools/rosbridge_suite), and what its
-servers really do (``docs/rosbridge-differences.md``).
+servers really do (``docs/reference/rosbridge-differences.md``).
 """
 
 from bridge.client.protocol.client_core import ClientCore

@@ -1,6 +1,6 @@
 """Doubles of the three real servers, with what they do otherwise than the specification says; measured, not guessed.
 
-A: rosbridge_suite on ROS 1; B: rosbridge_suite on ROS 2; R: rosbridge-server-rs on ROS 2 (``docs/rosbridge-differences.md``).
+A: rosbridge_suite on ROS 1; B: rosbridge_suite on ROS 2; R: rosbridge-server-rs on ROS 2 (``docs/reference/rosbridge-differences.md``).
 They are fakes over `tests.fake_rosbridge`, and add the forms of delivery: what each makes of ``compression`` and
 ``fragment_size``, and what it loses.
 """

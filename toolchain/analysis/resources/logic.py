@@ -1,7 +1,7 @@
 """A machine's logic from first principles: comparators, ANDs, counters, generators, inputs, readout, in bits.
 
 A part's logic is counted by its bits; the FPGA's logic for a bit is calibrated on yosys's synthesis of small machines
-(`scripts/verify resources --calibrate`; docs/design-space.md).
+(`scripts/verify resources --calibrate`; docs/how-to/design-space.md).
 """
 
 from __future__ import annotations
