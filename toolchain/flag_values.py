@@ -1,4 +1,4 @@
-"""What a user writes behind a flag: KEY=VALUE, or names with commas between them."""
+"""The values of flags: KEY=VALUE, or names with commas between them."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ if TYPE_CHECKING:
 
 
 def key_values(settings: Iterable[str], flag: str = "--set", example: str = "width=64") -> dict[str, str]:
-    """Return what a flag says, by key.
+    """Return the values of a flag by key.
 
     Raises:
-        BuildError: One without `=` or a key, or a key that is given twice.
+        BuildError: A setting has no `=` or no key, or a key is given twice.
     """
     found: dict[str, str] = {}
     for setting in settings:
@@ -32,7 +32,7 @@ def names_in(flag: str, text: str) -> list[str]:
     """Return the names in `A,B,C`.
 
     Raises:
-        BuildError: An empty one.
+        BuildError: A name is empty.
     """
     names = [name.strip() for name in text.split(",")] if text else []
     if not all(names):

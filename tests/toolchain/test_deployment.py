@@ -249,18 +249,18 @@ def test_no_format(folder):
         (
             'path = "bearings[0]"',
             'path = "bearings[0"',
-            "path in [[variable]] 2: 'bearings[0' is no place in a message",
+            "path in [[variable]] 2: 'bearings[0' is not a path in a message",
         ),
         ("values = 360", "values = 512", "[[variable]] 2: B1 serves 512 values, but 9 bits hold 511"),
-        ("ws://a:9090", "http://a:9090", "uri in [[source]] 1: 'http://a:9090' is no WebSocket URI"),
-        ("ws://a:9090", "ws://a:90900", "uri in [[source]] 1: 'ws://a:90900' is no WebSocket URI"),
-        ("ws://a:9090", "ws://[::1", "uri in [[source]] 1: 'ws://[::1' is no WebSocket URI"),
+        ("ws://a:9090", "http://a:9090", "uri in [[source]] 1: 'http://a:9090' is not a WebSocket URI"),
+        ("ws://a:9090", "ws://a:90900", "uri in [[source]] 1: 'ws://a:90900' is not a WebSocket URI"),
+        ("ws://a:9090", "ws://[::1", "uri in [[source]] 1: 'ws://[::1' is not a WebSocket URI"),
         (
             "max_cycles = 131072",
             f"max_cycles = {2**63}",
             "max_cycles = 9223372036854775808 in [machine]: expected less than or equal to 9223372036854775807",
         ),
-        ("boat_msgs/Sensors", "Sensors", "type in [[source]] 1: 'Sensors' is no message type"),
+        ("boat_msgs/Sensors", "Sensors", "type in [[source]] 1: 'Sensors' is not a message type"),
         ("step = 2.0", "step = 0.0", "step in [[searched]] 1: a step of 0"),
         ("step = 2.0", "step = nan", "step = nan in [[searched]] 1: expected a finite number"),
         (
@@ -268,7 +268,7 @@ def test_no_format(folder):
             "target_count = 256",
             "in [machine]: target_count = 256 does not fit counters of 8",
         ),
-        ("20x1200", "20 by 1200", "interface in [machine]: '20 by 1200' is no interface"),
+        ("20x1200", "20 by 1200", "interface in [machine]: '20 by 1200' is not an interface"),
         ("boards/board1.bm", "../board1.bm", "image in [[board]] 2: '../board1.bm' must be a path inside"),
         (
             "std_msgs/Float64MultiArray",

@@ -139,10 +139,10 @@ def test_of_replicas_one_may_be_missing():
         (7, NotANumberError, "variable left is of type int, expected an array of 12"),
         ({"a": 1}, NotANumberError, "variable left is of type dict, expected an array of 12"),
         ("no base 64", NotANumberError, "variable left is of type str"),
-        ([{}] * 12, NotANumberError, "variable left is no array of 12"),
+        ([{}] * 12, NotANumberError, "variable left is not an array of 12"),
         ([["1"] * 6] * 2, NotANumberError, "variable left is an array with strings"),
         ([[[1]] * 6] * 2, ReadingError, "variable left has 2 x 6 x 1 values"),
-        ([[1, 2], [3]], NotANumberError, "variable left is no array of 12"),
+        ([[1, 2], [3]], NotANumberError, "variable left is not an array of 12"),
         (
             [0] * 11 + [5],
             ValueOutOfRangeError,
@@ -170,10 +170,10 @@ def test_likelihoods_become_codes(scale):
 @pytest.mark.parametrize(
     ("scale", "value", "sentence"),
     [
-        (Scale.COLUMN, [0.0] * 6, "variable left: all lines have 0, so that none is possible"),
-        (Scale.COLUMN, [0.1, -0.1, 0, 0, 0, 0], "variable left: -0.1 is no probability"),
+        (Scale.COLUMN, [0.0] * 6, "variable left: all lines have 0, so none is possible"),
+        (Scale.COLUMN, [0.1, -0.1, 0, 0, 0, 0], "variable left: -0.1 is not a probability"),
         (Scale.COLUMN, [0.1, math.inf, 0, 0, 0, 0], "variable left: a likelihood is not finite"),
-        (Scale.NONE, [0.1, 1.5, 0, 0, 0, 0], "variable left: 1.5 is no probability, expected 0 to 1"),
+        (Scale.NONE, [0.1, 1.5, 0, 0, 0, 0], "variable left: 1.5 is not a probability, expected 0 to 1"),
     ],
 )
 def test_likelihoods_that_are_none_are_said(scale, value, sentence):

@@ -192,7 +192,7 @@ def test_only_the_ratios_of_a_written_prior_count():
         (
             {"prior_mode": PriorMode.WRITTEN, "prior_path": ""},
             {},
-            "--prior-path: '' is no place in a message",
+            "--prior-path: '' is not a path in a message",
         ),
     ],
 )
@@ -223,7 +223,7 @@ def test_a_deployment_whose_prior_does_not_agree_is_refused(tmp_path):
     for changes, sentence in (
         ({"variables": two}, "time and other both select the prior"),
         ({"variables": deployment.sensors}, "no variable selects it"),
-        ({"prior": WrittenPrior(path="p")}, "the machine's is a table"),
+        ({"prior": WrittenPrior(path="p")}, "the machine's prior is a table"),
     ):
         with pytest.raises(ValidationError, match=sentence):
             type(deployment)(**(fields | changes))

@@ -167,10 +167,10 @@ def test_the_same_model_changes_nothing(case, options):
 @pytest.mark.parametrize(
     ("old", "new", "sentence"),
     [
-        ("bits = 6", "bits = 5", "says bits of D1 = 5, but boards/board0.bm was built with 6: set it back"),
-        ("prob_bits = 7", "prob_bits = 6", "says prob_bits = 6, but boards/board0.bm was built with 7"),
-        ('interface = "20x1200"', 'interface = "20x1201"', "says interface = 20x1201"),
-        ("steps_per_clock = 8", "steps_per_clock = 1", "says steps_per_clock = 1, but"),
+        ("bits = 6", "bits = 5", "has bits of D1 = 5, but boards/board0.bm was built with 6: set it back"),
+        ("prob_bits = 7", "prob_bits = 6", "has prob_bits = 6, but boards/board0.bm was built with 7"),
+        ('interface = "20x1200"', 'interface = "20x1201"', "has interface = 20x1201"),
+        ("steps_per_clock = 8", "steps_per_clock = 1", "has steps_per_clock = 1, but"),
         ("boards/board0.bm", "boards/board1.bm", "is another board's or another build's image"),
         ("kind = ", "knid = ", "unknown key 'knid'"),
     ],
@@ -206,10 +206,10 @@ def test_the_project(built):
         ),
         (["deployment", "--order", "D1,D1"], "--order D1,D1: expected each of D1, D2 once"),
         (["deployment", "--path", "D3=x"], "--path D3=x: there is no such variable; there are D1, D2"),
-        (["deployment", "--path", "D1=a..b"], "'a..b' is no place in a message"),
+        (["deployment", "--path", "D1=a..b"], "'a..b' is not a path in a message"),
         (["deployment", "--path", "D3"], "--path D3: expected KEY=VALUE, such as --path range=data[0]"),
-        (["deployment", "--uri", "robot"], "--uri: 'robot' is no WebSocket URI"),
-        (["deployment", "--output", "a b"], "--output: 'a b' is no topic name"),
+        (["deployment", "--uri", "robot"], "--uri: 'robot' is not a WebSocket URI"),
+        (["deployment", "--output", "a b"], "--output: 'a b' is not a topic name"),
         (["deployment", "--target-count", "256"], "target_count = 256 does not fit counters of 8 bits"),
         (["deployment", "--tolerance", "-1"], "--tolerance is -1.0, expected greater than or equal to 0"),
         (["memories", "--set", "sigma=1"], "--set belongs to a model: add --model"),
@@ -226,7 +226,7 @@ def test_the_project(built):
             ["memories", "--model", "{case}", "--set", "values=99"],
             "variable 'D1': D1 serves 99 values, but 6 bits",
         ),
-        (["memories", "--model", "{case}/none"], "none is no folder"),
+        (["memories", "--model", "{case}/none"], "none is not a folder"),
     ],
 )
 def test_mistakes_change_nothing(case, built, arguments, sentence):

@@ -137,10 +137,10 @@ def test_a_prior_of_one_of_them(tmp_path, written):
         (
             "ranges[3]",
             "ranges[-3]",
-            "line 11: variables in [[source]] 2: 'ranges[-3]' is no place in a message",
+            "line 11: variables in [[source]] 2: 'ranges[-3]' is not a path in a message",
         ),
-        ("/scan", "scan me", "line 8: topic in [[source]] 2: 'scan me' is no topic name"),
-        ("ws://two:9090", "two:9090", "line 7: uri in [[source]] 2: 'two:9090' is no WebSocket URI"),
+        ("/scan", "scan me", "line 8: topic in [[source]] 2: 'scan me' is not a topic name"),
+        ("ws://two:9090", "two:9090", "line 7: uri in [[source]] 2: 'two:9090' is not a WebSocket URI"),
         (
             'topic = "/imu"',
             'topic = "/scan"',

@@ -33,33 +33,33 @@ def read_images(deployment: Deployment) -> list[Image]:
 
 
 def check_agreement(deployment: Deployment, images: Sequence[Image]) -> None:
-    """Refuse a `deployment.toml` that says something else of the machine than its images.
+    """Refuse a `deployment.toml` that describes another machine than its images.
 
     Raises:
-        DeploymentError: Names the key, and what the image says.
+        DeploymentError: They differ; names the key and both values.
     """
     machine = deployment.machine
     for index, (board, image) in enumerate(zip(deployment.boards, images, strict=True)):
         parameters = image.machine.parameters
         found = {key: getattr(parameters, key) for key in _MACHINE_KEYS}
-        said = {key: getattr(machine, key) for key in _MACHINE_KEYS}
+        expected = {key: getattr(machine, key) for key in _MACHINE_KEYS}
         for variable, bits in zip(deployment.sensors, parameters.sensor_bits, strict=False):
-            found[f"bits of {variable.name}"], said[f"bits of {variable.name}"] = bits, variable.bits
+            found[f"bits of {variable.name}"], expected[f"bits of {variable.name}"] = bits, variable.bits
         found |= {
             "number of sensors": parameters.sensors,
             "interface": f"{image.interface_sensors}x{image.interface_results}",
             "lines of the board": parameters.lines,
             "part of the model": image.partition,
         }
-        said |= {
+        expected |= {
             "number of sensors": len(deployment.sensors),
             "interface": machine.interface,
             "lines of the board": board.lines,
             "part of the model": Partition(index, len(images), board.line_offset, machine.lines),
         }
         for key, value in found.items():
-            if value != said[key]:
+            if value != expected[key]:
                 raise DeploymentError(
-                    f"{deployment.path} says {key} = {said[key]}, but {board.image} was built with {value}: set it back, "
+                    f"{deployment.path} has {key} = {expected[key]}, but {board.image} was built with {value}: set it back, "
                     "or build again with 'toolchain build'"
                 )

@@ -1,7 +1,7 @@
-"""Probabilities become codes of W bits, after normalising, with a report of what was lost on the way.
+"""Quantising: probabilities as codes of W bits, after normalising, and what that loses.
 
-A line-independent factor changes nothing in the posterior, so every address (a row of a column's table) is
-divided by its maximum over all lines of all boards: without it a machine would run for ever.
+A factor that is the same for all lines changes nothing in the posterior, so every address (a row of a column's table) is
+divided by its maximum over all lines of all boards. Otherwise a machine would hardly ever count.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ if TYPE_CHECKING:
     from toolchain.models.model import Known, Model
 
 _HALVINGS: Final = 12
-"""Of the range in which a floor is looked for, on a scale of powers: better than the two digits that are told."""
+"""Halvings of the range of a floor, on a logarithmic scale: finer than the two digits that are reported."""
 
 _ROUNDING: Final = 1e-12
-"""A divergence below it, in bits, is that of float64 from itself."""
+"""A divergence in bits below which only float64's rounding is left."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ColumnLoss:
-    """What quantising took from one column."""
+    """The loss of one column by quantising."""
 
     name: str
     """The known variable's name, or `prior`."""
@@ -52,7 +52,7 @@ class ColumnLoss:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VanishedFloor:
-    """An outlier floor that became code 0 somewhere: whose, what that does, and what to change."""
+    """An outlier floor that became code 0 somewhere."""
 
     name: str
     what: str
@@ -74,7 +74,7 @@ class Quantised:
     floors: tuple[VanishedFloor, ...]
     """Outlier floors that are too low for the codes."""
     warnings: tuple[str, ...]
-    """What a user should know, a sentence each."""
+    """Warnings for the user, one sentence each."""
 
 
 def quantise(
@@ -84,13 +84,13 @@ def quantise(
     scale: Scale = Scale.ADDRESS,
     sensor_mode: SensorMode = SensorMode.COLUMN,
 ) -> Quantised:
-    """Return the model's codes, and what making them has lost.
+    """Return the model's codes, and what quantising has lost.
 
     Args:
         model: The model.
         prob_bits: Bits of a code (W), 1 to 16.
-        scale: What is divided by its maximum first; where cells have readings of their own, not addresses.
-        sensor_mode: What cells are given.
+        scale: The part of a table that is divided by its maximum first; not addresses where cells have their own readings.
+        sensor_mode: The input of a cell.
 
     Raises:
         machines.errors.ParameterError: `prob_bits` is not 1 to 16.
@@ -143,7 +143,7 @@ def _quantised_prior(model: Model, prob_bits: int, scale: Scale) -> tuple[NDArra
     codes = np.zeros((1 << select.bits, model.lines), dtype=np.uint16)
     codes[: select.values] = served[:-1]
     codes[-1] = served[-1]
-    # How often each row is selected is not known here: all weigh the same.
+    # the frequency of each row is not known here, so all weigh the same
     loss = _loss("prior", select.bits, select.table / select.values, decode_code(served[:-1], prob_bits))
     return codes, loss
 
@@ -158,7 +158,7 @@ def scaled(table: NDArray[np.float64], scale: Scale) -> NDArray[np.float64]:
 
 
 def _loss(name: str, bits: int, exact: NDArray[np.float64], quantised: NDArray[np.float64]) -> ColumnLoss:
-    """Compare P(S, K) with its quantised likeness, float64[values, lines]; the latter's rows up to factors."""
+    """Compare P(S, K) with its quantised form, float64[values, lines], whose rows may have any factors."""
     weight = exact.sum(axis=1)
     remaining = quantised.sum(axis=1)
     alive = (remaining > 0) & (weight > 0)
@@ -180,7 +180,7 @@ def _loss(name: str, bits: int, exact: NDArray[np.float64], quantised: NDArray[n
 def _vanished_floor(
     known: Known, ratios: NDArray[np.float64], vanished: NDArray[np.bool_], prob_bits: int, scale: Scale
 ) -> VanishedFloor:
-    """Say that a variable's floor is too low for the codes, and how high or wide would do."""
+    """Describe a floor that is too low for the codes, with a floor or a width that is enough."""
     least = float(ratios[vanished].min())
     needed = math.ceil(-math.log2(least) - 1)
     ways = [f"a floor of about {enough:.2g}"] if (enough := _enough_floor(known, prob_bits, scale)) else []
@@ -199,7 +199,7 @@ def _vanished_floor(
 def _enough_floor(known: Known, prob_bits: int, scale: Scale) -> float:
     """Return a floor that no code loses, two digits rounded up; 0 where none up to the peak itself does.
 
-    More of it raises the largest probabilities too, so that it is not in proportion to what is lost.
+    A higher floor raises the largest probabilities, too, so the two are not proportional.
     """
     peak = known.table.max(axis=0)
     if known.normal is not None:

@@ -1,4 +1,4 @@
-"""What was built and what was lost, in plain sentences: `report.txt` of a deployment."""
+"""`report.txt` of a deployment: what was built and what was lost, in plain sentences."""
 
 from __future__ import annotations
 
@@ -51,18 +51,18 @@ def build_report(
 
 
 def with_remark(report: str, remark: str) -> str:
-    """Return a report that ends with how its options were chosen, where there is something to say about that."""
+    """Return a report with a remark at its end about how the options were chosen, if there is one."""
     return f"{report}\n{remark}\n" if remark else report
 
 
 def remark_of(report: str) -> str:
-    """Return how the options of a build were chosen, as its report says after the deployment's hash; empty where it does not."""
+    """Return the remark at the end of a report, after the deployment's hash; empty where there is none."""
     end = re.search(r"Deployment [0-9a-f]{16}\.\n\n(.*)\Z", report, re.DOTALL)
     return end[1].strip() if end else ""
 
 
 def loss_heading(sensor_mode: SensorMode) -> str:
-    """Say what the figures of a column's loss are."""
+    """Return the heading of the table of losses."""
     posterior = "the column's own posterior"
     if sensor_mode is SensorMode.CELL:
         posterior += " where all lines read the same"
@@ -70,7 +70,7 @@ def loss_heading(sensor_mode: SensorMode) -> str:
 
 
 def many_sentence(machine: MachineSection) -> str:
-    """Say what a frame's readings and results are where they are not one number a variable and one posterior."""
+    """Describe a frame's readings and results where they are not one number a variable and one posterior."""
     sentence = {
         SensorMode.COLUMN: "",
         SensorMode.CELL: f" Each of the {machine.lines} lines has a reading of its own (sensor_mode = cell).",
@@ -88,7 +88,7 @@ def many_sentence(machine: MachineSection) -> str:
 
 
 def _topics_sentence(deployment: Deployment) -> str:
-    """Say where readings come from (of several topics, which variables) and where posteriors go."""
+    """Name the sources of readings (with their variables, if there are several) and the topic of the posteriors."""
     output = deployment.outputs[0]
     places = [f"{source.uri}, topic {source.topic} ({source.type})" for source in deployment.sources]
     if len(places) == 1:
@@ -106,7 +106,7 @@ def _topics_sentence(deployment: Deployment) -> str:
 
 
 def _state_paragraph(model: Model) -> list[str]:
-    """Say which number, or word, is which state, where values have names."""
+    """List the number of each state, where values have names."""
     named = [
         f"  {name}: " + ", ".join(f"{offset + at * step:g} {state}" for at, state in enumerate(states))
         for name, offset, step, states in (

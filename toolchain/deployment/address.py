@@ -1,4 +1,4 @@
-"""How a reading becomes an address of its column: the one rule, in plain Python.
+"""The rule that makes a reading an address of its column, in plain Python.
 
 `address = floor((value - offset) / step + 0.5)`, then modulo `period` where there is one, then the range
 check. The subscriber applies it to every frame, the tests to every table.
@@ -21,11 +21,11 @@ def to_address(variable: Variable, value: object) -> int | None:
     """Return the address of one reading in its variable's column.
 
     Args:
-        variable: Offset, step, period, number of served addresses, and what to do with a reading out of
+        variable: Offset, step, period, number of served addresses, and the treatment of a reading out of
             range or missing.
-        value: What stood in the message. `None` stands for null and for a field that was absent; NaN and an
-            empty array are missing too. Booleans are 0 and 1. Strings are never numbers; one that is the name of
-            a state is that state.
+        value: The field's value. `None`, for null and for an absent field, NaN and an empty array are missing
+            readings. Booleans are 0 and 1. Strings are never numbers; one that is the name of a state is that
+            state.
 
     Returns:
         The address, 0 to `variable.values - 1`, or `None` for a missing reading.
@@ -68,7 +68,7 @@ def _missing(variable: Variable, what: str) -> int | None:
 
 
 def _unserved(variable: Variable, value: float, beyond_top: bool | None) -> int | None:
-    """Apply `on_range`; `beyond_top` says at which end, None that there is no end (a period)."""
+    """Apply `on_range` at the top or the bottom; `beyond_top` is None where a period leaves no end."""
     if variable.on_range == "missing":
         return _missing(variable, f"is {_shown(value)}, out of range")
     if variable.on_range == "clamp" and beyond_top is not None:

@@ -1,7 +1,7 @@
-"""How an array of readings becomes addresses: one a line, one a replica, or both (thesis 4.4).
+"""Arrays of readings as addresses: one a line, one a replica, or both (thesis 4.4).
 
-The rule for each number is `toolchain.deployment.address`'s. What is added is the array's shape, in the order of rows (replica by
-replica, line by line), and that a sensor's reading is missing on all lines of a machine or on none.
+Each number follows the rule of `toolchain.deployment.address`. An array has its rows in order (replica by replica, line by
+line), and a sensor's reading is missing on all lines of a machine or on none.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ if TYPE_CHECKING:
     from toolchain.deployment import Deployment, Scale, Variable
 
 MISSING: Final = -1
-"""Stands for a missing reading among the addresses, in all lines of its machine."""
+"""The address of a missing reading, in all lines of its machine."""
 
 
 def to_addresses(deployment: Deployment, variable: Variable, value: object) -> list[int] | None:
     """Return the addresses (`threshold`: codes) of one variable's readings in a frame.
 
     Args:
-        deployment: What the shape comes from: `deployment.reading_shape(variable)`.
+        deployment: The source of the shape, `deployment.reading_shape(variable)`.
         variable: As `toolchain.deployment.address.to_address` takes it.
-        value: What stood in the message: a flat array, or one of the shape; bytes (`uint8[]`) as bytes or as base64.
+        value: The field's value: a flat array, or one of the shape; bytes (`uint8[]`) as bytes or as base64.
             `None` or an empty array is a missing reading everywhere; null and NaN are missing ones.
 
     Returns:
@@ -41,13 +41,13 @@ def to_addresses(deployment: Deployment, variable: Variable, value: object) -> l
         every reading is missing.
 
     Raises:
-        ReadingError: The array has another length; or a reading in it can't be used, and which.
+        ReadingError: The array has another length, or a reading in it can't be used; names the reading.
     """
     machine = deployment.machine
     shape = deployment.reading_shape(variable)
     numbers = _numbers(variable, value, shape)
     if numbers is None:
-        to_address(variable, None if value is None else [])  # says what it is, where it must not be missing
+        to_address(variable, None if value is None else [])  # refuses it where it must not be missing
         return None
     if machine.sensor_mode is SensorMode.THRESHOLD and variable.kind == "sensor":
         addresses = _codes(variable, numbers, machine.prob_bits, machine.scale)
@@ -62,7 +62,7 @@ def to_addresses(deployment: Deployment, variable: Variable, value: object) -> l
 
 
 def _numbers(variable: Variable, value: object, shape: tuple[int, ...]) -> NDArray[np.float64] | None:
-    """The message's array as float64 of this shape, NaN where it is null; None where it is empty or absent."""
+    """Return the message's array as float64 of this shape, with NaN for null; None where it is empty or absent."""
     if value is None:
         return None
     given: Any = value
@@ -88,7 +88,9 @@ def _numbers(variable: Variable, value: object, shape: tuple[int, ...]) -> NDArr
     try:
         numbers = np.asarray(given, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
-        raise NotANumberError(f"variable {variable.name} is no array of {_length(shape)} numbers") from None
+        raise NotANumberError(
+            f"variable {variable.name} is not an array of {_length(shape)} numbers"
+        ) from None
     if numbers.size == 0:
         return None
     if numbers.shape != shape and numbers.shape != (math.prod(shape),):
@@ -102,7 +104,7 @@ def _length(shape: tuple[int, ...]) -> str:
 
 
 def _holds_text(values: list[Any]) -> bool:
-    """Whether there are strings, which NumPy would read as numbers; what lies deeper has no such shape anyway."""
+    """Return whether there are strings, which NumPy would read as numbers; deeper arrays have a wrong shape anyway."""
     return any(
         isinstance(each, str) or (isinstance(each, list) and any(isinstance(inner, str) for inner in each))
         for each in values
@@ -117,7 +119,7 @@ def _addresses(variable: Variable, numbers: NDArray[np.float64]) -> NDArray[np.i
         served = (places >= 0) & (places < variable.values)
     addresses = np.where(served, places, MISSING).astype(np.int64)
     for at in np.argwhere(~served):
-        # the rest are few, and each is treated (or refused) by the one rule
+        # the rest are few, and the rule treats or refuses each of them
         place = tuple(at.tolist())
         number = float(numbers[place])
         try:
@@ -148,7 +150,7 @@ def _codes(
 
 
 def _check_missing(variable: Variable, addresses: NDArray[np.int64]) -> None:
-    """A reading that is missing on some lines only would favour these."""
+    """Refuse a reading that is missing on some lines only, which would favour these lines."""
     missing = addresses == MISSING
     partly = missing.any(axis=-1) & ~missing.all(axis=-1)
     if partly.any():

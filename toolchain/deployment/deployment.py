@@ -28,11 +28,11 @@ if TYPE_CHECKING:
 FORMAT: Final = 1
 FILE_NAME: Final = "deployment.toml"
 REPLICA: Final = "replica"
-"""Label of the dimension of replicas, the first of what is published."""
+"""Label of the dimension of replicas, the first dimension of a published result."""
 
 
 class DeploymentFile(Section):
-    """What `deployment.toml` says, checked as a whole."""
+    """The content of `deployment.toml`, checked as a whole."""
 
     format: Literal[1] = FORMAT
     name: Name
@@ -66,7 +66,7 @@ class DeploymentFile(Section):
             )
         if self.machine.replicas > 1 and REPLICA in [dimension.label for dimension in self.searched]:
             raise ValueError(
-                f"a searched variable is called {REPLICA!r}, which is what the dimension of replicas is called"
+                f"a searched variable is called {REPLICA!r}, which is the name of the dimension of replicas"
             )
         offset = 0
         for index, board in enumerate(self.boards):
@@ -91,7 +91,7 @@ class DeploymentFile(Section):
             return
         if self.machine.prior_mode is not PriorMode.WRITTEN:
             raise ValueError(
-                "[prior] says where a written prior comes from, but the machine's is a table (prior_mode)"
+                "[prior] is the source of a written prior, but the machine's prior is a table (prior_mode)"
             )
         if self.prior.source >= len(self.sources):
             raise ValueError(
@@ -134,7 +134,7 @@ class Deployment(DeploymentFile):
 
     @property
     def result_dimensions(self) -> tuple[Dimension, ...]:
-        """The dimensions of what is published: the searched ones, and before them the replicas where there are several."""
+        """The dimensions of a published result: the replicas where there are several, then the searched ones."""
         replicas = self.machine.replicas
         if replicas == 1:
             return tuple(self.searched)
@@ -149,11 +149,11 @@ class Deployment(DeploymentFile):
 
     @property
     def path(self) -> Path:
-        """Where its `deployment.toml` is."""
+        """The path of its `deployment.toml`."""
         return self.directory / FILE_NAME
 
     def image_path(self, board: int) -> Path:
-        """Return where a board's image is."""
+        """Return the path of a board's image."""
         return self.directory / self.boards[board].image
 
     def output_uri(self, output: Output) -> str:

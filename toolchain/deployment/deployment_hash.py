@@ -1,7 +1,7 @@
 """The hash that guards a deployment against edits.
 
-It covers everything that follows from the model and nothing that says where things run (URIs and endpoints): a deployment
-stays valid when it is pointed at another robot, and not when a rule is edited that the tables were made from.
+It covers everything that follows from the model, but not URIs and endpoints: a deployment stays valid when it is pointed
+at another robot, but not when a rule is edited that its tables were made from.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def deployment_hash(deployment: DeploymentFile) -> str:
-    """Return the SHA-256 (hexadecimal) of all that follows from the model: all but URIs, endpoints and compression."""
+    """Return the SHA-256 (hexadecimal) of a deployment without its URIs, endpoints and compression."""
     content = deployment.model_dump(
         mode="json",
         exclude={

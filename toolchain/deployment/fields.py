@@ -1,4 +1,4 @@
-"""What a key of `deployment.toml` may hold: URIs, topics, types, paths in a message, names, hashes."""
+"""The types of the values in `deployment.toml`: URIs, topics, message types, paths in a message, names, hashes."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ def websocket_uri(uri: str) -> str:
     """Return a WebSocket's URI.
 
     Raises:
-        ValueError: It is none.
+        ValueError: It is not one.
     """
     try:
         is_whole = bool(urlsplit(uri).hostname) and urlsplit(uri).port != 0
     except ValueError:  # a port beyond 65535, half an IPv6 address
         is_whole = False
     if not is_whole or not re.fullmatch(r"wss?://[^\s/?#]+\S*", uri):
-        raise ValueError(f"{uri!r} is no WebSocket URI; expected one like 'ws://robot:9090'")
+        raise ValueError(f"{uri!r} is not a WebSocket URI; expected one like 'ws://robot:9090'")
     return uri
 
 
 def _topic(topic: str) -> str:
     if not _TOPIC.fullmatch(topic):
-        raise ValueError(f"{topic!r} is no topic name; expected one like '/boat/sensors'")
+        raise ValueError(f"{topic!r} is not a topic name; expected one like '/boat/sensors'")
     if not topic.startswith("/"):
         raise ValueError(
             f"{topic!r} has no slash at its beginning; write '/{topic}', which means the same on every server"
@@ -45,7 +45,7 @@ def _topic(topic: str) -> str:
 def _message_type(name: str) -> str:
     if not _TYPE.fullmatch(name):
         raise ValueError(
-            f"{name!r} is no message type; expected one like 'std_msgs/Float64' or 'std_msgs/msg/Float64'"
+            f"{name!r} is not a message type; expected one like 'std_msgs/Float64' or 'std_msgs/msg/Float64'"
         )
     return name
 
@@ -58,14 +58,14 @@ def _not_zero(step: float) -> float:
 
 def _sha256(text: str) -> str:
     if not re.fullmatch(r"[0-9a-f]{64}", text):
-        raise ValueError(f"{text!r} is no SHA-256 hash; expected 64 hexadecimal digits")
+        raise ValueError(f"{text!r} is not a SHA-256 hash; expected 64 hexadecimal digits")
     return text
 
 
 def _message_path(path: str) -> str:
     if not MESSAGE_PATH.fullmatch(path):
         raise ValueError(
-            f"{path!r} is no place in a message; expected one like 'pose.position.x', 'ranges[3]' or a field's name"
+            f"{path!r} is not a path in a message; expected one like 'pose.position.x', 'ranges[3]' or a field's name"
         )
     return path
 
@@ -81,36 +81,36 @@ Topic = Annotated[str, AfterValidator(_topic)]
 MessageType = Annotated[str, AfterValidator(_message_type)]
 MessagePath = Annotated[str, AfterValidator(_message_path)]
 PathOrName = Annotated[str, AfterValidator(lambda path: path and _message_path(path))]
-"""Empty where a variable is searched by its name."""
+"""A path, or empty to search the message for the variable's name."""
 Name = Annotated[str, Field(min_length=1, max_length=NAME_MAX), AfterValidator(_printable)]
-"""One line that a terminal shows as it is: names come from networks' files too."""
+"""One printable line: names come from networks' files, too."""
 Sha256 = Annotated[str, AfterValidator(_sha256)]
 Step = Annotated[float, AfterValidator(_not_zero)]
 
 Item = TypeVar("Item")
-# TOML has arrays and strings, we keep tuples and enums; what is inside them stays strict.
+# TOML arrays and strings become tuples and enums; their contents stay strict.
 Sequence = Annotated[tuple[Item, ...], Field(strict=False), FailFast()]
 Choice = Annotated[Item, Field(strict=False)]
-# What says nothing is left out of the file and of its hash.
+# empty states are left out of the file and of its hash
 States = Annotated[tuple[Name, ...], Field(strict=False, exclude_if=lambda states: not states)]
 
 
 def states_fit(name: str, states: tuple[str, ...], size: int) -> None:
-    """Refuse names of a variable's values that are not as many as these.
+    """Refuse a number of state names that is not the number of values.
 
     Raises:
-        ValueError: Says whose, and how many.
+        ValueError: The numbers differ; names both.
     """
     if states and len(states) != size:
         raise ValueError(f"{name} has {size} values, but {len(states)} states are named")
 
 
 def names_differ(kind: str, names: list[str]) -> None:
-    """Refuse a name that several entries of a kind have.
+    """Refuse a name that several entries of one kind share.
 
     Raises:
-        ValueError: Says which.
+        ValueError: Two entries share a name.
     """
     twice = [name for name, count in Counter(names).items() if count > 1]
     if twice:
-        raise ValueError(f"[[{kind}]] has {twice[0]!r} twice; every name must be its own")
+        raise ValueError(f"[[{kind}]] has {twice[0]!r} twice; names must differ")

@@ -15,15 +15,15 @@ def load_deployment(directory: Path, *, images: bool = True, edited: bool = Fals
 
     Args:
         directory: The folder that `toolchain build` wrote.
-        images: Whether to read the boards' images too and compare their hashes; a process that drives no
-            boards may leave it out, and starts without NumPy.
-        edited: Whether `deployment.toml` may have been edited, so that its hash is not that of what it says.
+        images: True to read the boards' images and compare their hashes; a process that drives no boards
+            starts without NumPy if it leaves them out.
+        edited: True to accept a `deployment.toml` that was edited, so that its hash is not that of its content.
 
     Raises:
-        DeploymentError: Not there, not TOML, a wrong key or value (file, line, nearest right name).
+        DeploymentError: The deployment is absent, not TOML, or has a wrong key or value (file, line, nearest right name).
         DeploymentVersionError: Another format.
-        DamagedDeploymentError: `deployment.toml` or an image is not what was built; says which file and
-            which hash.
+        DamagedDeploymentError: `deployment.toml` or an image is not the one that was built; names the file and
+            both hashes.
     """
     directory = Path(directory)
     path = directory / FILE_NAME
@@ -76,5 +76,5 @@ def _check_images(deployment: Deployment) -> None:
         if image.image_hash != board.image_hash:
             raise DamagedDeploymentError(
                 f"{path} is another board's or another build's image: its hash is {image.image_hash[:16]}, "
-                f"{deployment.path} says {board.image_hash[:16]}"
+                f"{deployment.path} names {board.image_hash[:16]}"
             )

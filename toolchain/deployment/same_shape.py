@@ -1,9 +1,9 @@
-"""Whether a deployment can take another's place in a run that goes on: what boards and topics were made for must stay.
+"""Comparison of deployments: whether one can take the place of another in a run.
 
-A run's shape is what a board is synthesised for (lines, partitions, widths, generators, registers) and what the
-processes are connected to (servers, topics, types). Tables, priors and seeds, when a machine stops, and how readings
-become addresses belong to one deployment alone, and may change. A field that is not named below as free must stay, so
-that a new one is safe before anybody thinks of it here.
+The shape of a run must stay: it is synthesised into the boards (lines, partitions, widths, generators, registers), or
+processes are connected to it (servers, topics, types). Tables, priors, seeds, stop conditions and the rules from
+readings to addresses may change. A field that is not named below as free must stay, so that a new field is safe by
+default.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _TABLES: Final = {"sources", "variables", "searched", "machine", "boards", "outp
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """A field that would have to stay."""
+    """A field that differs and must stay."""
 
     field: str
     """Its place in `deployment.toml`."""
@@ -45,7 +45,7 @@ class Difference:
 
 
 def differences(before: Deployment, after: Deployment) -> list[Difference]:
-    """What keeps `after` from taking the place of `before`, in the order of `deployment.toml`; empty where nothing does."""
+    """Return the differences that keep `after` from taking the place of `before`, in the order of `deployment.toml`."""
     old, new = dict(_shape(before)), dict(_shape(after))
     fields = [*old, *(field for field in new if field not in old)]
     found = [
@@ -54,7 +54,7 @@ def differences(before: Deployment, after: Deployment) -> list[Difference]:
         if old.get(field) != new.get(field)
     ]
     counts = [difference for difference in found if difference.field.endswith(_COUNTS)]
-    # where a table has other rows, what its rows say is no news
+    # where a table has other rows, the contents of its rows are left out
     tables = tuple(
         f"{difference.field.split(']]')[0]}]]" for difference in counts if "]]" in difference.field
     )
@@ -70,7 +70,7 @@ def _shape(deployment: Deployment) -> Iterator[tuple[str, str]]:
     yield "[[variable]] names", _text(sorted(variable.name for variable in deployment.variables))
     for variable in sorted(deployment.variables, key=lambda each: each.name):
         yield from _fields(f"[[variable]] {variable.name} ", variable, _VARIABLE_FREE | {"name", "bits"})
-    # columns are what a board has; which variable they are read from may be mended
+    # a board has columns; the variable that each one reads may change
     for column, variable in enumerate(deployment.sensors, start=1):
         yield f"[[variable]] bits of column {column}", _text(variable.bits)
     yield from _rows("[[searched]]", deployment.searched, _DIMENSION_FREE)

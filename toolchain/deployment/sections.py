@@ -37,7 +37,7 @@ _INTERFACE: Final = re.compile(r"([1-9]\d{0,4})x([1-9]\d{0,5})")
 
 
 class Stop(StrEnum):
-    """When the boards of a partitioned machine stop."""
+    """The time at which the boards of a partitioned machine stop."""
 
     SLICES = "slices"
     """All at the end of the slice in which the first one overflows."""
@@ -46,16 +46,16 @@ class Stop(StrEnum):
 
 
 class Queue(StrEnum):
-    """What happens to frames that come faster than they are computed."""
+    """The treatment of frames that arrive faster than they are computed."""
 
     LATEST = "latest"
-    """The newest wins; what was passed over is counted."""
+    """The newest wins; frames that are passed over are counted."""
     ALL = "all"
     """All are computed, in order."""
 
 
 class Scale(StrEnum):
-    """What is divided by its maximum before quantising."""
+    """The part of a table that is divided by its maximum before quantising."""
 
     ADDRESS = "address"
     """Every address of a column by itself: the fewest cycles."""
@@ -93,8 +93,8 @@ class Source(Section):
 class Variable(Section):
     """`[[variable]]`: a known variable, and how its readings become addresses.
 
-    Of kind `sensor` it is a column of the machine; of kind `prior_select` it chooses the row of the prior's table
-    (thesis 2.1.2), whose top row is the prior without it: what a missing reading chooses.
+    Of kind `sensor` it is a column of the machine; of kind `prior_select` it selects the row of the prior's table
+    (thesis 2.1.2), whose top row, for a missing reading, is the prior without a selection.
     """
 
     name: Name
@@ -185,27 +185,27 @@ class MachineSection(Section):
 
     @property
     def is_plain(self) -> bool:
-        """Whether it is one machine with one reading a column: readings are numbers, and a result is one posterior."""
+        """True for one machine with one reading a column: readings are numbers, and a result is one posterior."""
         return self.replicas == 1 and self.sensor_mode is SensorMode.COLUMN
 
     @property
     def results(self) -> int:
-        """Probabilities of a frame: one a line, for every replica."""
+        """The number of probabilities of a frame: one a line, for every replica."""
         return self.replicas * self.lines
 
     @property
     def interface_sensors(self) -> int:
-        """Inputs that the boards' registers have room for."""
+        """The number of inputs that the boards' registers have room for."""
         return parse_interface(self.interface)[0]
 
     @property
     def interface_results(self) -> int:
-        """Results that the boards' registers have room for."""
+        """The number of results that the boards' registers have room for."""
         return parse_interface(self.interface)[1]
 
 
 class WrittenPrior(Section):
-    """`[prior]`: where a written prior comes from: one number for each line, of which ratios count.
+    """`[prior]`: the source of a written prior, one number for each line, of which only ratios count.
 
     Without this section a machine with `prior_mode = written` keeps the prior of its images until a host writes
     another.
@@ -255,5 +255,5 @@ def parse_interface(text: str) -> tuple[int, int]:
     """
     match = _INTERFACE.fullmatch(text)
     if not match:
-        raise ValueError(f"{text!r} is no interface; expected inputs x results, such as '20x1200'")
+        raise ValueError(f"{text!r} is not an interface; expected inputs x results, such as '20x1200'")
     return int(match[1]), int(match[2])

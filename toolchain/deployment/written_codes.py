@@ -27,34 +27,36 @@ def written_codes(likelihoods: NDArray[np.float64], *, prob_bits: int, scale: Sc
         uint16 codes of the same shape.
 
     Raises:
-        ReadingError: One is no probability, or all of a row are 0.
+        ReadingError: A likelihood is not a probability, or a row is all 0.
     """
     if not np.isfinite(likelihoods).all():
         raise ReadingError("a likelihood is not finite")
     if (least := float(likelihoods.min())) < 0:
-        raise ReadingError(f"{least:g} is no probability")
+        raise ReadingError(f"{least:g} is not a probability")
     largest = likelihoods.max(axis=-1, keepdims=True)
     if scale is Scale.NONE:
         if float(largest.max()) > 1:
-            raise ReadingError(f"{float(largest.max()):g} is no probability, expected 0 to 1 (scale = none)")
+            raise ReadingError(
+                f"{float(largest.max()):g} is not a probability, expected 0 to 1 (scale = none)"
+            )
         return encode_probability(likelihoods, prob_bits)
     if not (largest > 0).all():
-        raise ReadingError("all lines have 0, so that none is possible")
+        raise ReadingError("all lines have 0, so none is possible")
     return encode_probability(likelihoods / largest, prob_bits)
 
 
 def written_prior(prior: ArrayLike, *, lines: int, prob_bits: int, replicas: int = 1) -> NDArray[np.uint16]:
-    """Return a written prior's codes, uint16[lines]: of the numbers only ratios count.
+    """Return the codes of a written prior, uint16[lines]; only ratios of its numbers count.
 
     Args:
-        prior: One number for each line of the machine, such as a posterior of an earlier frame. With replicas, so many
-            serve all of them, and `replicas` times as many are each one's own, one after the other.
+        prior: One number for each line of the machine, such as a posterior of an earlier frame. With replicas, that many
+            numbers serve all of them, and `replicas` times as many are one prior for each, one after the other.
         lines: Lines of the machine, over all boards.
         prob_bits: Bits of a code (W), 1 to 16.
         replicas: Machines on a board. With several, uint16[replicas, lines] is returned.
 
     Raises:
-        ReadingError: Another number of numbers, one that is no probability, or all of them 0.
+        ReadingError: Another count of numbers, a number that is not a probability, or all of them 0.
     """
     try:
         numbers = np.asarray(prior, dtype=np.float64)
@@ -70,7 +72,7 @@ def written_prior(prior: ArrayLike, *, lines: int, prob_bits: int, replicas: int
     largest = numbers.max(axis=-1, keepdims=True)
     if not np.all(np.isfinite(numbers)) or np.any(numbers < 0) or not np.all(largest > 0):
         raise ReadingError(
-            "the prior to write is no distribution: it holds a negative, infinite or NaN number, or only zeros"
+            "the prior to write is not a distribution: it holds a negative, infinite or NaN number, or only zeros"
         )
     codes = encode_probability(numbers / largest, prob_bits)
     return codes if replicas == 1 else np.broadcast_to(codes, (replicas, lines)).copy()

@@ -1,9 +1,9 @@
 """Learns a model's tables from recordings with ground truth: normals with an outliers' share, or counts.
 
 **Normals.** A reading is `mean(S) + bias + noise` with noise N(0, sigma^2), or, for a share of the readings, anything
-in the variable's range alike. Bias, sigma and share come from expectation maximisation on the residuals at the true
+uniformly in the variable's range. Bias, sigma and share come from expectation maximisation on the residuals at the true
 place; inside a cell the mean is taken as linear. Sigma and bias may be shared by a pool of variables; the share is
-each variable's own, with one outlier and one good reading in advance (a Beta(2, 2) prior's mode).
+each variable's own, with one outlier and one good reading in advance (the mode of a Beta(2, 2) prior).
 
 **Counts.** P(k | s) = (n(k, s) + a q(k | s)) / (n(s) + a): a Dirichlet prior worth `a` readings in every cell, which
 looks like q, the model's own table or a uniform one.
@@ -37,14 +37,14 @@ LEAST_READINGS: Final = 10
 _ROUNDS: Final = 1000
 _SETTLED: Final = 1e-10
 _LEAST_SIGMA: Final = 0.05
-"""Of a step: recordings that were rounded, or simulated without noise, have no spread at all."""
+"""In steps: rounded recordings, or those simulated without noise, have no spread at all."""
 _TO_SIGMA: Final = 1.4826
 """From a normal's median absolute deviation to its sigma."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Truth:
-    """Where the truth lay in each row that a model can learn from."""
+    """The true place in each row that a model can learn from."""
 
     rows: NDArray[np.int64]
     """int64[n], the recording's rows that have a true value of every searched dimension, inside the grid."""
@@ -53,12 +53,12 @@ class Truth:
     within: NDArray[np.float64]
     """float64[dimensions, n], how far from the cell's centre, in cells: -0.5 to 0.5."""
     outside: int
-    """How many other rows there are."""
+    """The number of other rows."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Support:
-    """How much data a table rests on."""
+    """The amount of data that a table rests on."""
 
     name: str
     """The variable."""
@@ -67,24 +67,24 @@ class Support:
     cells: int
     """Lines of the machine that have at least one of them."""
     median: float
-    """Of the readings in such a line."""
+    """The median number of readings in such a line."""
     refused: int
-    """Readings that are no values of the variable."""
+    """Readings that are not values of the variable."""
 
 
 def locate(model: Model, columns: Mapping[str, Sequence[object]], rows: int) -> Truth:
-    """Return where the truth lay.
+    """Return the true place in each row.
 
     Args:
-        model: The model; its searched dimensions say what a cell is.
+        model: The model, whose searched dimensions define the cells.
         columns: True values of each searched dimension, by its label.
-        rows: How many rows the recording has.
+        rows: The number of rows of the recording.
     """
     places = np.array(
         [[_position(dimension, value) for value in columns[dimension.label]] for dimension in model.searched]
     ).reshape(len(model.searched), rows)
     sizes = np.array([dimension.size for dimension in model.searched])[:, np.newaxis]
-    with np.errstate(invalid="ignore"):  # NaN is no place
+    with np.errstate(invalid="ignore"):  # NaN is not a place
         cells = np.floor(places + 0.5)
         inside = np.all((cells >= 0) & (cells < sizes), axis=0)
     cells = cells[:, inside].astype(np.int64)
@@ -108,16 +108,16 @@ def fit_model(
 
     Args:
         model: The model.
-        truth: Where the truth lay.
+        truth: The true place in each row.
         readings: Of each known variable that is to be learnt, one a row of the recording.
-        recordings: What is told about the recordings in the file.
+        recordings: The recordings as they are listed in the file.
         options: Method, pools, priors.
 
     Returns:
-        The fit, and how much data each table rests on.
+        The fit, and the amount of data that each table rests on.
 
     Raises:
-        ModelError: No row has a truth, or a variable that can't be learnt in this way.
+        ModelError: No row has a true place, or a variable can't be learnt with this method.
     """
     if not len(truth.rows):
         raise ModelError(
@@ -146,7 +146,7 @@ def fit_model(
 
 
 def _position(dimension: Dimension, value: object) -> float:
-    """Return a true value as a place along a dimension, in cells; NaN where it is none."""
+    """Return a true value as a place along a dimension, in cells; NaN where it is not a value."""
     if isinstance(value, str) and value in dimension.states:
         return float(dimension.states.index(value))
     if isinstance(value, str) or not isinstance(value, int | float):
@@ -197,7 +197,7 @@ def mixture(
     Args:
         residuals: Of each variable, reading minus expectation.
         widths: Each variable's range: an outlier lies anywhere in it.
-        bias: Whether the normal's mean is fitted; else it is 0.
+        bias: True to fit the normal's mean; else it is 0.
         least_sigma: The least standard deviation.
 
     Returns:

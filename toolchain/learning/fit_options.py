@@ -1,4 +1,4 @@
-"""How `toolchain fit` learns: the method and what it assumes beside the recordings."""
+"""The options of `toolchain fit`: the method and its assumptions."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from enum import StrEnum
 
 
 class FitMethod(StrEnum):
-    """What is learnt."""
+    """A method of learning."""
 
     NORMALS = "normals"
     """Sigma, outliers' share and bias of variables that are normal around a known mean."""
@@ -16,7 +16,7 @@ class FitMethod(StrEnum):
 
 
 class FitPrior(StrEnum):
-    """What a counted table looks like before any reading."""
+    """The form of a counted table before any reading."""
 
     MODEL = "model"
     """The model's own table."""
@@ -26,23 +26,23 @@ class FitPrior(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FitOptions:
-    """What a fit is told beside the model and the recordings."""
+    """The options of a fit, beside the model and the recordings."""
 
     truth: tuple[str, ...]
     """`LABEL=COLUMN` of each searched dimension."""
     readings: tuple[str, ...] = ()
-    """`NAME=COLUMN` of known variables; one `*` in both stands for the same text."""
+    """`NAME=COLUMN` of known variables; one `*` in both matches the same text."""
     method: FitMethod = FitMethod.NORMALS
-    """What is learnt."""
+    """The method of learning."""
     pool: tuple[str, ...] = ()
     """Patterns of variables that share sigma and bias; each keeps its own outliers' share."""
     bias: bool = False
-    """Whether a constant error is fitted."""
+    """True to fit a constant error."""
     floor: float = 0.005
-    """What an outlier gets at least, relative to the peak."""
+    """The least probability of an outlier, relative to the peak."""
     pseudo_count: float = 1.0
     """Readings that the Dirichlet prior of a cell is worth."""
     prior: FitPrior = FitPrior.MODEL
-    """What that prior looks like."""
+    """The form of that prior."""
     tolerance_s: float = 0.1
     """Seconds between a reading in a bag and the truth that belongs to it."""

@@ -1,4 +1,4 @@
-"""What was learnt from recordings, as a file: `.toml` of normals or `.npz` of counted tables, and a model with it."""
+"""Fits as files, `.toml` of normals or `.npz` of counted tables, and models that use them."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from toolchain.deployment.sections import Section
 from toolchain.errors import ModelError
 from toolchain.files.bounded_file import open_regular
 from toolchain.files.toml_file import TomlFile
+from toolchain.files.whole_file import whole_file
 from toolchain.models.conditional import normal_table, wrapped_normal_table
 from toolchain.models.model import Known, Model, Normal
 
@@ -39,7 +40,7 @@ _EPOCH: Final = (1980, 1, 1, 0, 0, 0)
 
 
 class FittedRecording(Section):
-    """`[[recording]]`: what was learnt from."""
+    """A `[[recording]]` that was learnt from."""
 
     file: str
     sha256: str
@@ -47,7 +48,7 @@ class FittedRecording(Section):
 
 
 class FittedVariable(Section):
-    """`[[variable]]`: one known variable; of counted ones only name and rows, for their tables are arrays."""
+    """A `[[variable]]`, a known variable; a counted one has only name and rows, since its table is an array."""
 
     name: str
     rows: int = Field(ge=0)
@@ -57,7 +58,7 @@ class FittedVariable(Section):
 
 
 class FitFile(Section):
-    """What the file says."""
+    """The content of a fit's file, but for counted tables."""
 
     format: Literal[1] = FORMAT
     method: Literal["normals", "counts"]
@@ -69,7 +70,7 @@ class FitFile(Section):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Fit:
-    """What was learnt."""
+    """Learnt parameters or tables."""
 
     file: FitFile
     """Method, recordings and the variables' numbers."""
@@ -134,7 +135,7 @@ def mean_slopes(model: Model, known: Known) -> NDArray[np.float64]:
     """
     if known.normal is None:
         raise ModelError(
-            f"{known.name} is not normal around a mean that the model says; fit it with --method counts"
+            f"{known.name} has no mean in the model to be normal around; fit it with --method counts"
         )
     sizes = tuple(dimension.size for dimension in model.searched)
     mean = known.normal.mean.reshape(sizes)
@@ -186,8 +187,7 @@ def write_fit(path: Path, fit: Fit) -> None:
     suffix = ".toml" if fit.file.method == "normals" else ".npz"
     if path.suffix != suffix:
         raise ModelError(f"{path}: the method {fit.file.method} writes a file that ends in {suffix}")
-    partial = path.with_name(path.name + ".part")
-    try:
+    with whole_file(path, ModelError) as partial:
         path.parent.mkdir(parents=True, exist_ok=True)
         if fit.file.method == "normals":
             renamed = {
@@ -197,9 +197,6 @@ def write_fit(path: Path, fit: Fit) -> None:
             partial.write_text(_HEADER + tomli_w.dumps(renamed), encoding="utf-8")
         else:
             _write_tables(partial, content, fit.tables)
-        partial.replace(path)
-    except OSError as reason:
-        raise ModelError(f"{path} can't be written: {reason.strerror or reason}") from None
 
 
 def read_fit(path: Path) -> Fit:
@@ -212,7 +209,7 @@ def read_fit(path: Path) -> Fit:
         return _read_tables(path)
     file = TomlFile.read(path, ModelError).validated(FitFile)
     if file.method != "normals":
-        raise ModelError(f"{path} says method = {file.method!r}, whose tables `toolchain fit` writes as .npz")
+        raise ModelError(f"{path} has method = {file.method!r}, whose tables `toolchain fit` writes as .npz")
     return Fit(file=file, tables={})
 
 
@@ -259,7 +256,7 @@ def _read_tables(path: Path) -> Fit:
         RuntimeError,
     ) as reason:
         raise ModelError(
-            f"{path} is no file of counted tables that `toolchain fit` wrote, or is damaged: {type(reason).__name__}"
+            f"{path} was not written by `toolchain fit`, or is damaged: {type(reason).__name__}"
         ) from None
     if file.method != "counts":
         raise ModelError(f"{path} holds {file.method}, which `toolchain fit` writes as .toml")

@@ -1,7 +1,7 @@
 """Recorded readings with ground truth, as columns: from CSV files, MCAP files and bags.
 
 A CSV's columns are those of its heading. A bag's are TOPIC:PATH, such as `/scan:ranges[3]`; its rows are the
-messages of the first column's topic, and of every other topic the message nearest in time belongs to them.
+messages of the first column's topic, each with the nearest message in time of every other topic.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ class Recording:
     """Columns of a recording."""
 
     path: Path
-    """Where it came from."""
+    """The file."""
     rows: int
-    """How many rows it has."""
+    """The number of rows."""
     columns: dict[str, list[object]]
-    """By name, one value a row: a number, a word, or None where there is nothing."""
+    """By name, one value a row: a number, a word, or None for nothing."""
 
 
 def read_recording(path: Path, columns: Sequence[str], *, tolerance_s: float = 0.1) -> Recording:
@@ -45,14 +45,14 @@ def read_recording(path: Path, columns: Sequence[str], *, tolerance_s: float = 0
 
     Args:
         path: A CSV file (`.csv`), or an MCAP file, a ROS 1 bag or a ROS 2 bag's folder.
-        columns: Which columns; the first one's topic gives a bag's rows.
-        tolerance_s: In a bag, how far from a row another topic's message may be, seconds.
+        columns: The columns; the first one's topic gives a bag's rows.
+        tolerance_s: In a bag, the most seconds between a row and another topic's message.
 
     Raises:
-        ModelError: Not there, damaged, without a column (lists those there are), or longer than `MAX_ROWS`.
+        ModelError: The recording is absent, damaged, without a column (lists its columns), or longer than `MAX_ROWS`.
     """
     if not path.exists():
-        raise ModelError(f"the recording {path} is not there")
+        raise ModelError(f"the recording {path} does not exist")
     if path.suffix.lower() == ".csv":
         return _read_csv(path, columns)
     return _read_bag(path, columns, round(tolerance_s * 1e9))
@@ -83,18 +83,18 @@ def _read_csv(path: Path, columns: Sequence[str]) -> Recording:
         raise ModelError(f"{path} can't be read: {reason.strerror or reason}") from None
     except UnicodeDecodeError:
         raise ModelError(
-            f"{path} is no CSV file: it is not UTF-8 text, at the line after {lines.line_num} or later"
+            f"{path} is not a CSV file: it is not UTF-8 text, at the line after {lines.line_num} or later"
         ) from None
     except csv.Error as reason:
-        raise ModelError(f"{path} is no CSV file: {reason}") from None
+        raise ModelError(f"{path} is not a CSV file: {reason}") from None
     return Recording(path, rows, found)
 
 
 def _lines(path: Path, file: TextIO) -> Iterator[str]:
-    """The lines of a file, which may be one without an end."""
+    """Yield the lines of a file, each of bounded length."""
     while line := file.readline(_LONGEST_LINE + 1):
         if len(line) > _LONGEST_LINE:
-            raise ModelError(f"{path} is no CSV file: a line has more than {_LONGEST_LINE} characters")
+            raise ModelError(f"{path} is not a CSV file: a line has more than {_LONGEST_LINE} characters")
         yield line
 
 
@@ -120,8 +120,8 @@ def _place(path: Path, heading: Sequence[str], column: str) -> int:
         message = f"{path} is empty; expected a heading with the columns' names"
     elif len(heading) == 1 and (sign := next((each for each in ";\t|" if each in heading[0]), None)):
         message = (
-            f"{path} has {sign!r} between its values, expected commas: its heading is {heading[0][:80]!r}; write it anew, "
-            "with points in the numbers"
+            f"{path} has {sign!r} between its values, expected commas: its heading is {heading[0][:80]!r}; export it "
+            "with commas, and points in the numbers"
         )
     else:
         message = f"{path} has no column {column!r}; it has {_listed(heading)}"
@@ -168,9 +168,7 @@ def _messages(path: Path, topics: tuple[str, ...]) -> Iterator[tuple[str, int, A
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
-        raise ModelError(
-            f"{path} is no CSV file, and bags are read by rosbags: pip install rosbags"
-        ) from None
+        raise ModelError(f"{path} is not a CSV file, and bags need rosbags: pip install rosbags") from None
     count = 0
     try:
         with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as reader:
@@ -190,12 +188,12 @@ def _messages(path: Path, topics: tuple[str, ...]) -> Iterator[tuple[str, int, A
 
 
 def _field(message: Any, path: str) -> object:
-    """Return a message's field; NaN, what is not there and an index beyond an array are nothing."""
+    """Return a message's field; None for NaN, an absent value and an index beyond an array."""
     value = message
     for step in path.split("."):
         match = _STEP.fullmatch(step)
         if match is None:
-            raise ModelError(f"{path!r} is no path; expected one such as pose.position.x or ranges[3]")
+            raise ModelError(f"{path!r} is not a path; expected one such as pose.position.x or ranges[3]")
         if match[1].startswith("_") or match[1] not in getattr(value, "__dataclass_fields__", {}):
             raise ModelError(f"the message has no field {match[1]!r} of {path!r}")
         value = getattr(value, match[1])

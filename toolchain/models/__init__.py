@@ -1,7 +1,7 @@
-"""Models: what is searched, what is known given it, and the exact posterior (thesis 2.1.2, 3.4).
+"""Models: searched and known variables, and the exact posterior (thesis 2.1.2, 3.4).
 
-What a `model.py` is written with can be imported from here; each name is loaded when it is first asked for, so that a
-command's `--help` needs no NumPy.
+The names that a `model.py` needs can be imported from here; each is loaded on first use, so that a command's `--help`
+needs no NumPy.
 """
 
 from importlib import import_module
@@ -50,12 +50,12 @@ _HOME_OF: Final = {name: module for module, names in _HOMES.items() for name in 
 
 
 def __getattr__(name: str) -> object:
-    """Return what one of the modules here offers, or say that it is not among that (PEP 562)."""
+    """Return a name of one of the modules here (PEP 562)."""
     if name not in _HOME_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module(f"{__name__}.{_HOME_OF[name]}"), name)
 
 
 def __dir__() -> list[str]:
-    """Return what a notebook is to offer: this, and not what it is made of."""
+    """Return the public names, for completion in a notebook."""
     return sorted(__all__)

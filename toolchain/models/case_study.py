@@ -40,7 +40,7 @@ def load_model(case: Path, settings: Mapping[str, str]) -> Model:
     """
     path = model_path(case)
     if not path.is_file():
-        what = f"has no {FILE_NAME}" if Path(case).is_dir() else "is no folder"
+        what = f"has no {FILE_NAME}" if Path(case).is_dir() else "is not a folder"
         raise ModelError(
             f"{case} {what}; expected a case study's folder with a {FILE_NAME} that defines model(), or a network's "
             "file: .bif, .xmlbif, .uai or .net"
@@ -67,7 +67,7 @@ def model_path(case: Path) -> Path:
 
 @contextmanager
 def _importing_from(folder: Path) -> Iterator[None]:
-    """Let `model.py` import the modules beside it; last on the path, so that they replace nothing."""
+    """Let `model.py` import the modules beside it; they come last on the path and so replace nothing."""
     sys.path.append(str(folder))
     try:
         yield
@@ -97,7 +97,7 @@ def _model_function(path: Path) -> Callable[..., object]:
 def _guarded(path: Path, what: str, call: Callable[[], object]) -> object:
     """Call into the user's file; what it raises becomes one sentence with the line it came from.
 
-    What the file itself refuses it says in its own words; what the toolchain refuses of it gets the line too.
+    An error that the file itself raises keeps its words; an error of the toolchain gets the file's line, too.
     """
     try:
         return call()
@@ -109,7 +109,7 @@ def _guarded(path: Path, what: str, call: Callable[[], object]) -> object:
     except ToolchainError:
         raise
     except SyntaxError as error:
-        place = f", line {error.lineno}" if error.lineno else ""  # a file that is no text has none
+        place = f", line {error.lineno}" if error.lineno else ""  # a file that is not text has no line
         raise ModelError(f"{error.filename or path}{place}: {error.msg}") from None
     except SystemExit as error:
         frames = traceback.extract_tb(error.__traceback__)

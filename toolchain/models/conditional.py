@@ -1,7 +1,7 @@
 """Conditional distributions P(K | S) by formula: normals over the bins of a reading, wrapped for bearings.
 
-A reading's address stands for the bin of half a step around it. Its probability is the Gaussian's integral
-over the bin, not the density at its middle, so that coarse bins stay right.
+A reading's address is the bin of half a step around it. Its probability is the Gaussian's integral over the bin, not
+the density at its middle, so that coarse bins stay exact.
 """
 
 from __future__ import annotations
@@ -44,15 +44,15 @@ def normal(
         name: The variable's name.
         mean: float64[lines], its mean on every line, in the reading's unit.
         sigma: Its standard deviation, float64[lines] or one for all, in the reading's unit.
-        values: How many bins (addresses).
+        values: The number of bins (addresses).
         offset: The middle of the first bin.
         step: The width of a bin.
-        bits: Address bits; 0 for as few as will do.
-        floor: What an outlier's bin gets everywhere, relative to the bin likelihood's peak.
-        outliers: Share of readings that have nothing to do with S: it is spread over all bins.
-        on_range: What a reading beyond the end bins is.
-        on_missing: Whether a reading may be missing.
-        path: Where in the message it is.
+        bits: Address bits; 0 for the fewest that are enough.
+        floor: Added to each bin for outliers, relative to the peak of the bin likelihood.
+        outliers: Share of readings that have nothing to do with S, which is spread over all bins.
+        on_range: The meaning of a reading beyond the end bins.
+        on_missing: `missing` where a reading may be missing.
+        path: The variable's place in the message.
 
     Raises:
         ModelError: A sigma, step, floor, share or number of values that is not positive.
@@ -89,18 +89,7 @@ def wrapped_normal(
 ) -> Known:
     """Return a known variable on a circle of `values * step` that is a wrapped normal given S.
 
-    Args:
-        name: The variable's name.
-        mean: float64[lines], its mean direction on every line, in the reading's unit, any turn.
-        sigma: Its standard deviation, float64[lines] or one for all, in the reading's unit.
-        values: How many bins (addresses) in a turn.
-        offset: The middle of the first bin.
-        step: The width of a bin.
-        bits: Address bits; 0 for as few as will do.
-        floor: What an outlier's bin gets everywhere, relative to the bin likelihood's peak.
-        outliers: Share of readings that have nothing to do with S: it is spread over all bins.
-        on_missing: Whether a reading may be missing.
-        path: Where in the message it is.
+    The arguments are those of `normal`: `values` are the bins of a turn, and a mean may lie in any turn.
 
     Raises:
         ModelError: A sigma, step, floor, share or number of values that is not positive.

@@ -1,6 +1,6 @@
 """Factors of a joint distribution: tables, normals and functions of one symbol given others, and potentials.
 
-What is continuous becomes a table here: a normal's integral over each value of its symbol, a function's value.
+Continuous distributions become tables here: a normal's integral over each value of its symbol, a function's value.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from toolchain.models.symbol import Symbol
 
     Formula: TypeAlias = Callable[..., ArrayLike] | ArrayLike
-    """Of the given symbols' values, one float64 array each of the same shape; or numbers that need none."""
+    """A function of the given symbols' values, one float64 array each of the same shape; or constant numbers."""
 
 _SUM_TOLERANCE: Final = 1e-6
 
@@ -36,11 +36,11 @@ class Distribution:
     symbol: Symbol
     """The symbol that it is a distribution of."""
     given: tuple[Symbol, ...]
-    """What it depends on."""
+    """The symbols that it depends on."""
     table: NDArray[np.float64]
     """float64[symbol's size, size of each given], summing to 1 over the first axis."""
     normal: Normal | None = None
-    """What it was made of, where it is one of normals; its arrays run over the given symbols' values, the
+    """The normals that the table was made of, or None; their arrays run over the given symbols' values, the
     last fastest."""
 
     @property
@@ -50,7 +50,7 @@ class Distribution:
 
     @property
     def title(self) -> str:
-        """As it is written: P(A | B, C)."""
+        """The distribution as it is written: P(A | B, C)."""
         return _title(self.symbol, self.given)
 
     def __repr__(self) -> str:
@@ -79,10 +79,10 @@ def table(symbol: Symbol, values: ArrayLike, *, given: Sequence[Symbol] = ()) ->
     Args:
         symbol: The symbol.
         values: float64[symbol's size, size of each given].
-        given: What it depends on.
+        given: The symbols that it depends on.
 
     Raises:
-        ModelError: Another shape, a number that is no probability, or a column that doesn't sum to 1.
+        ModelError: Another shape, a number that is not a probability, or a column that doesn't sum to 1.
     """
     given = tuple(given)
     scope = _scope(symbol, given)
@@ -92,7 +92,7 @@ def table(symbol: Symbol, values: ArrayLike, *, given: Sequence[Symbol] = ()) ->
         raise ModelError(f"{_title(symbol, given)} has shape {numbers.shape}, expected {shape}")
     if not np.all(np.isfinite(numbers)) or np.any(numbers < 0):
         raise ModelError(
-            f"{_title(symbol, given)} holds a number that is no probability: negative, infinite or NaN"
+            f"{_title(symbol, given)} holds a number that is not a probability: negative, infinite or NaN"
         )
     sums = numbers.sum(axis=0)
     wrong = np.argwhere(np.abs(sums - 1) > _SUM_TOLERANCE)
@@ -127,10 +127,10 @@ def conditional_normal(
 
     Args:
         symbol: An integer or interval symbol; each value gets the normal's integral over its interval.
-        given: What it depends on; none for a plain normal.
-        mean: Of the given symbols' values, or numbers that broadcast to their shape.
-        sigma: Likewise, the standard deviation.
-        floor: What every value gets at least, relative to the peak.
+        given: The symbols that it depends on; none for a plain normal.
+        mean: A function of the given symbols' values, or numbers that broadcast to their shape.
+        sigma: The standard deviation, likewise.
+        floor: The least probability of a value, relative to the peak.
         outliers: Share of readings that have nothing to do with the given symbols.
 
     Raises:
@@ -158,12 +158,12 @@ def function(symbol: Symbol, given: Sequence[Symbol], value: Formula) -> Distrib
     """Return P(symbol | given) of a symbol that is a function of the others: 1 at its value, 0 elsewhere.
 
     Args:
-        symbol: The symbol; its `on_range = clamp` takes values beyond its ends to the ends.
-        given: What it is a function of.
+        symbol: The symbol; with `on_range = clamp`, values beyond its ends become the ends.
+        given: The symbols that it is a function of.
         value: The function, of the given symbols' values as numbers.
 
     Raises:
-        ModelError: A value that the symbol doesn't have.
+        ModelError: The function gives a value that the symbol doesn't have.
     """
     given = tuple(given)
     scope = _scope(symbol, given)
@@ -189,7 +189,7 @@ def function(symbol: Symbol, given: Sequence[Symbol], value: Formula) -> Distrib
 
 
 def potential(symbols: Sequence[Symbol], values: ArrayLike) -> Potential:
-    """Return a factor that is no distribution by itself, such as a Markov network's.
+    """Return a factor that is not a distribution by itself, such as a Markov network's.
 
     Args:
         symbols: The symbols that it is a function of.

@@ -1,4 +1,4 @@
-"""Variable elimination: what is summed over disappears from a product of tables, one name after the other.
+"""Variable elimination: names are summed out of a product of tables, one after the other.
 
 Exact, in float64. The next name is always the one whose table is the smallest; a table above the limit is refused.
 """
@@ -58,13 +58,13 @@ def product(terms: Sequence[Term], scope: Sequence[str], sizes: Mapping[str, int
 def eliminate(terms: Iterable[Term], names: Iterable[str], sizes: Mapping[str, int]) -> list[Term]:
     """Return terms whose product is the given terms' product, summed over some names.
 
-    Tables are scaled by their maxima on the way, so that long products don't underflow: the result is right up to a
+    Tables are scaled by their maxima on the way, so that long products don't underflow: the result is exact up to a
     factor.
 
     Args:
         terms: The product.
-        names: What is summed over.
-        sizes: How many values each name of the terms has.
+        names: The names to sum out.
+        sizes: The number of values of each name.
 
     Raises:
         ModelError: A table on the way would be larger than the limit.
@@ -77,7 +77,7 @@ def eliminate(terms: Iterable[Term], names: Iterable[str], sizes: Mapping[str, i
             holding[name].add(number)
     unions = {name: _union(left[number] for number in sorted(holding[name])) for name in holding}
     costs = {name: math.prod(sizes[other] for other in unions[name]) for name in holding}
-    # The name breaks ties: the same question gives the same sums, to the bit. What has another cost by now is there again.
+    # The name breaks ties: the same question gives the same sums, to the bit. A changed cost is a new entry of the heap.
     cheapest = [(cost, name) for name, cost in costs.items()]
     heapify(cheapest)
     while holding:

@@ -25,7 +25,7 @@ def exact_posterior(
         model: The model.
         addresses: One per known variable, in the columns' order; None for a missing reading. Where lines have readings of
             their own (`sensor_mode = cell`), int64[lines] per variable.
-        prior_address: Which row of the selected prior; None for the prior without a selection.
+        prior_address: The row of the selected prior; None for the prior without a selection.
 
     Returns:
         float64[lines], summing to 1.
@@ -59,12 +59,12 @@ def exact_posterior(
 def fuse(prior: NDArray[np.float64], likelihoods: Iterable[NDArray[np.float64]]) -> NDArray[np.float64]:
     """Return the normalised product of a prior and likelihoods, float64[lines] each, up to factors.
 
-    The product is made of logarithms, so that thirty small likelihoods don't underflow.
+    The product is a sum of logarithms, so that thirty small likelihoods don't underflow.
 
     Raises:
         ModelError: The product is 0 on every line.
     """
-    with np.errstate(divide="ignore"):  # log 0 = -inf is what an impossible line is
+    with np.errstate(divide="ignore"):  # log 0 = -inf is an impossible line
         logarithm = np.log(prior)
         for likelihood in likelihoods:
             logarithm = logarithm + np.log(likelihood)

@@ -1,16 +1,17 @@
-"""Joint distributions as products of factors, and questions to them: searched and known (in the manner of ProBT).
+"""Joint distributions as products of factors, and questions to them, as in ProBT.
 
 A question that has naive fusion's form, P(S) P(k_1 | S) ... P(k_N | S) (equation 2.2), becomes a `Model`, which a BM1
-computes. What is neither searched nor known is summed over exactly; a question of another form is refused, with
-the path that joins two known symbols.
+computes. Symbols that are neither searched nor known are summed out exactly; a question of another form is refused,
+with the path that joins two known symbols.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from graphlib import CycleError, TopologicalSorter
 from operator import itemgetter
-from typing import TYPE_CHECKING, Final, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import numpy as np
 
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from toolchain.deployment import Dimension
     from toolchain.models.symbol import Symbol
 
     Named: TypeAlias = Symbol | str
@@ -39,16 +39,16 @@ class JointDistribution:
     """A product of factors: a Bayesian network, or with potentials a Markov network."""
 
     name: str
-    """What a deployment of it is called."""
+    """The name of a deployment of it."""
     factors: tuple[Factor, ...]
-    """The distributions P(A | B, C) and potentials; every symbol that is given has a factor too."""
+    """The distributions P(A | B, C) and potentials; every given symbol has a factor, too."""
     symbols: tuple[Symbol, ...] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         """Check that the factors belong together.
 
         Raises:
-            ModelError: Two symbols of one name, two distributions of one symbol, one that has none, or a circle.
+            ModelError: Two symbols of one name, two distributions of one symbol, one without any, or a cycle.
         """
         object.__setattr__(self, "factors", tuple(self.factors))
         symbols: dict[str, Symbol] = {}
@@ -70,15 +70,15 @@ class JointDistribution:
             raise ModelError(
                 f"{self.name}: {min(bare)} has no distribution; give it one, such as uniform({min(bare)})"
             )
-        if circle := _circle(children):
-            raise ModelError(f"{self.name}: {' -> '.join(circle)} is a circle; a joint distribution has none")
+        if cycle := _cycle(children):
+            raise ModelError(f"{self.name}: {' -> '.join(cycle)} is a cycle; a joint distribution has none")
         object.__setattr__(self, "symbols", tuple(symbols.values()))
 
     def symbol(self, name: Named) -> Symbol:
         """Return a symbol by its name.
 
         Raises:
-            ModelError: There is none; lists those there are.
+            ModelError: There is no such symbol; lists those there are.
         """
         wanted = name if isinstance(name, str) else name.name
         for symbol in self.symbols:
@@ -99,13 +99,13 @@ class JointDistribution:
         """Return the question P(searched | known).
 
         Args:
-            searched: What is searched, the slowest dimension first: a line of the machine for each combination.
-            known: What is known in every frame, in the order of the machine's columns.
-            given: What is known for ever, by name: the label or number that it has.
-            prior_select: What is known too, but selects the prior instead of being a column (thesis 2.1.2).
+            searched: The searched symbols, the slowest dimension first: a line of the machine for each combination.
+            known: The symbols known in every frame, in the order of the machine's columns.
+            given: Symbols with a fixed value, by name: the value's label or number.
+            prior_select: A known symbol that selects the prior instead of being a column (thesis 2.1.2).
 
         Raises:
-            ModelError: A symbol that isn't there, or one that is asked for twice.
+            ModelError: A symbol does not exist, or is in the question twice.
         """
         fixed = {
             self.symbol(name).name: self.symbol(name).index(label) for name, label in (given or {}).items()
@@ -135,13 +135,13 @@ class Question:
     joint: JointDistribution
     """The joint distribution."""
     searched: tuple[Symbol, ...]
-    """What is searched, the slowest dimension first."""
+    """The searched symbols, the slowest dimension first."""
     known: tuple[Symbol, ...]
-    """What is known, in the columns' order."""
+    """The known symbols, in the columns' order."""
     given: Mapping[str, int]
-    """What is known for ever: each name's value."""
+    """The index of each fixed value, by its symbol's name."""
     prior_select: Symbol | None
-    """What selects the prior, or None."""
+    """The symbol that selects the prior, or None."""
 
     def __repr__(self) -> str:
         known = [*(each.name for each in self.observed), *(f"{name}={at}" for name, at in self.given.items())]
@@ -152,14 +152,14 @@ class Question:
 
     @property
     def observed(self) -> tuple[Symbol, ...]:
-        """All that has a reading in every frame."""
+        """The symbols that have a reading in every frame."""
         return self.known if self.prior_select is None else (*self.known, self.prior_select)
 
     def model(self) -> Model:
         """Return the model that a BM1 computes.
 
         Raises:
-            ModelError: The question has no such form (says which known symbols are joined by which path), is
+            ModelError: The question is not naive fusion (names the path that joins two known symbols), is
                 impossible, or needs a table above the limit.
         """
         observed = [symbol.name for symbol in self.observed]
@@ -191,7 +191,7 @@ class Question:
         return self._fusion(own, product(common, searched, sizes).ravel(), sizes)
 
     def _factors(self, active: Sequence[Factor], observed: Sequence[str]) -> tuple[list[Factor], list[Term]]:
-        """Return what matters for some observed symbols, and the same as terms with what is given put in."""
+        """Return the factors that matter for some observed symbols, and their terms at the given values."""
         asked = {symbol.name for symbol in self.searched} | set(observed) | set(self.given)
         factors = relevant(active, asked)
         terms = [
@@ -201,15 +201,15 @@ class Question:
         return factors, terms
 
     def _refusal(self, active: Sequence[Factor], observed: Sequence[str]) -> ModelError:
-        """Return why this is no naive fusion: two observed symbols, the shortest path between them, and a way out.
+        """Return an error with two observed symbols that are not independent, the shortest path between them, and a way out.
 
-        Where not all are independent, some two are not, whatever the others do (d-separation has this property).
+        Where not all are independent, two of them are not, whatever the others do (a property of d-separation).
         """
         cut = {symbol.name for symbol in self.searched} | set(self.given)
         factors, terms = self._factors(active, observed)
         among_all = Links(terms, factors, cut)
-        # What two need is a part of what all need: no path of theirs is shorter than the one there. Only pairs that could
-        # have the shortest are looked at, for there may be thousands.
+        # Two symbols need a part of the factors that all need, so their path is not shorter than the one among all: pairs
+        # are tried from the shortest such path on, since there may be thousands.
         least = sorted(
             (
                 (length, one, other)
@@ -227,8 +227,7 @@ class Question:
             path = links.path(one, other)
             if path and (found is None or len(path) < len(found[0])):
                 found = path, links.drawn(path)
-        if found is None:  # then the observed ones would not be joined
-            raise AssertionError
+        assert found is not None  # noqa: S101 - the caller has found two that are joined
         path, drawn = found
         ends = f"{path[0]} or {path[-1]}"
         way_out = f"search {path[1]} too, or leave {ends} out" if len(path) > 2 else f"leave {ends} out"
@@ -241,7 +240,7 @@ class Question:
     def _fusion(
         self, own: Mapping[str, Sequence[Term]], weight: NDArray[np.float64], sizes: Mapping[str, int]
     ) -> Model:
-        """Put the model together: each observed symbol's terms, and the searched ones' own weight, float64[lines]."""
+        """Return the model of each observed symbol's terms and the searched symbols' own weight, float64[lines]."""
         searched = [symbol.name for symbol in self.searched]
         tables = {
             name: product(terms, (name, *searched), sizes).reshape(sizes[name], -1)
@@ -252,48 +251,41 @@ class Question:
         for total in sums.values():
             prior = _scaled(prior * total)
         if not prior.sum() > 0:
-            raise ModelError(f"{self.joint.name}: what is given is impossible, so there is nothing to search")
-        prior /= prior.sum()
-        select = None
-        if self.prior_select is not None:
-            name = self.prior_select.name
-            select = self._select(
-                self.prior_select, _given_line(tables[name], sums[name], prior) * prior, prior
+            raise ModelError(
+                f"{self.joint.name}: the given values are impossible together, so there is nothing to search"
             )
+        prior /= prior.sum()
+        given_line = {name: _given_line(tables[name], sums[name], prior) for name in tables}
+        normals = {symbol.name: self._normal(symbol) for symbol in self.known}
         return Model(
             name=self.joint.name,
-            searched=tuple(_dimension(symbol) for symbol in self.searched),
+            searched=tuple(
+                dimension(
+                    each.name,
+                    size=each.size,
+                    offset=each.type.offset,
+                    step=each.type.step,
+                    states=each.type.labels,
+                )
+                for each in self.searched
+            ),
             known=tuple(
-                _known(
-                    symbol, _given_line(tables[symbol.name], sums[symbol.name], prior), self._normal(symbol)
+                Known(
+                    table=given_line[symbol.name],
+                    floor=0.0 if (normal := normals[symbol.name]) is None else normal.floor,
+                    normal=normal,
+                    **_rule(symbol),
                 )
                 for symbol in self.known
             ),
             prior=prior,
-            prior_select=select,
-        )
-
-    def _select(
-        self, symbol: Symbol, together: NDArray[np.float64], prior: NDArray[np.float64]
-    ) -> PriorSelect:
-        """Return P(S | A) from P(A, S), float64[values, lines]; an impossible value selects the plain prior."""
-        total = together.sum(axis=1, keepdims=True)
-        rows = np.where(total > 0, together / np.where(total > 0, total, 1), prior)
-        return PriorSelect(
-            name=symbol.name,
-            table=rows / rows.sum(axis=1, keepdims=True),
-            bits=symbol.bits,
-            offset=symbol.type.offset,
-            step=symbol.type.step,
-            period=symbol.period,
-            on_range=symbol.on_range,
-            on_missing=symbol.on_missing,
-            path=symbol.path,
-            states=symbol.type.labels,
+            prior_select=None
+            if (select := self.prior_select) is None
+            else PriorSelect(table=_given_value(given_line[select.name] * prior, prior), **_rule(select)),
         )
 
     def _normal(self, symbol: Symbol) -> Normal | None:
-        """Return what a known symbol's table was made of over all lines, where it is one of normals given S alone."""
+        """Return the normals that a known symbol's table was made of, where it depends on searched symbols alone."""
         for factor in self.joint.factors:
             if isinstance(factor, Distribution) and factor.symbol == symbol and factor.normal is not None:
                 break
@@ -317,7 +309,7 @@ def _given_line(
 ) -> NDArray[np.float64]:
     """Return P(K | S) from any multiple of it, float64[values, lines].
 
-    A line that is impossible by itself gets P(K): no other line's code changes by it.
+    An impossible line gets P(K), which changes no other line's codes.
     """
     safe = np.where(total > 0, total, 1)
     table: NDArray[np.float64] = together / safe
@@ -327,57 +319,39 @@ def _given_line(
     return normalised
 
 
+def _given_value(together: NDArray[np.float64], prior: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return P(S | A) from P(A, S), float64[values, lines]; an impossible value selects the plain prior."""
+    total = together.sum(axis=1, keepdims=True)
+    rows = np.where(total > 0, together / np.where(total > 0, total, 1), prior)
+    normalised: NDArray[np.float64] = rows / rows.sum(axis=1, keepdims=True)
+    return normalised
+
+
 def _scaled(weights: NDArray[np.float64]) -> NDArray[np.float64]:
     largest = weights.max()
     scaled: NDArray[np.float64] = weights / largest if largest > 0 else weights
     return scaled
 
 
-def _dimension(symbol: Symbol) -> Dimension:
-    return dimension(
-        symbol.name,
-        size=symbol.size,
-        offset=symbol.type.offset,
-        step=symbol.type.step,
-        states=symbol.type.labels,
-    )
+def _rule(symbol: Symbol) -> dict[str, Any]:
+    """Return the fields that a known variable has from its symbol."""
+    return {
+        "name": symbol.name,
+        "bits": symbol.bits,
+        "offset": symbol.type.offset,
+        "step": symbol.type.step,
+        "period": symbol.period,
+        "on_range": symbol.on_range,
+        "on_missing": symbol.on_missing,
+        "path": symbol.path,
+        "states": symbol.type.labels,
+    }
 
 
-def _known(symbol: Symbol, table: NDArray[np.float64], normal: Normal | None) -> Known:
-    return Known(
-        name=symbol.name,
-        table=table,
-        bits=symbol.bits,
-        offset=symbol.type.offset,
-        step=symbol.type.step,
-        period=symbol.period,
-        on_range=symbol.on_range,
-        on_missing=symbol.on_missing,
-        path=symbol.path,
-        floor=0.0 if normal is None else normal.floor,
-        states=symbol.type.labels,
-        normal=normal,
-    )
-
-
-def _circle(parents: Mapping[str, Sequence[str]]) -> list[str]:
-    """Return names along a directed circle, the first one again at the end; none: an empty list."""
-    state: dict[str, bool] = {}  # False: on the way, True: done
-    for start in parents:
-        if start in state:
-            continue
-        way = [(start, iter(parents[start]))]
-        state[start] = False
-        while way:
-            name, rest = way[-1]
-            parent = next(rest, None)
-            if parent is None:
-                state[name] = True
-                way.pop()
-            elif state.get(parent) is False:
-                names = [each for each, _ in way]
-                return [parent, *reversed(names[names.index(parent) :])]
-            elif parent in parents and parent not in state:
-                state[parent] = False
-                way.append((parent, iter(parents[parent])))
+def _cycle(parents: Mapping[str, Sequence[str]]) -> list[str]:
+    """Return names along a directed cycle, the first one again at the end; empty where there is none."""
+    try:
+        TopologicalSorter(parents).prepare()
+    except CycleError as error:
+        return list(error.args[1])
     return []

@@ -1,4 +1,4 @@
-"""A model for a BM1: a searched variable on a grid, and what is known given each of its values (thesis 2.1.2).
+"""A model for a BM1: a searched variable on a grid, and variables known given each of its values (thesis 2.1.2).
 
 The machine computes P(S | k_1 ... k_N), proportional to P(S) P(k_1 | S) ... P(k_N | S) (equation 2.2). A
 model is the prior P(S), a table of P(K_i | S) for each known variable, and their order: the columns'.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
@@ -27,131 +27,122 @@ _SUM_TOLERANCE: Final = 1e-6
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Normal:
-    """What a table of normals was made of; learning replaces the parts that recordings tell (`toolchain fit`)."""
+    """The normals that a table was made of; `toolchain fit` replaces the parts that can be learnt."""
 
     mean: NDArray[np.float64]
     """float64[lines], in the reading's unit."""
     sigma: ArrayLike
     """Standard deviation, one or float64[lines], in the reading's unit."""
     floor: float = 0.0
-    """What an outlier's bin gets everywhere, relative to the bin likelihood's peak."""
+    """Added to each bin's probability for outliers, relative to the peak of the bin likelihood."""
     outliers: float = 0.0
     """Share of readings that have nothing to do with S."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Known:
-    """A known variable K: its conditional distribution, and how a reading becomes an address of it."""
+class TabulatedVariable:
+    """A variable with a reading in every frame, a table, and a rule that makes readings addresses of the table."""
 
     name: str
-    """The variable's name: the field in the message, unless `path` says where it is."""
+    """The variable's name: the field in the message, unless `path` is given."""
     table: NDArray[np.float64] = field(repr=False)
-    """P(K | S), float64[values, lines]; row k is address k, and every line's column sums to 1."""
+    """float64[values, lines]; row k is address k."""
     bits: int = 0
-    """Address bits of its column; 0 takes as few as hold all values and the missing reading's address."""
+    """Address bits; 0 for the fewest that hold all values and the top address, which is a missing reading."""
     offset: float = 0.0
     """The reading that is address 0, in the variable's unit."""
     step: float = 1.0
     """From one address to the next, in the variable's unit."""
     period: int | None = None
-    """After how many addresses the readings begin again (a turn of a bearing), or None."""
+    """The number of addresses after which the readings begin again (a turn of a bearing), or None."""
     on_range: Literal["error", "clamp", "missing"] = "error"
-    """What a reading out of range is: an error, the nearest end, or a missing reading."""
+    """The meaning of a reading out of range: an error, the nearest end, or a missing reading."""
     on_missing: Literal["error", "missing"] = "error"
-    """Whether a reading may be missing."""
+    """`missing` where a reading may be missing."""
     path: str = ""
-    """Where in the message it is; empty to search the message for the name."""
-    floor: float = 0.0
-    """The least probability of an outlier that the table was made with, relative to the peak of the
-    likelihood; 0 for none. Quantising says when codes are too coarse to hold it."""
+    """The variable's place in the message; empty to search the message for the name."""
     states: tuple[str, ...] = ()
-    """Its values' names, or none; a reading may be a name."""
-    normal: Normal | None = field(default=None, repr=False)
-    """What the table was made of, where it is one of normals."""
+    """The values' names, or none; a reading may be a name."""
 
-    def __post_init__(self) -> None:
-        """Check the table by itself.
-
-        Raises:
-            ModelError: The table is no conditional distribution, or the addresses don't fit.
-        """
-        what = f"P({self.name} | S)"
-        _keep_table(self, what)
-        _check_distribution(what, self.table)
+    def _keep_table(self, what: str) -> None:
+        """Keep a read-only copy of the table, and choose the address bits where none were given."""
+        given = np.asarray(self.table)
+        if given.ndim != 2 or 0 in given.shape:
+            raise ModelError(f"{what} has shape {given.shape}, expected (values, lines)")
+        check_table(what, *given.shape)
+        table = np.array(given, dtype=np.float64)
+        table.flags.writeable = False
+        object.__setattr__(self, "table", table)
+        object.__setattr__(self, "bits", self.bits or len(table).bit_length())
         self.as_variable()
 
     @property
     def values(self) -> int:
-        """How many addresses it serves."""
+        """The number of values that it has."""
         return len(self.table)
 
     def as_variable(self) -> Variable:
-        """Return how its readings become addresses, as `deployment.toml` says it.
+        """Return the rule from readings to addresses, as `deployment.toml` has it.
 
         Raises:
             ModelError: The name is empty, the addresses don't fit the bits, or the step is 0.
         """
-        return _variable(self, "sensor")
+        own = {each.name for each in fields(self)}
+        rule = {key: getattr(self, key) for key in Variable.model_fields if key in own}
+        try:
+            return Variable(
+                kind="sensor" if isinstance(self, Known) else "prior_select", values=self.values, **rule
+            )
+        except ValidationError as reason:
+            raise ModelError(f"variable {self.name!r}: {_first(reason)}") from None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class PriorSelect:
-    """A known variable A that selects the prior: P(S | A), one row of the prior's table for each value (thesis 2.1.2)."""
+class Known(TabulatedVariable):
+    """A known variable K, which is a column of the machine: its table is P(K | S), and each line's column sums to 1."""
 
-    name: str
-    """The variable's name: the field in the message, unless `path` says where it is."""
-    table: NDArray[np.float64] = field(repr=False)
-    """P(S | A), float64[values, lines]; row a is address a, and every row sums to 1."""
-    bits: int = 0
-    """Address bits of the prior's table; 0 takes as few as hold all values and the top row, which is the
-    prior without a selection."""
-    offset: float = 0.0
-    """The reading that is address 0, in the variable's unit."""
-    step: float = 1.0
-    """From one address to the next, in the variable's unit."""
-    period: int | None = None
-    """After how many addresses the readings begin again, or None."""
-    on_range: Literal["error", "clamp", "missing"] = "error"
-    """What a reading out of range is: an error, the nearest end, or a missing reading."""
-    on_missing: Literal["error", "missing"] = "error"
-    """Whether a reading may be missing."""
-    path: str = ""
-    """Where in the message it is; empty to search the message for the name."""
-    states: tuple[str, ...] = ()
-    """Its values' names, or none; a reading may be a name."""
+    floor: float = 0.0
+    """The least probability of an outlier in the table, relative to the peak of the likelihood; 0 for none.
+    Quantising warns when codes are too coarse to hold it."""
+    normal: Normal | None = field(default=None, repr=False)
+    """The normals that the table was made of, or None."""
 
     def __post_init__(self) -> None:
         """Check the table by itself.
 
         Raises:
-            ModelError: A row is no distribution, or the addresses don't fit.
+            ModelError: The table is not a conditional distribution, or the addresses don't fit.
         """
-        what = f"P(S | {self.name})"
-        _keep_table(self, what)
-        for address, row in enumerate(self.table):
-            _check_distribution(f"{what} of address {address}", row)
-        self.as_variable()
+        what = f"P({self.name} | S)"
+        self._keep_table(what)
+        _check_distribution(what, self.table)
 
-    @property
-    def values(self) -> int:
-        """How many rows it chooses from."""
-        return len(self.table)
 
-    def as_variable(self) -> Variable:
-        """Return how its readings become rows of the prior's table, as `deployment.toml` says it.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PriorSelect(TabulatedVariable):
+    """A known variable A that selects the prior (thesis 2.1.2): its table is P(S | A), and each row sums to 1.
+
+    The top row of the prior's table in the machine is the prior without a selection.
+    """
+
+    def __post_init__(self) -> None:
+        """Check the table by itself.
 
         Raises:
-            ModelError: The name is empty, the addresses don't fit the bits, or the step is 0.
+            ModelError: A row is not a distribution, or the addresses don't fit.
         """
-        return _variable(self, "prior_select")
+        what = f"P(S | {self.name})"
+        self._keep_table(what)
+        for address, row in enumerate(self.table):
+            _check_distribution(f"{what} of address {address}", row)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Model:
-    """A naive Bayesian fusion: what a BM1 computes."""
+    """A naive Bayesian fusion, which a BM1 computes."""
 
     name: str
-    """What the deployment is called."""
+    """The deployment's name."""
     searched: tuple[Dimension, ...]
     """The searched variable's dimensions, the slowest first; line = y * width + x for (y, x)."""
     known: tuple[Known, ...]
@@ -160,13 +151,13 @@ class Model:
     """P(S), float64[lines] summing to 1; None for a uniform one, or with a `prior_select` for the mean of
     its rows."""
     prior_select: PriorSelect | None = None
-    """What selects the prior; then `prior` is the one without a selection."""
+    """The variable that selects the prior; then `prior` is the one without a selection."""
 
     def __post_init__(self) -> None:
         """Check that the parts belong together.
 
         Raises:
-            ModelError: A wrong shape, a name that is none or is there twice; says which.
+            ModelError: A wrong shape, or a name that is wrong or used twice.
         """
         name = self.name if isinstance(self.name, str) else ""  # a user's file is not type-checked
         if not (0 < len(name) <= NAME_MAX and name.isprintable()):
@@ -230,19 +221,18 @@ class Model:
 
     @property
     def variables(self) -> tuple[Variable, ...]:
-        """All known variables as `deployment.toml` has them: the columns', then what selects the prior."""
+        """All known variables as `deployment.toml` has them: the columns', then the one that selects the prior."""
         return tuple(known.as_variable() for known in self._all_known())
 
     @property
     def lines(self) -> int:
-        """How many values the searched variable has (M of thesis 2.1.2)."""
+        """The number of values of the searched variable (M of thesis 2.1.2)."""
         return math.prod(dimension.size for dimension in self.searched)
 
     @property
     def prior_distribution(self) -> NDArray[np.float64]:
         """P(S), float64[lines]."""
-        if self.prior is None:  # __post_init__ has put one there
-            raise AssertionError
+        assert self.prior is not None  # noqa: S101 - __post_init__ sets it
         return self.prior
 
 
@@ -282,37 +272,6 @@ def cell_centres(*searched: Dimension) -> tuple[NDArray[np.float64], ...]:
     return tuple(axis.ravel() for axis in np.meshgrid(*axes, indexing="ij"))
 
 
-def _variable(known: Known | PriorSelect, kind: Literal["sensor", "prior_select"]) -> Variable:
-    try:
-        return Variable(
-            name=known.name,
-            path=known.path,
-            kind=kind,
-            bits=known.bits,
-            offset=known.offset,
-            step=known.step,
-            period=known.period,
-            values=known.values,
-            on_range=known.on_range,
-            on_missing=known.on_missing,
-            states=known.states,
-        )
-    except ValidationError as reason:
-        raise ModelError(f"variable {known.name!r}: {_first(reason)}") from None
-
-
-def _keep_table(variable: Known | PriorSelect, what: str) -> None:
-    """Keep a variable's table as a copy that nobody can write to, and as many address bits as hold it where none are said."""
-    given = np.asarray(variable.table)
-    if given.ndim != 2 or 0 in given.shape:
-        raise ModelError(f"{what} has shape {given.shape}, expected (values, lines)")
-    check_table(what, *given.shape)
-    table = np.array(given, dtype=np.float64)
-    table.flags.writeable = False
-    object.__setattr__(variable, "table", table)
-    object.__setattr__(variable, "bits", variable.bits or len(table).bit_length())
-
-
 def check_table(what: str, values: int, lines: int) -> None:
     """Refuse a known variable's table that is too large, before it is made.
 
@@ -328,7 +287,7 @@ def check_table(what: str, values: int, lines: int) -> None:
 
 def _check_distribution(what: str, table: NDArray[np.float64]) -> None:
     if not np.all(np.isfinite(table)) or np.any(table < 0):
-        raise ModelError(f"{what} holds a number that is no probability: negative, infinite or NaN")
+        raise ModelError(f"{what} holds a number that is not a probability: negative, infinite or NaN")
     sums = np.atleast_1d(table.sum(axis=0))
     wrong = np.abs(sums - 1) > _SUM_TOLERANCE
     if np.any(wrong):
@@ -338,7 +297,7 @@ def _check_distribution(what: str, table: NDArray[np.float64]) -> None:
 
 
 def _first(reason: ValidationError) -> str:
-    detail = reason.errors()[0]
+    detail = reason.errors(include_url=False)[0]
     if detail["type"] == "value_error":
         return str(detail["ctx"]["error"])
     what = detail["msg"].removeprefix("Input should be ").removeprefix("String should have ")

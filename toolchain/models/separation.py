@@ -1,4 +1,4 @@
-"""Which symbols of a product of factors are joined, once what is searched and given is cut out (the moral graph)."""
+"""The moral graph of a product of factors without its searched and given symbols: which symbols it joins."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ if TYPE_CHECKING:
     from toolchain.models.elimination import Term
 
 _LONGEST_DRAWN: Final = 12
-"""Symbols of a path that is told whole."""
+"""Symbols of a path that is drawn whole."""
 _SHOWN: Final = 4
-"""Arcs at either end of one that is not."""
+"""Arcs that are drawn at either end of a longer path."""
 
 
 class Links:
-    """Which symbols stand in a factor together, what is searched and given being cut out: the question's shape.
+    """The symbols that share a factor, without the searched and given ones.
 
     After cutting, symbols of different components are independent given what was cut (the moral graph's criterion).
     """
@@ -35,7 +35,7 @@ class Links:
             for name in inside:
                 beside = self._neighbours.setdefault(name, {})
                 for other in inside:
-                    # A distribution that has one as the other's parent says more than a common child does.
+                    # an arc between the two explains more than a common child
                     if other != name and (other not in beside or _is_arc(factor, name, other)):
                         beside[other] = factor
 
@@ -64,7 +64,7 @@ class Links:
         return path[::-1]
 
     def lengths(self, start: str, ends: Sequence[str]) -> dict[str, int]:
-        """Return how many symbols the shortest path to each of some has, both ends counted, where there is one."""
+        """Return the number of symbols on the shortest path to each of some symbols that is joined, both ends included."""
         before = self._reached(start)
         count = {start: 1}
         for name in before:  # nearer ones come first
@@ -72,7 +72,7 @@ class Links:
         return {end: count[end] for end in ends if end in count}
 
     def _reached(self, start: str) -> dict[str, str]:
-        """Return every symbol that is joined to one, and from which symbol the shortest path comes to it."""
+        """Return every symbol that is joined to one, with the symbol before it on the shortest path."""
         before = {start: start}
         waiting = deque([start])
         while waiting:
@@ -84,7 +84,7 @@ class Links:
         return before
 
     def drawn(self, path: Sequence[str]) -> str:
-        """Return a path as arrows; a common child stands between its two parents, and a long path is told by its ends."""
+        """Return a path as arrows, with common children between their parents; of a long path only the ends."""
         arrows = [self._arrow(before, after) for before, after in pairwise(path)]
         if len(path) > _LONGEST_DRAWN:
             arrows[_SHOWN:-_SHOWN] = [f" ... {path[-1 - _SHOWN]}"]
@@ -106,7 +106,7 @@ def _is_arc(factor: Factor, name: str, other: str) -> bool:
 
 
 def relevant(factors: Iterable[Factor], asked: set[str]) -> list[Factor]:
-    """Leave out what sums to 1: distributions of symbols that nothing left depends on and nobody asks for."""
+    """Leave out factors that sum to 1: distributions of symbols that are not asked for and on which none depends."""
     kept = list(factors)
     uses: dict[str, int] = {}
     own: dict[str, int] = {}
@@ -131,7 +131,7 @@ def relevant(factors: Iterable[Factor], asked: set[str]) -> list[Factor]:
 
 
 def without_idle(factor: Factor) -> Factor:
-    """Return the factor without the symbols that change nothing in it: an arc in name alone joins nothing."""
+    """Return the factor without the symbols that change nothing in it."""
     scope, table = list(factor.scope), factor.table
     for axis in range(len(scope) - 1, 0, -1):
         first = np.take(table, [0], axis=axis)

@@ -1,4 +1,4 @@
-"""Symbols: the variables of a joint distribution, each with the type that says which values it has (as in ProBT)."""
+"""Symbols: the variables of a joint distribution, each with a type that defines its values, as in ProBT."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _YES: Final = {"true", "yes", "on"}
 
 
 def _is_whole(number: object) -> bool:
-    """Whether it is an integer of Python or of NumPy; a user's file is not type-checked."""
+    """Return whether it is an integer of Python or of NumPy; a user's file is not type-checked."""
     return isinstance(number, int | np.integer)
 
 
@@ -38,7 +38,7 @@ class IntegerType:
         """Refuse an empty range.
 
         Raises:
-            ModelError: `high` is below `low`, or one is no whole number.
+            ModelError: `high` is below `low`, or one is not a whole number.
         """
         if not (_is_whole(self.low) and _is_whole(self.high)):
             raise ModelError(f"an integer type from {self.low!r} to {self.high!r}: expected whole numbers")
@@ -47,7 +47,7 @@ class IntegerType:
 
     @property
     def size(self) -> int:
-        """How many values it has."""
+        """The number of values."""
         return self.high - self.low + 1
 
     @property
@@ -62,7 +62,7 @@ class IntegerType:
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """Its values' names: none."""
+        """The values' names: none."""
         return ()
 
 
@@ -79,7 +79,7 @@ class IntervalType:
     wraps: bool = False
 
     def __post_init__(self) -> None:
-        """Refuse what can't be cut.
+        """Refuse an interval that can't be cut.
 
         Raises:
             ModelError: No intervals or no whole number of them, or `high` is not above `low`.
@@ -93,7 +93,7 @@ class IntervalType:
 
     @property
     def size(self) -> int:
-        """How many values it has."""
+        """The number of values."""
         return self.intervals
 
     @property
@@ -108,7 +108,7 @@ class IntervalType:
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """Its values' names: none."""
+        """The values' names: none."""
         return ()
 
 
@@ -116,8 +116,8 @@ class IntervalType:
 class LabelType:
     """Named values. As numbers they count from 0 in their order, but for two cases.
 
-    Names that are equally spaced numbers (`10`, `20`, `30`) are these numbers. Of `false` and `true`, `no` and `yes`, `off`
-    and `on` the former is 0 and the latter 1, whichever comes first: a ROS bool means what it says.
+    Names that are equally spaced numbers (`10`, `20`, `30`) are these numbers. `false`, `no` and `off` are 0, and `true`,
+    `yes` and `on` are 1, whichever comes first, as in a ROS bool.
     """
 
     labels: tuple[str, ...]
@@ -136,12 +136,12 @@ class LabelType:
 
     @property
     def size(self) -> int:
-        """How many values it has."""
+        """The number of values."""
         return len(self.labels)
 
     @property
     def wraps(self) -> bool:
-        """Whether its values lie on a circle: no."""
+        """False: its values never lie on a circle."""
         return False
 
     @property
@@ -171,20 +171,20 @@ Type: TypeAlias = IntegerType | IntervalType | LabelType
 
 @dataclass(frozen=True, slots=True)
 class Symbol:
-    """A variable: its name, its type, and where its readings come from when a question knows it."""
+    """A variable: its name, its type, and the source of its readings when a question knows it."""
 
     name: str
-    """Its name; also the field in the message, unless `path` says where it is."""
+    """Its name; also the field in the message, unless `path` is given."""
     type: Type
-    """Which values it has."""
+    """Its values."""
     path: str = ""
-    """Where in the message it is; empty to search the message for the name."""
+    """Its place in the message; empty to search the message for the name."""
     bits: int = 0
-    """Address bits of its column; 0 takes as few as will do."""
+    """Address bits of its column; 0 for the fewest that are enough."""
     on_range: Literal["error", "clamp", "missing"] = "error"
-    """What a reading that is none of its values is: an error, the nearest end, or a missing reading."""
+    """The meaning of a reading beyond its values: an error, the nearest end, or a missing reading."""
     on_missing: Literal["error", "missing"] = "error"
-    """Whether a reading may be missing."""
+    """`missing` where a reading may be missing."""
 
     def __post_init__(self) -> None:
         """Refuse a symbol without a name.
@@ -198,12 +198,12 @@ class Symbol:
 
     @property
     def size(self) -> int:
-        """How many values it has."""
+        """The number of values."""
         return self.type.size
 
     @property
     def period(self) -> int | None:
-        """After how many values they begin again; None where they don't."""
+        """The number of values after which they begin again; None where they don't."""
         return self.type.size if self.type.wraps else None
 
     def values(self) -> NDArray[np.float64]:
@@ -212,10 +212,10 @@ class Symbol:
         return values
 
     def index(self, label: str) -> int:
-        """Return which value a user means by a word: a label, or a number.
+        """Return the index of the value that a word names: a label, or a number.
 
         Raises:
-            ModelError: It is none of the symbol's values; lists them.
+            ModelError: The word is not one of the symbol's values; lists them.
         """
         if label in self.type.labels:
             return self.type.labels.index(label)

@@ -18,11 +18,11 @@ MAX_BYTES: Final = 32 << 20
 """The largest file that is read."""
 
 SUFFIXES: Final = (".bif", ".xmlbif", ".bifxml", ".xml", ".uai", ".net")
-"""What a network's file is called."""
+"""Endings of the names of networks' files."""
 
 
 def is_network(path: Path) -> bool:
-    """Whether a path's name is one of a network's file."""
+    """Return whether a path is named like a network's file."""
     return Path(path).suffix.lower() in SUFFIXES
 
 
@@ -34,7 +34,7 @@ def read_network(path: Path, *, on_missing: Literal["error", "missing"] = "error
         on_missing: Whether readings of its variables may be missing.
 
     Raises:
-        NetworkFileError: Not there, too large, or no such network; one sentence with file and line.
+        NetworkFileError: The file is absent, too large, or not a network; names the file and the line.
     """
     from toolchain.networks.builder import NetworkBuilder
 
@@ -48,7 +48,7 @@ def read_network(path: Path, *, on_missing: Literal["error", "missing"] = "error
     except NetworkFileError:
         raise
     except ModelError as reason:
-        raise NetworkFileError(f"{path}: {reason}") from None
+        raise NetworkFileError(str(reason), path=path) from None
 
 
 def _reader(path: Path) -> Callable[[bytes, NetworkBuilder], None]:
@@ -62,7 +62,5 @@ def _reader(path: Path) -> Callable[[bytes, NetworkBuilder], None]:
         case ".net":
             from toolchain.networks.net import read_net as reader
         case _:
-            raise NetworkFileError(
-                f"{path} is no network that is known here; expected a name that ends in {', '.join(SUFFIXES)}"
-            )
+            raise NetworkFileError(f"expected a name that ends in {', '.join(SUFFIXES)}", path=path)
     return reader

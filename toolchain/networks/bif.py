@@ -23,7 +23,7 @@ def read_bif(data: bytes, builder: NetworkBuilder) -> None:
     row, `default ...` those that are not given.
 
     Raises:
-        NetworkFileError: It is none; says the line and what was expected there.
+        NetworkFileError: The file is not BIF; names the line and what was expected.
     """
     text = Scanner(data, builder.path, comments=_COMMENTS)
     while (block := text.next()) or text.quoted:
@@ -36,7 +36,7 @@ def read_bif(data: bytes, builder: NetworkBuilder) -> None:
             case "probability":
                 _probability(text, builder)
             case _:
-                raise text.error(f"{block[:40]!r} stands where network, variable or probability is expected")
+                raise text.error(f"expected network, variable or probability, found {block[:40]!r}")
 
 
 def _properties(text: Scanner) -> None:
@@ -65,7 +65,7 @@ def _variable(text: Scanner, builder: NetworkBuilder) -> None:
             if len(states) != count:
                 raise text.error(f"{name} is to have {count} states, but {len(states)} are named")
         else:
-            raise text.error(f"{entry[:40] or 'the end'!r} stands where type, property or '}}' is expected")
+            raise text.error(f"expected type, property or '}}', found {entry[:40] or 'the end'!r}")
     if states is None:
         raise text.error(f"the variable {name} has no type")
     builder.variable(name, states, text)
@@ -79,7 +79,7 @@ def _probability(text: Scanner, builder: NetworkBuilder) -> None:
     if separator == "|":
         parents = text.words(")", "parents", MAX_PARENTS)
     elif separator != ")":
-        raise text.error(f"{separator[:40]!r} stands where '|' or ')' is expected")
+        raise text.error(f"expected '|' or ')', found {separator[:40]!r}")
     shape = builder.shape((child, *parents), text)
     rows = math.prod(shape[1:])
     values = np.full((shape[0], rows), np.nan)
@@ -108,9 +108,7 @@ def _probability(text: Scanner, builder: NetworkBuilder) -> None:
                     raise text.error(f"{child} has two rows for ({', '.join(labels)})")
                 values[:, at] = text.numbers(";", shape[0], f"a row of {child}")
             case _:
-                raise text.error(
-                    f"{entry[:40] or 'the end'!r} stands where table, default, a row or '}}' is expected"
-                )
+                raise text.error(f"expected table, default, a row or '}}', found {entry[:40] or 'the end'!r}")
     missing = np.isnan(values[0])
     if default is not None:
         values[:, missing] = default[:, np.newaxis]

@@ -1,9 +1,8 @@
-"""What a reader has found so far: variables and tables, bounded, checked as they come, each mistake with its place."""
+"""The variables and tables that a reader finds, bounded and checked as they come, each mistake with its line."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from itertools import chain
 from typing import TYPE_CHECKING, Final, Literal, Protocol
 
@@ -31,26 +30,18 @@ MAX_TOTAL: Final = 2 * MAX_ENTRIES
 MAX_NAME: Final = 200
 
 _ROUNDING: Final = 0.02
-"""How far from 1 a distribution may sum: networks in use are rounded to two or three digits."""
+"""The most that the sum of a distribution may differ from 1: published networks are rounded to two or three digits."""
 
 
 class Place(Protocol):
-    """Where a reader stands in its file."""
+    """The position of a reader in its file."""
 
     def error(self, sentence: str) -> NetworkFileError:
-        """Return an error that says file and line before the sentence."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Table:
-    child: str
-    parents: tuple[str, ...]
-    values: NDArray[np.float64]
-    place: Place
+        """Return an error with the file and the line before the sentence."""
 
 
 class NetworkBuilder:
-    """Takes a file's variables and tables, and makes a joint distribution of them."""
+    """A builder of a joint distribution from a file's variables and tables."""
 
     def __init__(self, path: Path, *, on_missing: Literal["error", "missing"] = "error") -> None:
         self.path = path
@@ -62,7 +53,7 @@ class NetworkBuilder:
         self._entries = 0
 
     def name(self, name: str) -> None:
-        """Take the network's name; the file's stands for `unknown` and the like."""
+        """Take the network's name; the file's name replaces `unknown` and the like."""
         if name.lower() not in {"unknown", "network", "unnamed", "default", ""}:
             self._name = "".join(each for each in name if each.isprintable())[:MAX_NAME]
 
@@ -75,7 +66,7 @@ class NetworkBuilder:
         """Return how many states a variable has.
 
         Raises:
-            NetworkFileError: There is no such variable so far.
+            NetworkFileError: The variable is not defined yet.
         """
         if name not in self._symbols:
             raise place.error(f"there is no variable {name[:MAX_NAME]!r} before this line")
@@ -94,17 +85,17 @@ class NetworkBuilder:
             raise place.error(str(reason)) from None
 
     def variable(self, name: str, states: Sequence[str] | int, place: Place) -> None:
-        """Take a variable with its states' names, or with so many states that are numbers from 0.
+        """Take a variable with the names of its states, or with the number of its states.
 
         Raises:
-            NetworkFileError: One that is there, one without a name or states, or more than the limits.
+            NetworkFileError: The name is taken or empty, there are no states, or a limit is exceeded.
         """
         if not 0 < len(name) <= MAX_NAME:
             raise place.error(f"a variable's name has {len(name)} characters, expected 1 to {MAX_NAME}")
         if not name.isprintable():
             raise place.error(f"the variable {name!r} has a character in its name that can't be printed")
         if name in self._symbols:
-            raise place.error(f"the variable {name!r} is there twice")
+            raise place.error(f"the variable {name!r} is defined twice")
         if len(self._symbols) == MAX_VARIABLES:
             raise place.error(f"more than {MAX_VARIABLES} variables")
         count = states if isinstance(states, int) else len(states)
@@ -124,7 +115,7 @@ class NetworkBuilder:
         """Return the shape of a table over some variables, within the limits.
 
         Raises:
-            NetworkFileError: A variable that is not there or there twice, or a table above the limits.
+            NetworkFileError: A variable is not defined or named twice, or the table is above a limit.
         """
         if len(scope) > MAX_PARENTS + 1:
             raise place.error(f"a table of {len(scope)} variables; the most is {MAX_PARENTS + 1}")
@@ -145,17 +136,17 @@ class NetworkBuilder:
     ) -> None:
         """Take P(child | parents), float64[child's states, states of each parent].
 
-        Numbers that sum to nearly 1 are rounded ones: they are divided by their sum.
+        Rounded numbers, whose sum is nearly 1, are divided by their sum.
 
         Raises:
-            NetworkFileError: One that is there, numbers that are no probabilities, or that don't sum to 1.
+            NetworkFileError: The child has a table, or the numbers are not probabilities or don't sum to 1.
         """
         if child in self._children:
             raise place.error(f"{child} has two tables")
         self._children.add(child)
         symbols = [self._symbols[name] for name in (child, *parents)]
         if not np.all(np.isfinite(values)) or np.any(values < 0):
-            raise place.error(f"the table of {child} holds a number that is no probability")
+            raise place.error(f"the table of {child} holds a number that is not a probability")
         sums = values.sum(axis=0)
         wrong = np.argwhere(np.abs(sums - 1) > _ROUNDING)
         if len(wrong):
@@ -174,7 +165,7 @@ class NetworkBuilder:
             raise place.error(str(reason)) from None
 
     def potential(self, scope: Sequence[str], values: NDArray[np.float64], place: Place) -> None:
-        """Take a factor that is no distribution, float64[states of each variable].
+        """Take a potential, float64[states of each variable].
 
         Raises:
             NetworkFileError: Numbers that are negative, infinite or NaN.

@@ -20,7 +20,7 @@ def read_net(data: bytes, builder: NetworkBuilder) -> None:
     """Read a NET file of discrete nodes; `data` has the parents in their order, the child fastest.
 
     Raises:
-        NetworkFileError: It is none, or has nodes that are no discrete chance nodes; says the line.
+        NetworkFileError: The file is not NET, or has other nodes than discrete chance nodes; names the line.
     """
     text = Scanner(data, builder.path, signs="{}()|;,=", comments=_COMMENTS)
     in_class = False
@@ -48,9 +48,9 @@ def read_net(data: bytes, builder: NetworkBuilder) -> None:
                 text.sign("=")
                 text.skip(";")
             case _:
-                raise text.error(f"{block[:40]!r} stands where net, node or potential is expected")
+                raise text.error(f"expected net, node or potential, found {block[:40]!r}")
     if in_class:
-        raise text.error("the end of the file stands where '}' of the class is expected")
+        raise text.error("expected '}' of the class, found the end of the file")
 
 
 def _node(text: Scanner, builder: NetworkBuilder) -> None:
@@ -59,7 +59,7 @@ def _node(text: Scanner, builder: NetworkBuilder) -> None:
     text.sign("{")
     while (key := text.next()) != "}":
         if not key:
-            raise text.error("the end of the file stands where '}' is expected")
+            raise text.error("expected '}', found the end of the file")
         text.sign("=")
         if key == "states":
             text.sign("(")
@@ -80,15 +80,13 @@ def _potential(text: Scanner, builder: NetworkBuilder) -> None:
     if separator == "|":
         parents = text.words(")", "parents", MAX_PARENTS)
     elif separator != ")":
-        raise text.error(
-            f"{separator[:40]!r} stands where '|' or ')' is expected: a potential of one node is read"
-        )
+        raise text.error(f"expected '|' or ')', found {separator[:40]!r}: a potential of one node is read")
     shape = builder.shape((*parents, child), text)
     values = None
     text.sign("{")
     while (key := text.next()) != "}":
         if not key:
-            raise text.error("the end of the file stands where '}' is expected")
+            raise text.error("expected '}', found the end of the file")
         text.sign("=")
         if key == "data":
             numbers = text.numbers(";", int(np.prod(shape)), f"the data of {child}", between="(),")

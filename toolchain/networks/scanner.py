@@ -1,4 +1,4 @@
-"""Takes a text file apart into words, quoted words, signs and numbers, and knows at which line it stands."""
+"""A scanner of text files: words, quoted words, signs and numbers, with the line of each."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ _SHOWN: Final = 40
 
 
 class Scanner:
-    """Reads on and on; `sign` and `word` take what stands next and refuse anything else."""
+    """A scanner that moves forward; `sign` and `word` take the next token and refuse any other kind."""
 
     def __init__(self, data: bytes, path: Path, *, signs: str = "{}()[]|;,", comments: str = "") -> None:
-        """Take a file's bytes.
+        """Scan a file's bytes.
 
         Args:
             data: The bytes.
-            path: What the file is called in errors.
+            path: The file's name in errors.
             signs: Characters that stand for themselves; a word ends before one.
-            comments: A regular expression of the format's comments; of the form /* ... */ only the beginning.
+            comments: A regular expression for the format's comments; for /* ... */ only the beginning.
 
         Raises:
             NetworkFileError: It is not UTF-8 text, or has a comment that is not closed.
@@ -38,7 +38,7 @@ class Scanner:
             text = data.decode("utf-8-sig")
         except UnicodeDecodeError as reason:
             line = data.count(b"\n", 0, reason.start) + 1
-            raise NetworkFileError(f"{path}, line {line}: not UTF-8 text") from None
+            raise NetworkFileError("not UTF-8 text", path=path, line=line) from None
         self._text = text
         self._start = self._end = 0
         if comments:
@@ -47,16 +47,16 @@ class Scanner:
         self._signs = re.compile(f"[{signs}]")
         self._token = re.compile(rf'\s*(?:"([^"\n]*)"|([{signs}])|([^\s{signs}"]+)|(\Z)|(.))')
         self.quoted = False
-        """Whether the word that was taken last stood in quotes."""
+        """Whether the last word was quoted."""
 
     def error(self, sentence: str) -> NetworkFileError:
-        """Return an error at the line of what was taken last."""
+        """Return an error at the line of the last token."""
         start = self._end - len(self._text[self._start : self._end].lstrip())
         line = self._text.count("\n", 0, start) + 1
-        return NetworkFileError(f"{self._path}, line {line}: {sentence}")
+        return NetworkFileError(sentence, path=self._path, line=line)
 
     def next(self) -> str:
-        """Take what stands next: a word, a quoted word without its quotes, or a sign; empty at the end.
+        """Take the next token: a word, a quoted word without its quotes, or a sign; empty at the end.
 
         Raises:
             NetworkFileError: A quote that is not closed on its line.
@@ -71,7 +71,7 @@ class Scanner:
         return match[match.lastindex or 4]
 
     def peek(self) -> str:
-        """Return what stands next without taking it."""
+        """Return the next token without taking it."""
         start, end, quoted = self._start, self._end, self.quoted
         piece = self.next()
         self._start, self._end, self.quoted = start, end, quoted
@@ -81,25 +81,25 @@ class Scanner:
         """Take a sign or a keyword.
 
         Raises:
-            NetworkFileError: Something else stands there.
+            NetworkFileError: The next token is another one.
         """
         found = self.next()
         if found != wanted or self.quoted:
-            raise self.error(f"{_shown(found)} stands where {wanted!r} is expected")
+            raise self.error(f"expected {wanted!r}, found {_shown(found)}")
 
     def word(self, what: str) -> str:
-        """Take a word, plain or quoted; `what` says of what.
+        """Take a word, plain or quoted; `what` names it in errors.
 
         Raises:
-            NetworkFileError: A sign or the end stands there.
+            NetworkFileError: The next token is a sign or the end.
         """
         found = self.next()
         if not self.quoted and (not found or self._is_sign(found)):
-            raise self.error(f"{_shown(found)} stands where {what} is expected")
+            raise self.error(f"expected {what}, found {_shown(found)}")
         return found
 
     def words(self, end: str, what: str, most: int) -> list[str]:
-        """Take words up to a sign, with commas between them or without; the sign too.
+        """Take words up to a sign and the sign, with or without commas between them.
 
         Raises:
             NetworkFileError: Another sign, the end, or more words than `most`.
@@ -112,7 +112,7 @@ class Scanner:
             if piece == "," and not self.quoted and found:
                 continue
             if not self.quoted and (not piece or self._is_sign(piece)):
-                raise self.error(f"{_shown(piece)} stands where {what} or {end!r} is expected")
+                raise self.error(f"expected {what} or {end!r}, found {_shown(piece)}")
             if len(found) == most:
                 raise self.error(f"more than {most} of {what}")
             found.append(piece)
@@ -121,26 +121,26 @@ class Scanner:
         """Take a whole number from 0.
 
         Raises:
-            NetworkFileError: It is none, or above `most`.
+            NetworkFileError: The word is not a whole number, or above `most`.
         """
         word = self.word(what)
         if not (word.isascii() and word.isdigit() and len(word) <= 9) or int(word) > most:
-            raise self.error(f"{_shown(word)} stands where {what}, 0 to {most}, is expected")
+            raise self.error(f"expected {what}, 0 to {most}, found {_shown(word)}")
         return int(word)
 
     def numbers(self, end: str, wanted: int, what: str, *, between: str = ",") -> NDArray[np.float64]:
-        """Take numbers up to a sign, with the signs `between` anywhere among them; the last sign too.
+        """Take numbers up to a sign and the sign, with the signs `between` anywhere among them.
 
         Returns:
             float64[wanted].
 
         Raises:
-            NetworkFileError: A word that is no number, more or fewer of them, or brackets that don't match.
+            NetworkFileError: A word is not a number, there are more or fewer, or brackets don't match.
         """
         stop = self._text.find(end, self._end)
         if stop < 0:
             self._start = self._end = len(self._text)
-            raise self.error(f"the end of the file stands where {end!r} is expected")
+            raise self.error(f"expected {end!r}, found the end of the file")
         piece = self._text[self._end : stop]
         begin, self._start, self._end = self._end, stop, stop + len(end)
         if "(" in between and piece.count("(") != piece.count(")"):
@@ -150,13 +150,13 @@ class Scanner:
         return self._floats(piece.split(maxsplit=wanted), wanted, what, begin)
 
     def next_numbers(self, wanted: int, what: str) -> NDArray[np.float64]:
-        """Take so many numbers with nothing between them but space.
+        """Take this many numbers with only white space between them.
 
         Returns:
             float64[wanted].
 
         Raises:
-            NetworkFileError: A word that is no number, or the end.
+            NetworkFileError: A word is not a number, or the file ends.
         """
         begin, words = self._end, []
         for _ in range(wanted):
@@ -167,7 +167,7 @@ class Scanner:
         return self._floats(words, wanted, what, begin)
 
     def skip(self, end: str) -> None:
-        """Take everything up to a sign, that one too; brackets and quotes may hold it.
+        """Take everything up to a sign and the sign, but for signs in brackets and quotes.
 
         Raises:
             NetworkFileError: The file ends first, or brackets don't match.
@@ -178,15 +178,15 @@ class Scanner:
             if self.quoted:
                 continue
             if not piece:
-                raise self.error(f"the end of the file stands where {end!r} is expected")
+                raise self.error(f"expected {end!r}, found the end of the file")
             if piece == end and depth == 0:
                 return
             depth += (piece in "({[") - (piece in ")}]")
             if depth < 0:
-                raise self.error(f"{piece!r} stands where {end!r} is expected")
+                raise self.error(f"expected {end!r}, found {piece!r}")
 
     def _without(self, comments: re.Pattern[str]) -> str:
-        """Return the text with spaces in the place of comments, and as many lines."""
+        """Return the text with comments replaced by spaces, and the same number of lines."""
         parts, end, at = [], 0, 0
         while match := comments.search(self._text, at):
             begin, at = match.span()
@@ -205,14 +205,14 @@ class Scanner:
         return self._signs.fullmatch(piece) is not None
 
     def _floats(self, words: list[str], wanted: int, what: str, begin: int) -> NDArray[np.float64]:
-        """Turn words into numbers; a word beyond the wanted ones may be all that follows, and is only counted."""
+        """Return words as numbers; the last word may be the rest of the text, and is only counted."""
         try:
             values = np.array([_float(word) for word in words[:wanted]])
         except ValueError:
             wrong = next(word for word in words if not _is_float(word))
             at = self._text.find(wrong, begin)
             self._start, self._end = at, at + 1
-            raise self.error(f"{_shown(wrong)} in {what} is no number") from None
+            raise self.error(f"{_shown(wrong)} in {what} is not a number") from None
         if len(words) != wanted:
             count = f"more than {wanted}" if len(words) > wanted else str(len(words))
             raise self.error(f"{what} has {count} numbers, expected {wanted}")
@@ -221,7 +221,7 @@ class Scanner:
 
 def _float(word: str) -> float:
     number = float(word)
-    if "_" in word or math.isnan(number):  # the former is Python's own way to write digits
+    if "_" in word or math.isnan(number):  # the former is Python's own notation
         raise ValueError
     return number
 

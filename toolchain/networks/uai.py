@@ -24,12 +24,12 @@ def read_uai(data: bytes, builder: NetworkBuilder) -> None:
     first parent fastest, against the format's definition.)
 
     Raises:
-        NetworkFileError: It is none; says the line and what was expected there.
+        NetworkFileError: The file is not UAI; names the line and what was expected.
     """
     text = Scanner(data, builder.path, comments=_COMMENTS)
     kind = text.word("BAYES or MARKOV")
     if kind not in {"BAYES", "MARKOV"}:
-        raise text.error(f"{kind[:40]!r} stands where BAYES or MARKOV is expected")
+        raise text.error(f"expected BAYES or MARKOV, found {kind[:40]!r}")
     variables = text.count("the number of variables", MAX_VARIABLES)
     for number in range(variables):
         builder.variable(str(number), text.count("a variable's size", MAX_STATES), text)
@@ -50,4 +50,4 @@ def read_uai(data: bytes, builder: NetworkBuilder) -> None:
         else:
             builder.potential(scope, values, text)
     if rest := text.next():
-        raise text.error(f"{rest[:40]!r} stands after the last factor")
+        raise text.error(f"expected the end of the file after the last factor, found {rest[:40]!r}")

@@ -25,13 +25,13 @@ def read_xmlbif(data: bytes, builder: NetworkBuilder) -> None:
     """Read an XMLBIF file; a TABLE has the GIVENs in their order, the FOR fastest.
 
     Raises:
-        NetworkFileError: It is none, is no XML, or declares an entity; says the line.
+        NetworkFileError: The file is not XMLBIF, or declares an entity; names the line.
     """
     _Reader(builder).read(data)
 
 
 class _Reader:
-    """Follows the elements; definitions wait for the last variable, which may come after them."""
+    """A reader of elements; definitions wait for the last variable, which may follow them."""
 
     def __init__(self, builder: NetworkBuilder) -> None:
         self._builder = builder
@@ -52,7 +52,7 @@ class _Reader:
             self._parser.Parse(data, True)
         except expat.ExpatError as reason:
             raise NetworkFileError(
-                f"{self._builder.path}, line {reason.lineno}: {expat.ErrorString(reason.code)}"
+                expat.ErrorString(reason.code), path=self._builder.path, line=reason.lineno
             ) from None
         except (LookupError, ValueError):
             raise self._here.error("its encoding is not known") from None
@@ -68,7 +68,7 @@ class _Reader:
 
     def _start(self, name: str, attributes: dict[str, str]) -> None:
         if len(self._path) == _MAX_DEPTH:
-            raise self._here.error(f"elements stand more than {_MAX_DEPTH} deep in each other")
+            raise self._here.error(f"elements are nested more than {_MAX_DEPTH} deep")
         if not self._path and name != "BIF":
             raise self._here.error(f"the file is {name[:40]!r}, expected BIF")
         self._path.append(name)
@@ -120,17 +120,17 @@ class _Reader:
             raise line.error(f"the table of {child} has {count} numbers, expected {entries}")
         for word in words:
             if not _DECIMAL.fullmatch(word):
-                raise line.error(f"{word[:40]!r} in the table of {child} is no number")
+                raise line.error(f"{word[:40]!r} in the table of {child} is not a number")
         values = np.array([float(word) for word in words]).reshape(shape)
         self._builder.distribution(child, parents, np.moveaxis(values, -1, 0), line)
 
 
 class _Line:
-    """A line of the file; a definition's is that of its end."""
+    """A line of the file; that of a definition is its last one."""
 
     def __init__(self, path: Path, number: int) -> None:
         self._path = path
         self._number = number
 
     def error(self, sentence: str) -> NetworkFileError:
-        return NetworkFileError(f"{self._path}, line {self._number}: {sentence}")
+        return NetworkFileError(sentence, path=self._path, line=self._number)

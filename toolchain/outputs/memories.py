@@ -1,8 +1,8 @@
-"""Which memories a machine has on each board, and the MIF of each: priors, tiles, random numbers (thesis 3.2).
+"""The memories of a machine on each board, each with its MIF: priors, tiles, random numbers (thesis 3.2).
 
 A column's tiles all see the same reading, so a column is one memory: its address is the reading's, and a word
-holds the code of every line of the board, line 0 in the lowest bits. The same goes for the prior elements. Where each line
-has a reading of its own, a tile is a memory by itself: its bits of those words.
+holds the code of every line of the board, line 0 in the lowest bits. The prior elements are one memory likewise. Where
+each line has a reading of its own, a tile is a memory by itself: its bits of those words.
 """
 
 from __future__ import annotations
@@ -33,18 +33,18 @@ _ROWS_AT_ONCE: Final = 64
 
 @dataclass(frozen=True, slots=True)
 class Memory:
-    """A memory of a board, or one that all boards have alike."""
+    """A memory of a board, or one that all boards share."""
 
     name: str
     """Its file's name."""
     width: int
     """Bits of a word."""
     depth: int
-    """How many words."""
+    """The number of words."""
     words: Callable[[], Iterable[int]]
-    """Returns every word, from address 0."""
+    """A function that returns every word, from address 0."""
     comments: tuple[str, ...]
-    """What it is, a line each."""
+    """Lines for the head of the file."""
 
     def lines(self) -> Iterator[str]:
         """Yield the MIF, in canonical form."""
@@ -80,7 +80,7 @@ def column_name(board: int, column: int, sensors: int) -> str:
 
 
 def seed_words(machine: BM1Machine) -> NDArray[np.uint64]:
-    """Return where every generator starts in every bank: uint64[banks, columns] or [banks, lines, columns]."""
+    """Return the start of every generator in every bank: uint64[banks, columns] or [banks, lines, columns]."""
     parameters = machine.parameters
     if (
         parameters.rng in POLYNOMIALS
@@ -201,7 +201,7 @@ def _seeds(machine: BM1Machine, prefix: str) -> list[Memory]:
 
 
 def generators(parameters: BM1Parameters) -> int:
-    """Return how many generators a board has: one a column, or one a cell."""
+    """Return the number of generators of a board: one a column, or one a cell."""
     return parameters.columns * (1 if parameters.shared else parameters.lines)
 
 

@@ -43,7 +43,7 @@ class Mif:
     width: int
     """Bits of a word."""
     words: tuple[int, ...]
-    """Every word, from address 0; what a file leaves out is 0, as in Quartus."""
+    """Every word, from address 0; addresses that a file leaves out are 0, as in Quartus."""
 
     def __post_init__(self) -> None:
         """Refuse words that no memory of this width holds.
@@ -63,9 +63,9 @@ def mif_lines(width: int, depth: int, words: Iterable[int], comments: Iterable[s
 
     Args:
         width: Bits of a word.
-        depth: How many words there are.
+        depth: The number of words.
         words: Every word, from address 0; 0 <= word < 2**width.
-        comments: Lines to put at the head; what is not printable ASCII is escaped.
+        comments: Lines for the head; characters other than printable ASCII are escaped.
     """
     for comment in comments:
         yield f"-- {printable(comment)}\n"
@@ -82,35 +82,35 @@ def mif_text(mif: Mif, comments: Iterable[str] = ()) -> str:
 
 
 def printable(text: str) -> str:
-    """Return a name as it may stand in a comment of any tool: one line of printable ASCII."""
+    """Return a name as one line of printable ASCII, for a comment that every tool reads."""
     return text.encode("unicode_escape").decode("ascii")
 
 
 def read_mif(path: Path) -> Mif:
-    """Read a memory's contents from a file, in whichever form it has.
+    """Read a memory's contents from a file in any form of MIF.
 
     Raises:
-        MifError: The file can't be read, or is no MIF; says where and what was expected.
+        MifError: The file can't be read, or is not a MIF; names the line and what was expected.
     """
     data = read_bounded(path, MOST_BYTES, MifError)
     return parse_mif(data.decode("latin-1"), str(path))
 
 
 def parse_mif(text: str, name: str = "the MIF") -> Mif:
-    """Return the memory's contents that a file's text says.
+    """Return a memory's contents from a file's text.
 
     Args:
         text: The text.
-        name: What errors call it.
+        name: Its name in errors.
 
     Raises:
-        MifError: The text is no MIF; says the line and what was expected.
+        MifError: The text is not a MIF; names the line and what was expected.
     """
     return _Reader(text, name).read()
 
 
 class _Reader:
-    """Reads token by token; `_kind` and `_word` are the token at hand, `_line` is its line."""
+    """A reader by token; `_kind` and `_word` are the current token, `_line` is its line."""
 
     def __init__(self, text: str, name: str) -> None:
         self._name = name

@@ -1,10 +1,9 @@
-"""Files that follow from a deployment, written together, with a word about each: unchanged, changed, new, removed."""
+"""The files that follow from a deployment, written together, and the change of each."""
 
 from __future__ import annotations
 
 import filecmp
 import re
-from contextlib import suppress
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import partial
@@ -14,6 +13,7 @@ from typing import TYPE_CHECKING, Final
 from machines.parameters import RngKind
 from pcie_shim.programming_file import image_bytes
 from toolchain.errors import BuildError
+from toolchain.files.whole_file import whole_file
 from toolchain.outputs.memories import FOLDER as MEMORIES_FOLDER
 from toolchain.outputs.memories import memories
 from toolchain.outputs.quartus import PROJECT, project_files
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 class Change(StrEnum):
-    """What writing did to a file."""
+    """The change that writing made to a file."""
 
     UNCHANGED = "unchanged"
     CHANGED = "changed"
@@ -40,12 +40,12 @@ class Change(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class OutputFiles:
-    """A part of a deployment: all its files, and how to know one that is left from an earlier build."""
+    """A part of a deployment: all its files, and a pattern for those left from an earlier build."""
 
     contents: dict[str, Callable[[], Iterable[bytes]]]
-    """By path from the deployment's folder, what to write, in pieces."""
+    """Functions that return the content in pieces, by the path from the deployment's folder."""
     own: re.Pattern[str]
-    """Paths that are this part's: those of them that are not in `contents` are removed."""
+    """Paths of this part: those that are not in `contents` are removed."""
 
 
 _MEMORIES: Final = re.compile(
@@ -95,7 +95,7 @@ def write_files(directory: Path, files: OutputFiles) -> list[tuple[str, Change]]
     """Write a part of a deployment into its folder, each file whole or not at all.
 
     Returns:
-        Every path from the folder, sorted, and what happened to it.
+        Every path from the folder, sorted, and its change.
 
     Raises:
         BuildError: The folder can't be written.
@@ -111,7 +111,7 @@ def write_files(directory: Path, files: OutputFiles) -> list[tuple[str, Change]]
 
 
 def compare_files(directory: Path, files: OutputFiles) -> list[tuple[str, Change]]:
-    """Return what `write_files` would do, without doing it; files that differ in comments alone are unchanged."""
+    """Return the changes that `write_files` would make; files that differ in comments alone are unchanged."""
     changes: dict[str, Change] = {}
     for name, pieces in files.contents.items():
         path = directory / name
@@ -142,36 +142,30 @@ def _existing(directory: Path, own: re.Pattern[str]) -> list[str]:
 
 
 def _write(path: Path, pieces: Callable[[], Iterable[bytes]]) -> Change:
-    part = path.with_name(path.name + ".part")
-    try:
+    with whole_file(path, BuildError) as partial:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with part.open("wb") as file:
+        with partial.open("wb") as file:
             file.writelines(pieces())
-        there = path.is_file()
-        if there and filecmp.cmp(path, part, shallow=False):
-            part.unlink()
+        existed = path.is_file()
+        if existed and filecmp.cmp(path, partial, shallow=False):
+            partial.unlink()
             return Change.UNCHANGED
-        part.replace(path)
-    except OSError as reason:
-        with suppress(OSError):
-            part.unlink(missing_ok=True)
-        raise _not_writable(path, reason) from None
-    return Change.CHANGED if there else Change.NEW
+    return Change.CHANGED if existed else Change.NEW
 
 
 def _remove(path: Path) -> None:
     try:
         path.unlink()
     except OSError as reason:
-        raise _not_writable(path, reason) from None
+        raise BuildError(f"{path} can't be written: {reason.strerror or reason}") from None
 
 
 def _says_the_same(path: Path, pieces: Iterable[bytes]) -> bool:
-    """Compare a file with what it should be, line by line but for comments and empty lines."""
+    """Compare a file with its expected content, line by line but for comments and empty lines."""
     expected = (line for piece in pieces for line in piece.splitlines())
     try:
         with path.open("rb") as file:
-            # a line that is much too long is read in parts, which then differ from what they should be
+            # a line that is much too long is read in parts, which then differ from the expected line
             found = iter(partial(file.readline, _LONGEST_LINE), b"")
             pairs = zip_longest(filter(None, map(_plain, found)), filter(None, map(_plain, expected)))
             return all(one == other for one, other in pairs)
@@ -189,7 +183,3 @@ def _encoded(memory: Memory) -> Iterator[bytes]:
 
 def _image(image: Image) -> Iterator[bytes]:
     yield image_bytes(image)
-
-
-def _not_writable(path: Path, reason: OSError) -> BuildError:
-    return BuildError(f"{path} can't be written: {reason.strerror or reason}")

@@ -1,4 +1,4 @@
-"""The table of random numbers that `rng = table` plays (thesis 3.2): made here, or read from a MIF of the user's."""
+"""The table of random numbers that `rng = table` plays (thesis 3.2): generated, or read from a user's MIF."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ if TYPE_CHECKING:
     from machines.bm1 import BM1Machine
 
 LENGTH: Final = 1 << 16
-"""Numbers of a table that is made here: a multiple of every number of codes."""
+"""Numbers of a generated table: a multiple of every number of codes."""
 
 
 def table_length(machine: BM1Machine) -> int:
-    """Return how many numbers a machine's table of random numbers has; where it plays none, one that is made."""
+    """Return the length of a machine's table of random numbers; that of a generated one where it has none."""
     return LENGTH if machine.rng_table is None else machine.rng_table.size
 
 
 def random_table(prob_bits: int) -> NDArray[np.uint32]:
     """Return numbers of `prob_bits` bits in a random order, uint32[65536], each equally often.
 
-    So every code's probability is exact over the ring's length. The order is that of splitmix64's numbers: always
-    the same.
+    So every code's probability is exact over the ring's length. The order is always the same: that of splitmix64's
+    numbers.
     """
     keys = mix(np.arange(1, LENGTH + 1, dtype=np.uint64) * np.uint64(GOLDEN))
     numbers: NDArray[np.uint32] = (np.argsort(keys, kind="stable") % (1 << prob_bits)).astype(np.uint32)
@@ -41,7 +41,7 @@ def read_table(path: Path) -> NDArray[np.uint32]:
     """Return the random numbers in a user's MIF, uint32[length].
 
     Raises:
-        MifError: The file can't be read, or is no MIF.
+        MifError: The file can't be read, or is not a MIF.
         BuildError: Its words have more than 32 bits.
     """
     mif = read_mif(path)

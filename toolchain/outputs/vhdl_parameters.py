@@ -1,4 +1,4 @@
-"""`bm1_parameters.vhd`: all that the machine's VHDL must know of a model, in one package (thesis 3.2)."""
+"""`bm1_parameters.vhd`: all parameters of a model that the machine's VHDL needs, in one package (thesis 3.2)."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def _vector(bits: int) -> str:
 
 
 def _hexadecimal(value: int, bits: int) -> str:
-    """Return a bit string literal: hexadecimal where the digits fit, else binary."""
+    """Return a bit string literal: hexadecimal for a multiple of 4 bits, else binary."""
     return f'x"{value:0{bits // 4}X}"' if bits % 4 == 0 else f'"{value:0{bits}b}"'
 
 

@@ -37,7 +37,7 @@ def test_a_csv_file(tmp_path):
     [
         ("a,b\n1,2\n", "c", "has no column 'c'; it has a, b"),
         ("a,b\n1,2\n3\n", "a", "line 3: 1 values, but the heading has 2"),
-        ('a,b\n1,"2\n', "a", "is no CSV file"),
+        ('a,b\n1,"2\n', "a", "is not a CSV file"),
         ("", "a", "is empty; expected a heading"),
         ("a,b\n", "a", "has a heading and no rows"),
         ("a,b,a\n1,2,3\n", "a", "has the column 'a' 2 times"),
@@ -58,12 +58,12 @@ def test_a_heading_with_spaces_after_its_commas(tmp_path):
 def test_a_csv_file_of_another_encoding(tmp_path):
     path = tmp_path / "readings.csv"
     path.write_bytes("a,b\n1,sí\n".encode("latin-1"))
-    with pytest.raises(ModelError, match="is no CSV file: it is not UTF-8 text"):
+    with pytest.raises(ModelError, match="is not a CSV file: it is not UTF-8 text"):
         read_recording(path, ["b"])
 
 
 def test_what_is_not_there(tmp_path):
-    with pytest.raises(ModelError, match="nowhere.csv is not there"):
+    with pytest.raises(ModelError, match="nowhere.csv does not exist"):
         read_recording(tmp_path / "nowhere.csv", ["a"])
 
 
@@ -131,7 +131,7 @@ def test_bags(tmp_path, kind):
         (["range"], "in a bag a column is TOPIC:PATH"),
         (["/rnge:data"], "has no topic '/rnge'; it has /range, /scan, /truth"),
         (["/range:value"], "the message has no field 'value'"),
-        (["/range:data[x]"], r"'data\[x\]' is no path"),
+        (["/range:data[x]"], r"'data\[x\]' is not a path"),
         (["/range:__class__.__mro__"], "the message has no field '__class__'"),
     ],
 )

@@ -155,7 +155,7 @@ def test_no_parameters_at_all(case):
 def test_no_folder_and_no_model(tmp_path):
     with pytest.raises(ModelError, match=r"has no model\.py"):
         load_model(tmp_path, {})
-    with pytest.raises(ModelError, match="is no folder"):
+    with pytest.raises(ModelError, match="is not a folder"):
         load_model(tmp_path / "nowhere", {})
 
 
