@@ -6,13 +6,10 @@ from terminal.errors import ExitCode
 
 
 class StackError(Exception):
-    """Root of the services' errors; its text is one sentence for the user.
-
-    Attributes:
-        exit_code: what the command exits with when this error ends it.
-    """
+    """Root of the services' errors; its text is one sentence for the user."""
 
     exit_code: int = ExitCode.USAGE
+    """Exit code of a command that this error ends."""
 
 
 class SettingsError(StackError):
@@ -20,27 +17,27 @@ class SettingsError(StackError):
 
 
 class InputLineError(StackError):
-    """A line on standard input is not what the command reads."""
+    """A line on standard input is malformed."""
 
 
 class LocalSocketError(StackError):
-    """A local socket can't be made, or what came over it is no message of ours."""
+    """A local socket can't be made, or bytes from it are not a record."""
 
     exit_code = ExitCode.CHILD
 
 
 class OtherPeerError(StackError):
-    """The process at the other end of a local socket is not the one that belongs there."""
+    """The process at the other end of a local socket has another role, version or deployment."""
 
 
 class NoDataError(StackError):
-    """No reading came within the time that the first one may take."""
+    """No reading came within the timeout of the first one."""
 
     exit_code = ExitCode.ROSBRIDGE
 
 
 class RosbridgeLostError(StackError):
-    """The rosbridge server went away in a run that does not wait for it."""
+    """The rosbridge server went away in a run of one frame."""
 
     exit_code = ExitCode.ROSBRIDGE
 
@@ -64,37 +61,37 @@ class ChildDiedError(StackError):
 
 
 class OverflowedQueueError(StackError):
-    """With `queue = all`, frames came in faster than they could be computed."""
+    """With `queue = all`, frames came faster than the boards compute them."""
 
     exit_code = ExitCode.CHILD
 
 
 class NotPreparedError(StackError):
-    """A service was asked to switch to a deployment that it does not have, or could not have."""
+    """A service was asked to switch to a deployment that it has not prepared."""
 
 
 class ShapeError(StackError):
-    """A deployment can't take the place of the one in force: boards or topics were made for another."""
+    """A deployment can't replace the one in force: its boards or topics differ."""
 
 
 class NotReloadedError(StackError):
-    """A reload that could not be finished now; the run goes on with the deployment that it had."""
+    """A reload could not be finished now; the run keeps the deployment that it had."""
 
     exit_code = ExitCode.CHILD
 
 
 class ControlError(StackError):
-    """What came over a control socket is no order, or the answer is none."""
+    """A control socket got a malformed order or answer, or is not there."""
 
 
 class OutdatedError(StackError):
-    """A master asks for what a service's folder holds by now, and the service has what was there before."""
+    """A service's folder has changed since its start, and a master asks for the new deployment."""
 
     exit_code = ExitCode.CHILD
 
 
 class ReportedError(StackError):
-    """A failure that another process put into words; it keeps that process's exit code."""
+    """A failure in another process, with that process's own sentence and exit code."""
 
     def __init__(self, exit_code: int, sentence: str) -> None:
         super().__init__(sentence)

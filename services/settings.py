@@ -1,4 +1,4 @@
-"""Settings of all services: flag over `BM_*` variable over deployment over default, in one class."""
+"""Settings of all services, in one class: flag over `BM_*` variable over deployment over default."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from pcie_shim.errors import PcieShimError
 from services.errors import SettingsError
 
 SHORTEST_S, LONGEST_S = 0.001, 86_400.0
-"""Seconds that a time-out may be set to."""
+"""Shortest and longest timeout."""
 Seconds = Annotated[float, Field(ge=SHORTEST_S, le=LONGEST_S)]
 ENV_PREFIX = "BM_"
 ROBOT = "robot:"
-"""How a URI begins that names a robot instead of an address."""
+"""Prefix of a URI that names a robot instead of an address."""
 
 
 class Settings(BaseSettings):
-    """What a user can set. A field of None or "" leaves the deployment's own value, or the default behaviour."""
+    """Settings of a user. A field of None or "" leaves the deployment's own value, or the default behaviour."""
 
     model_config = SettingsConfigDict(env_prefix=ENV_PREFIX, extra="forbid", frozen=True)
 
@@ -70,7 +70,7 @@ class Settings(BaseSettings):
     @field_validator("deployment", "run_directory", "control_directory", mode="before")
     @classmethod
     def _no_directory(cls, value: object) -> object:
-        return value or None  # an empty variable means none, not the folder that one happens to stand in
+        return value or None  # an empty variable means none, not the current folder
 
     @field_validator("boards", mode="before")
     @classmethod
@@ -83,8 +83,9 @@ class Settings(BaseSettings):
     @classmethod
     def _uri(cls, value: str | None) -> str | None:
         if value is not None and not value.startswith(("ws://", "wss://", ROBOT)):
-            msg = f"a rosbridge URI starts with ws:// or wss://, for example ws://192.168.1.10:9090 (or {ROBOT}NAME, as `discover` lists it)"
-            raise ValueError(msg)
+            raise ValueError(
+                f"a rosbridge URI starts with ws:// or wss://, for example ws://192.168.1.10:9090 (or {ROBOT}NAME, as `discover` lists it)"
+            )
         return value
 
     @field_validator("boards", "subscriber", "publisher", "pcie_app")
@@ -100,10 +101,10 @@ class Settings(BaseSettings):
 
 
 def load_settings(**flags: Any) -> Settings:
-    """Settings from flags (those that are not None) over the environment over the defaults.
+    """Return the settings: flags (those that are not None) over the environment over the defaults.
 
     Raises:
-        SettingsError: an unknown `BM_*` variable, or a value that can't be used; says which, and what was expected.
+        SettingsError: A `BM_*` variable is unknown, or a value can't be used.
         BridgeError: --uri names a robot that does not announce itself.
     """
     known = {ENV_PREFIX + name.upper() for name in Settings.model_fields}
@@ -111,8 +112,9 @@ def load_settings(**flags: Any) -> Settings:
         if name.upper().startswith(ENV_PREFIX) and name.upper() not in known:
             near = difflib.get_close_matches(name.upper(), known, 1, 0.5)
             hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(sorted(known))}"
-            msg = f"environment variable {name} is no setting of rosbayes; {hint} (unset it, or rename it)"
-            raise SettingsError(msg)
+            raise SettingsError(
+                f"environment variable {name} is not a setting of rosbayes; {hint} (unset it, or rename it)"
+            )
     given = {name: value for name, value in flags.items() if value is not None and value != ()}
     try:
         settings = Settings(**given)
@@ -124,39 +126,39 @@ def load_settings(**flags: Any) -> Settings:
             if name in given
             else f"environment variable {ENV_PREFIX}{name.upper()}"
         )
-        reason = _reason(name, str(first["msg"]))
-        msg = f"{where}: {reason} (got {first.get('input')!r})"
-        raise SettingsError(msg) from error
+        reason = _expected(name, str(first["msg"]))
+        raise SettingsError(f"{where}: {reason} (got {first.get('input')!r})") from error
     if "uri" in flags and settings.uri is not None and settings.uri.startswith(ROBOT):
         return settings.model_copy(update={"uri": _found(settings.uri.removeprefix(ROBOT))})
     return settings
 
 
-def _reason(name: str, said: str) -> str:
-    """What was expected of a setting: of a time-out both its limits, whichever was passed."""
+def _expected(name: str, message: str) -> str:
+    """Return what was expected of a setting: of a timeout both its limits."""
     known = Settings.model_fields.get(name)
     if known is not None and known.annotation is float:
         return f"expected seconds from {SHORTEST_S:g} to {LONGEST_S:g}"
-    return said.removeprefix("Value error, ").replace("Input should be", "expected", 1)
+    return message.removeprefix("Value error, ").replace("Input should be", "expected", 1)
 
 
 def _found(robot: str) -> str:
-    """The URI of a robot that announces its rosbridge server, asked for in a thread: a caller may have a loop.
+    """Return the URI of a robot that announces its rosbridge server.
 
     Raises:
-        BridgeError: nobody of that name does, or it can't be asked for.
+        BridgeError: No robot of that name does, or the network can't be asked.
     """
     from bridge.discovery import resolve
 
+    # in a thread, because the caller may have a loop
     with ThreadPoolExecutor(1) as pool:
         return pool.submit(lambda: asyncio.run(resolve(robot))).result()
 
 
 def endpoint_in(directory: Path, name: str) -> Endpoint:
-    """The endpoint of a named local socket in a directory.
+    """Return the endpoint of a named local socket in a directory.
 
     Raises:
-        SettingsError: the path is too long for a unix socket.
+        SettingsError: The path is too long for a unix socket.
     """
     try:
         return parse_endpoint(f"unix:{directory.absolute() / name}.sock")

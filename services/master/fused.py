@@ -1,7 +1,6 @@
 """Subscriber, publisher and PCIe application inside the master's process (`master --fused`): fewer hops, same code.
 
-Their records go from call to call instead of over local sockets, and nothing is written or read in between.
-Boards stay processes, or devices, of their own.
+Their records are passed by calls instead of over local sockets. Boards remain processes, or devices, of their own.
 """
 
 from __future__ import annotations
@@ -30,74 +29,74 @@ from terminal.errors import exit_code_of
 from toolchain.deployment import Deployment
 
 Result = TypeVar("Result")
-Hear = Callable[[AnyRecord], None]
+TakeRecord = Callable[[AnyRecord], None]
 
 
 class FusedLink:
-    """A service's link to the master that it lives in."""
+    """A service's link to the master of its own process."""
 
-    def __init__(self, to_master: Hear) -> None:
-        self._to_master: Hear | None = to_master
+    def __init__(self, to_master: TakeRecord) -> None:
+        self._to_master: TakeRecord | None = to_master
 
     async def __aenter__(self) -> Self:
-        """There is nothing to listen on."""
+        """Do nothing: there is no socket."""
         return self
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Say no more."""
+        """Pass on no more records."""
         self._to_master = None
 
     @property
     def has_master(self) -> bool:
-        """The master is there until the link is closed."""
+        """Whether the link is open."""
         return self._to_master is not None
 
     @property
     def backlog(self) -> int:
-        """Nothing ever waits."""
+        """Bytes that the master has not taken yet: none."""
         return 0
 
     def send(self, record: Record) -> bool:
-        """Hand a record to the master."""
+        """Pass a record to the master; return whether the link is open."""
         if self._to_master is None:
             return False
         self._to_master(cast("AnyRecord", record))
         return True
 
     def keep(self, record: Record) -> None:
-        """Hand a record to the master: there will be no other one."""
+        """Pass a record to the master; there are no later ones."""
         self.send(record)
 
     def notice(self, level: str, sentence: str) -> None:
-        """Tell the master something that ends nothing."""
+        """Send a message for the user that does not end the run."""
         self.send(Notice(level, sentence))
 
     def serve(self, deployment: Deployment) -> None:
-        """There is no other master to greet."""
+        """Do nothing: there are no later masters to greet."""
 
 
 class FusedEnd:
-    """The master's end of such a link: what a local socket's connection is to it otherwise."""
+    """The master's end of a fused link, in place of a local socket's connection."""
 
-    def __init__(self, role: str, to_service: Hear) -> None:
+    def __init__(self, role: str, to_service: TakeRecord) -> None:
         self.where = f"{role} in this process"
         self._to_service = to_service
 
     def send(self, record: Record) -> bool:
-        """Hand a record to the service."""
+        """Pass a record to the service."""
         self._to_service(cast("AnyRecord", record))
         return True
 
     def close(self) -> None:
-        """The service ends when what runs it is cancelled."""
+        """Do nothing: the service ends when its task is cancelled."""
 
 
 class FusedBoards:
-    """The PCIe application in an event loop: a frame is posted, and collected when the last board's answer is there.
+    """The PCIe application in an event loop: a frame is posted, and collected when the last board has answered.
 
-    What takes long, opening boards, looking for those that are gone, and reloading, is done by a thread; meanwhile no frame is posted.
+    A thread opens boards, looks for those that are gone, and reloads, which takes long; no frame is posted meanwhile.
     """
 
     def __init__(self, boards: DeployedBoards, settings: Settings, link: MakeLink) -> None:
@@ -116,7 +115,7 @@ class FusedBoards:
         """Serve until cancelled.
 
         Raises:
-            PcieShimError: the boards can't be opened, or one came back as another.
+            PcieShimError: The boards can't be opened, or one came back with another image.
         """
         async with self._link, status_served(self._run_directory, PCIE_APP, self._progress.status):
             try:
@@ -149,7 +148,7 @@ class FusedBoards:
             self._reloading = self._loop.create_task(self._reload(record))
 
     async def _reload(self, record: Prepare | Switch) -> None:
-        """Read images, or program boards: the master posts no frame meanwhile."""
+        """Read images, or program boards; the master sends no frame meanwhile."""
         boards = self._boards
         answer: Record
         if isinstance(record, Prepare):
@@ -171,7 +170,7 @@ class FusedBoards:
             self._watch()
 
     def _watch(self) -> None:
-        """Wake when the awaited board has said something."""
+        """Wake up when the awaited board has sent bytes."""
         awaited = self._boards.awaited
         if awaited != self._watched:
             self._unwatch()
@@ -186,7 +185,7 @@ class FusedBoards:
 
     def _collect(self) -> None:
         number = self._number
-        if number is None:  # a board that speaks unasked is leaving: the next frame finds out
+        if number is None:  # a board that sends unasked is leaving, which the next frame finds out
             self._unwatch()
             return
         try:
@@ -217,11 +216,11 @@ class FusedBoards:
 
 
 async def _in_thread(work: Callable[[], Result]) -> Result:
-    """What takes long, in a thread that nobody waits for when the run ends meanwhile."""
+    """Do slow work in a thread, which does not delay the end of the run."""
     loop = asyncio.get_running_loop()
     future: asyncio.Future[Result] = loop.create_future()
 
-    def tell(result: Result | None, error: BaseException | None) -> None:
+    def finish(result: Result | None, error: BaseException | None) -> None:
         if future.done():
             return
         if error is not None:
@@ -236,30 +235,30 @@ async def _in_thread(work: Callable[[], Result]) -> Result:
             result = work()
         except BaseException as error:
             failure = error
-        with contextlib.suppress(RuntimeError):  # the loop is closed: nobody waits any more
-            loop.call_soon_threadsafe(tell, result, failure)
+        with contextlib.suppress(RuntimeError):  # the run has ended, and its loop is closed
+            loop.call_soon_threadsafe(finish, result, failure)
 
     threading.Thread(target=run, daemon=True).start()
     return await future
 
 
 def fused_services(
-    settings: Settings, deployment: Deployment, to_master: Callable[[str], Hear]
+    settings: Settings, deployment: Deployment, to_master: Callable[[str], TakeRecord]
 ) -> dict[str, tuple[FusedEnd, Coroutine[Any, Any, int]]]:
-    """The three services by role: the master's end of each one's link, and what runs it.
+    """Return the three services by role: the master's end of each link, and the coroutine that serves it.
 
     Args:
-        settings: the master's, with the boards' endpoints filled in.
-        deployment: the deployment.
-        to_master: gives what hears the records of a role.
+        settings: The master's, with the boards' endpoints filled in.
+        deployment: The deployment.
+        to_master: Returns the function that takes the records of a role.
 
     Raises:
-        SettingsError: the boards' endpoints are wrong.
+        SettingsError: The boards' endpoints are wrong.
     """
     ends: dict[str, FusedEnd] = {}
 
     def link_of(role: str) -> MakeLink:
-        def make(to_service: Hear) -> Link:
+        def make(to_service: TakeRecord) -> Link:
             ends[role] = FusedEnd(role, to_service)
             return FusedLink(to_master(role))
 

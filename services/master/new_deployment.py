@@ -1,4 +1,4 @@
-"""A deployment that is to take the place of the one in force: read, compared in shape, and kept for the run's children."""
+"""A deployment that is to replace the one in force: read, compared in shape, and copied for the run's children."""
 
 from __future__ import annotations
 
@@ -18,49 +18,47 @@ _NAMED = 4
 
 
 def read_new(folder: Path, in_force: Deployment, as_used: Callable[[Deployment], Deployment]) -> Deployment:
-    """Read a deployment of the shape of the one in force. Its images are for pcie-app to check.
+    """Read a deployment of the shape of the one in force; pcie-app checks its images.
 
     Args:
-        folder: Where it is.
-        in_force: What it is to replace.
-        as_used: A deployment as this run uses it: what flags override counts for nothing.
+        folder: Its folder.
+        in_force: The deployment that it is to replace.
+        as_used: Gives a deployment without the fields that this run's flags override.
 
     Raises:
         ToolchainError: It is damaged, of another version, or not there.
-        ShapeError: It differs in what has to stay; names the fields.
+        ShapeError: Fields differ that a run can't change.
         SettingsError: The folder can't be reached.
     """
     try:
         loaded = load_deployment(folder, images=False)
     except OSError as error:
-        msg = f"{folder} can't be read: {error.strerror or error}"
-        raise SettingsError(msg) from error
+        raise SettingsError(f"{folder} can't be read: {error.strerror or error}") from error
     found = differences(as_used(in_force), as_used(loaded))
     if found:
         rest = f"; {len(found) - _NAMED} more" if len(found) > _NAMED else ""
-        msg = (
-            f"{loaded.path} is of another shape: {'; '.join(map(str, found[:_NAMED]))}{rest}. "
-            "A run takes other tables, priors, targets and ways to read messages; for this one, end it and start it anew"
+        raise ShapeError(
+            f"{loaded.path} has another shape: {'; '.join(map(str, found[:_NAMED]))}{rest}. "
+            "A run can change tables, priors, targets and the reading of messages; for this, restart it"
         )
-        raise ShapeError(msg)
     return loaded
 
 
 def keep(deployment: Deployment, directory: Path, generation: int) -> Path:
-    """Copy what the services read of a deployment, so that a child that is restarted finds it whatever becomes of the folder.
+    """Copy the files of a deployment that services read, so that a restarted child is independent of its folder.
 
     Args:
         deployment: The deployment.
-        directory: The run's own.
+        directory: The run's private directory.
         generation: Its number in the run.
 
     Returns:
         The folder with the copy.
 
     Raises:
-        SettingsError: A file of it is not there, can't be read, or is none.
+        SettingsError: A file is not there, can't be read, or is not a regular one.
         NotReloadedError: It can't be copied, or was changed meanwhile.
-        ToolchainError: The copy is none.
+        ToolchainError: The copy is not a deployment.
     """
     kept = directory / f"{COPY_PREFIX}{generation}"
     shutil.rmtree(kept, ignore_errors=True)
@@ -71,32 +69,34 @@ def keep(deployment: Deployment, directory: Path, generation: int) -> Path:
             copy.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
             shutil.copyfile(source, copy)
         except OSError as error:
-            msg = f"{source} can't be copied to {kept}, for services that are restarted: {error.strerror or error}"
-            raise NotReloadedError(msg) from error
+            raise NotReloadedError(
+                f"{source} can't be copied to {kept}, for services that are restarted: {error.strerror or error}"
+            ) from error
     if load_deployment(kept, images=False).hash != deployment.hash:
-        msg = f"{deployment.path} was changed while it was read; reload again when that is done"
-        raise NotReloadedError(msg)
+        raise NotReloadedError(
+            f"{deployment.path} was changed while it was read; reload again when that is done"
+        )
     return kept
 
 
 def _check_readable(source: Path) -> None:
-    """See that a deployment's file can be copied, before there is a copy to blame.
+    """Check that a deployment's file can be copied.
 
     Raises:
-        SettingsError: It can't, and says why.
+        SettingsError: It can't be read, or is not a regular file of a size that a deployment has.
     """
     try:
         found = source.stat()
-        if stat.S_ISREG(found.st_mode):  # to open a pipe would wait for who writes into it
+        if stat.S_ISREG(found.st_mode):  # opening a pipe would wait for a writer
             source.open("rb").close()
     except OSError as error:
-        msg = f"{source} can't be read: {error.strerror or error}"
-        raise SettingsError(msg) from error
+        raise SettingsError(f"{source} can't be read: {error.strerror or error}") from error
     if not stat.S_ISREG(found.st_mode) or found.st_size > _LARGEST_FILE:
-        msg = f"{source} is no file of at most {_LARGEST_FILE >> 20} MiB: it belongs to no deployment; build it again"
-        raise SettingsError(msg)
+        raise SettingsError(
+            f"{source} is not a file of at most {_LARGEST_FILE >> 20} MiB, as those of a deployment are; build it again"
+        )
 
 
 def forget(directory: Path, generation: int) -> None:
-    """Take a copy away that no child reads any more."""
+    """Remove a copy that no child reads any more."""
     shutil.rmtree(directory / f"{COPY_PREFIX}{generation}", ignore_errors=True)

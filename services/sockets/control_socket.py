@@ -1,7 +1,7 @@
-"""Orders to a running master, over a socket of its own: one JSON line in, one JSON object out.
+"""Control socket of a running master: one JSON line with an order in, one JSON object with the answer out.
 
 `master.control.sock` belongs to its user alone (0600), in the folder that BM_CONTROL_DIRECTORY names, else in the run's.
-What comes over it is bounded in size, time and number; what is no order gets one sentence, and is done with.
+Orders are bounded in size, time and number; anything else gets one sentence, and the connection is closed.
 """
 
 from __future__ import annotations
@@ -24,49 +24,48 @@ ORDER_LIMIT = 1 << 14
 """Bytes of the longest order: a folder's path of 4096 characters, each escaped, fits."""
 
 ORDER_TIME = 5.0
-"""Seconds that who connects has to say it."""
+"""Seconds that a client has to send its order."""
 
-CALLERS = 8
-"""Connections at a time; more are turned away."""
+CLIENTS = 8
+"""Connections at a time; more are refused."""
 
 ANSWER_LIMIT = 1 << 20
 
 
 class ReloadOrder(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="order", tag="reload"):
-    """Take the deployment in this folder; empty: in the one that is in force."""
+    """An order to use the deployment in this folder; empty for the folder of the one in force."""
 
     folder: str = ""
 
 
 class Answer(msgspec.Struct, frozen=True):
-    """What became of an order: an exit code for the command that gave it, and a sentence."""
+    """The result of an order: an exit code for the command that gave it, and a sentence."""
 
     exit_code: int
     sentence: str
 
 
-Obey = Callable[[ReloadOrder], Awaitable[str]]
-"""Does what was ordered, and gives a sentence about it."""
+Execute = Callable[[ReloadOrder], Awaitable[str]]
+"""Executes an order, and returns a sentence about it."""
 
 
 def control_socket(directory: Path, name: str = "master") -> Path:
-    """Where a process takes orders."""
+    """Return the path of a process's control socket."""
     return directory.absolute() / f"{name}{CONTROL_SUFFIX}"
 
 
 def order_of(line: bytes) -> ReloadOrder:
-    """What a line orders.
+    """Return the order in a line.
 
     Raises:
-        ControlError: Nothing; says what was expected.
+        ControlError: The line is not an order.
     """
     try:
         return msgspec.json.decode(line, type=ReloadOrder)
     except (msgspec.MsgspecError, RecursionError) as error:
-        msg = (
-            f'that is no order ({error}); expected {{"order": "reload", "folder": "/path"}} and a line\'s end'
-        )
-        raise ControlError(msg) from error
+        raise ControlError(
+            f'that is not an order ({error}); expected {{"order": "reload", "folder": "/path"}} and a line\'s end'
+        ) from error
 
 
 async def _order(reader: asyncio.StreamReader) -> ReloadOrder:
@@ -74,37 +73,35 @@ async def _order(reader: asyncio.StreamReader) -> ReloadOrder:
         async with asyncio.timeout(ORDER_TIME):
             line = await reader.readline()
     except TimeoutError as error:
-        msg = f"no order came within {ORDER_TIME:g} s"
-        raise ControlError(msg) from error
+        raise ControlError(f"no order came within {ORDER_TIME:g} s") from error
     except ValueError as error:
-        msg = f"an order has {ORDER_LIMIT} bytes at most"
-        raise ControlError(msg) from error
+        raise ControlError(f"an order has {ORDER_LIMIT} bytes at most") from error
     return order_of(line)
 
 
-class _Callers:
-    """Those who are connected: each has its task, which ends with the run."""
+class _Clients:
+    """Connected clients: each has its task, which ends with the run."""
 
-    def __init__(self, obey: Obey) -> None:
-        self._obey = obey
+    def __init__(self, execute: Execute) -> None:
+        self._execute = execute
         self._tasks: set[asyncio.Task[None]] = set()
 
-    def called(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        task = asyncio.ensure_future(self._serve(reader, writer, full=len(self._tasks) >= CALLERS))
+    def connected(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        task = asyncio.ensure_future(self._serve(reader, writer, full=len(self._tasks) >= CLIENTS))
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, *, full: bool) -> None:
         try:
             if full:
-                answer = Answer(ExitCode.CHILD, f"{CALLERS} others give orders already; try again")
+                answer = Answer(ExitCode.CHILD, f"{CLIENTS} others give orders now; try again later")
             else:
                 answer = await self._answer(reader)
             with contextlib.suppress(OSError, TimeoutError):
                 async with asyncio.timeout(ORDER_TIME):
                     writer.write(msgspec.json.encode(answer))
                     writer.write_eof()
-                    # a socket that is closed with something unread takes the answer along
+                    # a socket that is closed with unread bytes discards the answer
                     while await reader.read(1 << 16):
                         pass
         finally:
@@ -116,8 +113,8 @@ class _Callers:
         except (ControlError, OSError) as error:
             return Answer(ExitCode.USAGE, str(error))
         try:
-            return Answer(ExitCode.DONE, await self._obey(order))
-        except Exception as error:  # whoever ordered it is told, and the run goes on
+            return Answer(ExitCode.DONE, await self._execute(order))
+        except Exception as error:  # the client gets the error, and the run goes on
             return Answer(exit_code_of(error), str(error) or type(error).__name__)
 
     async def end(self) -> None:
@@ -127,10 +124,10 @@ class _Callers:
 
 
 @contextlib.asynccontextmanager
-async def control_served(directory: Path | None, obey: Obey) -> AsyncIterator[None]:
+async def control_served(directory: Path | None, execute: Execute) -> AsyncIterator[None]:
     """Take orders in the running loop while the context lasts; nothing happens without a directory.
 
-    A socket that can't be had is a warning: a robot's run does not end by that.
+    A socket that can't be opened is a warning: it must not end a robot's run.
     """
     endpoint = Endpoint(path="" if directory is None else str(control_socket(directory)))
     try:
@@ -141,23 +138,23 @@ async def control_served(directory: Path | None, obey: Obey) -> AsyncIterator[No
     if listener is None:
         yield
         return
-    callers = _Callers(obey)
-    server = await asyncio.start_unix_server(callers.called, sock=listener, limit=ORDER_LIMIT)
+    clients = _Clients(execute)
+    server = await asyncio.start_unix_server(clients.connected, sock=listener, limit=ORDER_LIMIT)
     try:
         yield
     finally:
         server.close()
-        await callers.end()
+        await clients.end()
         remove_listener(endpoint, listener)
 
 
 async def give_order(path: Path, order: ReloadOrder, *, timeout: float) -> str:
-    """Have a running master do something; gives its sentence.
+    """Give a running master an order; return its sentence.
 
     Raises:
-        ControlError: Nobody takes orders there, or the answer is none.
+        ControlError: No master takes orders there, or the answer is not one.
         NotReloadedError: No answer in time.
-        ReportedError: The master could not; with its sentence and exit code.
+        ReportedError: The master refused, with its own sentence and exit code.
     """
     try:
         async with asyncio.timeout(timeout):
@@ -169,19 +166,21 @@ async def give_order(path: Path, order: ReloadOrder, *, timeout: float) -> str:
             finally:
                 writer.close()
     except TimeoutError as error:
-        msg = f"the master at {path} did not answer within {timeout:g} s; `status` says which deployment is in force"
-        raise NotReloadedError(msg) from error
+        raise NotReloadedError(
+            f"the master at {path} did not answer within {timeout:g} s; `status` says which deployment is in force"
+        ) from error
     except OSError as error:
-        msg = f"no master takes orders at {path} ({error.strerror or error}); is a master --loop running, with this BM_CONTROL_DIRECTORY or BM_RUN_DIRECTORY?"
-        raise ControlError(msg) from error
+        raise ControlError(
+            f"no master takes orders at {path} ({error.strerror or error}); is a master --loop running, with this BM_CONTROL_DIRECTORY or BM_RUN_DIRECTORY?"
+        ) from error
     if not data:
-        msg = f"the master at {path} ended before it was done"
-        raise NotReloadedError(msg)
+        raise NotReloadedError(f"the master at {path} ended before it was done")
     try:
         answer = msgspec.json.decode(data, type=Answer)
     except (msgspec.MsgspecError, RecursionError) as error:
-        msg = f"what answers at {path} is no master of rosbayes, or one of another version ({error})"
-        raise ControlError(msg) from error
+        raise ControlError(
+            f"the answer at {path} is not one of a master of this version ({error})"
+        ) from error
     if answer.exit_code:
         raise ReportedError(answer.exit_code, answer.sentence)
     return answer.sentence
@@ -192,6 +191,7 @@ async def _all(reader: asyncio.StreamReader, path: Path) -> bytes:
     while part := await reader.read(65536):
         data += part
         if len(data) > ANSWER_LIMIT:
-            msg = f"what answers at {path} says more than {ANSWER_LIMIT} bytes: it is no master of rosbayes"
-            raise ControlError(msg)
+            raise ControlError(
+                f"the answer at {path} has more than {ANSWER_LIMIT} bytes: it is not one of a master"
+            )
     return bytes(data)

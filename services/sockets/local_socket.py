@@ -1,7 +1,7 @@
-"""Local sockets between services: length-prefixed MessagePack records, and the greeting.
+"""Local sockets between services: length-prefixed MessagePack records, and the handshake.
 
-A frame is four bytes of length (little-endian) and that many bytes of MessagePack. The core knows no
-socket; an asyncio shell and a blocking one stand around it.
+A frame is four bytes of length (little-endian) and that many bytes of MessagePack. The core does no I/O; there is an
+asyncio wrapper and a blocking one around it.
 """
 
 from __future__ import annotations
@@ -29,30 +29,31 @@ _decoder: msgspec.msgpack.Decoder[AnyRecord] = msgspec.msgpack.Decoder(AnyRecord
 
 
 def encode_record(record: Record) -> bytes:
-    """The bytes of one framed record.
+    """Return the bytes of one framed record.
 
     Raises:
-        LocalSocketError: the record is larger than MAX_RECORD.
+        LocalSocketError: The record is larger than MAX_RECORD.
     """
     body = _encoder.encode(record)
     if len(body) > MAX_RECORD:
-        msg = f"a {type(record).__name__} record has {len(body)} bytes, more than the {MAX_RECORD} that a local socket takes"
-        raise LocalSocketError(msg)
+        raise LocalSocketError(
+            f"a {type(record).__name__} record has {len(body)} bytes, more than the {MAX_RECORD} that a local socket takes"
+        )
     return _LENGTH.pack(len(body)) + body
 
 
 class RecordSplitter:
-    """Bytes in, records out. Keeps what is incomplete until the rest has come."""
+    """Bytes in, records out; an incomplete record is kept until its rest has come."""
 
     def __init__(self, peer: str) -> None:
         self._peer = peer
         self._pending = bytearray()
 
     def feed(self, data: bytes) -> list[AnyRecord]:
-        """The records that `data` completes, in order.
+        """Return the records that `data` completes, in order.
 
         Raises:
-            LocalSocketError: a length beyond MAX_RECORD, or bytes that are no record.
+            LocalSocketError: A length is beyond MAX_RECORD, or bytes are not a record.
         """
         pending = self._pending
         pending += data
@@ -61,8 +62,9 @@ class RecordSplitter:
         while len(pending) - at >= _LENGTH.size:
             (length,) = _LENGTH.unpack_from(pending, at)
             if length > MAX_RECORD:
-                msg = f"{self._peer} announced a record of {length} bytes; {MAX_RECORD} is the limit, so it is no service of rosbayes"
-                raise LocalSocketError(msg)
+                raise LocalSocketError(
+                    f"{self._peer} announced a record of {length} bytes; {MAX_RECORD} is the limit, so it is not a service of rosbayes"
+                )
             end = at + _LENGTH.size + length
             if len(pending) < end:
                 break
@@ -70,39 +72,42 @@ class RecordSplitter:
                 # a copy: parts of a record that stay encoded keep their buffer
                 records.append(_decoder.decode(bytes(memoryview(pending)[at + _LENGTH.size : end])))
             except (msgspec.MsgspecError, RecursionError) as error:
-                msg = f"{self._peer} sent bytes that are no record of rosbayes ({error})"
-                raise LocalSocketError(msg) from error
+                raise LocalSocketError(
+                    f"{self._peer} sent bytes that are not a record of rosbayes ({error})"
+                ) from error
             at = end
         del pending[:at]
         return records
 
 
 def own_hello(role: str, deployment_hash: str, generation: int = 0) -> Hello:
-    """The greeting of this process; a master says which generation of its run the deployment is."""
+    """Return the greeting of this process; a master's has the generation of the deployment in its run."""
     return Hello(role=role, version=VERSION, deployment_hash=deployment_hash, generation=generation)
 
 
 def check_hello(record: AnyRecord, expected_role: str, deployment_hash: str, where: str) -> None:
-    """Refuse a peer that is someone else, of another version, or serves another model.
+    """Check the greeting of a peer.
 
     Raises:
-        OtherPeerError: says what was expected and what was found.
+        OtherPeerError: The peer has another role, version or deployment.
     """
     if not isinstance(record, Hello):
-        msg = f"{where}: the peer did not greet (a {type(record).__name__} came first); is it a {expected_role}?"
-        raise OtherPeerError(msg)
+        raise OtherPeerError(
+            f"{where}: the peer did not greet (a {type(record).__name__} came first); is it a {expected_role}?"
+        )
     if record.role != expected_role:
-        msg = f"{where}: expected a {expected_role} there, found a {record.role}; check the endpoints"
-        raise OtherPeerError(msg)
+        raise OtherPeerError(
+            f"{where}: expected a {expected_role} there, found a {record.role}; check the endpoints"
+        )
     if record.version != VERSION:
-        msg = f"{where}: the {record.role} is rosbayes {record.version}, this is {VERSION}; run the same version on both sides"
-        raise OtherPeerError(msg)
+        raise OtherPeerError(
+            f"{where}: the {record.role} is rosbayes {record.version}, this is {VERSION}; run the same version on both sides"
+        )
     if record.deployment_hash != deployment_hash:
-        msg = (
+        raise OtherPeerError(
             f"{where}: the {record.role} runs deployment {record.deployment_hash[:12] or '(none)'}, "
             f"this process runs {deployment_hash[:12] or '(none)'}; give both the same deployment"
         )
-        raise OtherPeerError(msg)
 
 
 class RecordProtocol(asyncio.Protocol):
@@ -124,8 +129,8 @@ class RecordProtocol(asyncio.Protocol):
         self._failure: Exception | None = None
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """asyncio's: the socket is open."""
-        # uvloop's transports are no subclasses of asyncio's, but do what they do
+        """Take note that the socket is open (asyncio)."""
+        # uvloop's transports are not subclasses of asyncio's, but behave alike
         self._transport = cast("asyncio.Transport", transport)
         sock = transport.get_extra_info("socket")
         if sock is not None:
@@ -133,7 +138,7 @@ class RecordProtocol(asyncio.Protocol):
         self._on_open(self)
 
     def data_received(self, data: bytes) -> None:
-        """asyncio's: bytes came."""
+        """Take bytes (asyncio)."""
         try:
             for record in self._splitter.feed(data):
                 self._on_record(self, record)
@@ -142,7 +147,7 @@ class RecordProtocol(asyncio.Protocol):
             self.close()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """asyncio's: the socket is closed."""
+        """Take note that the socket is closed (asyncio)."""
         self._transport = None
         self._on_close(self, self._failure or exc)
 
@@ -152,20 +157,24 @@ class RecordProtocol(asyncio.Protocol):
         return 0 if self._transport is None else self._transport.get_write_buffer_size()
 
     def send(self, record: Record) -> bool:
-        """Write a record; False if the connection is gone."""
+        """Write a record; return whether the connection is open."""
         if self._transport is None or self._transport.is_closing():
             return False
         self._transport.write(encode_record(record))
         return True
 
     def close(self) -> None:
-        """Close after what was written has gone out."""
+        """Close the connection once everything written is sent."""
         if self._transport is not None:
             self._transport.close()
 
 
 async def open_connection(endpoint: Endpoint, make: Callable[[], RecordProtocol]) -> RecordProtocol:
-    """Connect once; raises OSError like the socket would."""
+    """Connect once.
+
+    Raises:
+        OSError: The socket's own.
+    """
     loop = asyncio.get_running_loop()
     if endpoint.path:
         _, protocol = await loop.create_unix_connection(make, endpoint.path)
@@ -192,14 +201,14 @@ class BlockingRecordSocket:
         self.close()
 
     def fileno(self) -> int:
-        """For selectors."""
+        """Return the descriptor, for selectors."""
         return self._sock.fileno()
 
     def receive(self) -> list[AnyRecord] | None:
-        """What has come so far, possibly nothing; None when the peer has closed.
+        """Return the records received so far, possibly none; None when the peer has closed.
 
         Raises:
-            LocalSocketError: what came is no record.
+            LocalSocketError: The bytes are not records.
         """
         try:
             data = self._sock.recv(1 << 16)
@@ -210,7 +219,7 @@ class BlockingRecordSocket:
         return self._splitter.feed(data) if data else None
 
     def send(self, record: Record) -> bool:
-        """Write a record whole; False if the peer is gone or has not read for `send_timeout` seconds."""
+        """Write a record whole; return False if the peer is gone or has not read for `send_timeout` seconds."""
         left = memoryview(encode_record(record))
         deadline = time.monotonic() + self._send_timeout
         while left:

@@ -14,54 +14,55 @@ from services.errors import OtherPeerError, OutdatedError, SettingsError
 from services.settings import Settings
 from services.sockets.local_socket import RecordProtocol, check_hello, own_hello
 from services.sockets.records import AnyRecord, Hello, Notice, Record, Trouble
+from terminal.errors import ExitCode
 from toolchain.deployment import Deployment, load_deployment
 from toolchain.errors import ToolchainError
 
 GREETING_TIME = 5.0
-"""Seconds that who connects has to greet, before the place is free for another."""
+"""Seconds that a client has to greet, before another may connect."""
 
 
 class Link(Protocol):
-    """What a service holds of its master: over a local socket, or inside the same process."""
+    """A service's connection to its master: over a local socket, or inside the same process."""
 
     @property
     def has_master(self) -> bool:
-        """Whether a master is there and has greeted."""
+        """Whether a master is connected and has greeted."""
 
     @property
     def backlog(self) -> int:
         """Bytes that the master has not taken yet."""
 
     def send(self, record: Record) -> bool:
-        """Send to the master; False where there is none."""
+        """Send a record; return whether a master is there."""
 
     def keep(self, record: Record) -> None:
-        """Send now, and again to every later master: what is true from now on (readiness)."""
+        """Send a record now and to every later master: a state that lasts, such as readiness."""
 
     def notice(self, level: str, sentence: str) -> None:
-        """Tell the master something that ends nothing."""
+        """Send a message for the user that does not end the run."""
 
     def serve(self, deployment: Deployment) -> None:
         """Greet later masters with another deployment from now on."""
 
     async def __aenter__(self) -> Self:
-        """Begin to serve."""
+        """Start to serve."""
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """End."""
+        """Stop."""
 
 
 MakeLink = Callable[[Callable[[AnyRecord], None]], Link]
-"""Makes a service's link; the argument takes the master's records, its greeting first."""
+"""Makes a service's link, given a function that takes the master's records, its greeting first."""
 
 
 class MasterLink:
     """Listens for a master, greets it, and passes its records on.
 
-    A second master is told that there is one already and is turned away; when a master goes, the next may come. A
-    service that was started before its folder was changed, and is asked for what is there now, ends by an error.
+    A second master is refused; when a master goes, the next may come. A service ends by an error when its folder has
+    changed since its start and a master asks for the new deployment.
     """
 
     def __init__(
@@ -97,10 +98,10 @@ class MasterLink:
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Stop listening; take the socket's file away.
+        """Stop listening, and remove the socket.
 
         Raises:
-            OutdatedError: that is why it ends.
+            OutdatedError: A master asked for the folder's new deployment.
         """
         if self._server is not None:
             self._server.close()
@@ -114,7 +115,7 @@ class MasterLink:
 
     def _open(self, protocol: RecordProtocol) -> None:
         if self._master is not None:
-            return  # it is told so when it greets: what is sent before might never be read
+            return  # it is refused when it greets: a record sent before might never be read
         self._master = protocol
         self._greeted = False
         protocol.send(own_hello(self._role, self._deployment.hash))
@@ -126,7 +127,9 @@ class MasterLink:
 
     def _take(self, protocol: RecordProtocol, record: AnyRecord) -> None:
         if protocol is not self._master:
-            protocol.send(Trouble(2, f"the {self._role} at {self._endpoint} serves another master already"))
+            protocol.send(
+                Trouble(ExitCode.USAGE, f"the {self._role} at {self._endpoint} serves another master already")
+            )
             protocol.close()
             return
         if not self._greeted:
@@ -161,16 +164,16 @@ class MasterLink:
         return 0 if self._master is None else self._master.backlog
 
     def send(self, record: Record) -> bool:
-        """Send to the master; False where there is none."""
+        """Send a record; return whether a master is there."""
         return self._master is not None and self._greeted and self._master.send(record)
 
     def keep(self, record: Record) -> None:
-        """Send now, and again to every later master: what is true from now on (readiness)."""
+        """Send a record now and to every later master: a state that lasts, such as readiness."""
         self._last[type(record)] = record
         self.send(record)
 
     def notice(self, level: str, sentence: str) -> None:
-        """Tell the master something that ends nothing."""
+        """Send a message for the user that does not end the run."""
         self.send(Notice(level, sentence))
 
     def serve(self, deployment: Deployment) -> None:
@@ -179,16 +182,16 @@ class MasterLink:
 
 
 def listening(endpoint: Endpoint, role: str, deployment: Deployment) -> MakeLink:
-    """A link over a local socket that the service listens on."""
+    """Return what makes a link over a local socket that the service listens on."""
     return lambda on_record: MasterLink(endpoint, role, deployment, on_record)
 
 
 def outdated(deployment: Deployment, refused: AnyRecord) -> OutdatedError | None:
-    """Why a service that refused a master's greeting has to be started anew; None where that would not help.
+    """Return why a service that refused a greeting has to be restarted; None where that would not help.
 
     Args:
-        deployment: what the service works by.
-        refused: the greeting.
+        deployment: The service's deployment.
+        refused: The greeting.
     """
     if not isinstance(refused, Hello) or refused.deployment_hash == deployment.hash:
         return None
@@ -200,51 +203,54 @@ def outdated(deployment: Deployment, refused: AnyRecord) -> OutdatedError | None
         return None
     return OutdatedError(
         f"{deployment.directory} was changed since this was started, from deployment {deployment.hash[:12]} to {there[:12]}, "
-        "and a master asks for what is there now; start this anew"
+        "and a master asks for the new one; restart this service"
     )
 
 
 def endpoint_from(text: str, flag: str) -> Endpoint:
-    """An endpoint that a user gave.
+    """Return the endpoint that a user gave.
 
     Raises:
-        SettingsError: it is none.
+        SettingsError: It is not an endpoint.
     """
     try:
         return parse_endpoint(text)
     except PcieShimError as error:
-        msg = f"{flag}: {error}"
-        raise SettingsError(msg) from error
+        raise SettingsError(f"{flag}: {error}") from error
 
 
 def deployment_for(settings: Settings, *, images: bool = False) -> Deployment:
-    """The deployment that the settings name.
+    """Return the deployment that the settings name.
 
     Raises:
-        SettingsError: none is named.
-        ToolchainError: it is damaged, of another version, or not there.
+        SettingsError: None is named.
+        ToolchainError: It is damaged, of another version, or not there.
     """
     if settings.deployment is None:
-        msg = "no deployment was given: use --deployment DIR (or BM_DEPLOYMENT), with a folder that `toolchain build` wrote"
-        raise SettingsError(msg)
+        raise SettingsError(
+            "no deployment was given: use --deployment DIR (or BM_DEPLOYMENT), with a folder that `toolchain build` wrote"
+        )
     return load_deployment(settings.deployment, images=images)
 
 
 def board_endpoints(settings: Settings, deployment: Deployment) -> list[Endpoint]:
-    """Where the boards are: the settings' list, else the deployment's own endpoints.
+    """Return where the boards are: the settings' list, else the deployment's own endpoints.
 
     Raises:
-        SettingsError: a board has no endpoint, or there are too few or too many.
+        SettingsError: A board has no endpoint, or there are too few or too many.
     """
     texts = settings.boards or tuple(board.endpoint for board in deployment.boards)
     if len(texts) != len(deployment.boards):
-        msg = f"--boards names {len(texts)} of the deployment's {len(deployment.boards)} boards; name each once, in the order of the partitions"
-        raise SettingsError(msg)
+        raise SettingsError(
+            f"--boards names {len(texts)} of the deployment's {len(deployment.boards)} boards; name each once, in the order of the partitions"
+        )
     if not all(texts) and any(texts):
-        msg = f"{deployment.path} names endpoints of some boards only; name all of them, or none (then the master starts emulated ones)"
-        raise SettingsError(msg)
+        raise SettingsError(
+            f"{deployment.path} names endpoints of some boards only; name all of them, or none (then the master starts emulated ones)"
+        )
     if not all(texts):
-        msg = "the deployment names no endpoints of boards; give --boards ENDPOINT,... (start some with: board --boards 4 --directory DIR)"
-        raise SettingsError(msg)
+        raise SettingsError(
+            "the deployment names no endpoints of boards; give --boards ENDPOINT,... (start some with: board --boards 4 --directory DIR)"
+        )
     where = "--boards" if settings.boards else f"{deployment.path}, [[board]] endpoint"
     return [endpoint_from(text, where) for text in texts]

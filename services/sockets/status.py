@@ -11,7 +11,7 @@ import time
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import msgspec
 
@@ -107,6 +107,7 @@ class ProcessStatus(msgspec.Struct, frozen=True, kw_only=True):
     hub: HubStatus | None = None
 
 
+Reason = TypeVar("Reason", bound=str)
 GetStatus = Callable[[], ProcessStatus]
 """Returns what a process knows; its identity and its rate are filled in here."""
 
@@ -132,7 +133,7 @@ def why_not_connected(rosbridges: Mapping[str, Ros]) -> str:
     return ""
 
 
-def reasons(counts: Mapping[str, int]) -> dict[str, int]:
+def reasons(counts: Mapping[Reason, int]) -> dict[str, int]:
     """Return the counts that are not 0."""
     return {reason: count for reason, count in dict(counts).items() if count}
 

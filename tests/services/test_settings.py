@@ -1,7 +1,6 @@
-"""Settings: flag over variable over default, and a sentence for every mistake."""
+"""Settings: flag over variable over default, and an error that names the setting for every mistake."""
 
 import os
-import re
 import subprocess
 import sys
 from pathlib import Path
@@ -24,52 +23,48 @@ def test_boards_are_split_at_commas(monkeypatch):
     assert load_settings().boards == ("unix:/tmp/a.sock", "tcp://10.0.0.2:7000")
 
 
-def test_an_unknown_variable_names_the_nearest(monkeypatch):
-    monkeypatch.setenv("BM_CONECT_TIMEOUT", "3")
-    with pytest.raises(
-        SettingsError, match="BM_CONECT_TIMEOUT is no setting.*did you mean BM_CONNECT_TIMEOUT"
-    ):
-        load_settings()
-
-
 @pytest.mark.parametrize(
-    ("flags", "match"),
+    ("name", "value", "expected"),
     [
-        ({"connect_timeout": -1.0}, r"--connect-timeout: expected seconds from 0.001 to 86400 \(got -1.0\)"),
-        ({"seen_timeout": float("nan")}, r"--seen-timeout: expected seconds from 0.001 to 86400 \(got nan\)"),
-        ({"uri": "http://robot:9090"}, "--uri: a rosbridge URI starts with ws://"),
-        ({"queue": "newest"}, "--queue: .*latest.*newest"),
-        ({"boards": "nonsense"}, "--boards: "),
+        ("connect_timeout", -1.0, "0.001 to 86400"),
+        ("seen_timeout", float("nan"), "0.001 to 86400"),
+        ("uri", "http://robot:9090", "ws://"),
+        ("queue", "newest", "latest"),
+        ("boards", "nonsense", "unix:"),
+        ("publisher", "nonsense", "unix:"),
     ],
 )
-def test_a_wrong_flag_says_which_and_what_was_expected(flags, match):
-    with pytest.raises(SettingsError, match=match):
-        load_settings(**flags)
+def test_a_wrong_flag_names_itself_and_its_limits(name, value, expected):
+    with pytest.raises(SettingsError) as refused:
+        load_settings(**{name: value})
+    assert str(refused.value).startswith(f"--{name.replace('_', '-')}: ")
+    assert expected in str(refused.value)
 
 
 @pytest.mark.parametrize("value", ["soon", "nan", "inf", "1e400", "-1", "0", "", "\x1b[2J\n"])
-def test_a_wrong_variable_says_which(monkeypatch, value):
+def test_a_wrong_variable_names_itself_and_its_value(monkeypatch, value):
     monkeypatch.setenv("BM_PEER_TIMEOUT", value)
-    sentence = r"environment variable BM_PEER_TIMEOUT: expected seconds from 0.001 to 86400 \(got "
-    with pytest.raises(SettingsError, match=sentence + re.escape(repr(value))):
+    with pytest.raises(SettingsError) as refused:
         load_settings()
+    assert "BM_PEER_TIMEOUT" in str(refused.value)
+    assert repr(value) in str(refused.value)
 
 
 def test_a_path_too_long_for_a_socket_is_refused(tmp_path):
-    with pytest.raises(SettingsError, match="too long"):
+    with pytest.raises(SettingsError):
         endpoint_in(tmp_path / ("x" * 120), "board0")
 
 
 @pytest.mark.parametrize("name", ["deployment", "run_directory", "control_directory"])
-def test_an_empty_variable_names_no_folder(name, monkeypatch):
+def test_an_empty_variable_does_not_name_a_folder(name, monkeypatch):
     monkeypatch.setenv(f"BM_{name.upper()}", "")
     assert getattr(load_settings(), name) is None
 
 
-def test_a_hub_with_a_wrong_variable_says_one_sentence():
+def test_a_command_refuses_an_unknown_variable_in_one_sentence_with_the_nearest():
     command = [Path(sys.executable).parent / "hub", "--port", "0"]
-    environment = os.environ | {"BM_X": "1"}
+    environment = os.environ | {"BM_CONECT_TIMEOUT": "1"}
     ended = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=240, check=False)
     assert ended.returncode == 2
     assert ended.stderr.count("\n") == 1
-    assert ended.stderr.startswith("error: environment variable BM_X is no setting")
+    assert "did you mean BM_CONNECT_TIMEOUT?" in ended.stderr

@@ -1,103 +1,126 @@
-"""What a reload says of the frames that were under way, and of the readings that came during it."""
+"""Reloads: what is asked of whom, what becomes of readings meanwhile, and the way back."""
 
-from collections import Counter
-from types import SimpleNamespace
+import asyncio
 
+import msgspec
 import pytest
 
-from services.master.peers import Peer
-from services.master.reload import LOST_IN_RELOAD, Reloads, what_became_of
+from services.errors import NotReloadedError, SettingsError
+from services.master.reload import fates
 from services.pipeline.frames import QUEUE_ALL_DEPTH
-from services.pipeline.generations import InForce
-from services.settings import Settings
 from services.sockets.control_socket import ReloadOrder
-from services.sockets.records import Prepare, Prepared, Reading, Switched
-from tests.integration.conftest import build_boat
-from toolchain.deployment import load_deployment
+from services.sockets.records import FrameResult, LossReason, Outcome, Prepare, Published, Switch
 
 MEANWHILE = "; 3 readings that came meanwhile found no place to wait and were lost"
 
 
 @pytest.mark.parametrize(
-    ("counts", "said"),
+    ("counts", "text"),
     [
         ((0, 0), "0 frames were in flight and finished before"),
         ((1, 0), "1 frame was in flight and finished before"),
         ((5, 2), "5 frames were in flight: 3 finished before, 2 lost after 30 s"),
         ((1, 0, 3), f"1 frame was in flight and finished before{MEANWHILE}"),
-        ((5, 2, 3), f"5 frames were in flight: 3 finished before, 2 lost after 30 s{MEANWHILE}"),
         (
-            (0, 0, 1),
-            "0 frames were in flight and finished before; 1 reading that came meanwhile found no place to wait and was lost",
+            (5, 2, 1),
+            "5 frames were in flight: 3 finished before, 2 lost after 30 s; 1 reading that came meanwhile found no place to wait and was lost",
         ),
     ],
 )
-def test_what_was_lost_is_not_finished(counts, said):
-    assert what_became_of(*counts) == said
+def test_lost_frames_are_not_counted_as_finished(counts, text):
+    assert fates(*counts) == text
 
 
-class Moves:
-    """A run in which nothing is under way."""
-
-    has_begun, waiting, under_way, in_flight = True, 0, "", 0
-
-    def __init__(self):
-        self.losses = Counter({LOST_IN_RELOAD: 40})  # of an earlier reload
-        self.handed_on = None
-
-    def hold(self):
-        pass
-
-    def go_on(self, readings=None):
-        self.handed_on = readings
-
-    def lose(self, reason, count):
-        self.losses[reason] += count
-
-    def lost_for(self, reason):
-        return self.losses[reason]
+@pytest.fixture
+async def begun(run):
+    run.peers.begun.set()
+    return run
 
 
-class Willing:
-    """A service that does at once what it is asked for; before that, `first` happens."""
-
-    def __init__(self, role, first=lambda _: None):
-        self.peer = Peer(role, None, None)
-        self.peer.protocol, self.peer.ready = self, True
-        self._first = first
-
-    def send(self, record):
-        self._first(record)
-        answer = Prepared if isinstance(record, Prepare) else Switched
-        self.peer.answered(answer(record.generation))
-        return True
+@pytest.fixture
+def order(built):
+    return ReloadOrder(str(built))
 
 
-async def test_readings_that_find_no_place_while_boards_are_programmed_are_said(tmp_path):
-    folder = build_boat(tmp_path / "boat")
-    moves = Moves()
+def kinds(service):
+    return [type(each) for each in service.records if isinstance(each, Prepare | Switch)]
 
-    def readings_come(record):
-        if not isinstance(record, Prepare):
-            for at in range(QUEUE_ALL_DEPTH + 3):
-                reloads.wait((Reading(at, at, at, at, [0] * 6, 0, generation=1), at))
 
-    peers = {role: Willing(role).peer for role in ("subscriber", "publisher")}
-    app = Willing("pcie-app", readings_come).peer
-    several = SimpleNamespace(
-        subscriber=peers["subscriber"],
-        publisher=peers["publisher"],
-        app=app,
-        not_ready=[],
-        directory=None,
-        board_endpoints=(),
-        give=lambda *_: None,
-    )
-    in_force = InForce(load_deployment(folder), folder)
-    reloads = Reloads(
-        Settings(queue="all"), in_force, several, moves, SimpleNamespace(info=print, warning=print)
-    )
-    sentence = await reloads.order(ReloadOrder(str(folder)))
+async def test_readings_that_come_while_boards_are_programmed_wait_or_are_counted(begun, order):
+    begun.flow._losses[LossReason.IN_RELOAD] = 40  # of an earlier reload
+    begun.app.before_switch = lambda: begun.read(QUEUE_ALL_DEPTH + 3, generation=1)
+    sentence = await begun.reloads.order(order)
     assert f"0 frames were in flight and finished before{MEANWHILE}, " in sentence
-    assert (in_force.generation, len(moves.handed_on)) == (1, QUEUE_ALL_DEPTH)
-    assert moves.losses[LOST_IN_RELOAD] == 43
+    assert begun.master.status().generation == 1
+    assert begun.lost == {LossReason.IN_RELOAD: 43}
+    assert begun.app.frames == [1]
+    assert begun.flow.waiting == QUEUE_ALL_DEPTH - 1
+    assert kinds(begun.subscriber) == kinds(begun.publisher) == kinds(begun.app) == [Prepare, Switch]
+    assert [peer.generation for peer in begun.peers] == [1, 1, 1]
+
+
+async def test_frames_in_flight_finish_by_the_deployment_that_they_were_read_for(begun, order):
+    begun.read(2)
+    reloading = asyncio.ensure_future(begun.reloads.order(order))
+    for number in (1, 2):
+        while not (kinds(begun.subscriber) == [Prepare, Switch] and begun.app.frames[-1] == number):
+            await asyncio.sleep(0.01)
+        assert kinds(begun.app) == [Prepare]
+        begun.take(begun.app, FrameResult(number, msgspec.Raw(b""), 0, 0, 0, 0))
+        begun.take(begun.publisher, Published(number, Outcome.PUBLISHED, None, 0, 1.0, 1, 1))
+    assert (await reloading).count("2 frames were in flight and finished before,") == 1
+    assert begun.lost == {}
+
+
+async def test_a_second_order_is_refused_meanwhile(begun, order):
+    first = asyncio.ensure_future(begun.reloads.order(order))
+    await asyncio.sleep(0)
+    with pytest.raises(NotReloadedError):
+        await begun.reloads.order(order)
+    await first
+
+
+@pytest.mark.parametrize("state", ["not begun", "not ready", "relative"])
+async def test_an_order_that_can_not_be_followed_is_refused(run, built, state):
+    if state != "not begun":
+        run.peers.begun.set()
+    run.peers.publisher.ready = state != "not ready"
+    with pytest.raises(SettingsError if state == "relative" else NotReloadedError):
+        await run.reloads.order(ReloadOrder("relative" if state == "relative" else str(built)))
+    assert kinds(run.subscriber) == []
+
+
+async def test_services_that_switched_go_back_when_the_boards_do_not(begun, order):
+    def boards_fail():
+        begun.read(generation=1)
+        begun.read()
+        begun.peers.app.answer.set_exception(NotReloadedError("pcie-app ended meanwhile"))
+
+    begun.app.before_switch = boards_fail
+    begun.app.answers = True
+    with pytest.raises(NotReloadedError):
+        await begun.reloads.order(order)
+    switches = [each.generation for each in begun.subscriber.records if isinstance(each, Switch)]
+    assert switches == [1, 0]
+    assert begun.master.status().generation == 0
+    assert begun.lost == {LossReason.IN_RELOAD: 1}
+    assert begun.app.frames == [1]  # frames are sent to the boards again
+
+
+async def test_a_reload_ends_with_its_run(begun, order):
+    """No service is asked to go back: they have ended, or end now."""
+    asked = asyncio.Event()
+    begun.app.answers, begun.app.before_switch = True, asked.set
+    begun.app.send, send = (
+        (lambda record: asked.set() or True if isinstance(record, Switch) else send(record)),
+        begun.app.send,
+    )
+    reloading = asyncio.ensure_future(begun.reloads.order(order))
+    await asyncio.wait_for(asked.wait(), 120)
+    begun.read(generation=1)
+    reloading.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await asyncio.wait_for(reloading, 120)
+    assert kinds(begun.subscriber) == [Prepare, Switch]
+    assert kinds(begun.publisher) == [Prepare]
+    assert begun.lost == {LossReason.IN_RELOAD: 1}

@@ -1,4 +1,4 @@
-"""A service whose folder was changed behind its back ends when a master asks for what is there now, and only then."""
+"""A service whose folder was changed ends when a master asks for the new deployment, and only then."""
 
 import asyncio
 import shutil
@@ -7,13 +7,16 @@ import pytest
 
 from pcie_shim.endpoint import parse_endpoint
 from services.errors import OutdatedError
+from services.sockets import serving
 from services.sockets.local_socket import RecordProtocol, open_connection, own_hello
-from services.sockets.records import Trouble
+from services.sockets.records import Hello, Notice, Trouble
 from services.sockets.serving import MasterLink, outdated
 from tests.integration.conftest import build_boat
 from toolchain.building.edits import DeploymentEdits
 from toolchain.building.regenerate import regenerate_deployment
 from toolchain.deployment import load_deployment
+
+PATIENCE = 120
 
 
 @pytest.fixture(scope="module")
@@ -31,12 +34,9 @@ def changed(built, tmp_path):
     return before, load_deployment(boat)
 
 
-def test_only_a_new_start_would_help(changed):
+def test_only_a_restart_would_help(changed):
     before, now = changed
-    told = outdated(before, own_hello("master", now.hash))
-    assert told is not None
-    assert str(before.directory) in str(told)
-    assert (before.hash[:12] in str(told), now.hash[:12] in str(told)) == (True, True)
+    assert isinstance(outdated(before, own_hello("master", now.hash)), OutdatedError)
     assert outdated(before, own_hello("master", "f" * 64)) is None  # some other master's deployment
     assert outdated(now, own_hello("master", before.hash)) is None  # an older master: the folder is right
     assert outdated(before, own_hello("subscriber", before.hash)) is None
@@ -45,40 +45,93 @@ def test_only_a_new_start_would_help(changed):
     assert outdated(before, own_hello("master", now.hash)) is None
 
 
-@pytest.mark.parametrize("asked", ["what is there now", "something else"])
-async def test_it_ends(changed, tmp_path, asked):
-    before, now = changed
-    endpoint = parse_endpoint(f"unix:{tmp_path}/s.sock")
-    listens, heard, closed = asyncio.Event(), [], asyncio.Event()
+class Served:
+    """A service behind a local socket, and masters that connect to it."""
 
-    async def service():
-        async with MasterLink(endpoint, "subscriber", before, heard.append):
-            listens.set()
+    def __init__(self, endpoint, deployment):
+        self.endpoint = endpoint
+        self.records = []
+        self.link = MasterLink(endpoint, "subscriber", deployment, self.records.append)
+        self.listens = asyncio.Event()
+        self.task = asyncio.ensure_future(self._serve())
+
+    async def _serve(self):
+        async with self.link:
+            self.listens.set()
             await asyncio.Event().wait()
 
-    async def greet(hash_):
-        said = []
-        closed.clear()
+    async def connect(self, hash_=None):
+        """A master's connection, the records that it gets, and an event of its end; without a hash it does not greet."""
+        await asyncio.wait_for(self.listens.wait(), PATIENCE)
+        records, closed = [], asyncio.Event()
         protocol = await open_connection(
-            endpoint,
+            self.endpoint,
             lambda: RecordProtocol(
-                "test", lambda _, record: said.append(record), lambda _: None, lambda _, why: closed.set()
+                "test", lambda _, record: records.append(record), lambda _: None, lambda _, why: closed.set()
             ),
         )
-        protocol.send(own_hello("master", hash_))
-        await asyncio.wait_for(closed.wait(), 120)
-        return said
+        if hash_ is not None:
+            protocol.send(own_hello("master", hash_))
+        return protocol, records, closed
 
-    serving = asyncio.ensure_future(service())
-    await asyncio.wait_for(listens.wait(), 120)
-    said = await greet(now.hash if asked == "what is there now" else "f" * 64)
-    assert isinstance(said[-1], Trouble)
-    if asked == "what is there now":
-        with pytest.raises(OutdatedError, match="start this anew"):
-            await asyncio.wait_for(serving, 120)
-        assert not (tmp_path / "s.sock").exists()
-    else:
-        await greet("e" * 64)
-        assert not serving.done()
-        serving.cancel()
-    assert heard == []
+
+@pytest.fixture
+async def serve(tmp_path):
+    made = []
+
+    def serve(deployment):
+        made.append(Served(parse_endpoint(f"unix:{tmp_path}/s.sock"), deployment))
+        return made[-1]
+
+    yield serve
+    for each in made:
+        each.task.cancel()
+        await asyncio.wait([each.task])
+
+
+@pytest.mark.parametrize("asks_for_new", [True, False])
+async def test_a_service_ends_if_a_restart_helps(changed, serve, asks_for_new):
+    before, now = changed
+    service = serve(before)
+    for hash_ in (now.hash,) if asks_for_new else ("f" * 64, "e" * 64):
+        _, records, closed = await service.connect(hash_)
+        await asyncio.wait_for(closed.wait(), PATIENCE)
+        assert isinstance(records[-1], Trouble)
+    if asks_for_new:
+        with pytest.raises(OutdatedError):
+            await asyncio.wait_for(service.task, PATIENCE)
+    assert service.task.done() is asks_for_new
+    assert service.records == []
+
+
+async def test_one_master_is_served_at_a_time(changed, serve):
+    now = changed[1]
+    service = serve(now)
+    service.link.keep(Notice("info", "state"))
+    first, records, closed = await service.connect(now.hash)
+    _, refused, refused_closed = await service.connect(now.hash)
+    await asyncio.wait_for(refused_closed.wait(), PATIENCE)
+    assert [type(each) for each in refused] == [Trouble]
+    assert service.link.has_master
+    assert service.link.send(Notice("info", "more"))
+    while len(records) < 3:
+        await asyncio.sleep(0.01)
+    assert [type(each) for each in records] == [Hello, Notice, Notice]
+    first.close()
+    await asyncio.wait_for(closed.wait(), PATIENCE)
+    while service.link.has_master:
+        await asyncio.sleep(0.01)
+    assert not service.link.send(Notice("info", "lost"))
+    _, records, _ = await service.connect(now.hash)
+    while len(records) < 2:
+        await asyncio.sleep(0.01)
+    assert records[1].sentence == "state"
+    assert [type(each) for each in service.records] == [Hello, Hello]
+
+
+async def test_a_client_that_does_not_greet_is_cut_off(changed, serve, monkeypatch):
+    monkeypatch.setattr(serving, "GREETING_TIME", 0.1)
+    service = serve(changed[1])
+    _, _, closed = await service.connect()
+    await asyncio.wait_for(closed.wait(), PATIENCE)
+    assert not service.link.has_master

@@ -1,0 +1,46 @@
+"""Command lines of the processes that a master starts, so that they use the settings of its run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pcie_shim.endpoint import Endpoint
+from services.settings import Settings
+from services.supervision.child import RESTARTS, own_command
+
+
+def boards_command(boards: int, directory: Path, *, once: bool) -> list[str]:
+    """Return the command of the process that starts emulated boards; with `once` it restarts none."""
+    restarts = "0" if once else str(RESTARTS)
+    return [
+        *(*own_command("board"), "--boards", str(boards)),
+        *("--directory", str(directory), "--restarts", restarts),
+    ]
+
+
+def service_command(
+    role: str, endpoint: Endpoint, settings: Settings, *, compiling_time: float, reprogram: bool
+) -> list[str]:
+    """Return the command of a service.
+
+    Args:
+        role: Which service.
+        endpoint: Where it listens.
+        settings: The run's settings, with the boards' endpoints.
+        compiling_time: Seconds that boards may take to compile their kernels.
+        reprogram: Whether boards that hold another image are programmed.
+    """
+    command = [*own_command(role), "--listen", str(endpoint)]
+    command += ["--deployment", str(settings.deployment), "--log-level", settings.log_level]
+    if role == "pcie-app":
+        command += ["--boards", ",".join(settings.boards)] if settings.boards else []
+        command += ["--stop", settings.stop] if settings.stop else []
+        command += ["--peer-timeout", str(settings.peer_timeout + compiling_time)]
+        command += ["--board-timeout", str(settings.board_timeout)]
+        return [*command, "--reprogram"] if reprogram else command
+    command += ["--uri", settings.uri] if settings.uri else []
+    command += ["--ros-version", settings.ros_version, "--connect-timeout", str(settings.connect_timeout)]
+    if role == "publisher":
+        return [*command, "--seen-timeout", str(settings.seen_timeout)]
+    command += ["--first-data-timeout", str(settings.first_data_timeout)]
+    return [*command, "--queue", settings.queue] if settings.queue else command

@@ -1,0 +1,384 @@
+"""Flow of frames through a run: readings wait, boards compute, results are published (thesis 3.3, figure 3.4).
+
+    subscriber ─reading─▶ [waiting] ─frame─▶ pcie-app ─result─▶ publisher ─outcome─▶ counted
+
+While a run reloads, readings for the next deployment wait beside those for the one in force.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections import Counter, deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from structlog.typing import FilteringBoundLogger
+
+from services.errors import (
+    BoardFailedError,
+    OverflowedQueueError,
+    ReportedError,
+    RosbridgeLostError,
+    VariableError,
+)
+from services.master.peers import ANSWER_TIME, Awaited, Peer, Peers
+from services.pipeline.frames import WaitingFrames
+from services.pipeline.generations import InForce
+from services.settings import Settings
+from services.sockets.records import (
+    AnyRecord,
+    FailureReason,
+    Frame,
+    FrameFailed,
+    FrameResult,
+    LossReason,
+    Notice,
+    Outcome,
+    Publish,
+    Published,
+    Reading,
+    Unusable,
+)
+from services.sockets.status import FrameCounts, reasons, seconds_since
+from services.supervision.child import RESTARTS, RESTARTS_WITHIN
+
+MOST_AT_PUBLISHER = 8
+"""Results that the publisher may have unanswered; beyond that frames wait, and `queue` decides which are kept."""
+
+_LOSSES = {
+    Outcome.NO_POSTERIOR: LossReason.NO_POSTERIOR,
+    Outcome.ROSBRIDGE_AWAY: LossReason.ROSBRIDGE_AWAY,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class WaitingReading:
+    """A reading that waits for the boards, and the time of its arrival (monotonic, ns)."""
+
+    reading: Reading
+    arrived: int
+
+
+@dataclass(frozen=True, slots=True)
+class _Computing:
+    """The frame on the boards, and the time when it was sent there (monotonic, ns)."""
+
+    number: int
+    waiting: WaitingReading
+    sent: int
+
+
+class FrameFlow:
+    """The frames of a run, from reading to outcome. A frame is on the boards, at most, at a time."""
+
+    def __init__(
+        self,
+        settings: Settings,
+        in_force: InForce,
+        peers: Peers,
+        log: FilteringBoundLogger,
+        *,
+        once: bool,
+        count: int | None,
+        show: Callable[[Published], None],
+    ) -> None:
+        """Begin with no frame.
+
+        Args:
+            settings: The settings of the run.
+            in_force: Its deployment.
+            peers: Its peers.
+            log: Its log.
+            once: Whether it ends with its first frame, whatever that comes to.
+            count: Results after which it ends.
+            show: Is called with each published result.
+        """
+        self._settings = settings
+        self._in_force = in_force
+        self._peers = peers
+        self._log = log
+        self._follows = settings.log_level == "debug"
+        self._once = once
+        self._count = count
+        self._show = show
+        self._queue = settings.queue or in_force.deployment.queue
+        self._readings: WaitingFrames[WaitingReading] = WaitingFrames(self._queue)
+        self._next_readings: WaitingFrames[WaitingReading] | None = None
+        self._held = False
+        self._catching_up = 0
+        self._computing: _Computing | None = None
+        self._at_publisher = 0
+        self._published_at = 0.0
+        self._number = 0
+        self._received = 0
+        self._last = (0, 0)
+        self._losses: Counter[LossReason] = Counter()
+        self._reported_causes: set[str] = set()
+        self._failures: deque[float] = deque(maxlen=RESTARTS + 1)
+        self.published = 0
+        self.has_data = False
+        """Whether a message has come, usable or not."""
+        self.end: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        """The end of the run: with the error that ends it, or without one."""
+
+    def fail(self, error: Exception) -> None:
+        """End the run by an error."""
+        if not self.end.done():
+            self.end.set_exception(error)
+
+    def counts(self) -> FrameCounts:
+        """Return the counts for the status."""
+        number, tick = self._last
+        return FrameCounts(
+            received=self._received,
+            completed=self.published,
+            lost=reasons(self.losses),
+            last_number=number or None,
+            last_age_s=seconds_since(tick),
+        )
+
+    @property
+    def losses(self) -> Counter[LossReason]:
+        """Readings and results lost so far, by reason."""
+        losses = Counter(self._losses)
+        losses[LossReason.PASSED_OVER] += self._readings.passed_over
+        return losses
+
+    # --- events at the peers -------------------------------------------------------------------
+
+    def ready(self, peer: Peer) -> None:
+        """Send the next frame if a peer was waited for."""
+        if peer is not self._peers.subscriber:
+            self._send_next()
+
+    def received(self, peer: Peer, record: AnyRecord) -> None:
+        """Take a record of a reading, a frame or a result."""
+        match record:
+            case Reading():
+                self._take_reading(record)
+            case Unusable():
+                self._take_unusable(record)
+            case FrameResult():
+                self._take_result(record)
+            case FrameFailed():
+                self._take_failure(record)
+            case Published():
+                self._take_outcome(record)
+            case _:
+                where = peer.protocol.where if peer.protocol else peer.role
+                self._log.warning(
+                    f"{where} sent a {type(record).__name__}, which is for another service to send"
+                )
+
+    def lost(self, peer: Peer) -> None:
+        """Count what a peer had when it went away: the frame that it computed, or the results that it had to publish."""
+        if peer is self._peers.app and self._computing is not None:
+            self._losses[LossReason.WITH_APP] += 1
+            if self._follows:
+                self._log.debug(LossReason.WITH_APP, frame=self._computing.number)
+            self._computing = None
+        if peer is self._peers.publisher and self._at_publisher:
+            self._losses[LossReason.WITH_PUBLISHER] += self._at_publisher
+            self._at_publisher = 0
+
+    def awaited(self, peer: Peer) -> Awaited | None:
+        """Return the frame or the results that a peer has not answered yet."""
+        if peer is self._peers.app and self._computing is not None:
+            what, since = f"answer frame {self._computing.number}", self._computing.sent / 1e9
+            return Awaited(what, since, self._settings.board_timeout + ANSWER_TIME)
+        if peer is self._peers.publisher and self._at_publisher:
+            return Awaited("publish", self._published_at, self._settings.seen_timeout + ANSWER_TIME)
+        return None
+
+    # --- a reload ------------------------------------------------------------------------------
+
+    @property
+    def waiting(self) -> int:
+        """Readings that wait for the boards."""
+        return len(self._readings)
+
+    @property
+    def in_flight(self) -> int:
+        """Frames that wait, are computed, or are being published."""
+        return len(self._readings) + (self._computing is not None) + self._at_publisher
+
+    @property
+    def busy_with(self) -> str:
+        """What frames wait for: the boards, the publisher, or nothing."""
+        if self._computing is not None:
+            return "a frame on the boards"
+        return "results at the publisher" if self._at_publisher else ""
+
+    def hold(self) -> None:
+        """Send no frame to the boards."""
+        self._held = True
+
+    def resume(self) -> None:
+        """Send frames to the boards again."""
+        self._held = False
+        self._catching_up = len(self._readings)
+        self._send_next()
+
+    def expect_next_generation(self) -> None:
+        """Let readings for the next deployment wait, from now on."""
+        self._next_readings = WaitingFrames(self._queue)
+
+    def drop_next_generation(self) -> None:
+        """Lose the readings for the next deployment."""
+        dropped, self._next_readings = self._next_readings, None
+        self._lose(dropped)
+
+    def adopt_next_generation(self) -> None:
+        """Lose the readings for the former deployment, and use those for the next one."""
+        if self._next_readings is not None:
+            self._lose(self._readings)
+            self._readings, self._next_readings = self._next_readings, None
+
+    def _lose(self, readings: WaitingFrames[WaitingReading] | None) -> None:
+        if readings is not None:
+            self._losses[LossReason.IN_RELOAD] += len(readings)
+            self._losses[LossReason.PASSED_OVER] += readings.passed_over
+
+    # --- from reading to outcome ---------------------------------------------------------------
+
+    def _take_reading(self, reading: Reading) -> None:
+        self.has_data = True
+        if self._once and self._number:
+            return
+        self._received += 1
+        self._losses[LossReason.PASSED_OVER] += reading.passed_over
+        self._losses[LossReason.UNPAIRED] += reading.unpaired
+        waiting = WaitingReading(reading, time.monotonic_ns())
+        ahead = reading.generation - self._in_force.generation
+        readings = {0: self._readings, 1: self._next_readings}.get(ahead)
+        if readings is None:
+            self._losses[LossReason.IN_RELOAD] += 1
+            return
+        try:
+            readings.put(waiting)
+        except OverflowedQueueError as error:
+            if ahead or self._held or self._catching_up:  # a reload was the slow part, not the boards
+                self._losses[LossReason.IN_RELOAD] += 1
+            else:
+                self.fail(error)
+            return
+        if not ahead:
+            self._send_next()
+
+    def _take_unusable(self, record: Unusable) -> None:
+        self.has_data = True
+        if self._once:
+            self.fail(VariableError(record.sentence))
+            return
+        self._losses[LossReason.UNUSABLE] += 1
+        if record.cause not in self._reported_causes:
+            self._reported_causes.add(record.cause)
+            self._log.warning(f"{record.sentence}; such messages are skipped and counted")
+
+    def _send_next(self) -> None:
+        app = self._peers.app
+        if self._computing is not None or self._held or not app.ready or app.protocol is None:
+            return
+        if self._at_publisher >= MOST_AT_PUBLISHER or not self._peers.publisher.ready:
+            return
+        if self._count is not None and self.published + self._at_publisher >= self._count:
+            return  # until it is known whether those at the publisher are enough
+        waiting = self._readings.get()
+        if waiting is None:
+            return
+        self._catching_up = max(0, self._catching_up - 1)
+        self._number += 1
+        reading, number = waiting.reading, self._number
+        bank = number % self._in_force.deployment.machine.rng_banks
+        self._computing = _Computing(number, waiting, time.monotonic_ns())
+        app.protocol.send(Frame(number, reading.addresses, bank, reading.prior_codes))
+        if self._follows:
+            self._follow(number, bank, waiting)
+
+    def _follow(self, number: int, bank: int, waiting: WaitingReading) -> None:
+        """Log a frame that was sent, and have the subscriber log it, which could not know its number before."""
+        waited = (time.monotonic_ns() - waiting.arrived) // 1000
+        self._log.debug("handed on to pcie-app", frame=number, bank=bank, waited_us=waited)
+        subscriber, reading = self._peers.subscriber.protocol, waiting.reading
+        if subscriber is not None:
+            taken = (reading.sent_tick - reading.received_tick) // 1000
+            subscriber.send(
+                Notice(
+                    "debug",
+                    f"frame={number} complete stamp_ns={reading.stamp_ns} received_ns={reading.received_ns} "
+                    f"taken_us={taken}",
+                )
+            )
+
+    def _take_result(self, result: FrameResult) -> None:
+        computing = self._computing
+        if computing is None or computing.number != result.number:
+            return
+        self._computing = None
+        reading = computing.waiting.reading
+        publisher = self._peers.publisher.protocol
+        record = Publish(
+            result=result,
+            stamp_ns=reading.stamp_ns,
+            received_ns=reading.received_ns,
+            received_tick=reading.received_tick,
+            reading_sent_tick=reading.sent_tick,
+            waited_ns=computing.sent - computing.waiting.arrived,
+        )
+        if not self._at_publisher:
+            self._published_at = time.monotonic()
+        self._at_publisher += 1  # before it is sent: a publisher in this process answers at once
+        if publisher is None or not publisher.send(record):
+            self._at_publisher -= 1
+            self._losses[LossReason.WITH_PUBLISHER] += 1
+        self._send_next()
+
+    def _take_failure(self, record: FrameFailed) -> None:
+        if self._computing is not None and self._computing.number == record.number:
+            self._computing = None
+        if self._once:
+            self.fail(ReportedError(record.exit_code, record.sentence))
+            return
+        self._losses[LossReason.FAILED] += 1
+        if record.reason is FailureReason.FAILED:
+            now = time.monotonic()
+            self._failures.append(now)
+            recent = sum(1 for each in self._failures if now - each <= RESTARTS_WITHIN)
+            if recent > RESTARTS:
+                self.fail(
+                    BoardFailedError(
+                        f"{record.sentence}; {recent} frames failed on boards within {RESTARTS_WITHIN:.0f} s"
+                    )
+                )
+                return
+            self._log.warning(record.sentence, frame=record.number)
+        elif self._follows:
+            self._log.debug(record.sentence, frame=record.number)
+        self._send_next()
+
+    def _take_outcome(self, record: Published) -> None:
+        self._at_publisher = max(0, self._at_publisher - 1)
+        self._published_at = time.monotonic()
+        if record.outcome is Outcome.PUBLISHED:
+            self.published += 1
+            self._last = (record.number, time.monotonic_ns())
+            self._losses[LossReason.SOME_TOPICS] += bool(record.missed)
+            self._show(record)
+        elif self._once and record.outcome is Outcome.NO_POSTERIOR:
+            self.fail(
+                VariableError(
+                    f"frame {record.number} has no posterior: no line of the model counted for its readings; nothing was published"
+                )
+            )
+            return
+        elif self._once:
+            self.fail(RosbridgeLostError("rosbridge went away before the result could be published"))
+            return
+        else:
+            self._losses[_LOSSES[record.outcome]] += 1
+        if self._count is not None and self.published >= self._count:
+            if not self.end.done():
+                self.end.set_result(None)
+        else:
+            self._send_next()

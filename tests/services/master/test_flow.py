@@ -1,0 +1,257 @@
+"""Flow of frames: each reading becomes one result, or is counted with a reason, whatever a peer does.
+
+Run.read ──▶ FrameFlow ──▶ app.frames;  computed(), failed() ──▶ publisher;  published() ──▶ counts
+"""
+
+import msgspec
+import pytest
+
+from services.errors import (
+    BoardFailedError,
+    OverflowedQueueError,
+    ReportedError,
+    RosbridgeLostError,
+    VariableError,
+)
+from services.master.flow import MOST_AT_PUBLISHER
+from services.pipeline.frames import QUEUE_ALL_DEPTH
+from services.sockets.records import (
+    FailureReason,
+    FrameFailed,
+    FrameResult,
+    LossReason,
+    Notice,
+    Outcome,
+    Prepared,
+    Publish,
+    Published,
+    Unusable,
+)
+from services.supervision.child import RESTARTS
+from tests.services.master.conftest import Run
+
+RAW = msgspec.Raw(b"\xc1")  # bytes that no decoder takes
+
+
+def computed(run, number=None):
+    run.take(run.app, FrameResult(number or run.app.frames[-1], RAW, 0, 0, 0, 0))
+
+
+def failed(run, reason=FailureReason.AWAY):
+    run.take(run.app, FrameFailed(run.app.frames[-1], 0, 5, "Board 0 is tired", reason))
+
+
+def published(run, number, outcome=Outcome.PUBLISHED, **fields):
+    run.take(run.publisher, Published(number, outcome, None, 0, 1.0, 1, 1, **fields))
+
+
+def test_losses_are_shown_by_these_names():
+    assert {reason.value for reason in LossReason} == {
+        *("passed over", "unpaired", "with an unusable variable", "failed on a board", "lost with pcie-app"),
+        *(
+            "lost with the publisher",
+            "lost in a reload",
+            "no posterior",
+            "rosbridge away",
+            "on some topics only",
+        ),
+    }
+
+
+async def test_a_reading_becomes_a_result(run):
+    run.read(2, stamp_ns=3, received_ns=4, received_tick=5, sent_tick=6, addresses=[7], prior_codes=b"x")
+    (frame,) = run.app.records
+    assert (frame.number, frame.addresses, frame.bank, frame.prior_codes) == (1, [7], 1, b"x")
+    computed(run, 9)  # of a frame that nobody waits for
+    assert run.publisher.records == []
+    computed(run)
+    (publish,) = run.publisher.records
+    assert isinstance(publish, Publish)
+    assert publish.result.boards is RAW
+    assert (publish.stamp_ns, publish.received_ns, publish.received_tick, publish.reading_sent_tick) == (
+        3,
+        4,
+        5,
+        6,
+    )
+    assert 0 < publish.waited_ns < 60e9
+    assert run.app.frames == [1, 2]
+    assert run.flow.in_flight == 2
+    published(run, 1)
+    frames = run.master.status().frames
+    assert (frames.received, frames.completed, frames.last_number, frames.lost) == (2, 1, 1, {})
+    assert run.flow.in_flight == 1
+
+
+async def test_the_newest_reading_wins_unless_all_are_kept(boat):
+    run = Run(boat)
+    run.read(5, passed_over=2, unpaired=3)
+    assert run.lost == {LossReason.PASSED_OVER: 13, LossReason.UNPAIRED: 15}
+    computed(run)
+    assert (run.app.frames, run.flow.in_flight) == ([1, 2], 2)
+
+
+async def test_a_publisher_that_takes_nothing_costs_its_results_and_no_more(run):
+    run.publisher.takes = False
+    run.read(MOST_AT_PUBLISHER + 4)
+    for _ in range(MOST_AT_PUBLISHER + 3):
+        computed(run)
+    assert run.lost == {LossReason.WITH_PUBLISHER: MOST_AT_PUBLISHER + 3}
+    assert run.app.frames[-1] == MOST_AT_PUBLISHER + 4
+    assert run.flow.in_flight == 1
+    assert run.flow.awaited(run.peers.publisher) is None
+
+
+async def test_frames_wait_for_a_publisher_that_does_not_answer(run):
+    run.read(MOST_AT_PUBLISHER + 2)
+    for _ in range(MOST_AT_PUBLISHER):
+        computed(run)
+    assert len(run.app.frames) == MOST_AT_PUBLISHER
+    assert run.flow.awaited(run.peers.publisher) is not None
+    assert run.flow.busy_with
+    published(run, 1)
+    assert len(run.app.frames) == MOST_AT_PUBLISHER + 1
+    run.flow.lost(run.peers.publisher)
+    assert run.lost == {LossReason.WITH_PUBLISHER: MOST_AT_PUBLISHER - 1}
+    run.flow.lost(run.peers.app)
+    assert run.lost[LossReason.WITH_APP] == 1
+    run.flow.ready(run.peers.app)
+    assert len(run.app.frames) == MOST_AT_PUBLISHER + 2
+    assert run.flow.in_flight == 1
+
+
+async def test_frames_wait_for_peers_that_are_not_ready(run):
+    for peer in (run.peers.app, run.peers.publisher):
+        peer.ready = False
+        run.read()
+        run.flow.ready(run.peers.subscriber)
+        assert run.app.frames == []
+        peer.ready = True
+    run.flow.ready(run.peers.app)
+    assert run.app.frames == [1]
+
+
+@pytest.mark.parametrize("held", [True, False])
+async def test_too_many_readings_end_the_run_unless_a_reload_holds_them(run, held):
+    if held:
+        run.flow.hold()
+    run.read(QUEUE_ALL_DEPTH + (not held))
+    assert run.error is None
+    run.read(7)
+    assert run.lost == ({LossReason.IN_RELOAD: 7} if held else {})
+    assert isinstance(run.error, OverflowedQueueError) is not held
+
+
+async def test_boards_may_catch_up_after_a_reload(run):
+    run.flow.hold()
+    run.flow.expect_next_generation()
+    run.read(QUEUE_ALL_DEPTH, generation=1)
+    run.flow._in_force.generation = 1
+    run.flow.adopt_next_generation()
+    run.flow.resume()
+    run.read(3, generation=1)
+    assert run.lost == {LossReason.IN_RELOAD: 2}  # one is on the boards, so one more could wait
+    for _ in range(QUEUE_ALL_DEPTH - 1):
+        failed(run)
+        run.read(generation=1)
+    assert run.error is None
+    # the readings of the reload are done, and still as many wait: now it is the boards
+    run.read(generation=1)
+    assert isinstance(run.error, OverflowedQueueError)
+
+
+async def test_readings_of_other_generations_are_lost_or_wait_for_theirs(run):
+    run.read(generation=1)
+    run.flow.expect_next_generation()
+    run.read(4)
+    run.read(2, generation=2)
+    run.read(2, generation=1)
+    assert (run.flow.waiting, run.lost) == (3, {LossReason.IN_RELOAD: 3})
+    run.flow.drop_next_generation()
+    run.flow.adopt_next_generation()  # there is none
+    assert (run.flow.waiting, run.lost) == (3, {LossReason.IN_RELOAD: 5})
+
+
+async def test_a_run_publishes_as_many_results_as_it_was_told(boat):
+    """A publisher that waits for its server has several results at once; it will publish them all."""
+    run = Run(boat, queue="all", count=3)
+    run.read(10)
+    for _ in range(5):
+        computed(run)
+    assert run.app.frames == [1, 2, 3]
+    published(run, 1, Outcome.NO_POSTERIOR)  # so one more is needed
+    assert run.app.frames == [1, 2, 3, 4]
+    computed(run)
+    for number in (2, 3, 4):
+        assert not run.flow.end.done()
+        published(run, number)
+    assert run.flow.end.result() is None
+    assert run.app.frames == [1, 2, 3, 4]
+
+
+async def test_every_outcome_is_counted(run):
+    run.flow._at_publisher = 4
+    published(run, 1, missed=1)
+    published(run, 2)
+    published(run, 3, Outcome.ROSBRIDGE_AWAY)
+    published(run, 4, Outcome.NO_POSTERIOR)
+    lost = {LossReason.SOME_TOPICS: 1, LossReason.ROSBRIDGE_AWAY: 1, LossReason.NO_POSTERIOR: 1}
+    assert run.lost == lost
+    assert run.master.summary().endswith(
+        ", 1 of them on some topics only; not published: 1 rosbridge away, 1 no posterior"
+    )
+
+
+@pytest.mark.parametrize("reason", FailureReason)
+async def test_only_a_board_that_fails_again_and_again_ends_the_run(run, reason):
+    run.read(RESTARTS + 2)
+    for _ in range(RESTARTS):
+        failed(run, reason)
+    assert run.lost == {LossReason.FAILED: RESTARTS}
+    assert run.error is None
+    failed(run, reason)
+    assert isinstance(run.error, BoardFailedError) is (reason is FailureReason.FAILED)
+    assert len(run.app.frames) == RESTARTS + (2 if run.error is None else 1)
+
+
+async def test_a_cause_is_reported_once(run):
+    for cause in ("a", "b", "a", "a"):
+        run.take(run.subscriber, Unusable(cause, "D1 is missing"))
+    assert run.lost == {LossReason.UNUSABLE: 4}
+    assert len(run.warnings) == 2
+    assert run.flow.has_data
+
+
+@pytest.mark.parametrize(
+    ("end", "error", "code"),
+    [
+        (lambda run: run.take(run.subscriber, Unusable("a", "D1 is missing")), VariableError, 4),
+        (failed, ReportedError, 5),
+        (lambda run: published(run, 1, Outcome.NO_POSTERIOR), VariableError, 4),
+        (lambda run: published(run, 1, Outcome.ROSBRIDGE_AWAY), RosbridgeLostError, 3),
+    ],
+    ids=["unusable", "failed", "no posterior", "rosbridge away"],
+)
+async def test_a_single_frame_that_has_no_result_ends_the_run(boat, end, error, code):
+    run = Run(boat, once=True)
+    run.read(2)  # the second is not looked at
+    assert run.master.status().frames.received == 1
+    end(run)
+    assert isinstance(run.error, error)
+    assert run.error.exit_code == code
+
+
+async def test_a_record_of_another_service_is_reported(run):
+    run.take(run.subscriber, Prepared(1))  # nobody waits for it
+    assert not run.warnings
+    run.take(run.subscriber, Publish(None, 0, 0, 0, 0, 0))
+    assert len(run.warnings) == 1
+    assert run.error is None
+
+
+async def test_a_frame_is_followed_by_its_number(boat):
+    run = Run(boat, log_level="debug")
+    run.read(stamp_ns=17)
+    (notice,) = run.subscriber.records
+    assert isinstance(notice, Notice)
+    assert notice.sentence.startswith("frame=1 complete stamp_ns=17 ")
