@@ -11,8 +11,8 @@ import pytest
 from pcie_shim.endpoint import Endpoint
 from services.errors import NotPreparedError, NotReloadedError, SettingsError, ShapeError
 from services.master.new_deployment import forget, keep, read_new
-from services.pipeline.generations import Generations
 from services.pipeline.deployed_boards import DeployedBoards
+from services.pipeline.generations import Generations
 from services.settings import Settings
 from services.sockets.records import Hello, NotReloaded, Prepare, Prepared, Switch, Switched
 from services.supervision.parent import DIRECTORY_VARIABLE
@@ -113,7 +113,7 @@ def stopped(*_):
 
 def test_a_signal_ends_a_service_that_reads_or_programs(folder, loaded, monkeypatch):
     held = Generations(loaded, lambda _: None)
-    held._make = stopped
+    held._derive = stopped
     with pytest.raises(StoppedError):
         held.prepare(Prepare(1, str(folder), loaded.hash))
     boards = DeployedBoards(Settings(), loaded, [Endpoint(path="/nowhere")] * len(loaded.boards))
@@ -125,8 +125,8 @@ def test_a_signal_ends_a_service_that_reads_or_programs(folder, loaded, monkeypa
 def test_a_service_switches_to_a_prepared_deployment(folder, loaded):
     edit(folder, target_count=99)
     held = Generations(loaded, lambda deployment: deployment.machine.target_count)
-    held.greeted(Hello("master", "", loaded.hash, 4))
-    assert (held.number, held.made) == (4, 255)
+    held.adopt(Hello("master", "", loaded.hash, 4))
+    assert (held.number, held.derived) == (4, 255)
     refusals = [
         held.switch(Switch(5)),
         held.prepare(Prepare(5, str(folder), loaded.hash)),  # of another hash
@@ -135,11 +135,11 @@ def test_a_service_switches_to_a_prepared_deployment(folder, loaded):
     assert [(type(each), each.generation) for each in refusals] == [(NotReloaded, 5)] * 3
     assert {each.exit_code for each in refusals} == {NotPreparedError.exit_code}
     assert held.prepare(Prepare(5, str(folder), load_deployment(folder).hash)) == Prepared(5)
-    assert (held.number, held.made) == (4, 255)
+    assert (held.number, held.derived) == (4, 255)
     assert held.switch(Switch(5)) == Switched(5)
-    assert held.made == 99
+    assert held.derived == 99
     assert held.switch(Switch(4)) == Switched(4)  # there is a way back
-    assert (held.deployment.hash, held.made) == (loaded.hash, 255)
+    assert (held.deployment.hash, held.derived) == (loaded.hash, 255)
 
 
 def test_a_damaged_image_concerns_the_service_that_reads_images(folder, loaded):
