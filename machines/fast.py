@@ -194,7 +194,7 @@ class FastBM1(BM1Kernel):
         self._first_slot = 0 if self._of_frame else bank * self._kept_blocks
 
     def _limit(self, run_until: int) -> int:
-        """The cycle at which a slice ends."""
+        """Return the cycle at which a slice ends."""
         return min(run_until, self._max_cycles) if run_until else self._max_cycles
 
 

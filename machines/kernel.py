@@ -2,6 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Collection
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -9,6 +10,9 @@ import numpy.typing as npt
 from machines.bm1 import BM1Machine, Start, StopReason, checked_codes, joint_reason
 from machines.errors import ParameterError, StartError
 from machines.parameters import CYCLES_MAX, BM1Parameters, PriorMode, SensorMode
+
+FAST_CODES_MAX: Final = 2**24
+"""Most different codes, of all columns together, for the fast kernel: it has a table of them."""
 
 
 class BM1Kernel(ABC):
@@ -139,8 +143,10 @@ class BM1Kernel(ABC):
 
 
 def make_kernel(machine: BM1Machine) -> BM1Kernel:
-    """Return the fastest kernel that can run the machine."""
-    if machine.parameters.shared and machine.parameters.rng.lfsr_bits is not None:
+    """Return the fastest kernel that can run the machine in a bounded memory."""
+    parameters = machine.parameters
+    codes = parameters.columns << parameters.prob_bits
+    if parameters.shared and parameters.rng.lfsr_bits is not None and codes <= FAST_CODES_MAX:
         # only a process that runs such machines loads numba
         from machines.fast import FastBM1
 

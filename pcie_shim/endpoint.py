@@ -1,4 +1,4 @@
-"""Endpoints: where a board listens, ``unix:/path`` or ``tcp://host:port``, and the sockets for them."""
+"""Endpoints of boards, `unix:/path` or `tcp://host:port`, and their sockets."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from urllib.parse import urlsplit
 from pcie_shim.errors import EndpointError, LinkTimeoutError, UnreachableError
 
 UNIX_PATH_BYTES: Final = 107
-"""Longest path of a unix socket that Linux takes."""
+"""Longest path of a unix socket on Linux."""
 
 _RETRY_S: Final = 0.02
 
@@ -42,7 +42,7 @@ class Endpoint:
 
     @property
     def programming(self) -> Endpoint:
-        """Where the same board is programmed: ``board0.program.sock`` beside ``board0.sock``, or the next port."""
+        """The board's programming port: `board0.program.sock` beside `board0.sock`, or the next TCP port."""
         if self.path:
             path = Path(self.path)
             return Endpoint(path=str(path.with_name(f"{path.stem}.program{path.suffix}")))
@@ -50,15 +50,15 @@ class Endpoint:
 
 
 def parse_endpoint(text: str) -> Endpoint:
-    """The endpoint that a text says.
+    """Parse an endpoint.
 
     Raises:
-        EndpointError: The text is neither ``unix:/path`` nor ``tcp://host:port``, or the path too long.
+        EndpointError: The text is neither `unix:/path` nor `tcp://host:port`, or the path too long.
     """
     if text.startswith("unix:"):
         endpoint = Endpoint(path=text.removeprefix("unix:"))
         if not endpoint.path.startswith("/"):
-            raise EndpointError(f"The endpoint '{text}' is not understood: unix: takes an absolute path")
+            raise EndpointError(f"The endpoint '{text}' has a relative path: unix: takes an absolute one")
         longest = len(os.fsencode(endpoint.programming.path))
         if longest > UNIX_PATH_BYTES:
             raise EndpointError(
@@ -69,7 +69,9 @@ def parse_endpoint(text: str) -> Endpoint:
     try:
         parts = urlsplit(text)
         host, port = parts.hostname, parts.port
-        (host or "").encode("idna")  # what the resolver will do, and fail with a UnicodeError (a ValueError)
+        (host or "").encode(
+            "idna"
+        )  # as the resolver does, which would fail with a UnicodeError (a ValueError)
     except ValueError:
         host, port = None, None
     if text.startswith("tcp://") and host and port and port < 65535 and text.count("/") == 2:
@@ -81,7 +83,7 @@ def parse_endpoint(text: str) -> Endpoint:
 
 
 def listen(endpoint: Endpoint) -> socket.socket:
-    """A listening socket; a unix socket is its owner's alone (0600) and replaces one that nobody serves.
+    """Return a listening socket; a unix socket has mode 0600 and replaces a stale one.
 
     Raises:
         EndpointError: Another process listens there, or the system refuses.
@@ -91,7 +93,7 @@ def listen(endpoint: Endpoint) -> socket.socket:
             family = socket.AF_INET6 if ":" in endpoint.host else socket.AF_INET
             return socket.create_server((endpoint.host, endpoint.port), family=family)
         server = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        # Linux gives the socket's file the mode of the socket: at no time can another user connect.
+        # Linux gives the file the socket's mode, so that another user can never connect
         os.fchmod(server.fileno(), 0o600)
         try:
             server.bind(endpoint.path)
@@ -116,12 +118,12 @@ def _is_served(path: str) -> bool:
         except ConnectionRefusedError:
             return False
         except BlockingIOError:
-            pass  # its queue is full: a blocking connect would wait until it is served
+            pass  # its backlog is full: a blocking connect would wait
         return True
 
 
 def connect(endpoint: Endpoint, *, timeout: float) -> socket.socket:
-    """A socket connected to a board that listens, or begins to within ``timeout`` seconds.
+    """Connect to a board, and retry for `timeout` seconds until it listens.
 
     Raises:
         UnreachableError: Nothing listens there.
@@ -160,13 +162,13 @@ def _connect_once(endpoint: Endpoint, timeout: float) -> socket.socket:
 
 
 def no_delay(connection: socket.socket) -> None:
-    """Send small frames at once, where that is a question at all (TCP)."""
+    """Disable Nagle's algorithm on TCP, so that small frames are sent at once."""
     if connection.family != socket.AF_UNIX:
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
 
 def remove_listener(endpoint: Endpoint, server: socket.socket) -> None:
-    """Close a listening socket and take its file away."""
+    """Close a listening socket and remove its file."""
     server.close()
     if endpoint.path:
         with suppress(OSError):

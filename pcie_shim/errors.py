@@ -1,4 +1,4 @@
-"""What can go wrong between the host and its boards, each a sentence for the user."""
+"""Errors between the host and its boards; the text of each is one sentence for the user."""
 
 from __future__ import annotations
 
@@ -6,39 +6,39 @@ from typing import ClassVar
 
 
 class PcieShimError(Exception):
-    """Root of this package's errors; ``str(error)`` says what happened and what to do."""
+    """Root of this package's errors."""
 
     exit_code: ClassVar[int] = 5
 
 
 class EndpointError(PcieShimError):
-    """An endpoint's text is not ``unix:/path`` or ``tcp://host:port``, or the system cannot listen there."""
+    """An endpoint that is neither `unix:/path` nor `tcp://host:port`, or at which the system cannot listen."""
 
     exit_code = 2
 
 
 class ImageError(PcieShimError):
-    """A programming file cannot be made or used: a model too large for the interface, a wrong partition."""
+    """A programming file that cannot be made or used: a model too large for the interface, a wrong partition."""
 
     exit_code = 2
 
 
 class DamagedImageError(ImageError):
-    """A programming file's bytes are not those that were written: the sentence says which hash is wrong."""
+    """A programming file whose bytes have changed since it was written."""
 
 
 class ImageMismatchError(ImageError):
-    """A programming file is whole, but made for another register map, format or set of boards."""
+    """An intact programming file for another register map, format or set of boards."""
 
 
 class FrameInputError(PcieShimError):
-    """What is to be computed does not fit the machine: addresses, target, prior or bank."""
+    """A frame that does not fit the machine: addresses, target, prior or bank."""
 
     exit_code = 2
 
 
 class LinkError(PcieShimError):
-    """The connection to a board cannot be used (any more)."""
+    """A link to a board that is unusable."""
 
 
 class UnreachableError(LinkError):
@@ -50,11 +50,11 @@ class LinkClosedError(LinkError):
 
 
 class LinkTimeoutError(LinkError):
-    """An answer, or the rest of a frame, did not come in time."""
+    """An answer, or the rest of a frame, did not arrive in time."""
 
 
 class FramingError(LinkError):
-    """The bytes received are no frame of the link: another program listens there, or the stream is broken."""
+    """Bytes that are not a frame: another program listens there, or the stream is broken."""
 
 
 class CrcError(FramingError):
@@ -62,7 +62,7 @@ class CrcError(FramingError):
 
 
 class SequenceError(FramingError):
-    """A frame came out of turn: lost, doubled, or not the answer to what was asked."""
+    """A frame out of order: lost, repeated, or not the answer to the request."""
 
 
 class ShortReadError(FramingError):
@@ -74,17 +74,17 @@ class DeviceGoneError(LinkError):
 
 
 class GreetingMismatchError(LinkError):
-    """The board speaks another protocol version, register map or BAR size; the sentence has both values."""
+    """A board with another protocol version, register map or BAR size."""
 
     exit_code = 2
 
 
 class AccessError(LinkError):
-    """The board refused an access and said why.
+    """An access that the board refused.
 
     Attributes:
-        code: The board's error code, a ``register_map.ErrorCode`` (or an unknown number).
-        detail: The board's own words.
+        code: The board's error code, a `register_map.ErrorCode` (or an unknown number).
+        detail: The board's explanation.
     """
 
     def __init__(self, sentence: str, *, code: int, detail: str) -> None:
@@ -98,11 +98,11 @@ class HeldError(AccessError):
 
 
 class StaleHandleError(AccessError):
-    """The board was programmed after this handle was opened: what it knows is no longer true."""
+    """A handle that is stale because the board was programmed after it was opened."""
 
 
 class BoardError(PcieShimError):
-    """A board of the mini-cluster failed a frame or cannot be opened.
+    """A board of the mini-cluster that failed a frame or cannot be opened.
 
     Attributes:
         board: The board's number in the mini-cluster, from 0.
@@ -122,13 +122,13 @@ class BoardHeldError(BoardError):
 
 
 class BoardMismatchError(BoardError):
-    """The board has another register map or image than the deployment; the sentence has both."""
+    """The board has another register map or image than the deployment."""
 
     exit_code = 2
 
 
 class BoardSilentError(BoardError):
-    """The board did not answer, or did not say done, in time."""
+    """The board did not answer or finish in time."""
 
 
 class BoardGoneError(BoardError):
@@ -136,12 +136,12 @@ class BoardGoneError(BoardError):
 
 
 class BoardLinkError(BoardError):
-    """What came over the link is broken: a short read, a wrong CRC, a wrong sequence number."""
+    """The board broke the protocol: a short read, a wrong CRC, a wrong sequence number."""
 
 
 class BoardRefusedError(BoardError):
-    """The board answered ERROR to an access that the driver made."""
+    """The board answered ERROR to an access of the driver."""
 
 
 class BoardStaleError(BoardError):
-    """The board was programmed by someone else since it was opened."""
+    """Another loader has programmed the board since it was opened."""

@@ -1,8 +1,8 @@
-"""The link's frames, without sockets: bytes to frames and back (docs/reference/boards.md has the wire format).
+"""Frames of the link, without sockets: bytes to frames and back (docs/reference/boards.md has the wire format).
 
 A frame is a header of 20 bytes (operation, flags, sequence, address, count, CRC-32) and 32-bit words,
 all little-endian: thesis 2.3, where the data link layer adds sequence numbers and CRCs to requests
-to read and write. :class:`FrameDecoder` keeps one buffer for the life of a link.
+to read and write. `FrameDecoder` keeps one buffer for the life of a link.
 """
 
 from __future__ import annotations
@@ -18,30 +18,30 @@ Octets: TypeAlias = bytes | bytearray | memoryview
 
 # Plain integers: an enumeration's members cost a look-up and a conversion in every frame.
 GREET: Final = 1
-"""Board to host, first frame of a link: who it is (:class:`Greeting`)."""
+"""Board to host, first frame of a link: the `Greeting`."""
 READ: Final = 2
-"""Host to board: ``count`` words from ``address`` on; the reply carries them."""
+"""Host to board: `count` words from `address` on; the reply carries them."""
 WRITE: Final = 3
-"""Host to board: the payload goes to ``address`` and on; acknowledged, unless posted."""
+"""Host to board: the payload goes to `address` and on; acknowledged, unless posted."""
 IRQ: Final = 4
 """Board to host: the machine has stopped; the payload is the block from DONE on and the results."""
 ERROR: Final = 5
-"""Board to host: what the frame of this sequence number asked was refused (:func:`encode_error`)."""
+"""Board to host: the request of this sequence number was refused (`encode_error`)."""
 PROGRAM: Final = 6
-"""Loader to the programming port: a part of a programming file; ``address`` is its offset in bytes."""
+"""Loader to the programming port: a part of a programming file; `address` is its offset in bytes."""
 
 REPLY: Final = 1
 """Flag: the answer to the request of the same sequence number."""
 POSTED: Final = 2
-"""Flag: no acknowledgement is wanted; a refusal is still answered by ERROR."""
+"""Flag: no acknowledgement; a refusal is still answered by ERROR."""
 BEGIN: Final = 4
-"""Flag of PROGRAM: the payload says what will come (:class:`ProgramBegin`)."""
+"""Flag of PROGRAM: the payload announces the file (`ProgramBegin`)."""
 END: Final = 8
-"""Flag of PROGRAM: the file is complete; the reply comes when the board runs it."""
+"""Flag of PROGRAM: the file is complete; the reply comes when the board has loaded it."""
 
 PROTOCOL_VERSION: Final = 1
 MAX_PAYLOAD_WORDS: Final = 8192
-"""Longest payload: the map's longest block (INPUTS) fits."""
+"""Longest payload: the map's longest block, INPUTS."""
 
 _MAGIC: Final = 0x4D42
 _HEAD: Final = struct.Struct("<HBBIII")
@@ -76,7 +76,7 @@ class Frame(NamedTuple):
 def encode(
     operation: int, flags: int, sequence: int, address: int, count: int, payload: Octets = b""
 ) -> bytes:
-    """A frame's bytes. ``payload`` is what its operation carries: ``count`` words, or nothing."""
+    """Return a frame's bytes; `payload` has `count` words, or none."""
     head = _HEAD.pack(_MAGIC, operation, flags, sequence, address, count)
     return b"".join((head, _CRC.pack(crc32(payload, crc32(head))), payload))
 
@@ -84,8 +84,8 @@ def encode(
 class FrameDecoder:
     """Turns a stream of bytes into frames.
 
-    Receive into :meth:`room`, say how much came with :meth:`received`, then take frames from
-    :meth:`next_frame` until it returns None. After an error the stream cannot be used any more.
+    Receive into `room`, report the number of bytes to `received`, then take frames from `next_frame` until it
+    returns None. After an error the decoder is unusable.
     """
 
     def __init__(self) -> None:
@@ -95,11 +95,11 @@ class FrameDecoder:
 
     @property
     def inside_frame(self) -> bool:
-        """Whether a frame has begun that has not ended."""
+        """Whether the buffer holds an incomplete frame."""
         return self._end > self._start
 
     def room(self) -> memoryview:
-        """Where the next bytes go; makes the payloads handed out so far invalid."""
+        """Return the buffer for the next bytes; payloads returned so far become invalid."""
         if self._start == self._end:
             self._start = self._end = 0
         elif self._start > _MAX_FRAME:
@@ -109,14 +109,14 @@ class FrameDecoder:
         return self._buffer[self._end :]
 
     def received(self, count: int) -> None:
-        """Say that ``count`` bytes were put at the beginning of :meth:`room`."""
+        """Account for `count` bytes at the beginning of `room`."""
         self._end += count
 
     def next_frame(self) -> Frame | None:
-        """The next whole frame, or None until more bytes come.
+        """Return the next complete frame, or None until more bytes come.
 
         Raises:
-            FramingError: The bytes are no frame.
+            FramingError: The bytes are not a frame.
             CrcError: A frame's CRC is wrong.
         """
         start = self._start
@@ -124,9 +124,9 @@ class FrameDecoder:
             return None
         magic, operation, flags, sequence, address, count, crc = _HEADER.unpack_from(self._buffer, start)
         if magic != _MAGIC or operation not in _OPERATIONS or flags > 15:
-            raise FramingError("what came is no frame of the link")
+            raise FramingError("the bytes received are not a frame of the link")
         if count > MAX_PAYLOAD_WORDS:
-            raise FramingError(f"a frame of {count} words came; {MAX_PAYLOAD_WORDS} are the most")
+            raise FramingError(f"a frame has {count} words; {MAX_PAYLOAD_WORDS} are the most")
         payload_start = start + HEADER_BYTES
         end = payload_start if (operation, flags & REPLY) in _WITHOUT_PAYLOAD else payload_start + 4 * count
         if self._end < end:
@@ -144,7 +144,7 @@ _LINK_MAGIC: Final = b"ROSBAYES"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Greeting:
-    """What a board says of itself when a link opens.
+    """A board's introduction when a link opens.
 
     Attributes:
         protocol_version: Version of the wire format.
@@ -152,7 +152,7 @@ class Greeting:
         board: The board's number, as it was started.
         map_hash: SHA-256 (hex) of the register map's definition.
         image_hash: SHA-256 (hex) of the loaded image; all zeros on a blank board.
-        token: Proves to the programming port that whoever has it holds this link.
+        token: Proves to the programming port that its sender holds this link.
     """
 
     protocol_version: int
@@ -164,7 +164,7 @@ class Greeting:
 
 
 def encode_greeting(greeting: Greeting) -> bytes:
-    """The greeting's frame."""
+    """Return the greeting's frame."""
     payload = _GREETING.pack(
         _LINK_MAGIC,
         greeting.protocol_version,
@@ -178,10 +178,10 @@ def encode_greeting(greeting: Greeting) -> bytes:
 
 
 def decode_greeting(frame: Frame) -> Greeting:
-    """The greeting in a frame.
+    """Decode the greeting in a frame.
 
     Raises:
-        FramingError: It is none.
+        FramingError: The frame is not a greeting.
     """
     if frame.operation != GREET or len(frame.payload) < _GREETING.size:
         raise FramingError("the link does not begin with a board's greeting")
@@ -199,14 +199,14 @@ def decode_greeting(frame: Frame) -> Greeting:
 
 
 def encode_error(sequence: int, address: int, code: int, detail: str) -> bytes:
-    """An ERROR frame: a word with the code, then the board's words for people, UTF-8, padded with zeros."""
+    """Return an ERROR frame: a word with the code, then the board's sentence in UTF-8, padded with zeros."""
     words = detail.encode()[:1024]
     payload = _CRC.pack(code) + words + bytes(-len(words) % 4)
     return encode(ERROR, REPLY, sequence, address, len(payload) // 4, payload)
 
 
 def decode_error(frame: Frame) -> tuple[int, str]:
-    """Code and words of an ERROR frame.
+    """Return the code and the sentence of an ERROR frame.
 
     Raises:
         FramingError: It has no code.
@@ -219,17 +219,17 @@ def decode_error(frame: Frame) -> tuple[int, str]:
 
 _PROGRAM_BEGIN: Final = struct.Struct("<Q32s8s")
 NO_TOKEN: Final = bytes(8)
-"""The token of a loader that holds no link."""
+"""The token of a loader without a link."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ProgramBegin:
-    """What a loader says before it sends a programming file.
+    """A loader's announcement of a programming file.
 
     Attributes:
-        size: Bytes that will come.
-        sha256: Of those bytes.
-        token: The greeting's token, where the loader holds the board's link; else :data:`NO_TOKEN`.
+        size: Size of the file in bytes.
+        sha256: SHA-256 of the file.
+        token: The token of the loader's link to the board, or `NO_TOKEN`.
     """
 
     size: int
@@ -237,12 +237,12 @@ class ProgramBegin:
     token: bytes
 
     def encode(self) -> bytes:
-        """The payload of a PROGRAM frame with BEGIN."""
+        """Return the payload of a PROGRAM frame with BEGIN."""
         return _PROGRAM_BEGIN.pack(self.size, self.sha256, self.token)
 
     @classmethod
     def decode(cls, payload: memoryview) -> ProgramBegin:
-        """The same from a frame's payload.
+        """Decode a frame's payload.
 
         Raises:
             FramingError: It is too short.

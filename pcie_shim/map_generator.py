@@ -1,4 +1,4 @@
-"""Makes the constants module and the register documentation from the SystemRDL file (``scripts/registers``).
+"""Makes the constants module and the register documentation from the SystemRDL file (`scripts/registers`).
 
 Only development needs it: the constants module is committed, so that run time needs no SystemRDL
 tools. The hash of the map covers the definition (names, addresses, sizes, fields, access, resets,
@@ -52,7 +52,7 @@ class Encoding:
 
 @dataclass(frozen=True)
 class Field:
-    """Bits ``low`` to ``high`` of a register."""
+    """Bits `low` to `high` of a register."""
 
     name: str
     low: int
@@ -114,7 +114,7 @@ class RegisterMap:
 
 
 def read_map(source: Path = SOURCE) -> RegisterMap:
-    """The map that a SystemRDL file defines.
+    """Return the map that a SystemRDL file defines.
 
     Raises:
         systemrdl.RDLCompileError: The file is no valid SystemRDL; the compiler has printed where.
@@ -177,7 +177,7 @@ def _one_line(text: str | None) -> str:
 
 
 def module_text(register_map: RegisterMap) -> str:
-    """The constants module."""
+    """Return the constants module."""
     lines = [
         '"""The boards\' register map as constants: offsets in bytes, masks, shifts, encodings.',
         "",
@@ -202,7 +202,7 @@ def module_text(register_map: RegisterMap) -> str:
         "",
         "",
         "class Block(NamedTuple):",
-        '    """A register, an array of registers or a memory: 32-bit words from ``address`` on."""',
+        '    """A register, an array of registers or a memory: 32-bit words from `address` on."""',
         "",
         "    name: str",
         "    address: int",
@@ -240,7 +240,7 @@ def _first_user(register_map: RegisterMap, encoding: Encoding) -> str:
 
 
 def document_text(register_map: RegisterMap) -> str:
-    """The register documentation, in Markdown: an overview, then every register with its fields."""
+    """Return the register documentation in Markdown: an overview, then every register with its fields."""
     lines = [
         "<!-- Generated from hdl/bm_registers.rdl by scripts/registers: change that file, not this one. -->",
         "# Board registers",
@@ -300,7 +300,7 @@ def generated_files(register_map: RegisterMap) -> dict[Path, str]:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Write all files, or with ``--check`` say whether they are what the SystemRDL file makes of them."""
+    """Write all files, or with `--check` say whether they are what the SystemRDL file makes of them."""
     parser = argparse.ArgumentParser(
         prog="scripts/registers",
         description="Makes the constants module, the documentation, the VHDL and the C header from hdl/bm_registers.rdl.",

@@ -1,12 +1,11 @@
-"""Programming files: what the toolchain makes of a model and the loader puts on a board (thesis 3.4).
+"""Programming files, which the toolchain builds from a model and the loader writes to a board (thesis 3.4).
 
-A file is a fixed header, a manifest (JSON, for people too: ``head -c 4000 board0.bm``) and the
-machine's tables, one section each, in the manifest's order. The header carries the manifest's
-SHA-256 and the manifest that of every section, so that a damaged file is found and the damaged part
-named. The same image and build date always give the same bytes.
+A file is a fixed header, a manifest (readable JSON: `head -c 4000 board0.bm`) and the machine's tables, one
+section each. The header has the manifest's SHA-256 and the manifest that of every section, so that an error
+names the damaged part. The same image and build date always give the same bytes.
 
-``image_hash`` identifies what a board computes: parameters, tables, partition, interface, model and
-register map; not when or with which version of the tools it was built.
+`image_hash` identifies the computation: parameters, tables, partition, interface, model and register map; not
+the date or the version of the tools.
 """
 
 from __future__ import annotations
@@ -20,26 +19,27 @@ import time
 from dataclasses import dataclass
 from functools import cached_property
 from importlib.metadata import version
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from machines.bm1 import BM1Machine
 from machines.errors import MachineError
-from machines.parameters import BM1Parameters, SensorMode
+from machines.parameters import BM1Parameters, RngKind, SensorMode
 from pcie_shim import register_map
 from pcie_shim.errors import DamagedImageError, ImageError, ImageMismatchError
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
 MAGIC: Final = b"BMIMAGE\x01"
 """First bytes of a programming file; the last of them is the format's version."""
 
 MAX_IMAGE_BYTES: Final = 1 << 30
-"""Larger programming files are refused, by whoever reads or receives them."""
+"""Largest programming file that is read or received."""
 
 _HEADER: Final = struct.Struct("<8sII32s")  # magic, length of the manifest, zero, SHA-256 of the manifest
 
@@ -63,16 +63,16 @@ class Partition:
 
 @dataclass(frozen=True, eq=False)
 class Image:
-    """What one board is programmed with.
+    """The contents of one board's programming file.
 
     Attributes:
         machine: The board's lines of the machine.
-        partition: Which part of the model they are.
+        partition: Their place in the model.
         interface_sensors: Input words of the interface (thesis 3.2: 20).
         interface_results: Result words of the interface (thesis 3.2: 1200).
-        model_hash: SHA-256 (hex) that names the model; the same for all boards of a deployment.
-        build_date: When it was built, ISO 8601 (see :func:`build_date`).
-        tool_version: Version of the toolchain that built it.
+        model_hash: SHA-256 (hex) of the model; the same for all boards of a deployment.
+        build_date: Date of the build, ISO 8601 (see `build_date`).
+        tool_version: Version of the toolchain.
 
     Raises:
         ImageError: The machine is larger than the interface, or the interface than the register map, or
@@ -88,7 +88,7 @@ class Image:
     tool_version: str
 
     def __post_init__(self) -> None:
-        """Refuse what no board can hold."""
+        """Refuse an image that no board can hold."""
         parameters, part = self.machine.parameters, self.partition
         lines, words = parameters.lines, interface_room(parameters)
         inputs, results = interface_words(parameters)
@@ -117,33 +117,33 @@ class Image:
 
     @property
     def map_hash(self) -> str:
-        """SHA-256 (hex) of the register map that the image is made for: this software's."""
+        """SHA-256 (hex) of the image's register map, which is this software's."""
         return register_map.MAP_SHA256
 
     @cached_property
     def image_hash(self) -> str:
-        """SHA-256 (hex) that identifies what the board computes, whenever it was built."""
+        """SHA-256 (hex) of the board's computation, independent of the build's date."""
         return _manifest(self, _sections(self.machine)).image_hash
 
 
 def interface_words(parameters: BM1Parameters) -> tuple[int, int]:
-    """Input words and result words that a board with this machine has: those of all its replicas."""
+    """Return the input words and result words of a board with this machine, those of all replicas."""
     return math.prod(parameters.input_shape), math.prod(parameters.count_shape)
 
 
 def interface_room(parameters: BM1Parameters) -> tuple[int, int]:
-    """Input words and result words that the register map has room for, with such inputs."""
+    """Return the input words and result words for which the register map has room, with such inputs."""
     inputs = register_map.SENSORS_WORDS if is_plain(parameters) else register_map.INPUTS_WORDS
     return inputs, register_map.RESULTS_WORDS
 
 
 def is_plain(parameters: BM1Parameters) -> bool:
-    """Whether the machine is a single one with one input per column: its inputs lie in SENSORS, else in INPUTS."""
+    """Return whether one replica has one input per column: then its inputs are in SENSORS, else in INPUTS."""
     return parameters.replicas == 1 and parameters.sensor_mode is SensorMode.COLUMN
 
 
 def _sizes(parameters: BM1Parameters) -> str:
-    """What a sentence says of a machine's size."""
+    """Describe a machine's size for an error's sentence."""
     if is_plain(parameters):
         return f"{parameters.sensors} sensors and {parameters.lines} lines"
     inputs, results = interface_words(parameters)
@@ -155,27 +155,30 @@ class _Checked(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
+_Word: TypeAlias = Annotated[int, Field(ge=0, lt=2**32)]
+
+
 class _PartitionEntry(_Checked):
-    index: int
-    count: int
-    line_offset: int
-    total_lines: int
+    index: _Word
+    count: _Word
+    line_offset: _Word
+    total_lines: _Word
 
 
 class _Interface(_Checked):
-    sensors: int
-    results: int
+    sensors: _Word
+    results: _Word
 
 
 class _Section(_Checked):
     name: str
     dtype: str
-    shape: tuple[int, ...]
+    shape: tuple[_Word, ...]
     sha256: str
 
 
 class _Identity(_Checked):
-    """What the image hash is made of."""
+    """The input of the image hash."""
 
     machine: str
     parameters: BM1Parameters
@@ -199,10 +202,10 @@ class _Manifest(_Checked):
 
 
 def build_date() -> str:
-    """Now, or the time that ``SOURCE_DATE_EPOCH`` gives (for builds that repeat to the byte); ISO 8601, UTC.
+    """Return the current time, or `SOURCE_DATE_EPOCH` for reproducible builds, as ISO 8601 in UTC.
 
     Raises:
-        ImageError: ``SOURCE_DATE_EPOCH`` is no time.
+        ImageError: `SOURCE_DATE_EPOCH` is not a time.
     """
     epoch = os.environ.get("SOURCE_DATE_EPOCH")
     try:
@@ -214,12 +217,12 @@ def build_date() -> str:
 
 
 def tool_version() -> str:
-    """The installed version of this software, for :attr:`Image.tool_version`."""
+    """Return the installed version of this software, for `Image.tool_version`."""
     return version("rosbayes")
 
 
 def image_bytes(image: Image) -> bytes:
-    """The bytes of the image's programming file: always the same for the same image."""
+    """Return the bytes of the image's programming file, which are always the same for the same image."""
     sections = _sections(image.machine)
     manifest = _canonical(_manifest(image, sections).model_dump(mode="json"))
     header = _HEADER.pack(MAGIC, len(manifest), 0, hashlib.sha256(manifest).digest())
@@ -227,7 +230,7 @@ def image_bytes(image: Image) -> bytes:
 
 
 def write_image(path: Path, image: Image) -> None:
-    """Write the image's programming file; a reader never sees half of it.
+    """Write the image's programming file atomically.
 
     Raises:
         ImageError: The file cannot be written.
@@ -242,39 +245,39 @@ def write_image(path: Path, image: Image) -> None:
 
 
 def read_image(path: Path) -> Image:
-    """The image in a programming file, all its hashes checked.
+    """Read the image of a programming file, and check all hashes.
 
     Raises:
         ImageError: The file cannot be read.
-        DamagedImageError: Its bytes are not those that were written; the sentence names the hash.
+        DamagedImageError: A hash is wrong.
         ImageMismatchError: It is for another register map or format.
     """
     return image_from_bytes(read_bytes(path), str(path))
 
 
 def read_bytes(path: Path) -> bytes:
-    """The bytes of a file, as :func:`image_from_bytes` takes them; no more than it accepts.
+    """Read the bytes of a file for `image_from_bytes`, no more than it accepts.
 
     Raises:
         ImageError: The file cannot be read.
     """
     try:
         with path.open("rb") as file:
-            # one byte more than allowed, so that a file that is too large is told from one that is not
+            # one byte more than allowed, which marks a file that is too large
             return file.read(MAX_IMAGE_BYTES + 1)
     except OSError as error:
         raise ImageError(f"{path} cannot be read: {error.strerror}") from error
 
 
 def image_from_bytes(content: bytes, name: str = "the image") -> Image:
-    """The image in the bytes of a programming file, all its hashes checked.
+    """Decode the image in the bytes of a programming file, and check all hashes.
 
     Args:
         content: The file's bytes.
-        name: What errors call it: a path, a board.
+        name: Its name in errors, such as a path.
 
     Raises:
-        DamagedImageError: The bytes are not those that were written; the sentence names the hash.
+        DamagedImageError: A hash is wrong.
         ImageMismatchError: It is for another register map or format.
     """
     manifest, data_start = _read_manifest(content, name)
@@ -290,11 +293,10 @@ def image_from_bytes(content: bytes, name: str = "the image") -> Image:
             f"{manifest.image_hash}; build the deployment again"
         )
     part, interface = manifest.identity.partition, manifest.identity.interface
-    columns = [array for section, array in sections if section.startswith("column ")]
-    by_name = dict(sections)
+    columns = [array for section, array in sections.items() if section.startswith("column ")]
     try:
         machine = BM1Machine(
-            manifest.identity.parameters, by_name["prior"], tuple(columns), by_name.get("rng")
+            manifest.identity.parameters, sections["prior"], tuple(columns), sections.get("rng")
         )
         return Image(
             machine=machine,
@@ -305,18 +307,20 @@ def image_from_bytes(content: bytes, name: str = "the image") -> Image:
             build_date=manifest.build_date,
             tool_version=manifest.tool_version,
         )
-    except KeyError:
-        raise ImageMismatchError(f"{name} has no prior: it is no image of a BM1") from None
     except MachineError as error:
         raise ImageMismatchError(f"{name} holds a machine that cannot be built: {error}") from error
 
 
 def _read_manifest(content: bytes, name: str) -> tuple[_Manifest, int]:
-    """The manifest, and where the sections start."""
+    """Return the manifest, and the offset of the first section."""
     if len(content) > MAX_IMAGE_BYTES:
-        raise ImageMismatchError(f"{name} is larger than {MAX_IMAGE_BYTES} bytes: it is no programming file")
+        raise ImageMismatchError(
+            f"{name} is larger than {MAX_IMAGE_BYTES} bytes: it is not a programming file"
+        )
     if len(content) < _HEADER.size or content[:7] != MAGIC[:7]:
-        raise DamagedImageError(f"{name} is no programming file: it does not start with {MAGIC[:7].decode()}")
+        raise DamagedImageError(
+            f"{name} is not a programming file: it does not start with {MAGIC[:7].decode()}"
+        )
     magic, length, _, digest = _HEADER.unpack_from(content)
     if magic != MAGIC:
         raise ImageMismatchError(
@@ -332,24 +336,42 @@ def _read_manifest(content: bytes, name: str) -> tuple[_Manifest, int]:
         raise ImageMismatchError(f"{name} has a manifest that this software cannot read: {first}") from error
 
 
-def _read_sections(
-    content: bytes, name: str, manifest: _Manifest, start: int
-) -> list[tuple[str, npt.NDArray[Any]]]:
-    sections: list[tuple[str, npt.NDArray[Any]]] = []
+def _read_sections(content: bytes, name: str, manifest: _Manifest, start: int) -> dict[str, npt.NDArray[Any]]:
+    """Return the tables by their names; the parameters say which there must be, before anything is allocated."""
+    sections: dict[str, npt.NDArray[Any]] = {}
+    due = _due_sections(manifest.identity.parameters)
     for section in manifest.identity.sections:
-        if section.dtype not in {"<u2", "<u4"} or any(size < 0 for size in section.shape):
+        name_due, dtype, shape = next(due, ("no further section", "", ()))
+        # -1: the only length that the parameters leave open
+        fits = len(shape) == len(section.shape) and all(
+            size in {-1, given} for size, given in zip(shape, section.shape, strict=True)
+        )
+        if (section.name, section.dtype) != (name_due, dtype) or not fits:
             raise ImageMismatchError(
-                f"{name} has a section '{section.name}' of an unknown kind: {section.dtype}"
+                f"{name} is not an image of its parameters: they need {name_due} of {dtype}{list(shape)} next"
             )
-        dtype = np.dtype(section.dtype)
-        end = start + dtype.itemsize * int(np.prod(section.shape, dtype=object))
+        end = start + np.dtype(dtype).itemsize * math.prod(section.shape)
         data = content[start:end]
         _check_hash(name, f"section '{section.name}'", data, section.sha256, "its manifest")
-        sections.append((section.name, np.frombuffer(data, dtype).reshape(section.shape)))
+        if end > len(content):
+            raise DamagedImageError(f"{name} is damaged: it ends within section '{section.name}'")
+        sections[section.name] = np.frombuffer(data, dtype).reshape(section.shape)
         start = end
+    if (missing := next(due, None)) is not None:
+        raise ImageMismatchError(f"{name} has no section '{missing[0]}', which its parameters need")
     if start != len(content):
         raise DamagedImageError(f"{name} is damaged: {len(content) - start} bytes follow its last section")
     return sections
+
+
+def _due_sections(parameters: BM1Parameters) -> Iterator[tuple[str, str, tuple[int, ...]]]:
+    """Yield the name, type and shape of each section that a machine with these parameters has."""
+    yield "prior", "<u2", (parameters.prior_addresses, parameters.lines)
+    if parameters.has_tables:
+        for column, bits in enumerate(parameters.sensor_bits, start=1):
+            yield f"column {column}", "<u2", (1 << bits, parameters.lines)
+    if parameters.rng is RngKind.TABLE:
+        yield "rng", "<u4", (-1,)
 
 
 def _check_hash(name: str, what: str, data: bytes, expected: str, source: str) -> None:
@@ -392,7 +414,7 @@ def _manifest(image: Image, sections: list[tuple[str, npt.NDArray[Any]]]) -> _Ma
 
 
 def _sections(machine: BM1Machine) -> list[tuple[str, npt.NDArray[Any]]]:
-    """The machine's tables in the file's order and types (one per MIF of the thesis's hardware project)."""
+    """Return the tables in the file's order and types (one per MIF of the thesis's hardware project)."""
     sections: list[tuple[str, npt.NDArray[Any]]] = [("prior", machine.prior.astype("<u2", copy=False))]
     for column, table in enumerate(machine.tables, start=1):
         sections.append((f"column {column}", table.astype("<u2", copy=False)))
@@ -402,5 +424,5 @@ def _sections(machine: BM1Machine) -> list[tuple[str, npt.NDArray[Any]]]:
 
 
 def _canonical(value: object) -> bytes:
-    """JSON that is the same for the same value, and can be read by people."""
+    """Return readable JSON, which is always the same for the same value."""
     return json.dumps(value, indent=1, sort_keys=True, ensure_ascii=False).encode() + b"\n"

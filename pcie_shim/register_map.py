@@ -128,7 +128,7 @@ class ErrorCode(IntEnum):
 
 
 class Block(NamedTuple):
-    """A register, an array of registers or a memory: 32-bit words from ``address`` on."""
+    """A register, an array of registers or a memory: 32-bit words from `address` on."""
 
     name: str
     address: int

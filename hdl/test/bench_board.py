@@ -29,9 +29,9 @@ from hdl.test.project import (
     SensorMode,
     Start,
     StopReason,
-    following,
     image_bytes,
     interface_words,
+    next_doorbell,
     reference_kernel,
 )
 from hdl.test.project import (
@@ -267,7 +267,7 @@ class Session:
         await self.write_settings()
         if self.chance(0.25):
             await self.wrong_start()
-        due = following(both.board.done)
+        due = next_doorbell(both.board.done)
         assert await both.write(rm.START, due)
         if await self.while_running(due):
             return
@@ -277,7 +277,7 @@ class Session:
             assert status is not None
             if (status & rm.STATUS_STOP_REASON_MASK) >> rm.STATUS_STOP_REASON_SHIFT != StopReason.SLICE:
                 return
-            due = following(both.board.done)
+            due = next_doorbell(both.board.done)
             if self.chance(0.15) or not await self.resume():
                 return
             if await self.while_running(due):
@@ -419,7 +419,7 @@ class Session:
     async def wrong_start(self) -> None:
         """Ring with a wrong number or wrong settings, then put them right."""
         p, both = self.parameters, self.both
-        due = following(both.board.done)
+        due = next_doorbell(both.board.done)
         await both.write(rm.START, 0)
         await both.write(rm.RESUME, 0)
         for number in (due + 1, both.board.done, 0xFFFFFFFF):
@@ -454,7 +454,7 @@ class Session:
             await both.read(address)
             if await both.write(rm.START, due):  # the value means nothing to this machine
                 await both.finish()
-                due = following(both.board.done)
+                due = next_doorbell(both.board.done)
             await both.write(address, before)
 
     # ---- while it runs ----------------------------------------------------------------------------------
@@ -480,7 +480,7 @@ class Session:
             address = self.pick(
                 [rm.TARGET_COUNT, self.inputs, rm.START, rm.RESUME, rm.CONTROL, rm.BANK, rm.HALT]
             )
-            value = self.pick([0, 1, 2, number, following(number)])
+            value = self.pick([0, 1, 2, number, next_doorbell(number)])
             if not (address == rm.CONTROL and value & 1):
                 assert not await both.write(address, value)
                 status = await both.read(rm.STATUS)
@@ -518,12 +518,12 @@ class Session:
     async def resume(self) -> bool:
         """Ring for the next slice; whether it runs."""
         p, both = self.parameters, self.both
-        due = following(both.board.done)
+        due = next_doorbell(both.board.done)
         cycles = both.slow.cycles
         if self.chance(0.3):
             await both.write_long(rm.RUN_UNTIL, cycles)
             assert not await both.write(rm.RESUME, due)
-            assert not await both.write(rm.RESUME, following(due))
+            assert not await both.write(rm.RESUME, next_doorbell(due))
         if self.chance(0.4):
             # the frame keeps the readings and the target that it was started with
             await self.write_inputs()

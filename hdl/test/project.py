@@ -13,8 +13,8 @@ from machines.parameters import BM1Parameters, PriorMode, RngKind, RngReset, Sen
 from machines.reference import ReferenceBM1
 from pcie_shim import register_map
 from pcie_shim.board.emulated_board import EmulatedBoard, RefusedError
-from pcie_shim.doorbell import following
 from pcie_shim.programming_file import Image, Partition, image_bytes, interface_words
+from pcie_shim.register_layout import next_doorbell
 from pcie_shim.register_map import BoardState, ErrorCode
 from toolchain.deployment import (
     Board,
@@ -47,10 +47,10 @@ __all__ = [
     "SensorMode",
     "Start",
     "StopReason",
-    "following",
     "image_bytes",
     "image_of",
     "interface_words",
+    "next_doorbell",
     "reference_kernel",
     "register_map",
     "write_hardware_files",

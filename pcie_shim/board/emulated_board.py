@@ -1,9 +1,8 @@
 """The emulated FPGA board, without sockets: a register file with a Bayesian machine behind it.
 
-It holds the whole map as bytes, so that a read is a slice; only what has an effect is code. The
-machine runs in chunks of some 50 ms (:meth:`EmulatedBoard.step`), so that whoever serves the board
-can hear a reset between them; chunks do not change results, since a machine that stops at a
-cycle and is resumed gives the same bits.
+The whole map is one array of bytes, so that a read is a slice; only registers with side effects need code. The
+machine runs in chunks of some 50 ms (`EmulatedBoard.step`), between which the server can read a reset; chunks
+do not change results, since a machine that stops at a cycle and is resumed gives the same bits.
 """
 
 from __future__ import annotations
@@ -20,9 +19,16 @@ from machines.errors import MachineError, StartError
 from machines.kernel import make_kernel
 from machines.parameters import CYCLES_MAX, PriorMode, RngReset
 from pcie_shim import register_map as rm
-from pcie_shim.doorbell import following
 from pcie_shim.errors import ImageError, PcieShimError
 from pcie_shim.programming_file import image_from_bytes, is_plain
+from pcie_shim.register_layout import (
+    ALL_ONES,
+    DONE_BLOCK,
+    REPLICA_OUTCOME,
+    SETTINGS,
+    WORD,
+    next_doorbell,
+)
 from pcie_shim.register_map import BoardState, ErrorCode, MachineKind, RngKind, SensorMode
 
 if TYPE_CHECKING:
@@ -36,15 +42,12 @@ if TYPE_CHECKING:
     from pcie_shim.programming_file import Image
 
 CHUNK_S: Final = 0.05
-"""Seconds that the machine may run before the board hears its host again."""
+"""Seconds that the machine runs before the board reads from its host again."""
 
 _NO_ACCESS, _READ, _READ_WRITE = 0, 1, 3
-_WORD: Final = struct.Struct("<I")
-_SETTINGS: Final = struct.Struct("<IQIIQ")  # TARGET_COUNT, MAX_CYCLES, BANK, PRIOR_SELECT, RUN_UNTIL
-_OUTCOME: Final = struct.Struct("<IIQQ")  # DONE, STATUS, CYCLES, COMPUTE_NS
-_REPLICA: Final = np.dtype([("reason", "<u4"), ("zero", "<u4"), ("cycles", "<u8")])  # of OUTCOMES
+_SETTINGS: Final = struct.Struct(f"{SETTINGS.format}Q")  # and RUN_UNTIL
 _SHORTEST_CHUNK: Final = 64  # cycles, however slow the machine
-_ALIGNMENT: Final = 4096  # fast kernels work in blocks of so many cycles: chunks end between them
+_ALIGNMENT: Final = 4096  # chunks end between the blocks of a fast kernel
 
 
 class RefusedError(PcieShimError):
@@ -63,10 +66,10 @@ class EmulatedBoard:
     """A board: blank until an image is loaded, then a BM1 behind registers (docs/reference/registers.md).
 
     Attributes:
-        programmed: Images loaded so far.
+        programmed: Number of images loaded so far.
         done: The number of the last start or resume that has stopped (register DONE).
-        running: Whether the machine runs: :meth:`step` must be called.
-        stuck: Set by tests: a machine that is started now will run for ever, without a cycle.
+        running: Whether the machine runs and `step` must be called.
+        stuck: Set by misbehaviour: a machine that is started now runs for ever without a cycle.
     """
 
     def __init__(self, make: Callable[[BM1Machine], BM1Kernel] = make_kernel) -> None:
@@ -76,12 +79,12 @@ class EmulatedBoard:
         self._access = bytearray(rm.BAR_SIZE // 4)
         self._kernel: BM1Kernel | None = None
         self._results: npt.NDArray[np.uint32] = np.empty(0, np.uint32)
-        self._outcomes: npt.NDArray[np.void] = np.empty(0, _REPLICA)
+        self._outcomes: npt.NDArray[np.void] = np.empty(0, REPLICA_OUTCOME)
         self._sensors = struct.Struct("")
         self._is_plain = True
         self._latched: dict[int, bytes] = {}
         self._error = ErrorCode.NONE
-        # of the start or resume that runs, or ran last
+        # those of the last start or resume
         self._chunk = self._first_chunk = _SHORTEST_CHUNK
         self._max_cycles = 0
         self._run_until = 0
@@ -106,11 +109,11 @@ class EmulatedBoard:
         return bool(self._memory[rm.CONTROL] & rm.CONTROL_INTERRUPT_ENABLE_MASK)
 
     def _power_up(self) -> None:
-        """Everything as on a blank board."""
+        """Set all registers to those of a blank board."""
         self._memory[:] = bytes(rm.BAR_SIZE)
         self._put(rm.ID, rm.ID_VALUE)
         self._put(rm.MAP_VERSION, rm.MAP_VERSION_VALUE)
-        self._put(rm.LIVENESS, 0xFFFFFFFF)
+        self._put(rm.LIVENESS, ALL_ONES)
         self._put(rm.PROGRAMMED, self.programmed)
         self._view[rm.MAP_HASH : rm.MAP_HASH + 32] = bytes.fromhex(rm.MAP_SHA256)
         self._latched.clear()
@@ -124,8 +127,8 @@ class EmulatedBoard:
     def load(self, content: bytes) -> None:
         """Program the board with the bytes of a programming file, as the loader sends them.
 
-        The machine is prepared, which takes a tenth of a second, runs for a few milliseconds, to measure its speed, and
-        is reset.
+        This prepares the machine, which takes a tenth of a second, runs it for a few milliseconds, to measure its
+        speed, and resets it.
 
         Raises:
             RefusedError: The machine runs, or the image is damaged or for another map.
@@ -144,11 +147,11 @@ class EmulatedBoard:
         self._describe(image)
         speed = _measure_speed(kernel)
         self._first_chunk = max(int(speed * CHUNK_S), _SHORTEST_CHUNK)
-        self._put(rm.CAP_SPEED, min(int(speed), 0xFFFFFFFF))
+        self._put(rm.CAP_SPEED, min(int(speed), ALL_ONES))
         self.reset()
 
     def _describe(self, image: Image) -> None:
-        """The capability registers, and access to what the image implements."""
+        """Set the capability registers, and allow access to the words that the image implements."""
         parameters, part = image.machine.parameters, image.partition
         written = parameters.prior_mode is PriorMode.WRITTEN
         self._view[rm.IMAGE_HASH : rm.IMAGE_HASH + 32] = bytes.fromhex(image.image_hash)
@@ -183,7 +186,8 @@ class EmulatedBoard:
             | image.interface_results << rm.CAP_INTERFACE_RESULTS_SHIFT,
         )
         self._put(rm.CAP_STEPS, parameters.steps_per_clock)
-        widths = bytes(parameters.sensor_bits)
+        # a machine with inputs per cell can have more sensors than the register has room for
+        widths = bytes(parameters.sensor_bits[: 4 * rm.CAP_SENSOR_BITS_WORDS])
         self._view[rm.CAP_SENSOR_BITS : rm.CAP_SENSOR_BITS + len(widths)] = widths
         self._sensors = struct.Struct(f"<{parameters.sensors}I")
         lines = parameters.replicas * parameters.lines
@@ -194,7 +198,7 @@ class EmulatedBoard:
         self._allow(inputs, image.interface_sensors, _READ_WRITE)
         self._allow(rm.RESULTS, image.interface_results, _READ)
         several = parameters.replicas if parameters.replicas > 1 else 0
-        self._outcomes = np.frombuffer(self._memory, _REPLICA, several, rm.OUTCOMES)
+        self._outcomes = np.frombuffer(self._memory, REPLICA_OUTCOME, several, rm.OUTCOMES)
         self._allow(rm.OUTCOMES, 4 * several, _READ)
         self._allow(rm.PRIOR_SELECTS, several, _READ_WRITE)
         if written:
@@ -205,10 +209,10 @@ class EmulatedBoard:
     # ---- registers ------------------------------------------------------------------------------------
 
     def read(self, address: int, count: int) -> bytes:
-        """``count`` words from ``address`` on, little-endian.
+        """Return `count` words from `address` on, little-endian.
 
         Raises:
-            RefusedError: Not all of them are in the map and implemented.
+            RefusedError: Some of them are not in the map or not implemented.
         """
         end = address + 4 * count
         outside = end > rm.BAR_SIZE or self._access.find(_NO_ACCESS, address >> 2, end >> 2) >= 0
@@ -216,18 +220,18 @@ class EmulatedBoard:
             self._refuse_access(address, count, "read")
         words = bytes(self._view[address:end])
         if address in _LONG_LOW:
-            # hosts that read 64 bits in two accesses shall see one value: the low word latches the high one
+            # a host that reads 64 bits in two accesses must see one value: the low word latches the high one
             self._latched[address + 4] = bytes(self._view[address + 4 : address + 8])
         elif address in self._latched:
             return self._latched.pop(address) + words[4:]
         return words
 
     def write(self, address: int, words: bytes | memoryview) -> None:
-        """Write little-endian words from ``address`` on; a doorbell among them starts the machine.
+        """Write little-endian words from `address` on; a doorbell among them starts the machine.
 
         Raises:
-            RefusedError: The board is busy, or an address or value is impossible; an earlier word of the same
-                burst may have been taken.
+            RefusedError: The board is busy, or an address or value is invalid; earlier words of the same burst
+                may be written.
         """
         count = len(words) >> 2
         end = address + 4 * count
@@ -241,50 +245,52 @@ class EmulatedBoard:
             if address <= rm.CONTROL:
                 self._take_control(address, words)
             return
-        # The doorbells are the last of their burst: they act on what stands before them.
+        # The doorbells are the last of their burst: they act on the words before them.
         plain = max(rm.START - address, 0)
         self._view[address : address + plain] = words[:plain]
         if address == rm.CONTROL:
             self._take_control(address, words)
         for doorbell in (rm.START, rm.RESUME):
             if address <= doorbell < end:
-                (number,) = _WORD.unpack_from(words, doorbell - address)
+                (number,) = WORD.unpack_from(words, doorbell - address)
                 if number:
                     self._ring(doorbell, number)
 
     def _take_control(self, address: int, words: bytes | memoryview) -> None:
-        """What a write to LIVENESS or CONTROL does."""
+        """Apply the side effect of a write to LIVENESS or CONTROL."""
         if address == rm.LIVENESS:
-            self._put(rm.LIVENESS, ~_WORD.unpack(words)[0] & 0xFFFFFFFF)
+            self._put(rm.LIVENESS, ~WORD.unpack(words)[0] & ALL_ONES)
             return
         self._put(rm.CONTROL, words[0] & rm.CONTROL_INTERRUPT_ENABLE_MASK)
         if words[0] & rm.CONTROL_RESET_MASK:
             self.reset()
 
     def _refuse_access(self, address: int, count: int, verb: str) -> NoReturn:
-        """Say what is wrong: misaligned, outside, too long, or not writable."""
+        """Refuse an access that is misaligned, outside the map, too long or not writable."""
         words = self._access[address >> 2 : (address >> 2) + count]
         if address & 3:
-            self._refuse(ErrorCode.MISALIGNED, f"address {address:#06x} is no multiple of 4")
+            self._refuse(ErrorCode.MISALIGNED, f"address {address:#06x} is not a multiple of 4")
         if not words or words[0] == _NO_ACCESS:
             if self._kernel is None and any(address in block for block in _DATA):
                 self._refuse(ErrorCode.BLANK, "the board is blank; program it first")
             self._refuse(ErrorCode.OUTSIDE, f"nothing can be {verb} at {address:#06x}")
         if len(words) < count or _NO_ACCESS in words:
-            self._refuse(ErrorCode.TOO_LONG, f"{count} words from {address:#06x} on run past what is there")
+            self._refuse(
+                ErrorCode.TOO_LONG, f"{count} words from {address:#06x} on run past the end of the block"
+            )
         read_only = address + 4 * words.index(_READ)
         self._refuse(ErrorCode.READ_ONLY, f"the register at {read_only:#06x} cannot be written")
 
     def _refuse(self, code: ErrorCode, detail: str) -> NoReturn:
         self._error = code
-        (status,) = _WORD.unpack_from(self._memory, rm.STATUS)
+        (status,) = WORD.unpack_from(self._memory, rm.STATUS)
         self._put(rm.STATUS, status & ~rm.STATUS_ERROR_MASK | code << rm.STATUS_ERROR_SHIFT)
         raise RefusedError(code, detail)
 
     # ---- the machine ----------------------------------------------------------------------------------
 
     def reset(self) -> None:
-        """Stop, clear counters and cycles, restart the RNGs from bank 0; DONE and all settings stay."""
+        """Stop, clear counters and cycles, and restart the RNGs from bank 0; DONE and all settings stay."""
         self.running = False
         self._error = ErrorCode.NONE
         self._compute_ns = 0
@@ -293,34 +299,37 @@ class EmulatedBoard:
             return
         self._kernel.reset()
         self._results[:] = 0
-        self._outcomes[:] = np.zeros((), _REPLICA)
+        self._outcomes[:] = np.zeros((), REPLICA_OUTCOME)
         self._publish(BoardState.IDLE, StopReason.NONE, 0)
 
     def release(self) -> None:
-        """The host has gone: stop a machine that runs, and send no more interrupts."""
+        """Stop a running machine and disable interrupts, because the host has disconnected."""
         if self.running:
             self.reset()
         self._put(rm.CONTROL, 0)
 
     def _ring(self, doorbell: int, number: int) -> None:
-        """A doorbell was written: check it, and run the first chunk."""
+        """Check a doorbell, and run the first chunk."""
         kernel = self._kernel
         if kernel is None:
             self._refuse(ErrorCode.BLANK, "the board is blank; program it first")
-        due = following(self.done)
+        due = next_doorbell(self.done)
         if self.running or number != due:
             self._refuse(ErrorCode.DOORBELL, f"number {number} was written, {due} is due")
         target, max_cycles, bank, prior_address, run_until = _SETTINGS.unpack_from(
             self._memory, rm.TARGET_COUNT
         )
         if run_until > CYCLES_MAX:
-            self._refuse(ErrorCode.BAD_VALUE, f"a slice to cycle {run_until} is longer than {CYCLES_MAX}")
+            self._refuse(
+                ErrorCode.BAD_VALUE, f"a slice cannot end at cycle {run_until}: {CYCLES_MAX} is the last"
+            )
         if doorbell == rm.RESUME:
             if kernel.reason is not StopReason.SLICE:
                 self._refuse(ErrorCode.DOORBELL, "there is no slice to resume")
             if 0 < run_until <= kernel.cycles:
                 self._refuse(
-                    ErrorCode.BAD_VALUE, f"a slice to cycle {run_until} cannot follow {kernel.cycles} cycles"
+                    ErrorCode.BAD_VALUE,
+                    f"a slice cannot end at cycle {run_until}: {kernel.cycles} cycles have run",
                 )
         self._compute_ns = 0
         self._run_until = run_until
@@ -362,7 +371,7 @@ class EmulatedBoard:
         return tuple(np.frombuffer(self._memory, "<u4", len(self._outcomes), rm.PRIOR_SELECTS).tolist())
 
     def _halted(self) -> Collection[int]:
-        """The replicas that a resume leaves where they are."""
+        """Return the replicas that a resume leaves where they are."""
         if not len(self._outcomes):
             return ()
         mask = int.from_bytes(self._view[rm.HALT : rm.HALT + 4 * rm.HALT_WORDS], "little")
@@ -381,13 +390,13 @@ class EmulatedBoard:
         return codes
 
     def step(self) -> None:
-        """Run the machine for one more chunk; ``running`` says whether it still has to go on."""
+        """Run the machine for one more chunk, after which `running` tells whether it has to go on."""
         kernel = self._kernel
         if kernel is not None and self.running:
             self._run(kernel, None, self._chunk_end(kernel.cycles))
 
     def _run(self, kernel: BM1Kernel, start: Start | None, end: int, halted: Collection[int] = ()) -> None:
-        """One chunk, to cycle ``end``, of a new frame (``start``) or of the one that runs."""
+        """Run one chunk, to cycle `end`, of a new frame (`start`) or of the current one."""
         if self.stuck:
             self.running = True
             self._publish(BoardState.RUNNING, StopReason.NONE, 0)
@@ -397,7 +406,7 @@ class EmulatedBoard:
         elapsed = time.perf_counter_ns() - began
         self._compute_ns += elapsed
         cycles = kernel.cycles
-        # Frames differ in speed (lines that cannot count cost nothing), and so does what else the core does.
+        # Frames differ in speed (lines that cannot count cost nothing), and so does the core's other load.
         if elapsed < CHUNK_S * 0.5e9:
             self._chunk *= 2
         elif elapsed > CHUNK_S * 1.5e9:
@@ -414,7 +423,7 @@ class EmulatedBoard:
             self._publish(BoardState.DONE, reason, cycles)
 
     def _chunk_end(self, cycles: int) -> int:
-        """Cycle at which the next chunk ends: the slice's end, if that is near enough; 0 for no end."""
+        """Return the cycle at which the next chunk ends: the slice's end, if that is nearer; 0 for no end."""
         end = cycles + self._chunk
         if end - cycles > _ALIGNMENT:
             end -= end % _ALIGNMENT
@@ -422,23 +431,23 @@ class EmulatedBoard:
         return run_until if end >= self._max_cycles or end >= run_until > 0 else end
 
     def _publish(self, state: BoardState, reason: StopReason, cycles: int) -> None:
-        """Put the outcome where the host reads it."""
+        """Write the outcome to the registers that the host reads."""
         status = (
             state << rm.STATUS_STATE_SHIFT
             | reason << rm.STATUS_STOP_REASON_SHIFT
             | self._error << rm.STATUS_ERROR_SHIFT
         )
-        _OUTCOME.pack_into(self._memory, rm.DONE, self.done, status, cycles, self._compute_ns)
+        DONE_BLOCK.pack_into(self._memory, rm.DONE, self.done, status, cycles, self._compute_ns)
 
     def interrupt_words(self) -> bytes:
-        """What an interrupt carries: the registers from DONE to COMPUTE_NS, one count per line, and replicas' outcomes."""
-        words = self._view[rm.DONE : rm.DONE + _OUTCOME.size].tobytes() + self._results.tobytes()
+        """Return an interrupt's payload: DONE to COMPUTE_NS, one count per line, and several replicas' outcomes."""
+        words = self._view[rm.DONE : rm.DONE + DONE_BLOCK.size].tobytes() + self._results.tobytes()
         return words if self._is_plain else words + self._outcomes.tobytes()
 
     # ---- memory ---------------------------------------------------------------------------------------
 
     def _put(self, address: int, value: int) -> None:
-        _WORD.pack_into(self._memory, address, value)
+        WORD.pack_into(self._memory, address, value)
 
     def _allow(self, address: int, words: int, access: int) -> None:
         first = address // 4
@@ -457,9 +466,9 @@ _DATA: Final = (
 
 
 def _measure_speed(kernel: BM1Kernel) -> float:
-    """Machine cycles per second where every line counts (all readings missing): the slowest that it gets.
+    """Return machine cycles per second with all readings missing, when every line counts: the slowest case.
 
-    It is the thread's own time that counts: what else the core does must not make a board look slow for good.
+    It measures the thread's own time, so that the core's other load does not make a board look slow for ever.
     """
     parameters = kernel.machine.parameters
     start = Start(
@@ -468,7 +477,7 @@ def _measure_speed(kernel: BM1Kernel) -> float:
         max_cycles=CYCLES_MAX,
         run_until=1,
     )
-    kernel.start(start)  # what a kernel does at its first start only is not its speed
+    kernel.start(start)  # a kernel's first start takes longer
     began = time.thread_time_ns()
     reason = kernel.start(start)
     while reason is StopReason.SLICE and kernel.cycles < _ALIGNMENT:

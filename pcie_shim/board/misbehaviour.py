@@ -1,4 +1,4 @@
-"""How an emulated board misbehaves on request, so that the host's answer to each can be tested."""
+"""The faults that an emulated board makes on request, to test how a host handles them."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from pcie_shim.errors import PcieShimError
 
 
 class UnknownMisbehaviourError(PcieShimError):
-    """The text asks for a misbehaviour that there is not."""
+    """A text that does not name a misbehaviour."""
 
     exit_code = 2
 
 
 class MisbehaviourKind(StrEnum):
-    """What the board does wrong."""
+    """The fault that the board makes."""
 
     DROP = "drop"
-    """An answer or interrupt is not sent."""
+    """The board does not send an answer or interrupt."""
     STALL = "stall"
     """The board stops serving its host, but keeps the link open."""
     SHORT_READ = "short-read"
-    """An answer to a read, or an interrupt, has one word less."""
+    """An answer to a read, or an interrupt, lacks one word."""
     ENDLESS = "endless"
     """A frame begins and does not end."""
     WRONG_SEQUENCE = "wrong-sequence"
@@ -34,19 +34,21 @@ class MisbehaviourKind(StrEnum):
     ALL_ONES = "all-ones"
     """Every register reads all ones, as if the device were gone."""
     WRONG_MAP = "wrong-map"
-    """The board says that it has another register map."""
+    """The board greets with another register map."""
     NEVER_DONE = "never-done"
     """The machine starts and never stops."""
+    DONE_TWICE = "done-twice"
+    """An interrupt is sent twice, as two interrupts with the same doorbell number."""
 
 
 @dataclass(frozen=True, slots=True)
 class Misbehaviour:
-    """What goes wrong, from when on, and how often.
+    """A kind of fault, the time of its first occurrence, and the number of occurrences.
 
     Attributes:
-        kind: What goes wrong.
-        after: Starts and resumes that go well first; 0: wrong from the opening of the link on.
-        times: Answers that go wrong, then all is well; 0: for ever.
+        kind: The fault.
+        after: Starts and resumes before the first fault; 0: from the opening of the link on.
+        times: Number of faults; 0: no limit.
     """
 
     kind: MisbehaviourKind
@@ -55,15 +57,14 @@ class Misbehaviour:
 
     @classmethod
     def parse(cls, text: str) -> Self:
-        """The misbehaviour that ``KIND[:AFTER[:TIMES]]`` asks for.
+        """Parse `KIND[:AFTER[:TIMES]]`.
 
         Raises:
-            UnknownMisbehaviourError: There is no such kind, or the numbers are none.
+            UnknownMisbehaviourError: There is no such kind, or AFTER or TIMES is not a number.
         """
         match = re.fullmatch(r"([a-z-]+)(?::(\d+))?(?::(\d+))?", text)
         if match is None or match[1] not in list(MisbehaviourKind):
             raise UnknownMisbehaviourError(
-                f"'{text}' is no misbehaviour: use KIND[:AFTER[:TIMES]] with one of "
-                f"{', '.join(MisbehaviourKind)}"
+                f"'{text}' is not a misbehaviour: use KIND[:AFTER[:TIMES]] with one of {', '.join(MisbehaviourKind)}"
             )
         return cls(MisbehaviourKind(match[1]), int(match[2] or 0), int(match[3] or 0))

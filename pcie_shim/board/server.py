@@ -1,8 +1,8 @@
-"""Serves an emulated board: one thread, its registers to one host at a time, its programming port beside them.
+"""The server of an emulated board: one thread, which serves the registers to one host at a time, and a loader.
 
-The loop hears its sockets between two chunks of the machine, so that a reset, a second host or
-the end of the process never waits longer than a chunk takes. A host that vanishes leaves the
-board idle for the next one; a host that sends nonsense is told so and loses its link.
+The loop polls its sockets between two chunks of the machine, so that a reset, a second host or the end of the
+process never waits longer than a chunk takes. When a host disconnects, the board is idle for the next one; a host
+that breaks the protocol gets an ERROR and loses its link.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from pcie_shim.board.misbehaviour import Misbehaviour, MisbehaviourKind
 from pcie_shim.endpoint import Endpoint, listen, no_delay, parse_endpoint, remove_listener
 from pcie_shim.errors import FramingError
 from pcie_shim.programming_file import MAX_IMAGE_BYTES
+from pcie_shim.register_layout import ALL_ONES
 from pcie_shim.register_map import ErrorCode
 
 if TYPE_CHECKING:
@@ -33,32 +34,32 @@ if TYPE_CHECKING:
 _LOG: Final = logging.getLogger(__name__)
 
 SEND_S: Final = 5.0
-"""Seconds that a host may leave what the board sends unread, before it loses its link."""
+"""Seconds that a host may leave the board's frames unread, before it loses its link."""
 KEEPALIVE_S: Final = 5
-"""Seconds between questions to a silent TCP host whether its machine is still there; three without answer end it."""
+"""Interval of TCP keep-alive probes to a silent host; three unanswered ones end the link."""
 PROGRAMMING_SILENCE_S: Final = 10.0
-"""Seconds that a loader may say nothing, before another may program the board."""
+"""Seconds without a frame of a loader, after which another may program the board."""
 
 _READABLE: Final = select.EPOLLIN | select.EPOLLHUP | select.EPOLLERR
 
 
 class StopSignal:
-    """Ends :func:`serve_board`, from a signal handler or another thread. Make it after a fork, not before."""
+    """Ends `serve_board`, from a signal handler or another thread; create it after a fork, not before."""
 
     def __init__(self) -> None:
         self._read, self._write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
 
     def set(self) -> None:
-        """Ask for the end; may be called in a signal handler, and more than once."""
+        """Request the end; may be called in a signal handler, and more than once."""
         with suppress(OSError):
             os.write(self._write, b"x")
 
     def fileno(self) -> int:
-        """Readable once :meth:`set` was called."""
+        """Return a descriptor that is readable once `set` was called."""
         return self._read
 
     def close(self) -> None:
-        """Give the descriptors back."""
+        """Close the descriptors."""
         os.close(self._read)
         os.close(self._write)
 
@@ -72,17 +73,17 @@ def serve_board(
     pin: bool = True,
     on_ready: Callable[[EmulatedBoard], None] | None = None,
 ) -> None:
-    """Serve one emulated board, blank at first, until ``stop`` is set; its sockets' files are removed then.
+    """Serve one emulated board, blank at first, until `stop` is set; then remove the sockets' files.
 
     Args:
-        endpoint: Where the registers are; the programming port lies beside it (``Endpoint.programming``).
+        endpoint: Where to serve the registers; the programming port is beside it (`Endpoint.programming`).
         index: The board's number, for its greeting.
         stop: Ends the loop.
-        misbehave: What the board does wrong, for tests of hosts.
-        pin: Keep this thread on one of the cores that it may use, number ``index`` modulo their number. Boards
-            compute for tenths of a millisecond, in which Linux does not spread over the cores what one
-            host has woken: left to it, the boards of a mini-cluster compute one after the other. The thread also
-            becomes one of computing (SCHED_BATCH), which does not interrupt others when it wakes.
+        misbehave: The fault that the board makes, for tests of hosts.
+        pin: Keep this thread on one of its allowed cores, number `index` modulo their number. Boards compute for
+            tenths of a millisecond, in which Linux does not spread the threads that one host has woken over the
+            cores: unpinned, the boards of a mini-cluster compute one after the other. The thread also gets the
+            policy SCHED_BATCH, with which it does not preempt others when it wakes.
         on_ready: Called with the board once both sockets listen.
 
     Raises:
@@ -92,7 +93,7 @@ def serve_board(
     if pin:
         cores = sorted(os.sched_getaffinity(0))
         os.sched_setaffinity(0, {cores[index % len(cores)]})
-        # a board that wakes shall not push aside the host that still has other boards to start
+        # a board that wakes must not preempt the host, which still has other boards to start
         os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
     registers = listen(where)
     try:
@@ -111,17 +112,17 @@ def serve_board(
 
 
 class _Connection:
-    """A socket with frames: what a host's and a loader's connection have in common."""
+    """A host's or a loader's connection: a socket with frames."""
 
     def __init__(self, connection: socket.socket) -> None:
         no_delay(connection)
         if connection.family != socket.AF_UNIX:
-            # a host whose machine or cable failed says nothing any more: it must not hold the board for ever
+            # a host whose machine or cable failed must not hold the board for ever
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, KEEPALIVE_S)
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, KEEPALIVE_S)
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT, 3)
-        # the loop reads only what epoll announced; what it sends may take SEND_S
+        # reads never block, since epoll comes first; writes may take SEND_S
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, struct.pack("@ll", int(SEND_S), 0))
         self.socket = connection
         self.decoder = framing.FrameDecoder()
@@ -130,7 +131,7 @@ class _Connection:
         self.stalled = False
 
     def receive(self) -> bool:
-        """Receive once; False when there was nothing. A closed connection is marked so."""
+        """Receive once; return False if nothing came or the connection is closed, which clears `open`."""
         try:
             count = self.socket.recv_into(self.decoder.room(), 0, socket.MSG_DONTWAIT)
         except BlockingIOError:
@@ -142,7 +143,7 @@ class _Connection:
         return self.open
 
     def answer(self, handle: Callable[[Frame], None]) -> None:
-        """Have all whole frames that have come handled, and refusals answered."""
+        """Handle all complete frames, and answer refusals with ERROR."""
         while self.open and not self.stalled:
             sequence = address = 0
             try:
@@ -150,7 +151,7 @@ class _Connection:
                 if frame is None:
                     return
                 _, _, sequence, address, _, _ = frame
-                self.sequence = due = (self.sequence + 1) & 0xFFFFFFFF
+                self.sequence = due = (self.sequence + 1) & ALL_ONES
                 if sequence == due:
                     handle(frame)
                     continue
@@ -164,7 +165,7 @@ class _Connection:
             self.open = False
 
     def send(self, data: bytes) -> None:
-        """Send all of it; a connection that takes none for SEND_S is given up."""
+        """Send all bytes; a connection that accepts none for SEND_S is closed."""
         try:
             self.socket.sendall(data)
         except OSError:
@@ -182,13 +183,13 @@ class _Host(_Connection):
 
 
 class _Loader(_Connection):
-    """The programming port's connection, and what has come of the programming file."""
+    """The programming port's connection, with the received part of the programming file."""
 
     def __init__(self, connection: socket.socket) -> None:
         super().__init__(connection)
         self.begin: ProgramBegin | None = None
         self.content = bytearray()
-        self.heard = time.monotonic()
+        self.last_frame = time.monotonic()
 
 
 class _Server:
@@ -206,9 +207,9 @@ class _Server:
         self._programming = programming
         self._index = index
         self._stop = stop
-        self._misbehave = misbehave
+        self._misbehaviour = misbehave
         self._starts = 0
-        self._misbehaved = 0
+        self._faults = 0
         self.board = EmulatedBoard()
         self._host: _Host | None = None
         self._loader: _Loader | None = None
@@ -231,7 +232,7 @@ class _Server:
                     self._interrupt_if_done()
                     if self._host is not None and not self._host.open:
                         self._drop_host()
-                self._forget_silent_loader()
+                self._drop_silent_loader()
         finally:
             self._drop_host()
             self._drop_loader()
@@ -254,9 +255,9 @@ class _Server:
         try:
             connection, _ = self._registers.accept()
         except OSError:
-            return  # whoever it was has gone already
+            return  # the peer has disconnected already
         if self._is_held():
-            _turn_away(connection, "another host has it; one host drives a board at a time")
+            _refuse(connection, "another host has it; one host drives a board at a time")
             return
         self._host = host = _Host(connection, self.board.programmed)
         self._epoll.register(connection.fileno(), _READABLE)
@@ -264,7 +265,7 @@ class _Server:
         _LOG.info("board %d: a host opened it", self._index)
 
     def _is_held(self) -> bool:
-        """Whether a host holds the board; one that has just left is heard out and does not."""
+        """Return whether a host holds the board; the last frames of one that has just left are handled first."""
         host = self._host
         if host is None:
             return False
@@ -278,7 +279,7 @@ class _Server:
 
     def _serve_host(self, host: _Host) -> None:
         if host.stalled:
-            # misbehaving: what the host sends is not read, but it may leave
+            # misbehaving: the host's frames are not read, but it may disconnect
             host.open = not _has_left(host.socket)
             time.sleep(0.01)
         else:
@@ -303,7 +304,7 @@ class _Server:
         )
 
     def _access(self, frame: Frame) -> None:
-        """Do what a frame of the host asks for."""
+        """Handle a frame of the host."""
         operation, flags, sequence, address, count, payload = frame
         board, host = self.board, self._host
         if host is None:
@@ -314,24 +315,24 @@ class _Server:
             self._send(host, framing.READ, framing.REPLY, sequence, address, board.read(address, count))
         elif operation == framing.WRITE:
             done = board.done
-            if self._misbehave is not None and not board.running:
+            if self._misbehaviour is not None and not board.running:
                 rings = address <= register_map.RESUME and address + 4 * count > register_map.START
                 board.stuck = rings and self._wrong(MisbehaviourKind.NEVER_DONE, ahead=1)
             board.write(address, payload)
-            # acknowledged before the interrupt that it may cause
+            # acknowledge before the interrupt that the write may cause
             if not flags & framing.POSTED:
                 self._send(host, framing.WRITE, framing.REPLY, sequence, address, b"")
             if board.done != done or board.running:
                 self._starts += 1
                 self._interrupt_if_done()
         else:
-            raise FramingError(f"operation {operation} is no business of the register port")
+            raise FramingError(f"the register port does not take operation {operation}")
 
     def _interrupt_if_done(self) -> None:
         board, host = self.board, self._host
         if board.running or host is None or not board.interrupt_enabled:
             return
-        host.interrupts = (host.interrupts + 1) & 0xFFFFFFFF
+        host.interrupts = (host.interrupts + 1) & ALL_ONES
         self._send(host, framing.IRQ, 0, host.interrupts, register_map.DONE, board.interrupt_words())
 
     def _drop_host(self) -> None:
@@ -345,20 +346,20 @@ class _Server:
     # ---- misbehaving ----------------------------------------------------------------------------------
 
     def _wrong(self, kind: MisbehaviourKind, *, ahead: int = 0) -> bool:
-        """Whether to misbehave in this way now, with ``ahead`` more starts than there were; counts it."""
-        wanted = self._misbehave
+        """Return whether to make this fault now, with `ahead` more starts than counted so far; counts the fault."""
+        wanted = self._misbehaviour
         if wanted is None or wanted.kind is not kind:
             return False
-        if 0 < wanted.after >= self._starts + ahead or 0 < wanted.times <= self._misbehaved:
+        if 0 < wanted.after >= self._starts + ahead or 0 < wanted.times <= self._faults:
             return False
-        self._misbehaved += 1
+        self._faults += 1
         return True
 
     def _send(
         self, host: _Host, operation: int, flags: int, sequence: int, address: int, words: bytes
     ) -> None:
-        """Send an answer or an interrupt, or what misbehaviour makes of it."""
-        if self._misbehave is None:
+        """Send an answer or an interrupt, or a faulty one."""
+        if self._misbehaviour is None:
             host.send(framing.encode(operation, flags, sequence, address, len(words) // 4, words))
             return
         if self._wrong(MisbehaviourKind.DROP):
@@ -371,8 +372,11 @@ class _Server:
         if words and self._wrong(MisbehaviourKind.ALL_ONES):
             words = b"\xff" * len(words)
         if self._wrong(MisbehaviourKind.WRONG_SEQUENCE):
-            sequence = (sequence + 1) & 0xFFFFFFFF
+            sequence = (sequence + 1) & ALL_ONES
         data = framing.encode(operation, flags, sequence, address, len(words) // 4, words)
+        if operation == framing.IRQ and self._wrong(MisbehaviourKind.DONE_TWICE):
+            host.interrupts = (host.interrupts + 1) & ALL_ONES
+            data += framing.encode(operation, flags, host.interrupts, address, len(words) // 4, words)
         if self._wrong(MisbehaviourKind.WRONG_CRC):
             data = data[:16] + bytes(byte ^ 0xFF for byte in data[16:20]) + data[20:]
         if self._wrong(MisbehaviourKind.ENDLESS):
@@ -388,14 +392,14 @@ class _Server:
         except OSError:
             return
         if self._is_being_programmed():
-            _turn_away(connection, "another loader is programming it")
+            _refuse(connection, "another loader is programming it")
             return
         self._loader = loader = _Loader(connection)
         self._epoll.register(connection.fileno(), _READABLE)
         loader.send(self._greeting(framing.NO_TOKEN))
 
     def _is_being_programmed(self) -> bool:
-        """Whether a loader is connected; one that has just left is heard out and is not."""
+        """Return whether a loader is connected; the last frames of one that has just left are handled first."""
         loader = self._loader
         if loader is None:
             return False
@@ -406,14 +410,14 @@ class _Server:
         return self._loader is not None
 
     def _serve_loader(self, loader: _Loader) -> None:
-        loader.heard = time.monotonic()
+        loader.last_frame = time.monotonic()
         loader.receive()
         loader.answer(self._program)
         if not loader.open:
             self._drop_loader()
 
     def _program(self, frame: Frame) -> None:
-        """Do what a frame of the loader asks for."""
+        """Handle a frame of the loader."""
         loader = self._loader
         if loader is None:
             return
@@ -423,7 +427,7 @@ class _Server:
             loader.send(framing.encode(framing.READ, framing.REPLY, sequence, address, count, words))
             return
         if operation != framing.PROGRAM:
-            raise FramingError(f"operation {operation} is no business of the programming port")
+            raise FramingError(f"the programming port does not take operation {operation}")
         if flags & framing.BEGIN:
             begin = framing.ProgramBegin.decode(payload)
             if begin.size > MAX_IMAGE_BYTES:
@@ -434,9 +438,9 @@ class _Server:
             loader.begin = begin
             loader.content.clear()
         elif loader.begin is None or address != len(loader.content):
-            raise FramingError(f"a part for offset {address} came out of turn")
+            raise FramingError(f"a part for offset {address} came out of order")
         elif len(loader.content) < loader.begin.size:
-            # the file's last word may be filled up with zeros
+            # the file's last word may be padded with zeros
             loader.content += payload[: loader.begin.size - len(loader.content)]
         if flags & framing.END:
             self._load(loader)
@@ -458,8 +462,8 @@ class _Server:
         self.board.load(content)
         _LOG.info("board %d: programmed with image %s", self._index, self.board.image_hash)
 
-    def _forget_silent_loader(self) -> None:
-        if self._loader is not None and time.monotonic() - self._loader.heard > PROGRAMMING_SILENCE_S:
+    def _drop_silent_loader(self) -> None:
+        if self._loader is not None and time.monotonic() - self._loader.last_frame > PROGRAMMING_SILENCE_S:
             self._drop_loader()
 
     def _drop_loader(self) -> None:
@@ -469,14 +473,14 @@ class _Server:
             loader.socket.close()
 
 
-def _turn_away(connection: socket.socket, detail: str) -> None:
+def _refuse(connection: socket.socket, detail: str) -> None:
     with suppress(OSError):
         connection.sendall(framing.encode_error(0, 0, ErrorCode.HELD, detail))
     connection.close()
 
 
 def _has_left(connection: socket.socket) -> bool:
-    """Whether the other end has closed, as far as can be seen without reading what it sent."""
+    """Return whether the peer has closed the connection, without reading from it."""
     poll = select.poll()
     poll.register(connection, select.POLLRDHUP)
     return bool(poll.poll(0))

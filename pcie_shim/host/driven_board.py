@@ -1,4 +1,4 @@
-"""One board as the driver sees it: its link, what its registers are known to hold, its part of a frame."""
+"""One board of the mini-cluster: its link, the known contents of its registers, its part of a frame."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ import numpy as np
 
 from machines.bm1 import StopReason, joint_reason
 from pcie_shim import register_map as rm
-from pcie_shim.doorbell import following
 from pcie_shim.errors import (
     AccessError,
     BoardError,
@@ -38,31 +37,31 @@ from pcie_shim.errors import (
     UnreachableError,
 )
 from pcie_shim.host.frame import BoardResult
-from pcie_shim.host.link import ALL_ONES
 from pcie_shim.host.loader import program
 from pcie_shim.host.socket_link import SocketLink
 from pcie_shim.programming_file import interface_words, is_plain
+from pcie_shim.register_layout import ALL_ONES, REPLICA_OUTCOME, next_doorbell
 from pcie_shim.register_map import BoardState
 
 if TYPE_CHECKING:
     import numpy.typing as npt
 
     from pcie_shim.endpoint import Endpoint
+    from pcie_shim.host.frame_encoder import BoardWords
     from pcie_shim.host.link import Done, Link, RegisterWrite
     from pcie_shim.programming_file import Image
 
 _ASSUMED_SPEED: Final = 1e4  # cycles per second of a board that does not say its own
 _START: Final = struct.Struct("<QI")  # RUN_UNTIL, START
-_RESUME: Final = struct.Struct("<QII")  # RUN_UNTIL, START (0: not rung), RESUME
+_RESUME: Final = struct.Struct("<QII")  # RUN_UNTIL, START (0 rings nothing), RESUME
 _BANK_AT: Final = rm.BANK - rm.TARGET_COUNT
 _REASONS: Final = frozenset(StopReason) - {StopReason.NONE}
 _PRIOR_AT: Final = rm.PRIOR_SELECT - rm.TARGET_COUNT
-_REPLICA: Final = np.dtype([("reason", "<u4"), ("zero", "<u4"), ("cycles", "<u8")])  # of OUTCOMES
 _CAPABILITIES: Final = range(rm.CAP_MACHINE, rm.CAP_INTERFACE + 4, 4)
 
 
 class DrivenBoard:
-    """One board as the driver sees it: its link, and what its registers are known to hold."""
+    """One board: its link, and the known contents of its registers."""
 
     def __init__(self, index: int, endpoint: Endpoint, image: Image) -> None:
         self.index = index
@@ -74,7 +73,7 @@ class DrivenBoard:
         self.inputs_at = rm.SENSORS if is_plain(parameters) else rm.INPUTS
         self.counts_bytes = 4 * self.replicas * self.lines
         self.result_bytes = self.counts_bytes + (
-            self.replicas * _REPLICA.itemsize if self.replicas > 1 else 0
+            self.replicas * REPLICA_OUTCOME.itemsize if self.replicas > 1 else 0
         )
         self.link: Link | None = None
         self.broken = "it was not opened"
@@ -82,10 +81,10 @@ class DrivenBoard:
         self._forget()
 
     def _forget(self) -> None:
-        """Nothing is known of the registers."""
+        """Forget the contents of the registers."""
         self.settings = b""
         self.selects = b""
-        self.outcomes: npt.NDArray[np.void] = np.zeros(0, _REPLICA)
+        self.outcomes: npt.NDArray[np.void] = np.zeros(0, REPLICA_OUTCOME)
         self.prior: npt.NDArray[np.uint16] | None = None
         self.number = 0
         self.waiting = False
@@ -95,7 +94,7 @@ class DrivenBoard:
     # ---- opening --------------------------------------------------------------------------------------
 
     def open(self, timeout: float, connect_timeout: float, programming_timeout: float) -> None:
-        """Open the board: see ``MiniCluster.open``; a step of programming a blank one may take ``programming_timeout``.
+        """Open the board as `MiniCluster.open` does; each step of programming may take `programming_timeout`.
 
         Raises:
             PcieShimError: The link's errors, and the image's.
@@ -120,7 +119,7 @@ class DrivenBoard:
         self.readable.register(link.fileno(), select.POLLIN)
 
     def _identified(self, timeout: float, connect_timeout: float) -> Link:
-        """A link to what is certainly a board with this register map."""
+        """Return a link to a board whose identity and register map are checked."""
         link = SocketLink.open(self.endpoint, timeout=timeout, connect_timeout=connect_timeout)
         try:
             self._check_identity(link)
@@ -136,8 +135,8 @@ class DrivenBoard:
         alive = link.read32(rm.LIVENESS) == pattern ^ ALL_ONES
         if identity != rm.ID_VALUE or not alive:
             raise GreetingMismatchError(
-                f"What answers at {self.endpoint} is no board: its ID is {identity:#010x} (a board's: "
-                f"{rm.ID_VALUE:#010x}), and its LIVENESS register is {'alive' if alive else 'dead'}"
+                f"The device at {self.endpoint} is not a board: its ID is {identity:#010x} instead of {rm.ID_VALUE:#010x}, "
+                f"and its LIVENESS register is {'alive' if alive else 'dead'}"
             )
         map_hash = link.read_block(rm.MAP_HASH, rm.MAP_HASH_WORDS).hex()
         if map_hash != rm.MAP_SHA256:
@@ -156,22 +155,24 @@ class DrivenBoard:
             )
 
     def _check_capabilities(self, link: Link) -> None:
-        """What the host is going to write and read must be there, whatever the hash of the image says."""
+        """Check that the registers which the host uses exist, whatever the image hash is."""
         parameters = self.image.machine.parameters
         words = struct.iter_unpack("<I", link.read_block(_CAPABILITIES.start, len(_CAPABILITIES)))
-        said = dict(zip(_CAPABILITIES, (word for (word,) in words), strict=True))
-        mode = (said[rm.CAP_MACHINE] & rm.CAP_MACHINE_SENSOR_MODE_MASK) >> rm.CAP_MACHINE_SENSOR_MODE_SHIFT
-        room = said[rm.CAP_INTERFACE] & 0xFFFF, said[rm.CAP_INTERFACE] >> 16
+        capabilities = dict(zip(_CAPABILITIES, (word for (word,) in words), strict=True))
+        mode = (
+            capabilities[rm.CAP_MACHINE] & rm.CAP_MACHINE_SENSOR_MODE_MASK
+        ) >> rm.CAP_MACHINE_SENSOR_MODE_SHIFT
+        room = capabilities[rm.CAP_INTERFACE] & 0xFFFF, capabilities[rm.CAP_INTERFACE] >> 16
         inputs, results = interface_words(parameters)
         wanted = rm.SensorMode[parameters.sensor_mode.name]
         for what, theirs, ours in (
-            ("replicas", said[rm.CAP_REPLICAS], parameters.replicas),
+            ("replicas", capabilities[rm.CAP_REPLICAS], parameters.replicas),
             ("sensor mode", mode, int(wanted)),
-            ("lines", said[rm.CAP_LINES], parameters.lines),
+            ("lines", capabilities[rm.CAP_LINES], parameters.lines),
         ):
             if theirs != ours:
                 raise ImageMismatchError(
-                    f"The board at {self.endpoint} says {what} {theirs}, the deployment's image has {ours}: "
+                    f"The board at {self.endpoint} has {what} {theirs}, the deployment's image has {ours}: "
                     "program it with the loader, or restart it"
                 )
         if inputs > room[0] or results > room[1]:
@@ -190,17 +191,11 @@ class DrivenBoard:
 
     # ---- a frame --------------------------------------------------------------------------------------
 
-    def start(
-        self,
-        settings: bytes,
-        sensors: bytes,
-        selects: bytes,
-        prior: npt.NDArray[np.uint16] | None,
-        end: int,
-    ) -> None:
-        """Post a new frame: what changed of the settings, the sensors, the doorbell (figure 3.3)."""
+    def start(self, words: BoardWords, end: int) -> None:
+        """Post a new frame: the sensors, the settings that changed, and the doorbell (figure 3.3)."""
         assert self.link is not None  # noqa: S101 - MiniCluster.run has checked
-        self.waiting = True  # from here on, whatever interrupts the frame must interrupt the board
+        self.waiting = True  # from here on an interrupted frame must interrupt the board
+        settings, sensors, selects, prior = words
         writes: list[RegisterWrite] = [(self.inputs_at, sensors)] if sensors else []
         if selects != self.selects:
             writes.append((rm.PRIOR_SELECTS, selects))
@@ -222,7 +217,7 @@ class DrivenBoard:
         self._ring(writes, rm.TARGET_COUNT + at, settings[at:], _START, end)
 
     def resume(self, end: int, halted: bytes = b"") -> None:
-        """Post the next slice of the frame; ``halted`` are the words of HALT, where they change anything."""
+        """Post the next slice of the frame; `halted` are the words of HALT, empty if nothing is halted."""
         assert self.link is not None  # noqa: S101 - MiniCluster.collect has checked
         self._ring([(rm.HALT, halted)] if halted else [], rm.RUN_UNTIL, b"", _RESUME, end, 0)
 
@@ -230,40 +225,47 @@ class DrivenBoard:
         self, writes: list[RegisterWrite], address: int, before: bytes, layout: struct.Struct, *words: int
     ) -> None:
         assert self.link is not None  # noqa: S101 - MiniCluster.run has checked
-        self.number = following(self.number)
+        self.number = next_doorbell(self.number)
         self.waiting = True
         self.done = None
         self.link.post([*writes, (address, before + layout.pack(*words, self.number))])
 
     def receive(self) -> bool:
-        """Take what has come, after a poll; True once the board has said done."""
+        """Receive once, after a poll; return whether the board is done.
+
+        Raises:
+            LinkError: The link broke, or the board's answer is wrong, early or repeated.
+        """
         assert self.link is not None  # noqa: S101 - a closed link is not polled
         done = self.link.receive_done()
-        if done is None:
-            return False
+        is_done = done is not None
+        while done is not None:
+            self._take(done)
+            done = self.link.take_done()
+        return is_done
+
+    def _take(self, done: Done) -> None:
+        """Check the board's answer, and keep it."""
         if not self.waiting or done.number != self.number:
             raise SequenceError(
-                f"The board at {self.endpoint} said done number {done.number} where {self.number} was due"
+                f"The board at {self.endpoint} answered doorbell {done.number} where {self.number} was due once"
             )
         if len(done.results) != self.result_bytes:
             raise ShortReadError(
-                f"The board at {self.endpoint} said done with {len(done.results) // 4} results where "
+                f"The board at {self.endpoint} sent {len(done.results) // 4} results where "
                 f"{self.result_bytes // 4} were due"
             )
         if done.state != BoardState.DONE or done.reason not in _REASONS:
             raise FramingError(
-                f"The board at {self.endpoint} said done with a status of {done.status:#010x}, which is none"
+                f"The board at {self.endpoint} stopped with an impossible status, {done.status:#010x}"
             )
         if self.replicas > 1:
-            outcomes = np.frombuffer(done.results, _REPLICA, self.replicas, self.counts_bytes)
+            outcomes = np.frombuffer(done.results, REPLICA_OUTCOME, self.replicas, self.counts_bytes)
             if not _REASONS.issuperset(outcomes["reason"].tolist()):
-                raise FramingError(
-                    f"The board at {self.endpoint} said done with a replica's reason that is none"
-                )
+                raise FramingError(f"The board at {self.endpoint} stopped a replica with an unknown reason")
             self.outcomes = outcomes.copy()
         self.waiting = False
         self.done = done
-        return True
 
     @property
     def reason(self) -> int:
@@ -271,7 +273,7 @@ class DrivenBoard:
         return 0 if self.done is None else self.done.reason
 
     def result(self) -> BoardResult:
-        """The frame's result; the counts are copied out of the link's buffer."""
+        """Return the frame's result; the counts are copied out of the link's buffer."""
         assert self.done is not None  # noqa: S101 - every board has said done
         if self.replicas > 1:
             reasons = tuple(StopReason(reason) for reason in self.outcomes["reason"].tolist())
@@ -303,6 +305,6 @@ _BOARD_ERRORS: Final[tuple[tuple[tuple[type[PcieShimError], ...], type[BoardErro
 
 
 def board_error(board: DrivenBoard, error: PcieShimError) -> BoardError:
-    """The same, said of a board of the mini-cluster."""
+    """Return the error of a board of the mini-cluster for an error of its link or image."""
     kind = next(kind for causes, kind in _BOARD_ERRORS if isinstance(error, causes))
     return kind(f"Board {board.index}: {error}", board=board.index)

@@ -20,7 +20,7 @@ class FrameInput:
 
     Attributes:
         addresses: One table address per sensor column, in the model's order; None is a missing reading. For cells with
-            inputs of their own, and for replicas: an array of integers of the whole machine's ``input_shape``,
+            inputs of their own, and for replicas: an array of integers of the whole machine's `input_shape`,
             addresses or codes, with -1 in all lines of a missing reading.
         prior_address: Row of the prior's table (prior select); with replicas one for all, or a tuple of one each.
         prior_codes: uint16[total lines], a written prior; with replicas the same for all, or uint16[replicas, total
@@ -28,7 +28,7 @@ class FrameInput:
         target_count: Count that stops the machines (thesis figure 3.3: number of target samples).
         max_cycles: Most cycles, whatever the counts.
         bank: Set of seeds from which the RNGs restart.
-        stop: ``slices``: all boards stop in the slice in which the first one overflows; ``own``: each for itself.
+        stop: `slices`: all boards stop in the slice in which the first one overflows; `own`: each for itself.
     """
 
     addresses: tuple[int | None, ...] | npt.NDArray[np.integer]
@@ -75,7 +75,7 @@ class FrameOutput:
         compute_ns: Waiting for the boards, their computing and the link's way included.
         reads_ns: Taking the results out of what came.
         boards_compute_ns: The boards' own computing: the slowest board of each slice, summed. What
-            ``compute_ns`` has above it is transport, and boards that had to share a core.
+            `compute_ns` has above it is transport, and boards that had to share a core.
         slices: Number of rounds of starting or resuming and waiting.
     """
 

@@ -13,9 +13,6 @@ if TYPE_CHECKING:
     from pcie_shim.errors import LinkTimeoutError
     from pcie_shim.framing import Octets
 
-ALL_ONES: Final = 0xFFFFFFFF
-"""What a bus reads where no device answers."""
-
 LONGEST_POLL_S: Final = 3600.0
 """Longest single wait: poll takes milliseconds in 31 bits."""
 
@@ -86,6 +83,9 @@ class Link(Protocol):
 
     def receive_done(self) -> Done | None:
         """Receive once, after a poll of `fileno()`; return the board's answer if it is complete."""
+
+    def take_done(self) -> Done | None:
+        """Return the board's answer if it has been received completely already."""
 
     def fileno(self) -> int:
         """Return a descriptor that is readable when something has come."""

@@ -1,4 +1,4 @@
-"""Programs boards over their own port, without a restart of the host (thesis 3.4: the SofLoader)."""
+"""The loader, which programs boards over their own port without a restart of the host (thesis 3.4: SofLoader)."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ def program(
     timeout: float = 30.0,
     token: bytes = framing.NO_TOKEN,
 ) -> str:
-    """Program a board, and read back what it then is.
+    """Program a board, and read back its identity.
 
-    The file is checked before the board is touched, and so is the board's register map.
+    The file and the board's register map are checked before the board is changed.
 
     Args:
-        endpoint: The board's (its registers'); the programming port lies beside it.
+        endpoint: The endpoint of the board's registers; the programming port is beside it.
         image: An image, the path of a programming file, or its bytes.
         timeout: Seconds for each step: connecting, taking the file, making the machine.
-        token: The greeting's token of the link that holds the board, where this host holds it.
+        token: The token of this host's link to the board, if it has one.
 
     Returns:
         The image hash that the board reads back.
@@ -67,7 +67,7 @@ def program(
 
 
 def _content(image: Image | Path | bytes) -> tuple[bytes, str]:
-    """The programming file's bytes and the image hash that the board must show."""
+    """Return the programming file's bytes and the image hash that the board must show."""
     if isinstance(image, Image):
         return image_bytes(image), image.image_hash
     if isinstance(image, bytes):

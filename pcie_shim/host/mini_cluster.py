@@ -1,21 +1,19 @@
-"""Drives the mini-cluster: one blocking thread, all boards (thesis 3.2, figure 3.3).
+"""The mini-cluster: all boards of a model, driven by one blocking thread (thesis 3.2, figure 3.3).
 
-A frame's sensors and its start are posted to every board before the first is waited for; then the
-results are taken as the boards stop. Boards that hold parts of one model stop together
-(``slices``) or each for itself (``own``, as in the thesis).
+A frame's sensors and its start are posted to every board before the first is waited for; then results are taken
+as the boards stop. Boards that hold parts of one model stop together (`slices`) or each by itself (`own`, as in
+the thesis).
 """
 
 from __future__ import annotations
 
 import select
-import struct
 import time
 from typing import TYPE_CHECKING, Final, NoReturn, Self
 
 import numpy as np
 
 from machines.bm1 import StopReason, first_slice
-from machines.parameters import CYCLES_MAX, PriorMode, SensorMode
 from pcie_shim.endpoint import parse_endpoint
 from pcie_shim.errors import (
     AccessError,
@@ -27,40 +25,36 @@ from pcie_shim.errors import (
     StaleHandleError,
 )
 from pcie_shim.host.driven_board import DrivenBoard, board_error
-from pcie_shim.host.frame import FrameInput, FrameOutput
+from pcie_shim.host.frame import FrameOutput
+from pcie_shim.host.frame_encoder import FrameEncoder
 from pcie_shim.host.link import LONGEST_POLL_S
-from pcie_shim.programming_file import is_plain
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from types import TracebackType
 
-    import numpy.typing as npt
-
-    from machines.parameters import BM1Parameters
     from pcie_shim.endpoint import Endpoint
+    from pcie_shim.host.frame import FrameInput
     from pcie_shim.programming_file import Image
 
 SLACK_S: Final = 5.0
-"""Seconds that a board may take beyond what its cycles need at its measured speed."""
+"""Seconds that a board may take beyond the time of its cycles at its measured speed."""
 FIRST_WAIT_S: Final = 0.01
-"""Seconds for which only the board that was started last is watched."""
+"""Longest wait in which only the board that was started last is polled."""
 PROGRAMMING_S: Final = 30.0
-"""Seconds for each step of programming a blank board, at least."""
-
-_SETTINGS: Final = struct.Struct("<IQII")  # TARGET_COUNT, MAX_CYCLES, BANK, PRIOR_SELECT
+"""Shortest timeout of each step of programming a blank board, in seconds."""
 
 
-class _Course:
-    """How far the posted frame is."""
+class _Progress:
+    """The progress of the posted frame."""
 
     def __init__(self, max_cycles: int, end: int, boards: Sequence[DrivenBoard]) -> None:
         self.max_cycles = max_cycles
-        self.begun = 0  # where the slice began
-        self.end = end  # where it ends; 0: where the frame does
+        self.begun = 0  # first cycle of the slice
+        self.end = end  # last cycle of the slice; 0: the frame's
         self.running = boards
         self.halted: frozenset[int] = frozenset()
-        self.left = 0  # boards of the slice that have not said done
+        self.left = 0  # boards of the slice that still run
         self.cycles = 0
         self.limit = 0.0
         self.deadline = 0.0
@@ -73,19 +67,16 @@ class MiniCluster:
     """All boards of a deployment, in the order of their partition; used by one thread."""
 
     def __init__(self, boards: Sequence[DrivenBoard], *, timeout: float, slack: float) -> None:
-        """Use :meth:`open`."""
+        """Prepare for these boards; use `open`, which also connects."""
         self._boards = tuple(boards)
-        self._parameters: BM1Parameters = self._boards[0].image.machine.parameters
+        self._encoder = FrameEncoder([board.image for board in self._boards])
         self._timeout = timeout
         self._slack = slack
         self._interrupted: list[DrivenBoard] = []
-        self._course: _Course | None = None
+        self._progress: _Progress | None = None
         self._poll = select.poll()
         self._by_descriptor: dict[int, DrivenBoard] = {}
-        self._replicas = self._parameters.replicas
-        self._is_plain = is_plain(self._parameters)
-        self._sensor_words = struct.Struct(f"<{self._parameters.sensors}I")
-        self._missing = tuple((1 << bits) - 1 for bits in self._parameters.sensor_bits)
+        self._replicas = self._boards[0].replicas
 
     @classmethod
     def open(
@@ -96,13 +87,13 @@ class MiniCluster:
         timeout: float = 10.0,
         slack: float = SLACK_S,
     ) -> Self:
-        """Open all boards: identity, liveness and image are checked, blank boards programmed, machines reset.
+        """Open all boards: check identity, liveness and image, program blank boards, and reset the machines.
 
         Args:
             endpoints: Where the boards listen, in the order of the partition.
-            images: What they (are to) hold.
+            images: The boards' images.
             timeout: Seconds for a board to listen, and for each of its answers.
-            slack: Seconds that a frame may take beyond what its cycles need at the boards' speed.
+            slack: Seconds that a frame may take beyond the time of its cycles at the boards' speed.
 
         Raises:
             EndpointError: An endpoint's text is wrong.
@@ -138,15 +129,15 @@ class MiniCluster:
         return sum(board.lines for board in self._boards)
 
     def is_open(self, board: int) -> bool:
-        """Whether board number ``board`` can be used; else :meth:`reopen` it."""
+        """Return whether board number `board` is usable; otherwise `reopen` it."""
         return self._boards[board].link is not None or self._boards[board] in self._interrupted
 
     def reopen(self, board: int, *, timeout: float | None = None) -> None:
-        """Open a board again, after its restart or a broken link; a blank one is programmed.
+        """Reopen a board after its restart or a broken link, and program it if it is blank.
 
         Args:
             board: Its number.
-            timeout: Seconds for it to listen and greet; None: as when the mini-cluster was opened.
+            timeout: Seconds for it to listen and greet; None: those given to `open`.
 
         Raises:
             BoardError: It cannot be opened.
@@ -155,7 +146,7 @@ class MiniCluster:
 
     def close(self) -> None:
         """Close all links; boards that run stop."""
-        self._course = None
+        self._progress = None
         for board in self._boards:
             self._close(board, "the mini-cluster was closed")
 
@@ -164,12 +155,12 @@ class MiniCluster:
     def run(self, frame: FrameInput) -> FrameOutput:
         """Compute one frame on all boards.
 
-        After an error the frame is lost, and nothing of it is kept. The boards that did not fail can be used
-        again at once; the one that failed must be opened again (:meth:`reopen`), unless it only refused.
+        After an error the frame is lost. The boards that did not fail are usable at once; the one that failed must be
+        reopened (`reopen`), unless it only refused.
 
         Raises:
             FrameInputError: The frame does not fit the machine; no board was touched.
-            BoardError: A board failed; ``error.board`` is its number.
+            BoardError: A board failed; `error.board` is its number.
         """
         self.post(frame)
         while (output := self.collect(LONGEST_POLL_S)) is None:
@@ -177,180 +168,179 @@ class MiniCluster:
         return output
 
     def post(self, frame: FrameInput) -> None:
-        """Start a frame on all boards without waiting for any; :meth:`collect` has its result. Errors as :meth:`run`."""
-        if self._course is not None:
-            raise FrameInputError("A frame is under way; collect its result before the next is posted")
-        settings, sensors, selects = self._words(frame)
-        priors = self._priors(frame)
+        """Start a frame on all boards without waiting; `collect` returns its result. Errors as `run`."""
+        if self._progress is not None:
+            raise FrameInputError("A frame is in progress; collect its result before posting the next")
+        words = self._encoder.encode(frame)
         self._make_ready()
         end = first_slice(frame.target_count) if frame.stop == "slices" else 0
         if end >= frame.max_cycles or (self._replicas > 1 and len(self._boards) == 1):
             end = 0  # one slice, which ends where the frame does
-        course = self._course = _Course(frame.max_cycles, end, self._boards)
+        progress = self._progress = _Progress(frame.max_cycles, end, self._boards)
         try:
-            for board, own, prior in zip(self._boards, sensors, priors, strict=True):
+            for board, own in zip(self._boards, words, strict=True):
                 try:
-                    board.start(settings, own, selects, prior, end)
+                    board.start(own, end)
                 except LinkError as error:
                     self._fail(board, error)
-            self._posted(course)
+            self._expect_done(progress)
         except BaseException:
             self._abandon()
             raise
 
     def collect(self, seconds: float) -> FrameOutput | None:
-        """Take what the boards have said of the posted frame, and go on with its next slice where there is one.
+        """Take the boards' answers to the posted frame, and start its next slice where there is one.
 
         Args:
-            seconds: To wait at most, if nothing has come yet; 0 for a look.
+            seconds: Longest wait if nothing has come yet; 0 polls.
 
         Returns:
-            The frame's result, or None while boards still run: then :attr:`awaited` says which link to watch.
+            The frame's result, or None while boards still run: then `awaited` is the descriptor to poll.
 
         Raises:
-            BoardError: As :meth:`run`.
+            BoardError: As `run`.
         """
-        course = self._course
-        if course is None:
-            raise FrameInputError("There is no frame under way: post one first")
+        progress = self._progress
+        if progress is None:
+            raise FrameInputError("There is no frame in progress: post one first")
         try:
-            if not self._receive(course, seconds):
+            if not self._receive(progress, seconds):
                 return None
-            output = self._next_slice(course)
+            output = self._next_slice(progress)
         except BaseException:
             self._abandon()
             raise
         if output is not None:
-            self._course = None
+            self._progress = None
         return output
 
     @property
     def awaited(self) -> int | None:
-        """Descriptor of the link that is worth watching until the next :meth:`collect`; None if no frame is under way."""
-        course = self._course
-        if course is None:
+        """Descriptor to poll before the next `collect`; None if no frame is in progress."""
+        progress = self._progress
+        if progress is None:
             return None
-        board = next((board for board in reversed(course.running) if board.waiting), None)
+        board = next((board for board in reversed(progress.running) if board.waiting), None)
         return None if board is None or board.link is None else board.link.fileno()
 
     @property
     def seconds_left(self) -> float:
-        """Seconds until a board of the posted frame is late: :meth:`collect` is to be called then at the latest."""
-        return 0.0 if self._course is None else max(0.0, self._course.deadline - time.monotonic())
+        """Seconds until a board of the posted frame is late: call `collect` by then."""
+        return 0.0 if self._progress is None else max(0.0, self._progress.deadline - time.monotonic())
 
-    def _posted(self, course: _Course) -> None:
-        """All boards of a slice have been started: from now on they are waited for."""
+    def _expect_done(self, progress: _Progress) -> None:
+        """Set the deadline of a slice that was just started on its boards."""
         # emulated boards may all share one core
-        cycles = (course.end or course.max_cycles) - course.begun
-        course.cycles = cycles
-        course.limit = self._slack + cycles * len(self._boards) / min(board.speed for board in self._boards)
-        course.deadline = time.monotonic() + course.limit
-        course.left = len(course.running)
+        cycles = (progress.end or progress.max_cycles) - progress.begun
+        progress.cycles = cycles
+        progress.limit = self._slack + cycles * len(self._boards) / min(board.speed for board in self._boards)
+        progress.deadline = time.monotonic() + progress.limit
+        progress.left = len(progress.running)
         now = time.perf_counter_ns()
-        course.writes_ns += now - course.clock_ns
-        course.clock_ns = now
+        progress.writes_ns += now - progress.clock_ns
+        progress.clock_ns = now
 
-    def _receive(self, course: _Course, seconds: float) -> bool:
-        """Hear the boards, for so many seconds at most; True once every running board has said done."""
-        # The board that was started last is mostly the last to be done: waking for each of the others would only
-        # take their cores from those that compute. Who fails or takes longer is seen by the poll of all.
-        if seconds and course.left == len(course.running):
-            course.running[-1].readable.poll(min(seconds, FIRST_WAIT_S) * 1000)
-        while course.left:
-            remaining = course.deadline - time.monotonic()
+    def _receive(self, progress: _Progress, seconds: float) -> bool:
+        """Receive from the boards, for this many seconds at most; return whether every running board is done."""
+        # The board that was started last is mostly the last to be done: waking for each of the others would take
+        # cores from those that compute. The poll of all boards sees one that fails or takes longer.
+        if seconds and progress.left == len(progress.running):
+            progress.running[-1].readable.poll(min(seconds, FIRST_WAIT_S) * 1000)
+        while progress.left:
+            remaining = progress.deadline - time.monotonic()
             events = self._poll.poll(min(max(remaining, 0.0), seconds) * 1000)
             if not events:
                 if remaining <= 0:
-                    late = next(board for board in course.running if board.waiting)
+                    late = next(board for board in progress.running if board.waiting)
                     assert late.link is not None  # noqa: S101 - it is waited for
-                    self._fail(late, late.link.late(course.limit, f"say done after {course.cycles} cycles"))
+                    self._fail(late, late.link.late(progress.limit, f"finish {progress.cycles} cycles"))
                 return False
             for descriptor, _ in events:
                 board = self._by_descriptor[descriptor]
                 try:
-                    course.left -= board.receive()
+                    progress.left -= board.receive()
                 except LinkError as error:
                     self._fail(board, error)
         return True
 
-    def _next_slice(self, course: _Course) -> FrameOutput | None:
-        """After a slice: the frame's result, or None where boards go on with the next one."""
+    def _next_slice(self, progress: _Progress) -> FrameOutput | None:
+        """Return the frame's result after its last slice, else start the next slice and return None."""
         now = time.perf_counter_ns()
-        course.waits_ns += now - course.clock_ns
-        course.clock_ns = now
-        course.slices += 1
-        course.computing_ns += max(
-            board.done.compute_ns for board in course.running if board.done is not None
+        progress.waits_ns += now - progress.clock_ns
+        progress.clock_ns = now
+        progress.slices += 1
+        progress.computing_ns += max(
+            board.done.compute_ns for board in progress.running if board.done is not None
         )
         halts = b""
         if self._replicas > 1:
-            running, halts = self._going_on(course)
+            running, halts = self._boards_of_replicas(progress)
         else:
-            running = [board for board in course.running if board.reason == StopReason.SLICE]
+            running = [board for board in progress.running if board.reason == StopReason.SLICE]
             if any(board.reason == StopReason.OVERFLOW for board in self._boards):
                 running = []
         if running:
-            course.running = running
-            course.begun, course.end = course.end, 2 * course.end
-            if course.end >= course.max_cycles:
-                course.end = 0  # the last slice ends where the frame does
+            progress.running = running
+            progress.begun, progress.end = progress.end, 2 * progress.end
+            if progress.end >= progress.max_cycles:
+                progress.end = 0  # the last slice ends where the frame does
             for board in running:
                 try:
-                    board.resume(course.end, halts)
+                    board.resume(progress.end, halts)
                 except LinkError as error:
                     self._fail(board, error)
-            self._posted(course)
+            self._expect_done(progress)
             return None
         results = tuple(board.result() for board in self._boards)
         return FrameOutput(
             boards=results,
-            register_writes_ns=course.writes_ns,
-            compute_ns=course.waits_ns,
-            reads_ns=time.perf_counter_ns() - course.clock_ns,
-            boards_compute_ns=course.computing_ns,
-            slices=course.slices,
+            register_writes_ns=progress.writes_ns,
+            compute_ns=progress.waits_ns,
+            reads_ns=time.perf_counter_ns() - progress.clock_ns,
+            boards_compute_ns=progress.computing_ns,
+            slices=progress.slices,
         )
 
-    def _going_on(self, course: _Course) -> tuple[list[DrivenBoard], bytes]:
-        """Replicas stop by themselves: the boards on which one goes on, and the words of HALT for all that do not.
+    def _boards_of_replicas(self, progress: _Progress) -> tuple[list[DrivenBoard], bytes]:
+        """Return the boards on which a replica goes on, and the words of HALT for the replicas that do not.
 
-        A replica goes on if no board's part of it has overflowed; where its own part has stopped there is nothing to halt.
+        A replica goes on if no board's part of it has overflowed; a part that has stopped needs no halt.
         """
         reasons = np.stack([board.outcomes["reason"] for board in self._boards])
         over = (reasons == StopReason.OVERFLOW).any(axis=0)
-        course.halted |= frozenset(np.flatnonzero(over).tolist())
+        progress.halted |= frozenset(np.flatnonzero(over).tolist())
         running = [
             board
-            for board in course.running
+            for board in progress.running
             if bool(((board.outcomes["reason"] == StopReason.SLICE) & ~over).any())
         ]
-        mask = sum(1 << replica for replica in course.halted)
+        mask = sum(1 << replica for replica in progress.halted)
         return running, mask.to_bytes(4 * -(-self._replicas // 32), "little")
 
     def _abandon(self) -> None:
-        """The frame is lost. What the other boards still compute is of no use: a closed link stops them."""
-        self._course = None
+        """Drop the frame, and stop the boards that still compute it by closing their links."""
+        self._progress = None
         for board in self._boards:
             if board.waiting and board.link is not None:
                 self._close(board, "another board failed the frame")
                 self._interrupted.append(board)
 
     def _fail(self, board: DrivenBoard, error: LinkError) -> NoReturn:
-        """The frame fails because of this board; only one that merely refused stays usable."""
+        """Fail the frame because of this board, which is closed unless it only refused."""
         if isinstance(error, AccessError) and not isinstance(error, StaleHandleError):
-            board.waiting = True  # it may have started all the same: run() has it opened again
+            board.waiting = True  # it may have started nevertheless: the next frame reopens it
         else:
             self._close(board, str(error))
         raise board_error(board, error) from error
 
     def _make_ready(self) -> None:
-        """Open again what the last, failed frame left interrupted."""
+        """Reopen the boards that the last, failed frame interrupted."""
         while self._interrupted:
             self._open(self._interrupted.pop(), self._timeout)
         for board in self._boards:
             if board.link is None:
                 raise BoardGoneError(
-                    f"Board {board.index} at {board.endpoint} is not open ({board.broken}): open it again",
+                    f"Board {board.index} at {board.endpoint} is not open ({board.broken}): reopen it",
                     board=board.index,
                 )
 
@@ -374,130 +364,8 @@ class MiniCluster:
         board.close(reason)
 
     def _descriptor(self, board: DrivenBoard) -> int | None:
-        """Where a board was polled; a link that closed itself no longer knows."""
+        """Return the descriptor that is polled for a board, even if its link has closed itself."""
         return next((known for known, owner in self._by_descriptor.items() if owner is board), None)
-
-    # ---- what goes into the registers -----------------------------------------------------------------
-
-    def _words(self, frame: FrameInput) -> tuple[bytes, list[bytes], bytes]:
-        """Settings, each board's inputs, and the replicas' prior selects, as register words."""
-        parameters = self._parameters
-        prior_address, selects = (
-            (frame.prior_address, b"")
-            if self._is_plain and isinstance(frame.prior_address, int)
-            else self._prior_selects(frame)
-        )
-        for name, value, lowest, highest in (
-            ("The target count", frame.target_count, 1, parameters.target_count_max),
-            ("The most cycles", frame.max_cycles, 1, CYCLES_MAX),
-            ("The RNG bank", frame.bank, 0, parameters.rng_banks - 1),
-            ("The prior's address", prior_address, 0, parameters.prior_addresses - 1),
-        ):
-            if not lowest <= value <= highest:
-                raise FrameInputError(f"{name} is {value}; this machine takes {lowest} to {highest}")
-        if frame.stop not in {"slices", "own"}:
-            raise FrameInputError(f"The boards cannot stop by '{frame.stop}': use slices or own")
-        settings = _SETTINGS.pack(frame.target_count, frame.max_cycles, frame.bank, prior_address)
-        if not self._is_plain:
-            return settings, self._input_words(np.asarray(frame.addresses)), selects
-        addresses = frame.addresses
-        if len(addresses) != parameters.sensors:
-            raise FrameInputError(
-                f"The frame has {len(addresses)} readings; this machine has {parameters.sensors} sensors"
-            )
-        words = []
-        for column, (address, missing) in enumerate(zip(addresses, self._missing, strict=True), start=1):
-            if address is not None and not 0 <= address <= missing:
-                raise FrameInputError(
-                    f"The address of sensor column {column} is {address}; this machine takes 0 to "
-                    f"{missing - 1}, or none"
-                )
-            words.append(missing if address is None else address)
-        return settings, [self._sensor_words.pack(*words)] * len(self._boards), selects
-
-    def _prior_selects(self, frame: FrameInput) -> tuple[int, bytes]:
-        """The prior's address (the worst of replicas', for the check of its range), and the words of PRIOR_SELECTS."""
-        given = frame.prior_address
-        if isinstance(given, tuple):
-            if self._replicas == 1 or len(given) != self._replicas:
-                raise FrameInputError(
-                    f"The frame has {len(given)} addresses of the prior; this machine takes "
-                    + (f"one, or {self._replicas}" if self._replicas > 1 else "one")
-                )
-        elif self._replicas == 1:
-            return given, b""
-        else:
-            given = (given,) * self._replicas
-        worst = min(given) if min(given) < 0 else max(given)
-        fits = 0 <= worst < self._parameters.prior_addresses
-        return worst, np.array(given, dtype="<u4").tobytes() if fits else b""
-
-    def _input_words(self, inputs: npt.NDArray[np.integer]) -> list[bytes]:
-        """Each board's words of INPUTS: where cells have inputs, those of its lines."""
-        parameters = self._parameters
-        per_cell = parameters.sensor_mode is not SensorMode.COLUMN
-        replicas, sensors, lines = self._replicas, parameters.sensors, self.total_lines
-        shape = (sensors, lines) if per_cell else (sensors,)
-        if replicas > 1:
-            shape = (replicas, *shape)
-        if not sensors:
-            return [b""] * len(self._boards)
-        if inputs.shape != shape or inputs.dtype.kind not in "ui":
-            raise FrameInputError(
-                f"The frame's readings have the shape {inputs.shape} and are {inputs.dtype}; this machine takes "
-                f"integers of the shape {shape}"
-            )
-        missing = np.array(self._missing, dtype=np.int64)[:, np.newaxis]
-        words = inputs.reshape(replicas, sensors, -1).astype(np.int64)
-        absent = words == -1
-        partly = absent.any(axis=2) & ~absent.all(axis=2)
-        wrong = np.argwhere((~absent & ((words < 0) | (words > missing))) | partly[:, :, np.newaxis] & absent)
-        if len(wrong):
-            replica, column, line = (int(at) for at in wrong[0])
-            where = f" at line {line}" if per_cell else ""
-            where += f" of replica {replica}" if replicas > 1 else ""
-            top = int(missing[column, 0])
-            value = int(words[replica, column, line])
-            raise FrameInputError(
-                f"The input of sensor column {column + 1}{where} is {value}; this machine takes 0 to "
-                f"{top - 1 if parameters.has_tables else top}"
-                + (", or -1 in all lines of a missing reading" if per_cell else ", or -1 for none")
-            )
-        words = np.where(absent, missing, words).astype("<u4")
-        if not per_cell:
-            return [words.tobytes()] * len(self._boards)
-        offsets = [board.image.partition.line_offset for board in self._boards]
-        return [
-            words[:, :, offset : offset + board.lines].tobytes()
-            for offset, board in zip(offsets, self._boards, strict=True)
-        ]
-
-    def _priors(self, frame: FrameInput) -> list[npt.NDArray[np.uint16] | None]:
-        """Each board's part of the written prior; None where the prior is a table."""
-        codes = frame.prior_codes
-        if self._parameters.prior_mode is not PriorMode.WRITTEN:
-            if codes is not None:
-                raise FrameInputError("The frame has a prior to write, but the machine's prior is a table")
-            return [None] * len(self._boards)
-        if codes is None:
-            own = [board.image.machine.prior[0] for board in self._boards]
-            return list(own) if self._replicas == 1 else [np.tile(codes, self._replicas) for codes in own]
-        several = codes.shape == (self._replicas, self.total_lines) and self._replicas > 1
-        if (
-            not (several or codes.shape == (self.total_lines,))
-            or int(codes.max()) > self._parameters.ones_code
-        ):
-            raise FrameInputError(
-                f"The prior to write has shape {codes.shape} and codes up to {codes.max()}; this machine takes "
-                f"{self.total_lines} codes from 0 to {self._parameters.ones_code}"
-                + (f", or so many for each of its {self._replicas} replicas" if self._replicas > 1 else "")
-            )
-        offsets = [board.image.partition.line_offset for board in self._boards]
-        by_line = np.broadcast_to(codes, (self._replicas, self.total_lines))
-        return [
-            by_line[:, offset : offset + board.lines].reshape(-1)
-            for offset, board in zip(offsets, self._boards, strict=True)
-        ]
 
 
 def _check_images(boards: int, images: Sequence[Image]) -> None:

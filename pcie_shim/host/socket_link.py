@@ -25,7 +25,8 @@ from pcie_shim.errors import (
     ShortReadError,
     StaleHandleError,
 )
-from pcie_shim.host.link import ALL_ONES, LONGEST_POLL_S, Done, Link
+from pcie_shim.host.link import LONGEST_POLL_S, Done, Link
+from pcie_shim.register_layout import ALL_ONES, DONE_BLOCK, WORD
 from pcie_shim.register_map import ErrorCode
 
 if TYPE_CHECKING:
@@ -35,23 +36,20 @@ if TYPE_CHECKING:
     from pcie_shim.framing import Frame, Octets
     from pcie_shim.host.link import RegisterWrite
 
-_WORD: Final = struct.Struct("<I")
-_DONE: Final = struct.Struct("<IIQQ")  # the registers DONE, STATUS, CYCLES and COMPUTE_NS
-_DONE_WORDS: Final = _DONE.size // 4
 _CLOSING_CODES: Final = (ErrorCode.STALE, ErrorCode.HELD, ErrorCode.BAD_FRAME)
 
 
 class SocketLink(Link):
-    """One open link; closes itself, and says why, once the stream cannot be trusted.
+    """One open link over a socket; once the stream cannot be trusted, it closes itself.
 
     Attributes:
         endpoint: Where the board listens.
-        greeting: What the board said when the link opened.
+        greeting: The board's greeting when the link opened.
         timeout: Seconds that an answer may take.
     """
 
     def __init__(self, endpoint: Endpoint, *, timeout: float, connect_timeout: float) -> None:
-        """Connect and hear the greeting; use :meth:`open`, which also checks it."""
+        """Connect and receive the greeting; use `open`, which also checks it."""
         self.endpoint = endpoint
         self.timeout = timeout
         self._closed = ""
@@ -74,18 +72,18 @@ class SocketLink(Link):
 
     @classmethod
     def open(cls, endpoint: Endpoint, *, timeout: float, connect_timeout: float | None = None) -> Self:
-        """A link to a board that speaks this protocol and has this register map.
+        """Open a link to a board that has this protocol version and register map.
 
         Args:
             endpoint: The board's registers, or its programming port.
             timeout: Seconds for each answer.
-            connect_timeout: Seconds for the board to listen and greet; None: as ``timeout``.
+            connect_timeout: Seconds for the board to listen and greet; None: `timeout`.
 
         Raises:
             UnreachableError: Nothing listens there.
             HeldError: Another host holds the board.
             GreetingMismatchError: It has another protocol version, register map or BAR size.
-            LinkError: It does not greet, or is no board.
+            LinkError: It does not greet, or is not a board.
         """
         link = cls(
             endpoint, timeout=timeout, connect_timeout=timeout if connect_timeout is None else connect_timeout
@@ -118,11 +116,11 @@ class SocketLink(Link):
         return not self._closed
 
     def fileno(self) -> int:
-        """The socket's descriptor, for a poll over many links."""
+        """Return the socket's descriptor, for a poll over many links."""
         return self._socket.fileno()
 
     def close(self, reason: str = "it was closed") -> None:
-        """End the link; what is used afterwards raises :class:`LinkClosedError` with this reason."""
+        """End the link; later calls raise `LinkClosedError` with this reason."""
         if not self._closed:
             self._closed = reason
             self._socket.close()
@@ -130,14 +128,14 @@ class SocketLink(Link):
     # ---- registers ------------------------------------------------------------------------------------
 
     def read32(self, address: int) -> int:
-        """One register.
+        """Read one register.
 
         Raises:
             DeviceGoneError: The ID register reads all ones.
             AccessError: The board refused the address.
             LinkError: The link broke; it is closed.
         """
-        (value,) = _WORD.unpack(self.read_block(address, 1))
+        (value,) = WORD.unpack(self.read_block(address, 1))
         if value == ALL_ONES and address == register_map.ID:
             self._give_up(
                 DeviceGoneError(f"The ID of the board at {self.endpoint} reads all ones: no device answers")
@@ -151,10 +149,10 @@ class SocketLink(Link):
             AccessError: The board refused the address or the value.
             LinkError: The link broke; it is closed.
         """
-        self.write_block(address, _WORD.pack(value))
+        self.write_block(address, WORD.pack(value))
 
     def read_block(self, address: int, count: int) -> bytes:
-        """``count`` words from ``address`` on, as little-endian bytes.
+        """Read `count` words from `address` on, as little-endian bytes.
 
         Raises:
             ShortReadError: Fewer or more words came; the link is closed.
@@ -172,7 +170,7 @@ class SocketLink(Link):
         return bytes(frame.payload)
 
     def write_block(self, address: int, words: Octets) -> None:
-        """Write little-endian words from ``address`` on and wait until the board has taken them.
+        """Write little-endian words from `address` on and wait until the board has taken them.
 
         Raises:
             AccessError: The board refused the address, the length or a value.
@@ -181,7 +179,7 @@ class SocketLink(Link):
         self.request(framing.WRITE, 0, address, len(words) // 4, words)
 
     def wait_done(self, number: int, *, timeout: float) -> Done:
-        """Wait until the board has stopped after start or resume ``number``; needs CONTROL.INTERRUPT_ENABLE.
+        """Wait until the board has stopped after start or resume `number`; needs CONTROL.INTERRUPT_ENABLE.
 
         Raises:
             AccessError: The board refused the start, or a write posted before it.
@@ -189,14 +187,14 @@ class SocketLink(Link):
             LinkError: The link broke; it is closed.
         """
         deadline = time.monotonic() + timeout
-        what = f"say done number {number}"
+        what = f"answer doorbell {number}"
         while (done := self.take_done()) is None:
             self._wait_readable(deadline, timeout, what)
             self._receive_some()
         if done.number != number:
             self._give_up(
                 SequenceError(
-                    f"The board at {self.endpoint} said done number {done.number} where {number} was due: "
+                    f"The board at {self.endpoint} answered doorbell {done.number} where {number} was due: "
                     "the link is closed"
                 )
             )
@@ -228,7 +226,7 @@ class SocketLink(Link):
             self._broken_send(error)
 
     def receive_done(self) -> Done | None:
-        """Receive once (after a poll said that something is there); what the board said, if it is whole.
+        """Receive once, after a poll; return the board's answer if it is complete.
 
         Raises:
             AccessError: The board refused a posted write.
@@ -238,7 +236,7 @@ class SocketLink(Link):
         return self.take_done()
 
     def take_done(self) -> Done | None:
-        """What the board said, if it has come; None if it has not.
+        """Return the board's answer if it has been received completely, else None.
 
         Raises:
             AccessError: The board refused a posted write.
@@ -256,10 +254,10 @@ class SocketLink(Link):
             return None if frame is None else self._interrupt(frame)
         if frame.operation == framing.ERROR:
             self._refused(frame)
-        return self._give_up(SequenceError("an answer came that nobody asked for"))
+        return self._give_up(SequenceError("an answer came without a request"))
 
     def request(self, operation: int, flags: int, address: int, count: int, payload: Octets = b"") -> Frame:
-        """Send one request and wait for its answer; an interrupt that comes before it is kept.
+        """Send one request and wait for its answer; keep an interrupt that comes before it.
 
         Returns:
             The reply; its payload is valid until the link receives again.
@@ -289,7 +287,7 @@ class SocketLink(Link):
     # ---- receiving ------------------------------------------------------------------------------------
 
     def _receive(self, deadline: float, timeout: float, what: str) -> Frame:
-        """The next frame, whatever it is; the socket's own limit bounds each receive."""
+        """Return the next frame of any kind; the socket's own timeout bounds each receive."""
         while (frame := self._decoder.next_frame()) is None:
             if time.monotonic() > deadline:
                 raise self.late(timeout, what)
@@ -325,7 +323,7 @@ class SocketLink(Link):
         self._give_up(self.late(timeout, what))
 
     def _interrupt(self, frame: Frame) -> Done:
-        if frame.words < _DONE_WORDS:
+        if frame.words < DONE_BLOCK.size // 4:
             self._give_up(
                 ShortReadError(
                     f"The board at {self.endpoint} sent an interrupt of {frame.words} words: the link is closed"
@@ -336,19 +334,19 @@ class SocketLink(Link):
             self._give_up(
                 SequenceError(f"interrupt {frame.sequence} came where interrupt {self._interrupts} was due")
             )
-        number, status, cycles, compute_ns = _DONE.unpack_from(frame.payload)
+        number, status, cycles, compute_ns = DONE_BLOCK.unpack_from(frame.payload)
         if number == status == ALL_ONES:
             self._give_up(
                 DeviceGoneError(
                     f"The registers of the board at {self.endpoint} read all ones: no device answers"
                 )
             )
-        return Done(number, status, cycles, compute_ns, frame.payload[_DONE.size :])
+        return Done(number, status, cycles, compute_ns, frame.payload[DONE_BLOCK.size :])
 
     # ---- failing --------------------------------------------------------------------------------------
 
     def _refused(self, frame: Frame) -> NoReturn:
-        """Raise what an ERROR frame says; after some codes the link is of no use any more."""
+        """Raise the error of an ERROR frame, and close the link after some codes."""
         try:
             code, detail = framing.decode_error(frame)
         except FramingError as error:
@@ -356,7 +354,7 @@ class SocketLink(Link):
         name = ErrorCode(code).name if code in ErrorCode.__members__.values() else f"code {code}"
         sentence = f"The board at {self.endpoint} refused access to {frame.address:#06x} ({name}): {detail}"
         if code in _CLOSING_CODES:
-            self.close(f"the board said {name}")
+            self.close(f"the board answered {name}")
         if code == ErrorCode.HELD:
             raise HeldError(f"The board at {self.endpoint} is held: {detail}", code=code, detail=detail)
         if code == ErrorCode.STALE:
@@ -370,7 +368,7 @@ class SocketLink(Link):
     def _broken_send(self, error: OSError) -> NoReturn:
         if isinstance(error, BlockingIOError):
             self._give_up(self.late(self.timeout, "take what was written"))
-        # A board that closes says why first: that word may be waiting.
+        # A board sends the reason before it closes: its ERROR may be in the buffer.
         frame = None
         with suppress(LinkError):
             deadline = time.monotonic() + self.timeout
@@ -382,7 +380,7 @@ class SocketLink(Link):
         self._give_up(self._gone(error.strerror or str(error)))
 
     def late(self, timeout: float, what: str) -> LinkTimeoutError:
-        """The error that says that the board did not (do) ``what`` within ``timeout`` seconds."""
+        """Return the error that the board did not `what` within `timeout` seconds."""
         rest = ": a frame began and did not end" if self._decoder.inside_frame else ""
         return LinkTimeoutError(
             f"The board at {self.endpoint} did not {what} within {timeout:.3g} s{rest}: the link is closed"
@@ -392,7 +390,7 @@ class SocketLink(Link):
         return LinkClosedError(f"The board at {self.endpoint} is gone: {reason}")
 
     def _give_up(self, error: LinkError) -> NoReturn:
-        """Close the link, and raise the error that says why."""
+        """Close the link, and raise the error."""
         if type(error) in {FramingError, CrcError, SequenceError}:
             # the decoder knows no endpoint
             text = str(error)
@@ -406,8 +404,8 @@ class SocketLink(Link):
             raise LinkClosedError(f"The link to the board at {self.endpoint} is closed: {self._closed}")
 
     def _limit(self, seconds: float) -> None:
-        """Let the kernel bound every blocking call: cheaper than Python's own time-outs, a system call each."""
-        # of 0 microseconds the kernel makes no limit at all
+        """Let the kernel bound every blocking call, which is cheaper than Python's timeouts (a system call each)."""
+        # 0 microseconds would be no limit
         value = struct.pack("@ll", *divmod(max(1, round(seconds * 1e6)), 10**6))
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, value)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, value)

@@ -30,6 +30,11 @@ def test_the_fast_one_where_it_can(kind, shared):
     assert kernel.counts.max() == 20
 
 
+def test_a_machine_with_too_many_codes_for_the_fast_kernel_gets_the_reference():
+    parameters = BM1Parameters(lines=1, sensor_bits=(16,) * 256, prob_bits=16, sensor_mode="threshold")
+    assert type(make_kernel(BM1Machine(parameters, np.full((1, 1), 100), ()))) is ReferenceBM1
+
+
 def test_warming_up_twice_is_no_harm():
     warm_up()
     warm_up()

@@ -1,4 +1,5 @@
-# What goes in at one end of a stream comes out at the other, however it is cut; anything else is an error.
+"""Frames: they survive any split of the stream, and other bytes are an error."""
+
 import itertools
 
 import pytest
@@ -93,9 +94,9 @@ def test_a_flipped_bit_is_never_taken_for_a_frame(
 def test_a_wrong_crc_and_a_boundless_length_are_told_apart() -> None:
     stream = bytearray(encode(framing.WRITE, 0, 1, 0, 1, b"1234"))
     stream[-1] ^= 1
-    with pytest.raises(CrcError, match="CRC-32"):
+    with pytest.raises(CrcError):
         decode(bytes(stream), [])
-    with pytest.raises(FramingError, match="8193 words came; 8192 are the most"):
+    with pytest.raises(FramingError):
         decode(encode(framing.READ, 0, 1, 0, framing.MAX_PAYLOAD_WORDS + 1), [])
 
 
@@ -127,15 +128,15 @@ def test_greeting_error_and_begin_come_back() -> None:
 @pytest.mark.parametrize("payload", [b"", b"x" * 96])
 def test_other_frames_are_no_greeting(payload: bytes) -> None:
     (frame,) = _frames(encode(framing.GREET, 0, 0, 0, len(payload) // 4, payload))
-    with pytest.raises(FramingError, match="greeting"):
+    with pytest.raises(FramingError):
         framing.decode_greeting(frame)
 
 
 def test_short_payloads_are_refused() -> None:
     (frame,) = _frames(encode(framing.ERROR, framing.REPLY, 1, 0, 0))
-    with pytest.raises(FramingError, match="without a code"):
+    with pytest.raises(FramingError):
         framing.decode_error(frame)
-    with pytest.raises(FramingError, match="too short"):
+    with pytest.raises(FramingError):
         ProgramBegin.decode(memoryview(b"123"))
 
 

@@ -1,4 +1,5 @@
-# The committed constants and documentation are what the SystemRDL file makes of them.
+"""The committed constants and documentation, compared with the SystemRDL file."""
+
 import dataclasses
 from pathlib import Path
 

@@ -1,6 +1,9 @@
-#   this process ──socket── board process (registers, machine)
-#        └────────socket──── its programming port
-# What one host, a second one, one that vanishes, one that talks nonsense, and loaders get.
+"""The board's server: one host, a second one, one that disconnects, one that breaks the protocol, and loaders.
+
+this process ──socket── board process (registers, machine)
+     └─────────socket── its programming port
+"""
+
 import hashlib
 import socket
 import struct
@@ -85,6 +88,21 @@ def test_a_frame_over_a_link(start_board: StartBoard, kind: str) -> None:
         assert bytes(done.results) == kernel.counts.tobytes()
 
 
+def test_results_of_an_interrupt_outlive_later_reads(start_board: StartBoard) -> None:
+    board = start_board()
+    program(board.endpoint, image(MACHINE))
+    with open_link(board) as link:
+        link.write32(rm.CONTROL, ENABLE)
+        link.write_block(rm.SENSORS, words(2, 5))
+        link.write_block(rm.TARGET_COUNT, struct.pack("<IQIIQI", 50, 4000, 1, 0, 0, 1))
+        while link.read32(rm.DONE) != 1:
+            pass
+        # the interrupt came before this answer; these reads fill the buffer in which it was received
+        results = link.read_block(rm.RESULTS, 1200)[:32]
+        link.read_block(rm.MAP_HASH, 8)
+        assert bytes(link.wait_done(1, timeout=PATIENCE).results) == results != bytes(32)
+
+
 def test_without_interrupts_the_host_reads_done(start_board: StartBoard) -> None:
     board = start_board()
     program(board.endpoint, image(MACHINE))
@@ -101,9 +119,7 @@ def test_a_refused_access_leaves_the_link_usable(start_board: StartBoard) -> Non
             link.read32(0x3FFC)
         with refused(ErrorCode.MISALIGNED):
             link.write32(2, 0)
-        with pytest.raises(
-            AccessError, match=r"unix:.* refused access to 0x0000 \(READ_ONLY\): the register"
-        ):
+        with pytest.raises(AccessError):
             link.write32(rm.ID, 0)
         with refused(ErrorCode.BLANK):
             link.write32(rm.START, 1)
@@ -145,7 +161,7 @@ def test_a_second_host_is_refused_and_the_first_goes_on(start_board: StartBoard)
     board = start_board()
     program(board.endpoint, image(never_stopping()))
     with open_link(board) as link:
-        with pytest.raises(HeldError, match=r"board0\.sock is held: another host has it; one host drives"):
+        with pytest.raises(HeldError):
             open_link(board)
         run_for_minutes(link)
         with pytest.raises(HeldError):
@@ -166,7 +182,7 @@ def test_a_host_that_vanishes_leaves_the_board_well(start_board: StartBoard) -> 
         assert link.read32(rm.STATUS) == BoardState.IDLE
         assert link.read32(rm.CONTROL) == 0
         assert link.read32(rm.DONE) == 0
-    with pytest.raises(LinkClosedError, match="it was closed"):
+    with pytest.raises(LinkClosedError):
         link.read32(rm.ID)
 
 
@@ -201,27 +217,26 @@ def test_a_host_whose_machine_is_gone_does_not_hold_the_board_for_ever() -> None
 
 
 @pytest.mark.parametrize(
-    ("nonsense", "answer"),
+    "nonsense",
     [
-        (b"GET / HTTP/1.1\r\nHost: board\r\n\r\n", "no frame of the link"),
-        (framing.encode(framing.READ, 0, 2, 0, 1), "request 2 came where 1 was due"),
-        (framing.encode(framing.READ, 0, 1, 0, 1)[:-1] + b"\xff", "CRC-32 is wrong"),
-        (framing.encode(framing.READ, 0, 1, 0, 9000), "8192 are the most"),
-        (framing.encode(framing.IRQ, 0, 1, 0, 0), "no business of the register port"),
-        (framing.encode(framing.PROGRAM, 0, 1, 0, 0), "no business of the register port"),
+        b"GET / HTTP/1.1\r\nHost: board\r\n\r\n",
+        framing.encode(framing.READ, 0, 2, 0, 1),
+        framing.encode(framing.READ, 0, 1, 0, 1)[:-1] + b"\xff",
+        framing.encode(framing.READ, 0, 1, 0, 9000),
+        framing.encode(framing.IRQ, 0, 1, 0, 0),
+        framing.encode(framing.PROGRAM, 0, 1, 0, 0),
     ],
 )
-def test_a_host_that_talks_nonsense_is_told_and_loses_its_link(
-    start_board: StartBoard, nonsense: bytes, answer: str
-) -> None:
+def test_a_host_that_breaks_the_protocol_loses_its_link(start_board: StartBoard, nonsense: bytes) -> None:
     board = start_board()
     with connect(parse_endpoint(board.endpoint), timeout=PATIENCE) as raw:
         raw.settimeout(PATIENCE)
         raw.sendall(nonsense)
-        came = b""
-        while part := raw.recv(4096):
-            came += part
-    assert answer.encode() in came
+        decoder = framing.FrameDecoder()
+        while count := raw.recv_into(decoder.room()):
+            decoder.received(count)
+    assert decoder.next_frame().operation == framing.GREET
+    assert framing.decode_error(decoder.next_frame())[0] == ErrorCode.BAD_FRAME
     with open_link(board) as link:
         assert link.read32(rm.ID) == rm.ID_VALUE
 
@@ -229,10 +244,10 @@ def test_a_host_that_talks_nonsense_is_told_and_loses_its_link(
 def test_the_host_hears_why_its_link_was_closed(start_board: StartBoard) -> None:
     with open_link(start_board()) as link:
         link._sequence += 1
-        with pytest.raises(AccessError, match=r"BAD_FRAME\): request 2 came where 1 was due"):
+        with pytest.raises(AccessError):
             link.read32(rm.ID)
         assert not link.is_open
-        with pytest.raises(LinkClosedError, match="the board said BAD_FRAME"):
+        with pytest.raises(LinkClosedError):
             link.read32(rm.ID)
 
 
@@ -242,7 +257,7 @@ def test_a_wrong_done_number_closes_the_link(start_board: StartBoard) -> None:
     with open_link(board) as link:
         link.write32(rm.CONTROL, ENABLE)
         link.write_block(rm.TARGET_COUNT, struct.pack("<IQIIQI", 5, 4000, 0, 0, 0, 1))
-        with pytest.raises(SequenceError, match="done number 1 where 7 was due: the link is closed"):
+        with pytest.raises(SequenceError):
             link.wait_done(7, timeout=PATIENCE)
         assert not link.is_open
 
@@ -266,7 +281,7 @@ def test_a_running_machine_does_not_keep_a_board_from_stopping(start_board: Star
     with open_link(board) as link:
         run_for_minutes(link)
         assert board.stop() == 0
-        with pytest.raises(LinkClosedError, match="is gone: "):
+        with pytest.raises(LinkClosedError):
             link.read32(rm.ID)
     assert list(folder.iterdir()) == []
 
@@ -280,7 +295,7 @@ def test_a_killed_boards_place_is_taken_by_the_next(start_board: StartBoard) -> 
 
 def test_a_taken_place_is_refused_and_left_alone(start_board: StartBoard) -> None:
     board = start_board()
-    with pytest.raises(EndpointError, match="another process listens there"):
+    with pytest.raises(EndpointError):
         board_module.serve_board(board.endpoint, index=1, stop=board_module.StopSignal(), pin=False)
     with open_link(board) as link:
         assert link.greeting.board == 0
@@ -330,7 +345,7 @@ def test_the_loader_is_refused_while_a_host_holds_the_board(start_board: StartBo
     board = start_board()
     program(board.endpoint, image(MACHINE))
     with open_link(board) as link:
-        with pytest.raises(HeldError, match="is held: a host has it; end that host, or program through it"):
+        with pytest.raises(HeldError):
             program(board.endpoint, image(machine(2)))
         assert link.read32(rm.PROGRAMMED) == 1
     assert program(board.endpoint, image(machine(2))) == image(machine(2)).image_hash
@@ -341,11 +356,9 @@ def test_a_handle_open_across_a_reprogramming_is_stale(start_board: StartBoard) 
     program(board.endpoint, image(MACHINE))
     link = open_link(board)
     program(board.endpoint, image(machine(2)), token=link.greeting.token)
-    with pytest.raises(
-        StaleHandleError, match=r"is stale: the board was programmed after it was opened; open"
-    ):
+    with pytest.raises(StaleHandleError):
         link.read32(rm.ID)
-    with pytest.raises(LinkClosedError, match="the board said STALE"):
+    with pytest.raises(LinkClosedError):
         link.read32(rm.ID)
     with open_link(board) as link:
         assert link.read32(rm.CAP_LINES) == 8
@@ -364,7 +377,7 @@ def test_a_running_board_is_not_programmed_even_by_its_host(start_board: StartBo
 def test_one_loader_at_a_time(start_board: StartBoard) -> None:
     board = start_board()
     first = SocketLink.open(parse_endpoint(board.endpoint).programming, timeout=PATIENCE)
-    with pytest.raises(HeldError, match="another loader is programming it"):
+    with pytest.raises(HeldError):
         program(board.endpoint, image(MACHINE))
     first.close()
     program(board.endpoint, image(MACHINE))
@@ -398,7 +411,7 @@ def test_a_file_that_changes_on_the_way_is_refused(start_board: StartBoard) -> N
         link.request(framing.PROGRAM, framing.BEGIN, 0, len(payload) // 4, payload)
         padded = changed + bytes(-len(changed) % 4)
         link.request(framing.PROGRAM, 0, 0, len(padded) // 4, padded)
-        with pytest.raises(AccessError, match="are not those that were announced"):
+        with pytest.raises(AccessError):
             link.request(framing.PROGRAM, framing.END, len(content), 0)
         assert link.read_block(rm.IMAGE_HASH, 8) == bytes(32)
 
@@ -406,7 +419,7 @@ def test_a_file_that_changes_on_the_way_is_refused(start_board: StartBoard) -> N
 def test_an_endless_file_is_refused(start_board: StartBoard) -> None:
     with SocketLink.open(parse_endpoint(start_board().endpoint).programming, timeout=PATIENCE) as link:
         payload = begin(b"", size=2**40)
-        with pytest.raises(AccessError, match="1099511627776 bytes, 1073741824 are the most"):
+        with pytest.raises(AccessError):
             link.request(framing.PROGRAM, framing.BEGIN, 0, len(payload) // 4, payload)
 
 
@@ -429,7 +442,7 @@ def test_an_image_for_another_map_is_refused_by_the_board_too(
     content = image_bytes(image(MACHINE))
     monkeypatch.setattr(rm, "MAP_SHA256", ours)
     board = start_board()
-    with pytest.raises(ImageMismatchError, match=f"{'77' * 32}.*{ours}"):
+    with pytest.raises(ImageMismatchError):
         program(board.endpoint, content)
     # a loader that does not look
     with SocketLink.open(parse_endpoint(board.endpoint).programming, timeout=PATIENCE) as link:
@@ -437,5 +450,5 @@ def test_an_image_for_another_map_is_refused_by_the_board_too(
         link.request(framing.PROGRAM, framing.BEGIN, 0, len(payload) // 4, payload)
         padded = content + bytes(-len(content) % 4)
         link.request(framing.PROGRAM, 0, 0, len(padded) // 4, padded)
-        with pytest.raises(AccessError, match=f"BAD_IMAGE.*{'77' * 32}.*{ours}"):
+        with pytest.raises(AccessError):
             link.request(framing.PROGRAM, framing.END, len(content), 0)

