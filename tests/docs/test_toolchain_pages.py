@@ -1,4 +1,4 @@
-"""The pages of documentation say what the code does: every key, every option, and an example that runs."""
+"""The toolchain's pages: every key, option, check and constant is described, and the examples run."""
 
 import json
 import re
@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import typer
 from pydantic import BaseModel
+from typer.main import get_command
 
-from tests.command_runner import invoke
+from tests.toolchain.running import TARGET, assert_refused, toolchain
 from toolchain.building.build import assemble
 from toolchain.building.options import BuildOptions
 from toolchain.building.sources_file import read_sources
@@ -51,37 +51,50 @@ def sections():
 
 @pytest.mark.parametrize(("heading", "keys"), list(sections()))
 def test_every_key_of_the_deployment(heading, keys):
-    assert sorted(documented((DOCS / "reference/deployment.md").read_text(), heading)) == sorted(keys)
+    assert sorted(documented((DOCS / "reference" / "deployment.md").read_text(), heading)) == sorted(keys)
 
 
-def test_every_option_of_the_build():
-    build = typer.main.get_command(app).commands["build"]
-    options = {
-        name
-        for each in build.params
-        for name in (*each.opts, *each.secondary_opts)
-        if name.startswith("-") and each.name != "help"
-    }
-    described = documented((DOCS / "reference/toolchain.md").read_text(), "Options")
-    assert {key.split(" ")[0] for key in described} == options
+def options_of(*path):
+    command = get_command(app)
+    for name in path:
+        command = command.commands[name]
+    names = {name for each in command.params for name in (*each.opts, *each.secondary_opts)}
+    return {name for name in names if name.startswith("-")} - {"--help", "-h"}
+
+
+@pytest.mark.parametrize(
+    ("command", "page", "heading"),
+    [("build", "reference/toolchain.md", "Options"), ("fit", "how-to/models.md", "6. Learning the tables")],
+)
+def test_every_option_of_a_command(command, page, heading):
+    described = documented((DOCS / page).read_text(), heading)
+    assert {key.split(" ")[0] for key in described} == options_of(command)
+
+
+@pytest.mark.parametrize("part", ["memories", "project", "deployment"])
+def test_every_option_of_regenerate(part):
+    section = (
+        (DOCS / "reference" / "toolchain.md")
+        .read_text()
+        .split("\n## One part again", 1)[1]
+        .split("\n## ", 1)[0]
+    )
+    question = {"--set", "--searched", "--known", "--given", "--prior-select", "--on-missing"}
+    for name in options_of("regenerate", part) - question:
+        assert name in section
 
 
 def test_the_example_is_a_model(tmp_path):
-    example = re.search(r"```python\n(.*?)```", (DOCS / "reference/toolchain.md").read_text(), re.DOTALL)[1]
+    example = re.search(r"```python\n(.*?)```", (DOCS / "reference" / "toolchain.md").read_text(), re.DOTALL)[
+        1
+    ]
     (tmp_path / "model.py").write_text(example)
     model = load_model(tmp_path, {"cells": "7"})
     assert model.lines == 7
     assert [known.name for known in model.known] == ["range", "door"]
 
 
-MODELS = (DOCS / "how-to/models.md").read_text()
-
-
-def test_every_option_of_the_fit():
-    command = typer.main.get_command(app).commands["fit"]
-    options = {name for each in command.params for name in each.opts if name.startswith("-")} - {"--help"}
-    described = documented(MODELS, "6. Learning the tables")
-    assert {key.split(" ")[0] for key in described} == options
+MODELS = (DOCS / "how-to" / "models.md").read_text()
 
 
 def blocks(language):
@@ -100,7 +113,7 @@ def test_the_models_page_works_as_printed(tmp_path, monkeypatch):
     commands = re.findall(r"^    (toolchain .*)$", MODELS, re.MULTILINE)
     assert len(commands) == 7
     for command in commands:
-        result = invoke(app, shlex.split(command)[1:])
+        result = toolchain(*shlex.split(command)[1:])
         assert result.exit_code == 0, f"{command}\n{result.stderr}"
     text = (tmp_path / "mymodel" / "model.py").read_text()
     text = text.replace("    return joint.ask(searched=[place], known=[distance, door])\n", "")
@@ -125,14 +138,16 @@ def test_the_boiler_is_a_question_and_the_printed_refusal_is_said(tmp_path):
 
 
 def test_every_check_is_described():
-    described = documented((DOCS / "reference/toolchain.md").read_text(), "What is wrong, before anything runs")
+    described = documented(
+        (DOCS / "reference" / "toolchain.md").read_text(), "What is wrong, before anything runs"
+    )
     assert set(described) == set(Check) - {Check.RNG}
 
 
 def test_every_constant_of_the_parameters():
     text = parameters_vhd(*built_for_the_documentation())
     constants = set(re.findall(r"^  constant (\w+)", text, re.MULTILINE))
-    assert set(documented((DOCS / "reference/outputs.md").read_text(), "bm1_parameters.vhd")) == constants
+    assert set(documented((DOCS / "reference" / "outputs.md").read_text(), "bm1_parameters.vhd")) == constants
 
 
 def built_for_the_documentation():
@@ -145,18 +160,8 @@ def built_for_the_documentation():
     return built.deployment, built.images
 
 
-@pytest.mark.parametrize("part", ["memories", "project", "deployment"])
-def test_every_option_of_regenerate(part):
-    text = (DOCS / "reference/toolchain.md").read_text()
-    section = text.split("\n## One part again", 1)[1].split("\n## ", 1)[0]
-    question = {"--set", "--searched", "--known", "--given", "--prior-select", "--on-missing", "--help", "-h"}
-    command = typer.main.get_command(app).commands["regenerate"].commands[part]
-    for name in {name for each in command.params for name in each.opts if name.startswith("-")} - question:
-        assert name in section
-
-
 def test_the_sources_of_the_deployment_page(tmp_path):
-    page = (DOCS / "reference/deployment.md").read_text()
+    page = (DOCS / "reference" / "deployment.md").read_text()
     (example,) = re.findall(r"^```toml\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
     (tmp_path / "sources.toml").write_text(example)
     file = read_sources(tmp_path / "sources.toml", "ws://robot:9090")
@@ -173,31 +178,22 @@ def test_the_sources_of_the_deployment_page(tmp_path):
 
 
 @pytest.mark.parametrize("mode", ["cell", "threshold"])
-def test_inspect_explains_such_a_deployment(tmp_path, mode):
-    page = (DOCS / "reference/toolchain.md").read_text()
+def test_inspect_explains_the_disparity_model(tmp_path, mode):
+    page = (DOCS / "reference" / "toolchain.md").read_text()
     (example,) = re.findall(r"```python\n(# disparity/model\.py.*?)```", page, re.DOTALL)
-    (tmp_path / "disparity").mkdir()
-    (tmp_path / "disparity/model.py").write_text(example)
-
-    flags = ["--uri", "ws://localhost:9090", "--topic", "/costs", "--type", "stereo/Costs"]
-    flags += ["--sensor-mode", mode, "--replicas", "3"]
-    out = tmp_path / "out"
-    built = invoke(app, ["build", str(tmp_path / "disparity"), "-o", str(out), *flags])
+    model, out = tmp_path / "disparity", tmp_path / "out"
+    model.mkdir()
+    (model / "model.py").write_text(example)
+    built = toolchain("build", model, "-o", out, *TARGET, "--sensor-mode", mode, "--replicas", 3)
     assert built.exit_code == 0, built.output
-    looked = invoke(app, ["inspect", str(out), "--frames", "5"])
+    looked = toolchain("inspect", out, "--frames", 5)
     if mode == "threshold":
-        assert looked.exit_code == 2
-        assert "--model" in looked.stderr
+        assert_refused(looked, "--model")
     else:
         assert looked.exit_code == 0, looked.output
-        assert "Each board holds 3 of these machines around the same generators" in looked.stdout
         assert "5 frames of readings for 3 replicas, drawn from" in looked.stdout
-        assert "A frame is 3 posteriors and ends with the last of them" in looked.stdout
-    named = invoke(
-        app, ["inspect", str(out), "--frames", "5", "--model", str(tmp_path / "disparity"), "--json"]
-    )
+    named = toolchain("inspect", out, "--frames", 5, "--model", model, "--json")
     assert named.exit_code == 0, named.output
     # lines that all read the same would have nothing to be wrong about
     assert 0.001 < json.loads(named.stdout)["accuracy"]["machine"]["total_variation"]["value"] < 0.1
-    recorded = invoke(app, ["inspect", str(out), "--readings", str(tmp_path / "r.csv")])
-    assert recorded.exit_code == 2
+    assert_refused(toolchain("inspect", out, "--readings", tmp_path / "r.csv"), "r.csv")

@@ -139,17 +139,8 @@ def test_a_network_with_a_question(network):
 
 
 def test_a_network_with_a_fixed_and_a_selecting_variable(network):
-    question = [
-        "--searched",
-        "grass",
-        "--known",
-        "shoes",
-        "--given",
-        "sprinkler=on",
-        "--prior-select",
-        "rain",
-    ]
-    assert build(network, *question).exit_code == 0
+    question = "--searched grass --known shoes --given sprinkler=on --prior-select rain"
+    assert build(network, *question.split()).exit_code == 0
     deployment = load_deployment(network.parent / "out")
     assert [(each.name, each.kind) for each in deployment.variables] == [
         ("shoes", "sensor"),
@@ -188,13 +179,6 @@ def test_a_wrong_target_is_refused_before_the_model_is_read(case, option, value)
         target += [option, value]
     result = build(case, target=target)
     assert_refused(result, f"error: {option}: ")
-
-
-@pytest.mark.parametrize("command", [[], ["build"], ["fit"], ["new"]])
-def test_short_help(command):
-    result = toolchain(*command, "-h")
-    assert result.exit_code == 0
-    assert "Usage: " in result.stdout
 
 
 def test_a_written_prior(case):

@@ -32,9 +32,7 @@ MAX_TABLE_BYTES: Final = 1 << 28
 MAX_BYTES: Final = 1 << 30
 _MAX_META_BYTES: Final = 4 << 20
 
-_HEADER: Final = (
-    "# Written by `toolchain fit`; read by toolchain.learning.fitted.with_fit. docs/how-to/models.md has the keys.\n"
-)
+_HEADER: Final = "# Written by `toolchain fit`; read by toolchain.learning.fitted.with_fit. docs/how-to/models.md has the keys.\n"
 _META: Final = "fit.json"
 _EPOCH: Final = (1980, 1, 1, 0, 0, 0)
 
