@@ -16,19 +16,10 @@ from pcie_shim.board.emulated_board import EmulatedBoard, RefusedError
 from pcie_shim.programming_file import Image, Partition, image_bytes, interface_words
 from pcie_shim.register_layout import next_doorbell
 from pcie_shim.register_map import BoardState, ErrorCode
-from toolchain.deployment import (
-    Board,
-    Deployment,
-    Dimension,
-    MachineSection,
-    Source,
-    Variable,
-)
-from toolchain.outputs.memories import memories
-from toolchain.outputs.vhdl_parameters import parameters_vhd
-
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from toolchain.deployment import Deployment
 
 __all__ = [
     "BM1Kernel",
@@ -83,6 +74,10 @@ def image_of(machine: BM1Machine, more_inputs: int = 0, more_results: int = 0) -
 
 def write_hardware_files(image: Image, folder: Path) -> None:
     """Write what a build writes for an image's hardware: the package of parameters and all memories."""
+    # here, not above: a bench needs no toolchain, and simulations start by the dozen
+    from toolchain.outputs.memories import memories
+    from toolchain.outputs.vhdl_parameters import parameters_vhd
+
     deployment = _deployment(image)
     (folder / PARAMETERS_FILE).write_text(parameters_vhd(deployment, [image]), "ascii")
     (folder / MEMORY_FOLDER).mkdir(exist_ok=True)
@@ -92,6 +87,8 @@ def write_hardware_files(image: Image, folder: Path) -> None:
 
 def _deployment(image: Image) -> Deployment:
     """Return a deployment that has this image on its only board."""
+    from toolchain.deployment import Board, Deployment, Dimension, MachineSection, Source, Variable
+
     parameters = image.machine.parameters
     widths = [*parameters.sensor_bits, *([parameters.prior_bits] if parameters.prior_bits else [])]
     return Deployment(
