@@ -75,43 +75,32 @@ begin
         prefer <= '0';
       else
 
-        case state is
-
-          when STANDING =>
-
-            if (take_write = '1') then
-              state  <= BUSY_WRITE;
-              prefer <= '1';
-            elsif (take_read = '1') then
-              state  <= BUSY_READ;
-              prefer <= '0';
-            end if;
-
-          when BUSY_WRITE =>
-
-            if (respond_i = '1') then
-              state <= ANSWER_WRITE;
-            end if;
-
-          when BUSY_READ =>
-
-            if (respond_i = '1') then
-              state <= ANSWER_READ;
-            end if;
-
-          when ANSWER_WRITE =>
-
-            if (axi_bready = '1') then
-              state <= STANDING;
-            end if;
-
-          when others =>
-
-            if (axi_rready = '1') then
-              state <= STANDING;
-            end if;
-
-        end case;
+        -- no case: GHDL's synthesis makes latches of one over an enumeration
+        if (state = STANDING) then
+          if (take_write = '1') then
+            state  <= BUSY_WRITE;
+            prefer <= '1';
+          elsif (take_read = '1') then
+            state  <= BUSY_READ;
+            prefer <= '0';
+          end if;
+        elsif (state = BUSY_WRITE) then
+          if (respond_i = '1') then
+            state <= ANSWER_WRITE;
+          end if;
+        elsif (state = BUSY_READ) then
+          if (respond_i = '1') then
+            state <= ANSWER_READ;
+          end if;
+        elsif (state = ANSWER_WRITE) then
+          if (axi_bready = '1') then
+            state <= STANDING;
+          end if;
+        else
+          if (axi_rready = '1') then
+            state <= STANDING;
+          end if;
+        end if;
 
         if (respond_i = '1') then
           answer <= OKAY;

@@ -174,38 +174,31 @@ begin
         has_run <= '0';
       else
 
-        case state is
-
-          when STANDING =>
-
-            if (start = '1') then
-              state      <= LOADING;
-              cycles     <= (others => '0');
-              max_cycles <= unsigned(max_cycles_i);
-              target     <= target_i;
-            elsif (resume = '1') then
-              state <= RUNNING;
-            end if;
-
-          when LOADING =>
-
-            if (stopped = '1') then
-              state   <= STANDING;
-              has_run <= '1';
-            elsif (loaded = '1') then
-              state <= RUNNING;
-            end if;
-
-          when others =>
-
-            if (stopped = '1') then
-              state   <= STANDING;
-              has_run <= '1';
-            else
-              cycles <= cycles + 1;
-            end if;
-
-        end case;
+        -- no case: GHDL's synthesis makes latches of one over an enumeration
+        if (state = STANDING) then
+          if (start = '1') then
+            state      <= LOADING;
+            cycles     <= (others => '0');
+            max_cycles <= unsigned(max_cycles_i);
+            target     <= target_i;
+          elsif (resume = '1') then
+            state <= RUNNING;
+          end if;
+        elsif (state = LOADING) then
+          if (stopped = '1') then
+            state   <= STANDING;
+            has_run <= '1';
+          elsif (loaded = '1') then
+            state <= RUNNING;
+          end if;
+        else
+          if (stopped = '1') then
+            state   <= STANDING;
+            has_run <= '1';
+          else
+            cycles <= cycles + 1;
+          end if;
+        end if;
 
       end if;
     end if;
@@ -213,7 +206,8 @@ begin
   end process sequence_of_frame;
 
   -- A frame of which no replica can count ends without a cycle.
-  stopped <= '1' when (state = RUNNING and (or enable) = '0') or (loaded = '1' and (and impossible_i) = '1') else
+  stopped <= '1' when (state /= STANDING and state /= LOADING and (or enable) = '0')
+                      or (loaded = '1' and (and impossible_i) = '1') else
              '0';
 
   join_reasons : process (all) is

@@ -50,7 +50,7 @@ architecture rtl of bm1_matrix is
   constant PER_COLUMN : positive := inputs_per_column(MODE, LINES);
 
   signal prior_row   : std_logic_vector(LINES * PROB_BITS - 1 downto 0);
-  signal column_rows : std_logic_vector(COLUMNS * LINES * PROB_BITS - 1 downto 0);
+  signal column_rows : std_logic_vector(SENSORS * LINES * PROB_BITS - 1 downto 0);
   signal never       : std_logic_vector(LINES - 1 downto 0);
   signal full        : std_logic_vector(LINES - 1 downto 0);
 
@@ -93,7 +93,7 @@ begin
           clk_i     => clk_i,
           enable_i  => load_i,
           address_i => inputs_i((c - 1) * SLOT_BITS + ADDRESS_BITS(c) - 1 downto (c - 1) * SLOT_BITS),
-          data_o    => column_rows((c + 1) * LINES * PROB_BITS - 1 downto c * LINES * PROB_BITS)
+          data_o    => column_rows(c * LINES * PROB_BITS - 1 downto (c - 1) * LINES * PROB_BITS)
         );
 
     end generate each_column;
@@ -140,7 +140,7 @@ begin
     begin
 
       given_source : if MODE = SENSOR_COLUMN generate
-        given(PROB_BITS - 1 downto 0) <= column_rows((c * LINES + l + 1) * PROB_BITS - 1 downto (c * LINES + l) * PROB_BITS);
+        given(PROB_BITS - 1 downto 0) <= column_rows(((c - 1) * LINES + l + 1) * PROB_BITS - 1 downto ((c - 1) * LINES + l) * PROB_BITS);
 
         unused_bits : if PROB_BITS < SLOT_BITS generate
           given(SLOT_BITS - 1 downto PROB_BITS) <= (others => '0');

@@ -234,36 +234,29 @@ begin
         error_code <= (others => '0');
       else
 
-        case state is
-
-          when WAITING =>
-
-            if (request_i = '1') then
-              state   <= CHECKING;
-              write   <= write_i;
-              address <= address_i;
-              strobe  <= strobe_i;
-              data    <= data_i;
+        -- no case: GHDL's synthesis makes latches of one over an enumeration
+        if (state = WAITING) then
+          if (request_i = '1') then
+            state   <= CHECKING;
+            write   <= write_i;
+            address <= address_i;
+            strobe  <= strobe_i;
+            data    <= data_i;
+          end if;
+        elsif (state = CHECKING) then
+          if (busy = '0') then
+            if (allowed = '1' and write = '0') then
+              state <= READING;
+            else
+              state <= WAITING;
             end if;
-
-          when CHECKING =>
-
-            if (busy = '0') then
-              if (allowed = '1' and write = '0') then
-                state <= READING;
-              else
-                state <= WAITING;
-              end if;
-              if (allowed = '0') then
-                error_code <= verdict;
-              end if;
+            if (allowed = '0') then
+              error_code <= verdict;
             end if;
-
-          when others =>
-
-            state <= WAITING;
-
-        end case;
+          end if;
+        else
+          state <= WAITING;
+        end if;
 
         if (control(CONTROL_RESET_LOW) = '1') then
           error_code <= (others => '0');

@@ -39,42 +39,40 @@ architecture rtl of bm1_tile_element is
 
 begin
 
-  source : case MODE generate
+  -- a chain of conditions: GHDL's synthesis does not know case generates
+  source : if MODE = SENSOR_COLUMN generate
+    -- The tables of a column see the same address: they lie side by side in one memory outside.
+    code <= given_i(PROB_BITS - 1 downto 0);
+  elsif MODE = SENSOR_CELL generate
 
-    when SENSOR_COLUMN =>
-      -- The tables of a column see the same address: they lie side by side in one memory outside.
-      code <= given_i(PROB_BITS - 1 downto 0);
+    probabilities : component bm1_table
+      generic map (
+        FILE_NAME    => TABLE_FILE,
+        WORD_BITS    => LINES * PROB_BITS,
+        DEPTH        => 2 ** ADDRESS_BITS,
+        ADDRESS_BITS => ADDRESS_BITS,
+        FIRST_BIT    => LINE * PROB_BITS,
+        DATA_BITS    => PROB_BITS
+      )
+      port map (
+        clk_i     => clk_i,
+        enable_i  => load_i,
+        address_i => given_i(ADDRESS_BITS - 1 downto 0),
+        data_o    => code
+      );
 
-    when SENSOR_CELL =>
+  else generate
 
-      probabilities : component bm1_table
-        generic map (
-          FILE_NAME    => TABLE_FILE,
-          WORD_BITS    => LINES * PROB_BITS,
-          DEPTH        => 2 ** ADDRESS_BITS,
-          ADDRESS_BITS => ADDRESS_BITS,
-          FIRST_BIT    => LINE * PROB_BITS,
-          DATA_BITS    => PROB_BITS
-        )
-        port map (
-          clk_i     => clk_i,
-          enable_i  => load_i,
-          address_i => given_i(ADDRESS_BITS - 1 downto 0),
-          data_o    => code
-        );
+    hold_code : process (clk_i) is
+    begin
 
-    when SENSOR_THRESHOLD =>
-
-      hold_code : process (clk_i) is
-      begin
-
-        if rising_edge(clk_i) then
-          if (load_i = '1') then
-            code <= given_i(PROB_BITS - 1 downto 0);
-          end if;
+      if rising_edge(clk_i) then
+        if (load_i = '1') then
+          code <= given_i(PROB_BITS - 1 downto 0);
         end if;
+      end if;
 
-      end process hold_code;
+    end process hold_code;
 
   end generate source;
 

@@ -77,7 +77,64 @@ begin
   begin
 
     if rising_edge(clk_i) then
+      if (write_i = '1' and unsigned(word_i) = LIVENESS_ADDRESS / 4) then
+        liveness(31 downto 0) <= data_i(31 downto 0);
+      end if;
       control(0) <= '0';
+      if (write_i = '1' and unsigned(word_i) = CONTROL_ADDRESS / 4) then
+        control(1 downto 0) <= data_i(1 downto 0);
+      end if;
+      if (write_i = '1' and unsigned(word_i) = TARGET_COUNT_ADDRESS / 4) then
+        target_count(31 downto 0) <= data_i(31 downto 0);
+      end if;
+      if (write_i = '1' and unsigned(word_i) = MAX_CYCLES_ADDRESS / 4) then
+        max_cycles(31 downto 0) <= data_i(31 downto 0);
+      end if;
+      if (write_i = '1' and unsigned(word_i) = MAX_CYCLES_ADDRESS / 4 + 1) then
+        max_cycles(63 downto 32) <= data_i(31 downto 0);
+      end if;
+      if (write_i = '1' and unsigned(word_i) = BANK_ADDRESS / 4) then
+        bank(31 downto 0) <= data_i(31 downto 0);
+      end if;
+      if (write_i = '1' and unsigned(word_i) = PRIOR_SELECT_ADDRESS / 4) then
+        prior_select(31 downto 0) <= data_i(31 downto 0);
+      end if;
+      if (write_i = '1' and unsigned(word_i) = RUN_UNTIL_ADDRESS / 4) then
+        run_until(31 downto 0) <= data_i(31 downto 0);
+      end if;
+      if (write_i = '1' and unsigned(word_i) = RUN_UNTIL_ADDRESS / 4 + 1) then
+        run_until(63 downto 32) <= data_i(31 downto 0);
+      end if;
+      if (write_i = '1' and unsigned(word_i) = START_ADDRESS / 4) then
+        start(31 downto 0) <= data_i(31 downto 0);
+      end if;
+      if (write_i = '1' and unsigned(word_i) = RESUME_ADDRESS / 4) then
+        resume(31 downto 0) <= data_i(31 downto 0);
+      end if;
+      if (write_i = '1' and unsigned(word_i) = HALT_ADDRESS / 4) then
+        halt(31 downto 0) <= data_i(31 downto 0);
+      end if;
+      if (write_i = '1' and unsigned(word_i) = HALT_ADDRESS / 4 + 1) then
+        halt(63 downto 32) <= data_i(31 downto 0);
+      end if;
+      if (write_i = '1' and unsigned(word_i) = HALT_ADDRESS / 4 + 2) then
+        halt(95 downto 64) <= data_i(31 downto 0);
+      end if;
+      if (write_i = '1' and unsigned(word_i) = HALT_ADDRESS / 4 + 3) then
+        halt(127 downto 96) <= data_i(31 downto 0);
+      end if;
+      if (write_i = '1' and unsigned(word_i) = HALT_ADDRESS / 4 + 4) then
+        halt(159 downto 128) <= data_i(31 downto 0);
+      end if;
+      if (write_i = '1' and unsigned(word_i) = HALT_ADDRESS / 4 + 5) then
+        halt(191 downto 160) <= data_i(31 downto 0);
+      end if;
+      if (write_i = '1' and unsigned(word_i) = HALT_ADDRESS / 4 + 6) then
+        halt(223 downto 192) <= data_i(31 downto 0);
+      end if;
+      if (write_i = '1' and unsigned(word_i) = HALT_ADDRESS / 4 + 7) then
+        halt(255 downto 224) <= data_i(31 downto 0);
+      end if;
       if (rst_i = '1') then
         liveness <= x"00000000";
         control <= x"00000000";
@@ -89,92 +146,6 @@ begin
         start <= x"00000000";
         resume <= x"00000000";
         halt <= x"00000000" & x"00000000" & x"00000000" & x"00000000" & x"00000000" & x"00000000" & x"00000000" & x"00000000";
-      elsif (write_i = '1') then
-
-        case to_integer(unsigned(word_i)) is
-
-          when LIVENESS_ADDRESS / 4 =>
-
-            liveness(31 downto 0) <= data_i(31 downto 0);
-
-          when CONTROL_ADDRESS / 4 =>
-
-            control(1 downto 0) <= data_i(1 downto 0);
-
-          when TARGET_COUNT_ADDRESS / 4 =>
-
-            target_count(31 downto 0) <= data_i(31 downto 0);
-
-          when MAX_CYCLES_ADDRESS / 4 =>
-
-            max_cycles(31 downto 0) <= data_i(31 downto 0);
-
-          when MAX_CYCLES_ADDRESS / 4 + 1 =>
-
-            max_cycles(63 downto 32) <= data_i(31 downto 0);
-
-          when BANK_ADDRESS / 4 =>
-
-            bank(31 downto 0) <= data_i(31 downto 0);
-
-          when PRIOR_SELECT_ADDRESS / 4 =>
-
-            prior_select(31 downto 0) <= data_i(31 downto 0);
-
-          when RUN_UNTIL_ADDRESS / 4 =>
-
-            run_until(31 downto 0) <= data_i(31 downto 0);
-
-          when RUN_UNTIL_ADDRESS / 4 + 1 =>
-
-            run_until(63 downto 32) <= data_i(31 downto 0);
-
-          when START_ADDRESS / 4 =>
-
-            start(31 downto 0) <= data_i(31 downto 0);
-
-          when RESUME_ADDRESS / 4 =>
-
-            resume(31 downto 0) <= data_i(31 downto 0);
-
-          when HALT_ADDRESS / 4 =>
-
-            halt(31 downto 0) <= data_i(31 downto 0);
-
-          when HALT_ADDRESS / 4 + 1 =>
-
-            halt(63 downto 32) <= data_i(31 downto 0);
-
-          when HALT_ADDRESS / 4 + 2 =>
-
-            halt(95 downto 64) <= data_i(31 downto 0);
-
-          when HALT_ADDRESS / 4 + 3 =>
-
-            halt(127 downto 96) <= data_i(31 downto 0);
-
-          when HALT_ADDRESS / 4 + 4 =>
-
-            halt(159 downto 128) <= data_i(31 downto 0);
-
-          when HALT_ADDRESS / 4 + 5 =>
-
-            halt(191 downto 160) <= data_i(31 downto 0);
-
-          when HALT_ADDRESS / 4 + 6 =>
-
-            halt(223 downto 192) <= data_i(31 downto 0);
-
-          when HALT_ADDRESS / 4 + 7 =>
-
-            halt(255 downto 224) <= data_i(31 downto 0);
-
-          when others =>
-
-            null;
-
-        end case;
-
       end if;
     end if;
 
@@ -191,328 +162,264 @@ begin
   resume_o <= resume;
   halt_o <= halt;
 
+  -- Reading a low word holds the high one until that is read, so that the pair is never torn.
+  hold_high_words : process (clk_i) is
+  begin
+
+    if rising_edge(clk_i) then
+      if (read_i = '1' and unsigned(word_i) = CYCLES_ADDRESS / 4) then
+        cycles_high <= cycles_i(63 downto 32);
+        cycles_held <= '1';
+      end if;
+      if (rst_i = '1' or (read_i = '1' and unsigned(word_i) = CYCLES_ADDRESS / 4 + 1)) then
+        cycles_held <= '0';
+      end if;
+      if (read_i = '1' and unsigned(word_i) = COMPUTE_NS_ADDRESS / 4) then
+        compute_ns_high <= compute_ns_i(63 downto 32);
+        compute_ns_held <= '1';
+      end if;
+      if (rst_i = '1' or (read_i = '1' and unsigned(word_i) = COMPUTE_NS_ADDRESS / 4 + 1)) then
+        compute_ns_held <= '0';
+      end if;
+    end if;
+
+  end process hold_high_words;
+
   select_word : process (clk_i) is
+
+    variable found : std_logic_vector(31 downto 0);
+
   begin
 
     if rising_edge(clk_i) then
       if (read_i = '1') then
-
-        case to_integer(unsigned(word_i)) is
-
-          when ID_ADDRESS / 4 =>
-
-            data_o <= x"31304D42";
-
-          when MAP_VERSION_ADDRESS / 4 =>
-
-            data_o <= x"00010001";
-
-          when LIVENESS_ADDRESS / 4 =>
-
-            data_o <= liveness_i(31 downto 0);
-
-          when PROGRAMMED_ADDRESS / 4 =>
-
-            data_o <= programmed_i(31 downto 0);
-
-          when MAP_HASH_ADDRESS / 4 =>
-
-            data_o <= map_hash_i(31 downto 0);
-
-          when MAP_HASH_ADDRESS / 4 + 1 =>
-
-            data_o <= map_hash_i(63 downto 32);
-
-          when MAP_HASH_ADDRESS / 4 + 2 =>
-
-            data_o <= map_hash_i(95 downto 64);
-
-          when MAP_HASH_ADDRESS / 4 + 3 =>
-
-            data_o <= map_hash_i(127 downto 96);
-
-          when MAP_HASH_ADDRESS / 4 + 4 =>
-
-            data_o <= map_hash_i(159 downto 128);
-
-          when MAP_HASH_ADDRESS / 4 + 5 =>
-
-            data_o <= map_hash_i(191 downto 160);
-
-          when MAP_HASH_ADDRESS / 4 + 6 =>
-
-            data_o <= map_hash_i(223 downto 192);
-
-          when MAP_HASH_ADDRESS / 4 + 7 =>
-
-            data_o <= map_hash_i(255 downto 224);
-
-          when IMAGE_HASH_ADDRESS / 4 =>
-
-            data_o <= image_hash_i(31 downto 0);
-
-          when IMAGE_HASH_ADDRESS / 4 + 1 =>
-
-            data_o <= image_hash_i(63 downto 32);
-
-          when IMAGE_HASH_ADDRESS / 4 + 2 =>
-
-            data_o <= image_hash_i(95 downto 64);
-
-          when IMAGE_HASH_ADDRESS / 4 + 3 =>
-
-            data_o <= image_hash_i(127 downto 96);
-
-          when IMAGE_HASH_ADDRESS / 4 + 4 =>
-
-            data_o <= image_hash_i(159 downto 128);
-
-          when IMAGE_HASH_ADDRESS / 4 + 5 =>
-
-            data_o <= image_hash_i(191 downto 160);
-
-          when IMAGE_HASH_ADDRESS / 4 + 6 =>
-
-            data_o <= image_hash_i(223 downto 192);
-
-          when IMAGE_HASH_ADDRESS / 4 + 7 =>
-
-            data_o <= image_hash_i(255 downto 224);
-
-          when CAP_MACHINE_ADDRESS / 4 =>
-
-            data_o <= cap_machine_i(31 downto 0);
-
-          when CAP_LINES_ADDRESS / 4 =>
-
-            data_o <= cap_lines_i(31 downto 0);
-
-          when CAP_TOTAL_LINES_ADDRESS / 4 =>
-
-            data_o <= cap_total_lines_i(31 downto 0);
-
-          when CAP_LINE_OFFSET_ADDRESS / 4 =>
-
-            data_o <= cap_line_offset_i(31 downto 0);
-
-          when CAP_PARTITION_ADDRESS / 4 =>
-
-            data_o <= cap_partition_i(31 downto 0);
-
-          when CAP_SENSORS_ADDRESS / 4 =>
-
-            data_o <= cap_sensors_i(31 downto 0);
-
-          when CAP_WIDTHS_ADDRESS / 4 =>
-
-            data_o <= cap_widths_i(31 downto 0);
-
-          when CAP_BANKS_ADDRESS / 4 =>
-
-            data_o <= cap_banks_i(31 downto 0);
-
-          when CAP_REPLICAS_ADDRESS / 4 =>
-
-            data_o <= cap_replicas_i(31 downto 0);
-
-          when CAP_INTERFACE_ADDRESS / 4 =>
-
-            data_o <= cap_interface_i(31 downto 0);
-
-          when CAP_SPEED_ADDRESS / 4 =>
-
-            data_o <= cap_speed_i(31 downto 0);
-
-          when CAP_STEPS_ADDRESS / 4 =>
-
-            data_o <= cap_steps_i(31 downto 0);
-
-          when CAP_SENSOR_BITS_ADDRESS / 4 =>
-
-            data_o <= cap_sensor_bits_i(31 downto 0);
-
-          when CAP_SENSOR_BITS_ADDRESS / 4 + 1 =>
-
-            data_o <= cap_sensor_bits_i(63 downto 32);
-
-          when CAP_SENSOR_BITS_ADDRESS / 4 + 2 =>
-
-            data_o <= cap_sensor_bits_i(95 downto 64);
-
-          when CAP_SENSOR_BITS_ADDRESS / 4 + 3 =>
-
-            data_o <= cap_sensor_bits_i(127 downto 96);
-
-          when CAP_SENSOR_BITS_ADDRESS / 4 + 4 =>
-
-            data_o <= cap_sensor_bits_i(159 downto 128);
-
-          when CAP_SENSOR_BITS_ADDRESS / 4 + 5 =>
-
-            data_o <= cap_sensor_bits_i(191 downto 160);
-
-          when CAP_SENSOR_BITS_ADDRESS / 4 + 6 =>
-
-            data_o <= cap_sensor_bits_i(223 downto 192);
-
-          when CAP_SENSOR_BITS_ADDRESS / 4 + 7 =>
-
-            data_o <= cap_sensor_bits_i(255 downto 224);
-
-          when CAP_SENSOR_BITS_ADDRESS / 4 + 8 =>
-
-            data_o <= cap_sensor_bits_i(287 downto 256);
-
-          when CAP_SENSOR_BITS_ADDRESS / 4 + 9 =>
-
-            data_o <= cap_sensor_bits_i(319 downto 288);
-
-          when CAP_SENSOR_BITS_ADDRESS / 4 + 10 =>
-
-            data_o <= cap_sensor_bits_i(351 downto 320);
-
-          when CAP_SENSOR_BITS_ADDRESS / 4 + 11 =>
-
-            data_o <= cap_sensor_bits_i(383 downto 352);
-
-          when CAP_SENSOR_BITS_ADDRESS / 4 + 12 =>
-
-            data_o <= cap_sensor_bits_i(415 downto 384);
-
-          when CAP_SENSOR_BITS_ADDRESS / 4 + 13 =>
-
-            data_o <= cap_sensor_bits_i(447 downto 416);
-
-          when CAP_SENSOR_BITS_ADDRESS / 4 + 14 =>
-
-            data_o <= cap_sensor_bits_i(479 downto 448);
-
-          when CAP_SENSOR_BITS_ADDRESS / 4 + 15 =>
-
-            data_o <= cap_sensor_bits_i(511 downto 480);
-
-          when CONTROL_ADDRESS / 4 =>
-
-            data_o <= control(31 downto 0) and x"00000002";
-
-          when TARGET_COUNT_ADDRESS / 4 =>
-
-            data_o <= target_count(31 downto 0);
-
-          when MAX_CYCLES_ADDRESS / 4 =>
-
-            data_o <= max_cycles(31 downto 0);
-
-          when MAX_CYCLES_ADDRESS / 4 + 1 =>
-
-            data_o <= max_cycles(63 downto 32);
-
-          when BANK_ADDRESS / 4 =>
-
-            data_o <= bank(31 downto 0);
-
-          when PRIOR_SELECT_ADDRESS / 4 =>
-
-            data_o <= prior_select(31 downto 0);
-
-          when RUN_UNTIL_ADDRESS / 4 =>
-
-            data_o <= run_until(31 downto 0);
-
-          when RUN_UNTIL_ADDRESS / 4 + 1 =>
-
-            data_o <= run_until(63 downto 32);
-
-          when START_ADDRESS / 4 =>
-
-            data_o <= start(31 downto 0);
-
-          when RESUME_ADDRESS / 4 =>
-
-            data_o <= resume(31 downto 0);
-
-          when DONE_ADDRESS / 4 =>
-
-            data_o <= done_i(31 downto 0);
-
-          when STATUS_ADDRESS / 4 =>
-
-            data_o <= status_i(31 downto 0);
-
-          when CYCLES_ADDRESS / 4 =>
-
-            data_o <= cycles_i(31 downto 0);
-            -- the high word is held until it is read, so that the pair is never torn
-            cycles_high <= cycles_i(63 downto 32);
-            cycles_held <= '1';
-
-          when CYCLES_ADDRESS / 4 + 1 =>
-
-            if (cycles_held = '1') then
-              data_o <= cycles_high;
-            else
-              data_o <= cycles_i(63 downto 32);
-            end if;
-            cycles_held <= '0';
-
-          when COMPUTE_NS_ADDRESS / 4 =>
-
-            data_o <= compute_ns_i(31 downto 0);
-            -- the high word is held until it is read, so that the pair is never torn
-            compute_ns_high <= compute_ns_i(63 downto 32);
-            compute_ns_held <= '1';
-
-          when COMPUTE_NS_ADDRESS / 4 + 1 =>
-
-            if (compute_ns_held = '1') then
-              data_o <= compute_ns_high;
-            else
-              data_o <= compute_ns_i(63 downto 32);
-            end if;
-            compute_ns_held <= '0';
-
-          when HALT_ADDRESS / 4 =>
-
-            data_o <= halt(31 downto 0);
-
-          when HALT_ADDRESS / 4 + 1 =>
-
-            data_o <= halt(63 downto 32);
-
-          when HALT_ADDRESS / 4 + 2 =>
-
-            data_o <= halt(95 downto 64);
-
-          when HALT_ADDRESS / 4 + 3 =>
-
-            data_o <= halt(127 downto 96);
-
-          when HALT_ADDRESS / 4 + 4 =>
-
-            data_o <= halt(159 downto 128);
-
-          when HALT_ADDRESS / 4 + 5 =>
-
-            data_o <= halt(191 downto 160);
-
-          when HALT_ADDRESS / 4 + 6 =>
-
-            data_o <= halt(223 downto 192);
-
-          when HALT_ADDRESS / 4 + 7 =>
-
-            data_o <= halt(255 downto 224);
-
-          when others =>
-
-            data_o <= (others => '0');
-
-        end case;
-
-      end if;
-      if (rst_i = '1') then
-        cycles_held <= '0';
-        compute_ns_held <= '0';
+        -- one at most is not 0
+        found := (others => '0');
+        if (unsigned(word_i) = ID_ADDRESS / 4) then
+          found := found or x"31304D42";
+        end if;
+        if (unsigned(word_i) = MAP_VERSION_ADDRESS / 4) then
+          found := found or x"00010001";
+        end if;
+        if (unsigned(word_i) = LIVENESS_ADDRESS / 4) then
+          found := found or liveness_i(31 downto 0);
+        end if;
+        if (unsigned(word_i) = PROGRAMMED_ADDRESS / 4) then
+          found := found or programmed_i(31 downto 0);
+        end if;
+        if (unsigned(word_i) = MAP_HASH_ADDRESS / 4) then
+          found := found or map_hash_i(31 downto 0);
+        end if;
+        if (unsigned(word_i) = MAP_HASH_ADDRESS / 4 + 1) then
+          found := found or map_hash_i(63 downto 32);
+        end if;
+        if (unsigned(word_i) = MAP_HASH_ADDRESS / 4 + 2) then
+          found := found or map_hash_i(95 downto 64);
+        end if;
+        if (unsigned(word_i) = MAP_HASH_ADDRESS / 4 + 3) then
+          found := found or map_hash_i(127 downto 96);
+        end if;
+        if (unsigned(word_i) = MAP_HASH_ADDRESS / 4 + 4) then
+          found := found or map_hash_i(159 downto 128);
+        end if;
+        if (unsigned(word_i) = MAP_HASH_ADDRESS / 4 + 5) then
+          found := found or map_hash_i(191 downto 160);
+        end if;
+        if (unsigned(word_i) = MAP_HASH_ADDRESS / 4 + 6) then
+          found := found or map_hash_i(223 downto 192);
+        end if;
+        if (unsigned(word_i) = MAP_HASH_ADDRESS / 4 + 7) then
+          found := found or map_hash_i(255 downto 224);
+        end if;
+        if (unsigned(word_i) = IMAGE_HASH_ADDRESS / 4) then
+          found := found or image_hash_i(31 downto 0);
+        end if;
+        if (unsigned(word_i) = IMAGE_HASH_ADDRESS / 4 + 1) then
+          found := found or image_hash_i(63 downto 32);
+        end if;
+        if (unsigned(word_i) = IMAGE_HASH_ADDRESS / 4 + 2) then
+          found := found or image_hash_i(95 downto 64);
+        end if;
+        if (unsigned(word_i) = IMAGE_HASH_ADDRESS / 4 + 3) then
+          found := found or image_hash_i(127 downto 96);
+        end if;
+        if (unsigned(word_i) = IMAGE_HASH_ADDRESS / 4 + 4) then
+          found := found or image_hash_i(159 downto 128);
+        end if;
+        if (unsigned(word_i) = IMAGE_HASH_ADDRESS / 4 + 5) then
+          found := found or image_hash_i(191 downto 160);
+        end if;
+        if (unsigned(word_i) = IMAGE_HASH_ADDRESS / 4 + 6) then
+          found := found or image_hash_i(223 downto 192);
+        end if;
+        if (unsigned(word_i) = IMAGE_HASH_ADDRESS / 4 + 7) then
+          found := found or image_hash_i(255 downto 224);
+        end if;
+        if (unsigned(word_i) = CAP_MACHINE_ADDRESS / 4) then
+          found := found or cap_machine_i(31 downto 0);
+        end if;
+        if (unsigned(word_i) = CAP_LINES_ADDRESS / 4) then
+          found := found or cap_lines_i(31 downto 0);
+        end if;
+        if (unsigned(word_i) = CAP_TOTAL_LINES_ADDRESS / 4) then
+          found := found or cap_total_lines_i(31 downto 0);
+        end if;
+        if (unsigned(word_i) = CAP_LINE_OFFSET_ADDRESS / 4) then
+          found := found or cap_line_offset_i(31 downto 0);
+        end if;
+        if (unsigned(word_i) = CAP_PARTITION_ADDRESS / 4) then
+          found := found or cap_partition_i(31 downto 0);
+        end if;
+        if (unsigned(word_i) = CAP_SENSORS_ADDRESS / 4) then
+          found := found or cap_sensors_i(31 downto 0);
+        end if;
+        if (unsigned(word_i) = CAP_WIDTHS_ADDRESS / 4) then
+          found := found or cap_widths_i(31 downto 0);
+        end if;
+        if (unsigned(word_i) = CAP_BANKS_ADDRESS / 4) then
+          found := found or cap_banks_i(31 downto 0);
+        end if;
+        if (unsigned(word_i) = CAP_REPLICAS_ADDRESS / 4) then
+          found := found or cap_replicas_i(31 downto 0);
+        end if;
+        if (unsigned(word_i) = CAP_INTERFACE_ADDRESS / 4) then
+          found := found or cap_interface_i(31 downto 0);
+        end if;
+        if (unsigned(word_i) = CAP_SPEED_ADDRESS / 4) then
+          found := found or cap_speed_i(31 downto 0);
+        end if;
+        if (unsigned(word_i) = CAP_STEPS_ADDRESS / 4) then
+          found := found or cap_steps_i(31 downto 0);
+        end if;
+        if (unsigned(word_i) = CAP_SENSOR_BITS_ADDRESS / 4) then
+          found := found or cap_sensor_bits_i(31 downto 0);
+        end if;
+        if (unsigned(word_i) = CAP_SENSOR_BITS_ADDRESS / 4 + 1) then
+          found := found or cap_sensor_bits_i(63 downto 32);
+        end if;
+        if (unsigned(word_i) = CAP_SENSOR_BITS_ADDRESS / 4 + 2) then
+          found := found or cap_sensor_bits_i(95 downto 64);
+        end if;
+        if (unsigned(word_i) = CAP_SENSOR_BITS_ADDRESS / 4 + 3) then
+          found := found or cap_sensor_bits_i(127 downto 96);
+        end if;
+        if (unsigned(word_i) = CAP_SENSOR_BITS_ADDRESS / 4 + 4) then
+          found := found or cap_sensor_bits_i(159 downto 128);
+        end if;
+        if (unsigned(word_i) = CAP_SENSOR_BITS_ADDRESS / 4 + 5) then
+          found := found or cap_sensor_bits_i(191 downto 160);
+        end if;
+        if (unsigned(word_i) = CAP_SENSOR_BITS_ADDRESS / 4 + 6) then
+          found := found or cap_sensor_bits_i(223 downto 192);
+        end if;
+        if (unsigned(word_i) = CAP_SENSOR_BITS_ADDRESS / 4 + 7) then
+          found := found or cap_sensor_bits_i(255 downto 224);
+        end if;
+        if (unsigned(word_i) = CAP_SENSOR_BITS_ADDRESS / 4 + 8) then
+          found := found or cap_sensor_bits_i(287 downto 256);
+        end if;
+        if (unsigned(word_i) = CAP_SENSOR_BITS_ADDRESS / 4 + 9) then
+          found := found or cap_sensor_bits_i(319 downto 288);
+        end if;
+        if (unsigned(word_i) = CAP_SENSOR_BITS_ADDRESS / 4 + 10) then
+          found := found or cap_sensor_bits_i(351 downto 320);
+        end if;
+        if (unsigned(word_i) = CAP_SENSOR_BITS_ADDRESS / 4 + 11) then
+          found := found or cap_sensor_bits_i(383 downto 352);
+        end if;
+        if (unsigned(word_i) = CAP_SENSOR_BITS_ADDRESS / 4 + 12) then
+          found := found or cap_sensor_bits_i(415 downto 384);
+        end if;
+        if (unsigned(word_i) = CAP_SENSOR_BITS_ADDRESS / 4 + 13) then
+          found := found or cap_sensor_bits_i(447 downto 416);
+        end if;
+        if (unsigned(word_i) = CAP_SENSOR_BITS_ADDRESS / 4 + 14) then
+          found := found or cap_sensor_bits_i(479 downto 448);
+        end if;
+        if (unsigned(word_i) = CAP_SENSOR_BITS_ADDRESS / 4 + 15) then
+          found := found or cap_sensor_bits_i(511 downto 480);
+        end if;
+        if (unsigned(word_i) = CONTROL_ADDRESS / 4) then
+          found := found or (control(31 downto 0) and x"00000002");
+        end if;
+        if (unsigned(word_i) = TARGET_COUNT_ADDRESS / 4) then
+          found := found or target_count(31 downto 0);
+        end if;
+        if (unsigned(word_i) = MAX_CYCLES_ADDRESS / 4) then
+          found := found or max_cycles(31 downto 0);
+        end if;
+        if (unsigned(word_i) = MAX_CYCLES_ADDRESS / 4 + 1) then
+          found := found or max_cycles(63 downto 32);
+        end if;
+        if (unsigned(word_i) = BANK_ADDRESS / 4) then
+          found := found or bank(31 downto 0);
+        end if;
+        if (unsigned(word_i) = PRIOR_SELECT_ADDRESS / 4) then
+          found := found or prior_select(31 downto 0);
+        end if;
+        if (unsigned(word_i) = RUN_UNTIL_ADDRESS / 4) then
+          found := found or run_until(31 downto 0);
+        end if;
+        if (unsigned(word_i) = RUN_UNTIL_ADDRESS / 4 + 1) then
+          found := found or run_until(63 downto 32);
+        end if;
+        if (unsigned(word_i) = START_ADDRESS / 4) then
+          found := found or start(31 downto 0);
+        end if;
+        if (unsigned(word_i) = RESUME_ADDRESS / 4) then
+          found := found or resume(31 downto 0);
+        end if;
+        if (unsigned(word_i) = DONE_ADDRESS / 4) then
+          found := found or done_i(31 downto 0);
+        end if;
+        if (unsigned(word_i) = STATUS_ADDRESS / 4) then
+          found := found or status_i(31 downto 0);
+        end if;
+        if (unsigned(word_i) = CYCLES_ADDRESS / 4) then
+          found := found or cycles_i(31 downto 0);
+        end if;
+        if (unsigned(word_i) = CYCLES_ADDRESS / 4 + 1) then
+          if (cycles_held = '1') then
+            found := found or cycles_high;
+          else
+            found := found or cycles_i(63 downto 32);
+          end if;
+        end if;
+        if (unsigned(word_i) = COMPUTE_NS_ADDRESS / 4) then
+          found := found or compute_ns_i(31 downto 0);
+        end if;
+        if (unsigned(word_i) = COMPUTE_NS_ADDRESS / 4 + 1) then
+          if (compute_ns_held = '1') then
+            found := found or compute_ns_high;
+          else
+            found := found or compute_ns_i(63 downto 32);
+          end if;
+        end if;
+        if (unsigned(word_i) = HALT_ADDRESS / 4) then
+          found := found or halt(31 downto 0);
+        end if;
+        if (unsigned(word_i) = HALT_ADDRESS / 4 + 1) then
+          found := found or halt(63 downto 32);
+        end if;
+        if (unsigned(word_i) = HALT_ADDRESS / 4 + 2) then
+          found := found or halt(95 downto 64);
+        end if;
+        if (unsigned(word_i) = HALT_ADDRESS / 4 + 3) then
+          found := found or halt(127 downto 96);
+        end if;
+        if (unsigned(word_i) = HALT_ADDRESS / 4 + 4) then
+          found := found or halt(159 downto 128);
+        end if;
+        if (unsigned(word_i) = HALT_ADDRESS / 4 + 5) then
+          found := found or halt(191 downto 160);
+        end if;
+        if (unsigned(word_i) = HALT_ADDRESS / 4 + 6) then
+          found := found or halt(223 downto 192);
+        end if;
+        if (unsigned(word_i) = HALT_ADDRESS / 4 + 7) then
+          found := found or halt(255 downto 224);
+        end if;
+        data_o <= found;
       end if;
     end if;
 

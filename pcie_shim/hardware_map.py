@@ -248,91 +248,96 @@ def _reset(register: Register) -> str:
 
 
 def _writes(registers: tuple[Register, ...]) -> list[str]:
+    """Return the process that stores what software writes.
+
+    Every word is decided by itself: GHDL 2.0 writes a case without what holds otherwise into its Verilog, which makes latches.
+    """
     written = [register for register in registers if register.written]
     lines = ["  store : process (clk_i) is", "  begin", "", "    if rising_edge(clk_i) then"]
     for register in written:
         lines += [f"      {register.name}({bit}) <= '0';" for bit in _bits(register.pulsed)]
-    lines += ["      if (rst_i = '1') then"]
-    lines += [f"        {register.name} <= {_reset(register)};" for register in written]
-    lines += ["      elsif (write_i = '1') then", "", "        case to_integer(unsigned(word_i)) is", ""]
-    for register in written:
         for word in range(register.words):
-            lines += [f"          when {register.choice(word)} =>", ""]
+            lines.append(f"      if (write_i = '1' and unsigned(word_i) = {register.choice(word)}) then")
             mask = register.stored | register.pulsed
             lines += [
-                f"            {register.name}({32 * word + high} downto {32 * word + low}) <= data_i({high} downto {low});"
+                f"        {register.name}({32 * word + high} downto {32 * word + low}) <= data_i({high} downto {low});"
                 for low, high in _runs(mask)
             ]
-            lines.append("")
-    lines += [
-        "          when others =>",
-        "",
-        "            null;",
-        "",
-        "        end case;",
-        "",
-        "      end if;",
-        "    end if;",
-        "",
-        "  end process store;",
-        "",
-    ]
+            lines.append("      end if;")
+    lines += ["      if (rst_i = '1') then"]
+    lines += [f"        {register.name} <= {_reset(register)};" for register in written]
+    lines += ["      end if;", "    end if;", "", "  end process store;", ""]
     lines += [f"  {register.name}_o <= {register.name};" for register in written]
     return [*lines, ""]
 
 
 def _reads(registers: tuple[Register, ...]) -> list[str]:
-    lines = ["  select_word : process (clk_i) is", "  begin", "", "    if rising_edge(clk_i) then"]
+    """Return the processes that hold high words and select what software reads."""
     latched = [register for register in registers if register.latched]
-    lines.append("      if (read_i = '1') then")
-    lines += ["", "        case to_integer(unsigned(word_i)) is", ""]
+    lines = [
+        "  -- Reading a low word holds the high one until that is read, so that the pair is never torn.",
+        "  hold_high_words : process (clk_i) is",
+        "  begin",
+        "",
+        "    if rising_edge(clk_i) then",
+    ]
+    for register in latched:
+        lines += [
+            f"      if (read_i = '1' and unsigned(word_i) = {register.choice(0)}) then",
+            f"        {register.name}_high <= {register.name}_i(63 downto 32);",
+            f"        {register.name}_held <= '1';",
+            "      end if;",
+            f"      if (rst_i = '1' or (read_i = '1' and unsigned(word_i) = {register.choice(1)})) then",
+            f"        {register.name}_held <= '0';",
+            "      end if;",
+        ]
+    lines += ["    end if;", "", "  end process hold_high_words;", ""]
+    lines += [
+        "  select_word : process (clk_i) is",
+        "",
+        "    variable found : std_logic_vector(31 downto 0);",
+        "",
+        "  begin",
+        "",
+        "    if rising_edge(clk_i) then",
+        "      if (read_i = '1') then",
+        "        -- one at most is not 0",
+        "        found := (others => '0');",
+    ]
     for register in registers:
         for word in range(register.words):
-            lines += [f"          when {register.choice(word)} =>", ""]
-            lines += [f"            {line}" for line in _read(register, word)]
-            lines.append("")
-    lines += [
-        "          when others =>",
+            lines.append(f"        if (unsigned(word_i) = {register.choice(word)}) then")
+            lines += [f"          {line}" for line in _read(register, word)]
+            lines.append("        end if;")
+    return [
+        *lines,
+        "        data_o <= found;",
+        "      end if;",
+        "    end if;",
         "",
-        "            data_o <= (others => '0');",
-        "",
-        "        end case;",
+        "  end process select_word;",
         "",
     ]
-    lines += ["      end if;"]
-    if latched:
-        lines.append("      if (rst_i = '1') then")
-        lines += [f"        {register.name}_held <= '0';" for register in latched]
-        lines.append("      end if;")
-    return [*lines, "    end if;", "", "  end process select_word;", ""]
 
 
 def _read(register: Register, word: int) -> list[str]:
     """Return the statements that answer the read of a word."""
     part = f"({32 * word + 31} downto {32 * word})"
-    if register.latched and word == 0:
-        return [
-            f"data_o <= {register.name}_i{part};",
-            "-- the high word is held until it is read, so that the pair is never torn",
-            f"{register.name}_high <= {register.name}_i(63 downto 32);",
-            f"{register.name}_held <= '1';",
-        ]
-    if register.latched:
+    if register.latched and word == 1:
         return [
             f"if ({register.name}_held = '1') then",
-            f"  data_o <= {register.name}_high;",
+            f"  found := found or {register.name}_high;",
             "else",
-            f"  data_o <= {register.name}_i{part};",
+            f"  found := found or {register.name}_i{part};",
             "end if;",
-            f"{register.name}_held <= '0';",
         ]
     if register.driven:
-        return [f"data_o <= {register.name}_i{part};"]
+        return [f"found := found or {register.name}_i{part};"]
     if register.stored:
-        if register.stored == 0xFFFFFFFF:
-            return [f"data_o <= {register.name}{part};"]
-        return [f"data_o <= {register.name}{part} and {_literal(register.stored)};"]
-    return [f"data_o <= {_literal(register.constant)};"]
+        mask = "" if register.stored == 0xFFFFFFFF else f" and {_literal(register.stored)}"
+        stored = f"{register.name}{part}{mask}"
+        return [f"found := found or ({stored});" if mask else f"found := found or {stored};"]
+    return [f"found := found or {_literal(register.constant)};"]
 
 
 def _bits(mask: int) -> list[int]:

@@ -144,9 +144,10 @@ def run_tool(
     command: Sequence[str],
     folder: Path,
     environment: Mapping[str, str] | None = None,
-    limit: float = _LIMIT_S,
+    *,
+    separate: bool = False,
 ) -> str:
-    """Run a tool in a folder and return what it printed.
+    """Run a tool in a folder and return what it printed: with `separate`, its output without its warnings.
 
     Raises:
         HardwareToolError: It is not installed, failed, or did not end in time.
@@ -156,12 +157,22 @@ def run_tool(
         raise HardwareToolError(message)
     try:
         done = subprocess.run(
-            command, check=True, cwd=folder, env=environment, capture_output=True, text=True, timeout=limit
+            command, check=True, cwd=folder, env=environment, capture_output=True, text=True, timeout=_LIMIT_S
         )
     except subprocess.TimeoutExpired:
-        message = f"{command[0]} did not end within {limit:.0f} s"
+        message = f"{command[0]} did not end within {_LIMIT_S:.0f} s"
         raise HardwareToolError(message) from None
     except subprocess.CalledProcessError as error:
         message = f"{command[0]} failed: {(error.stdout + error.stderr).strip()[-1500:]}"
         raise HardwareToolError(message) from None
-    return done.stdout + done.stderr
+    return done.stdout if separate else done.stdout + done.stderr
+
+
+def unit_benches() -> dict[str, tuple[str, dict[str, int]]]:
+    """Return the benches of single units: each one's module, and the unit with its generics."""
+    from hdl.test.guard_generics import GENERICS
+
+    return {
+        "hdl.test.bench_register_block": ("bm_register_block", {}),
+        "hdl.test.bench_guard": ("bm1_guard", GENERICS),
+    }

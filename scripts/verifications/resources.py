@@ -6,12 +6,13 @@ Runs `tests/verification/resources`, a line for each machine.
 from __future__ import annotations
 
 import argparse
-import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+
+from scripts.verifications.debian import MissingToolError, install
 
 FOLDER = Path(__file__).parents[2] / "tests" / "verification" / "resources"
 
@@ -63,12 +64,10 @@ def main() -> int:
     arguments = parser.parse_args()
     tools = [] if arguments.calibrate else ["iverilog"]
     tools += [] if arguments.simulate_only else ["yosys"]
-    absent = [tool for tool in tools if shutil.which(tool) is None]
-    if absent:
-        print(
-            f"error: {' and '.join(absent)} not found; Debian: apt-get install iverilog yosys",
-            file=sys.stderr,
-        )
+    try:
+        install({tool: tool for tool in tools})
+    except MissingToolError as error:
+        print(f"error: {error}", file=sys.stderr)
         return 2
     if arguments.calibrate:
         return subprocess.run(

