@@ -43,10 +43,10 @@ MUTANTS: Final = (
         "",
     ),
     Mutant(
-        "a tap of the LFSR is lost",
+        "a tap of the LFSR is another one",
         "bm1_lfsr.vhd",
         "(xor (following and TAPS))",
-        "(xor (following(STATE_BITS - 1 downto 1) and TAPS(STATE_BITS - 1 downto 1)))",
+        "((xor (following and TAPS)) xor following(0))",
     ),
     Mutant(
         "the LFSR shifts right",
@@ -235,6 +235,7 @@ def caught_by(mutant: Mutant) -> tuple[Check, str] | None:
     The cheap checks are tried first, and proofs before sessions.
 
     Raises:
+        HardwareToolError: A tool refuses the mutant: that finds no mistake.
         ValueError: The text that the mutant replaces is not in its file, or is there twice.
     """
     with tempfile.TemporaryDirectory(prefix="mutant-rosbayes-") as where:

@@ -16,6 +16,7 @@ from pcie_shim.board.emulated_board import EmulatedBoard, RefusedError
 from pcie_shim.programming_file import Image, Partition, image_bytes, interface_words
 from pcie_shim.register_layout import next_doorbell
 from pcie_shim.register_map import BoardState, ErrorCode
+
 if TYPE_CHECKING:
     from pathlib import Path
 

@@ -9,7 +9,7 @@ from typing import Final
 
 from hdl.test.proofs import failed_proof, proofs
 from hdl.test.random_machines import random_case
-from hdl.test.simulation import HDL, HardwareToolError, prepare, run_bench, unit_benches
+from hdl.test.simulation import HDL, prepare, run_bench, unit_benches
 
 BOARD_BENCH: Final = "hdl.test.bench_board"
 _OPTIONS: Final = ("-gMEMORY_FOLDER=Memory_MIFs/",)
@@ -40,25 +40,23 @@ class Check:
         Args:
             hdl: Folder of the VHDL; another one for mutants.
             frames: Frames of a session; None for as many as usual.
+
+        Raises:
+            HardwareToolError: A tool is missing, or refuses the hardware.
         """
         with tempfile.TemporaryDirectory(prefix="hdl-rosbayes-") as where:
             folder = Path(where)
-            try:
-                if self.kind == "proof":
-                    return failed_proof(self.what, folder, hdl)
-                if self.kind == "unit":
-                    top, generics = unit_benches()[self.what]
-                    prepare(random_case(0).image, folder, hdl)
-                    options = [f"-g{name}={value}" for name, value in generics.items()]
-                    outcome = run_bench(self.what, folder, top, options=options)
-                else:
-                    prepare(random_case(int(self.what)).image, folder, hdl)
-                    variables = {"HDL_SEED": self.what} | (
-                        {} if frames is None else {"HDL_FRAMES": str(frames)}
-                    )
-                    outcome = run_bench(BOARD_BENCH, folder, variables=variables, options=_OPTIONS)
-            except HardwareToolError as error:
-                return str(error)
+            if self.kind == "proof":
+                return failed_proof(self.what, folder, hdl)
+            if self.kind == "unit":
+                top, generics = unit_benches()[self.what]
+                prepare(random_case(0).image, folder, hdl)
+                options = [f"-g{name}={value}" for name, value in generics.items()]
+                outcome = run_bench(self.what, folder, top, options=options)
+            else:
+                prepare(random_case(int(self.what)).image, folder, hdl)
+                variables = {"HDL_SEED": self.what} | ({} if frames is None else {"HDL_FRAMES": str(frames)})
+                outcome = run_bench(BOARD_BENCH, folder, variables=variables, options=_OPTIONS)
         return "; ".join(failure.splitlines()[0] for failure in outcome.failures) or None
 
 

@@ -16,6 +16,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
 from hdl.test.mutants import MUTANTS, Mutant, caught_by
+from hdl.test.simulation import HardwareToolError
 from hdl.test.verification import Check, formal, sessions, units
 from scripts.verifications.debian import MissingToolError, install
 
@@ -64,7 +65,10 @@ def _together(run: Callable[[_Item], bool], items: Sequence[_Item]) -> list[bool
 
 def _try_check(check: Check) -> bool:
     began = time.monotonic()
-    why = check.failure()
+    try:
+        why = check.failure()
+    except HardwareToolError as error:
+        why = str(error)
     verdict = "ok  " if why is None else "FAIL"
     print(
         f"{verdict} {check.name}{'' if why is None else f': {why}'} ({time.monotonic() - began:.1f} s)",
@@ -75,7 +79,11 @@ def _try_check(check: Check) -> bool:
 
 def _try_mutant(mutant: Mutant) -> bool:
     began = time.monotonic()
-    found = caught_by(mutant)
+    try:
+        found = caught_by(mutant)
+    except (HardwareToolError, ValueError) as error:
+        print(f"FAIL {mutant.name}: {error}", flush=True)
+        return False
     said = "FAIL nobody finds it" if found is None else f"ok   found by {found[0].name}"
     print(f"{said}: {mutant.name} ({time.monotonic() - began:.1f} s)", flush=True)
     return found is not None
