@@ -3,6 +3,7 @@
 -- A board: the Bayesian machine of bm1_parameters.vhd behind its registers and an AXI4-Lite slave.
 -- MIT licence; datasheet: docs/hardware/bm1.md
 -- ================================================================================================
+
 library ieee;
   use ieee.std_logic_1164.all;
 
@@ -19,26 +20,26 @@ entity bm1 is
   );
   port (
     -- system
-    clk_i         : in    std_logic;                                       -- clock
-    rstn_i        : in    std_logic;                                       -- reset of the board, low active, synchronous
-    irq_o         : out   std_logic;                                       -- one clock: the machine has stopped
+    clk_i  : in    std_logic; -- clock
+    rstn_i : in    std_logic; -- reset of the board, low active, synchronous
+    irq_o  : out   std_logic; -- one clock: the machine has stopped
     -- AXI4-Lite
-    axi_awvalid : in    std_logic;                                       -- write address
+    axi_awvalid : in    std_logic; -- write address
     axi_awready : out   std_logic;
     axi_awaddr  : in    std_logic_vector(BAR_ADDRESS_BITS - 1 downto 0);
     axi_awprot  : in    std_logic_vector(2 downto 0);
-    axi_wvalid  : in    std_logic;                                       -- write data
+    axi_wvalid  : in    std_logic; -- write data
     axi_wready  : out   std_logic;
     axi_wdata   : in    std_logic_vector(31 downto 0);
     axi_wstrb   : in    std_logic_vector(3 downto 0);
-    axi_bvalid  : out   std_logic;                                       -- write response
+    axi_bvalid  : out   std_logic; -- write response
     axi_bready  : in    std_logic;
     axi_bresp   : out   std_logic_vector(1 downto 0);
-    axi_arvalid : in    std_logic;                                       -- read address
+    axi_arvalid : in    std_logic; -- read address
     axi_arready : out   std_logic;
     axi_araddr  : in    std_logic_vector(BAR_ADDRESS_BITS - 1 downto 0);
     axi_arprot  : in    std_logic_vector(2 downto 0);
-    axi_rvalid  : out   std_logic;                                       -- read data
+    axi_rvalid  : out   std_logic; -- read data
     axi_rready  : in    std_logic;
     axi_rdata   : out   std_logic_vector(31 downto 0);
     axi_rresp   : out   std_logic_vector(1 downto 0)
@@ -94,11 +95,11 @@ begin
 
   axi : entity work.bm1_axi
     generic map (
-      ADDRESS_BITS => BAR_ADDRESS_BITS
+      address_bits => BAR_ADDRESS_BITS
     )
     port map (
-      clk_i         => clk_i,
-      rst_i         => rst,
+      clk_i       => clk_i,
+      rst_i       => rst,
       axi_awvalid => axi_awvalid,
       axi_awready => axi_awready,
       axi_awaddr  => axi_awaddr,
@@ -116,41 +117,41 @@ begin
       axi_rready  => axi_rready,
       axi_rdata   => axi_rdata,
       axi_rresp   => axi_rresp,
-      request_o     => request,
-      write_o       => write,
-      address_o     => address,
-      strobe_o      => strobe,
-      data_o        => write_data,
-      respond_i     => respond,
-      refused_i     => refused,
-      data_i        => read_data
+      request_o   => request,
+      write_o     => write,
+      address_o   => address,
+      strobe_o    => strobe,
+      data_o      => write_data,
+      respond_i   => respond,
+      refused_i   => refused,
+      data_i      => read_data
     );
 
   registers : entity work.bm1_registers
     generic map (
-      LINES             => BOARD_LINES,
-      SENSORS           => SENSORS,
-      REPLICAS          => REPLICAS,
-      MODE              => SENSOR_MODE,
-      ADDRESS_BITS      => SENSOR_BITS,
-      PROB_BITS         => PROB_BITS,
-      PRIOR_BITS        => PRIOR_BITS,
-      WRITTEN           => PRIOR_WRITTEN,
-      COUNTER_BITS      => COUNTER_BITS,
-      KIND              => RNG_KIND,
-      RNG_SHARED            => RNG_SHARED,
-      STEPS             => STEPS_PER_CLOCK,
-      BANKS             => RNG_BANKS,
-      RESET_BANK        => RNG_RESET_BANK,
-      INTERFACE_INPUTS  => INTERFACE_SENSORS,
-      INTERFACE_RESULTS => INTERFACE_RESULTS,
-      MODEL_LINES       => LINES,
-      LINE_OFFSET       => PARTITIONS(BOARD).line_offset,
-      BOARD             => BOARD,
-      BOARDS            => BOARDS,
-      IMAGE_HASH        => PARTITIONS(BOARD).image_hash,
-      MEMORY_FOLDER     => MEMORY_FOLDER,
-      CLOCK_HZ          => CLOCK_HZ
+      lines             => BOARD_LINES,
+      sensors           => SENSORS,
+      replicas          => REPLICAS,
+      mode              => SENSOR_MODE,
+      address_bits      => SENSOR_BITS,
+      prob_bits         => PROB_BITS,
+      prior_bits        => PRIOR_BITS,
+      written           => PRIOR_WRITTEN,
+      counter_bits      => COUNTER_BITS,
+      kind              => RNG_KIND,
+      rng_shared        => RNG_SHARED,
+      steps             => STEPS_PER_CLOCK,
+      banks             => RNG_BANKS,
+      reset_bank        => RNG_RESET_BANK,
+      interface_inputs  => INTERFACE_SENSORS,
+      interface_results => INTERFACE_RESULTS,
+      model_lines       => LINES,
+      line_offset       => PARTITIONS(BOARD).line_offset,
+      board             => BOARD,
+      boards            => BOARDS,
+      image_hash        => PARTITIONS(BOARD).image_hash,
+      memory_folder     => MEMORY_FOLDER,
+      clock_hz          => CLOCK_HZ
     )
     port map (
       clk_i             => clk_i,
@@ -188,25 +189,25 @@ begin
 
   core : entity work.bm1_core
     generic map (
-      LINES         => BOARD_LINES,
-      SENSORS       => SENSORS,
-      REPLICAS      => REPLICAS,
-      MODE          => SENSOR_MODE,
-      ADDRESS_BITS  => SENSOR_BITS,
-      PROB_BITS     => PROB_BITS,
-      PRIOR_BITS    => PRIOR_BITS,
-      WRITTEN       => PRIOR_WRITTEN,
-      COUNTER_BITS  => COUNTER_BITS,
-      KIND          => RNG_KIND,
-      STATE_BITS    => SEED_BITS,
-      TAPS          => RNG_TAPS,
-      RNG_SHARED        => RNG_SHARED,
-      STEPS         => STEPS_PER_CLOCK,
-      BANKS         => RNG_BANKS,
-      RESET_BANK    => RNG_RESET_BANK,
-      TABLE_LENGTH  => RNG_TABLE_LENGTH,
-      MEMORY_FOLDER => MEMORY_FOLDER,
-      BOARD         => BOARD
+      lines         => BOARD_LINES,
+      sensors       => SENSORS,
+      replicas      => REPLICAS,
+      mode          => SENSOR_MODE,
+      address_bits  => SENSOR_BITS,
+      prob_bits     => PROB_BITS,
+      prior_bits    => PRIOR_BITS,
+      written       => PRIOR_WRITTEN,
+      counter_bits  => COUNTER_BITS,
+      kind          => RNG_KIND,
+      state_bits    => SEED_BITS,
+      taps          => RNG_TAPS,
+      rng_shared    => RNG_SHARED,
+      steps         => STEPS_PER_CLOCK,
+      banks         => RNG_BANKS,
+      reset_bank    => RNG_RESET_BANK,
+      table_length  => RNG_TABLE_LENGTH,
+      memory_folder => MEMORY_FOLDER,
+      board         => BOARD
     )
     port map (
       clk_i             => clk_i,

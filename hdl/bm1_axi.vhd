@@ -3,6 +3,7 @@
 -- AXI4-Lite slave: turns its channels into one access at a time.
 -- MIT licence; datasheet: docs/hardware/bm1_axi.md
 -- ================================================================================================
+
 library ieee;
   use ieee.std_logic_1164.all;
 
@@ -12,46 +13,46 @@ entity bm1_axi is
   );
   port (
     -- system
-    clk_i         : in    std_logic;                                   -- clock
-    rst_i         : in    std_logic;                                   -- reset of the board
+    clk_i : in    std_logic; -- clock
+    rst_i : in    std_logic; -- reset of the board
     -- AXI4-Lite
-    axi_awvalid : in    std_logic;                                   -- write address
+    axi_awvalid : in    std_logic; -- write address
     axi_awready : out   std_logic;
     axi_awaddr  : in    std_logic_vector(ADDRESS_BITS - 1 downto 0);
-    axi_wvalid  : in    std_logic;                                   -- write data
+    axi_wvalid  : in    std_logic; -- write data
     axi_wready  : out   std_logic;
     axi_wdata   : in    std_logic_vector(31 downto 0);
     axi_wstrb   : in    std_logic_vector(3 downto 0);
-    axi_bvalid  : out   std_logic;                                   -- write response
+    axi_bvalid  : out   std_logic; -- write response
     axi_bready  : in    std_logic;
     axi_bresp   : out   std_logic_vector(1 downto 0);
-    axi_arvalid : in    std_logic;                                   -- read address
+    axi_arvalid : in    std_logic; -- read address
     axi_arready : out   std_logic;
     axi_araddr  : in    std_logic_vector(ADDRESS_BITS - 1 downto 0);
-    axi_rvalid  : out   std_logic;                                   -- read data
+    axi_rvalid  : out   std_logic; -- read data
     axi_rready  : in    std_logic;
     axi_rdata   : out   std_logic_vector(31 downto 0);
     axi_rresp   : out   std_logic_vector(1 downto 0);
     -- access
-    request_o     : out   std_logic;                                   -- one clock: an access begins
-    write_o       : out   std_logic;                                   -- it writes; else it reads
-    address_o     : out   std_logic_vector(ADDRESS_BITS - 1 downto 0); -- in bytes
-    strobe_o      : out   std_logic_vector(3 downto 0);                -- bytes that are written
-    data_o        : out   std_logic_vector(31 downto 0);               -- data to write
-    respond_i     : in    std_logic;                                   -- one clock: it has ended
-    refused_i     : in    std_logic;                                   -- it was refused
-    data_i        : in    std_logic_vector(31 downto 0)                -- data read
+    request_o : out   std_logic;                                   -- one clock: an access begins
+    write_o   : out   std_logic;                                   -- it writes; else it reads
+    address_o : out   std_logic_vector(ADDRESS_BITS - 1 downto 0); -- in bytes
+    strobe_o  : out   std_logic_vector(3 downto 0);                -- bytes that are written
+    data_o    : out   std_logic_vector(31 downto 0);               -- data to write
+    respond_i : in    std_logic;                                   -- one clock: it has ended
+    refused_i : in    std_logic;                                   -- it was refused
+    data_i    : in    std_logic_vector(31 downto 0)                -- data read
   );
 end entity bm1_axi;
 
 architecture rtl of bm1_axi is
 
-  type state_t is (STANDING, BUSY_WRITE, BUSY_READ, ANSWER_WRITE, ANSWER_READ);
+  type state_t is (standing, busy_write, busy_read, answer_write, answer_read);
 
   constant OKAY   : std_logic_vector(1 downto 0) := "00";
   constant SLVERR : std_logic_vector(1 downto 0) := "10";
 
-  signal state      : state_t                       := STANDING;
+  signal state      : state_t                       := standing;
   signal answer     : std_logic_vector(1 downto 0)  := OKAY;
   signal data       : std_logic_vector(31 downto 0) := (others => '0');
   signal take_write : std_logic;
@@ -60,10 +61,10 @@ architecture rtl of bm1_axi is
 
 begin
 
-  take_write <= '1' when state = STANDING and rst_i = '0' and axi_awvalid = '1' and axi_wvalid = '1'
+  take_write <= '1' when state = standing and rst_i = '0' and axi_awvalid = '1' and axi_wvalid = '1'
                          and not (prefer = '1' and axi_arvalid = '1') else
                 '0';
-  take_read  <= '1' when state = STANDING and rst_i = '0' and axi_arvalid = '1' and take_write = '0' else
+  take_read  <= '1' when state = standing and rst_i = '0' and axi_arvalid = '1' and take_write = '0' else
                 '0';
 
   sequence_of_channels : process (clk_i) is
@@ -71,34 +72,33 @@ begin
 
     if rising_edge(clk_i) then
       if (rst_i = '1') then
-        state  <= STANDING;
+        state  <= standing;
         prefer <= '0';
       else
-
         -- no case: GHDL's synthesis makes latches of one over an enumeration
-        if (state = STANDING) then
+        if (state = standing) then
           if (take_write = '1') then
-            state  <= BUSY_WRITE;
+            state  <= busy_write;
             prefer <= '1';
           elsif (take_read = '1') then
-            state  <= BUSY_READ;
+            state  <= busy_read;
             prefer <= '0';
           end if;
-        elsif (state = BUSY_WRITE) then
+        elsif (state = busy_write) then
           if (respond_i = '1') then
-            state <= ANSWER_WRITE;
+            state <= answer_write;
           end if;
-        elsif (state = BUSY_READ) then
+        elsif (state = busy_read) then
           if (respond_i = '1') then
-            state <= ANSWER_READ;
+            state <= answer_read;
           end if;
-        elsif (state = ANSWER_WRITE) then
+        elsif (state = answer_write) then
           if (axi_bready = '1') then
-            state <= STANDING;
+            state <= standing;
           end if;
         else
           if (axi_rready = '1') then
-            state <= STANDING;
+            state <= standing;
           end if;
         end if;
 
@@ -118,10 +118,10 @@ begin
   axi_awready <= take_write;
   axi_wready  <= take_write;
   axi_arready <= take_read;
-  axi_bvalid  <= '1' when state = ANSWER_WRITE else
-                   '0';
-  axi_rvalid  <= '1' when state = ANSWER_READ else
-                   '0';
+  axi_bvalid  <= '1' when state = answer_write else
+                 '0';
+  axi_rvalid  <= '1' when state = answer_read else
+                 '0';
   axi_bresp   <= answer;
   axi_rresp   <= answer;
   axi_rdata   <= data;

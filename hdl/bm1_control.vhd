@@ -3,6 +3,7 @@
 -- Sequence of a frame: loads codes and seeds, runs cycles, and stops each replica (thesis, 3.2).
 -- MIT licence; datasheet: docs/hardware/bm1_control.md
 -- ================================================================================================
+
 library ieee;
   use ieee.std_logic_1164.all;
   use ieee.numeric_std.all;
@@ -18,29 +19,29 @@ entity bm1_control is
   );
   port (
     -- system
-    clk_i             : in    std_logic;                                   -- clock
-    rst_i             : in    std_logic;                                   -- reset of the board
+    clk_i : in    std_logic; -- clock
+    rst_i : in    std_logic; -- reset of the board
     -- commands, one clock long
-    start_i           : in    std_logic;                                   -- start a frame
-    resume_i          : in    std_logic;                                   -- run the frame's next slice
-    reset_i           : in    std_logic;                                   -- stop and clear
+    start_i  : in    std_logic; -- start a frame
+    resume_i : in    std_logic; -- run the frame's next slice
+    reset_i  : in    std_logic; -- stop and clear
     -- settings
-    target_i          : in    std_logic_vector(COUNTER_BITS - 1 downto 0); -- taken by a start
-    max_cycles_i      : in    std_logic_vector(63 downto 0);               -- taken by a start
-    run_until_i       : in    std_logic_vector(63 downto 0);               -- must stay while the machine runs; 0: none
-    halt_i            : in    std_logic_vector(REPLICAS - 1 downto 0);     -- taken by a resume
+    target_i     : in    std_logic_vector(COUNTER_BITS - 1 downto 0); -- taken by a start
+    max_cycles_i : in    std_logic_vector(63 downto 0);               -- taken by a start
+    run_until_i  : in    std_logic_vector(63 downto 0);               -- must stay while the machine runs; 0: none
+    halt_i       : in    std_logic_vector(REPLICAS - 1 downto 0);     -- taken by a resume
     -- matrices
-    overflow_i        : in    std_logic_vector(REPLICAS - 1 downto 0);     -- a counter is at the target
-    impossible_i      : in    std_logic_vector(REPLICAS - 1 downto 0);     -- every line has a code 0
-    load_o            : out   std_logic;                                   -- take the frame's codes
-    clear_o           : out   std_logic;                                   -- clear the counters
-    enable_o          : out   std_logic_vector(REPLICAS - 1 downto 0);     -- run a cycle
-    target_o          : out   std_logic_vector(COUNTER_BITS - 1 downto 0); -- target count of the frame
+    overflow_i   : in    std_logic_vector(REPLICAS - 1 downto 0);     -- a counter is at the target
+    impossible_i : in    std_logic_vector(REPLICAS - 1 downto 0);     -- every line has a code 0
+    load_o       : out   std_logic;                                   -- take the frame's codes
+    clear_o      : out   std_logic;                                   -- clear the counters
+    enable_o     : out   std_logic_vector(REPLICAS - 1 downto 0);     -- run a cycle
+    target_o     : out   std_logic_vector(COUNTER_BITS - 1 downto 0); -- target count of the frame
     -- generators
-    seeds_ready_i     : in    std_logic;                                   -- the seeds are loaded
-    restart_o         : out   std_logic;                                   -- load seeds
-    restart_bank_o    : out   std_logic;                                   -- of the chosen bank; else of bank 0
-    step_o            : out   std_logic;                                   -- a cycle is run
+    seeds_ready_i  : in    std_logic; -- the seeds are loaded
+    restart_o      : out   std_logic; -- load seeds
+    restart_bank_o : out   std_logic; -- of the chosen bank; else of bank 0
+    step_o         : out   std_logic; -- a cycle is run
     -- outcome
     running_o         : out   std_logic;                                   -- the machine runs
     done_o            : out   std_logic;                                   -- it stops with this clock
@@ -61,7 +62,7 @@ architecture rtl of bm1_control is
 
   type cycles_t is array (0 to REPLICAS - 1) of unsigned(63 downto 0);
 
-  type state_t is (STANDING, LOADING, RUNNING);
+  type state_t is (standing, loading, running);
 
   constant REASON_NONE       : reason_t := std_logic_vector(to_unsigned(STOP_REASON_NONE, 3));
   constant REASON_OVERFLOW   : reason_t := std_logic_vector(to_unsigned(STOP_REASON_OVERFLOW, 3));
@@ -69,7 +70,7 @@ architecture rtl of bm1_control is
   constant REASON_SLICE      : reason_t := std_logic_vector(to_unsigned(STOP_REASON_SLICE, 3));
   constant REASON_IMPOSSIBLE : reason_t := std_logic_vector(to_unsigned(STOP_REASON_IMPOSSIBLE, 3));
 
-  signal state      : state_t                                     := STANDING;
+  signal state      : state_t                                     := standing;
   signal cycles     : unsigned(63 downto 0)                       := (others => '0');
   signal max_cycles : unsigned(63 downto 0)                       := (others => '0');
   signal target     : std_logic_vector(COUNTER_BITS - 1 downto 0) := (others => '0');
@@ -89,11 +90,11 @@ architecture rtl of bm1_control is
 
 begin
 
-  start  <= '1' when start_i = '1' and reset_i = '0' and rst_i = '0' and state = STANDING else
+  start  <= '1' when start_i = '1' and reset_i = '0' and rst_i = '0' and state = standing else
             '0';
-  resume <= '1' when resume_i = '1' and reset_i = '0' and rst_i = '0' and state = STANDING else
+  resume <= '1' when resume_i = '1' and reset_i = '0' and rst_i = '0' and state = standing else
             '0';
-  loaded <= '1' when state = LOADING and seeds_ready_i = '1' else
+  loaded <= '1' when state = loading and seeds_ready_i = '1' else
             '0';
 
   -- The limits are compared with what has been counted, so the clock that finds one reached runs no cycle.
@@ -103,7 +104,7 @@ begin
               '0';
 
   each_replica : for r in 0 to REPLICAS - 1 generate
-    enable(r) <= '1' when state = RUNNING and going(r) = '1' and (overflow_i(r) or at_max or at_slice) = '0' else
+    enable(r) <= '1' when state = running and going(r) = '1' and (overflow_i(r) or at_max or at_slice) = '0' else
                  '0';
     ready(r)  <= '1' when reasons(r) = REASON_SLICE and halted(r) = '0' else
                  '0';
@@ -127,7 +128,7 @@ begin
           if (impossible_i(r) = '1') then
             reasons(r) <= REASON_IMPOSSIBLE;
           end if;
-        elsif (state = RUNNING and going(r) = '1' and enable(r) = '0') then
+        elsif (state = running and going(r) = '1' and enable(r) = '0') then
           going(r) <= '0';
           if (overflow_i(r) = '1') then
             reasons(r) <= REASON_OVERFLOW;
@@ -149,7 +150,7 @@ begin
         if rising_edge(clk_i) then
           if (rst_i = '1' or reset_i = '1' or start = '1') then
             ran(r) <= (others => '0');
-          elsif (state = RUNNING and going(r) = '1' and enable(r) = '0') then
+          elsif (state = running and going(r) = '1' and enable(r) = '0') then
             ran(r) <= cycles;
           end if;
         end if;
@@ -160,7 +161,7 @@ begin
       ran(r) <= cycles;
     end generate own_cycles;
 
-    replica_reasons_o(3 * r + 2 downto 3 * r)    <= reasons(r);
+    replica_reasons_o(3 * r + 2 downto 3 * r)   <= reasons(r);
     replica_cycles_o(64 * r + 63 downto 64 * r) <= std_logic_vector(ran(r));
   end generate each_replica;
 
@@ -169,44 +170,42 @@ begin
 
     if rising_edge(clk_i) then
       if (rst_i = '1' or reset_i = '1') then
-        state   <= STANDING;
+        state   <= standing;
         cycles  <= (others => '0');
         has_run <= '0';
       else
-
         -- no case: GHDL's synthesis makes latches of one over an enumeration
-        if (state = STANDING) then
+        if (state = standing) then
           if (start = '1') then
-            state      <= LOADING;
+            state      <= loading;
             cycles     <= (others => '0');
             max_cycles <= unsigned(max_cycles_i);
             target     <= target_i;
           elsif (resume = '1') then
-            state <= RUNNING;
+            state <= running;
           end if;
-        elsif (state = LOADING) then
+        elsif (state = loading) then
           if (stopped = '1') then
-            state   <= STANDING;
+            state   <= standing;
             has_run <= '1';
           elsif (loaded = '1') then
-            state <= RUNNING;
+            state <= running;
           end if;
         else
           if (stopped = '1') then
-            state   <= STANDING;
+            state   <= standing;
             has_run <= '1';
           else
             cycles <= cycles + 1;
           end if;
         end if;
-
       end if;
     end if;
 
   end process sequence_of_frame;
 
   -- A frame of which no replica can count ends without a cycle.
-  stopped <= '1' when (state /= STANDING and state /= LOADING and (or enable) = '0')
+  stopped <= '1' when (state /= standing and state /= loading and (or enable) = '0')
                       or (loaded = '1' and (and impossible_i) = '1') else
              '0';
 
@@ -219,28 +218,34 @@ begin
     joint := REASON_NONE;
 
     for r in 0 to REPLICAS - 1 loop
+
       if (reasons(r) = REASON_IMPOSSIBLE and joint = REASON_NONE) then
         joint := REASON_IMPOSSIBLE;
       end if;
+
     end loop;
 
     for r in 0 to REPLICAS - 1 loop
+
       if (reasons(r) = REASON_MAX_CYCLES) then
         joint := REASON_MAX_CYCLES;
       end if;
+
     end loop;
 
     for r in 0 to REPLICAS - 1 loop
+
       if (reasons(r) = REASON_OVERFLOW) then
         joint := REASON_OVERFLOW;
       end if;
+
     end loop;
 
     if ((or ready) = '1') then
       joint := REASON_SLICE;
     end if;
 
-    if (state /= STANDING) then
+    if (state /= standing) then
       joint := REASON_NONE;
     end if;
 
@@ -256,7 +261,7 @@ begin
                     '0';
   restart_bank_o <= start;
   step_o         <= or enable;
-  running_o      <= '0' when state = STANDING else
+  running_o      <= '0' when state = standing else
                     '1';
   done_o         <= stopped and not reset_i and not rst_i;
   has_run_o      <= has_run;

@@ -3,6 +3,7 @@
 -- The Bayesian machine without its registers: generators, control, and a matrix for each replica.
 -- MIT licence; datasheet: docs/hardware/bm1_core.md
 -- ================================================================================================
+
 library ieee;
   use ieee.std_logic_1164.all;
 
@@ -24,7 +25,7 @@ entity bm1_core is
     KIND          : rng_kind_t;       -- generators: LFSR or table
     STATE_BITS    : positive;         -- width of a generator's state
     TAPS          : std_logic_vector; -- of an LFSR; STATE_BITS wide
-    RNG_SHARED        : boolean;          -- one generator a column; else one a cell
+    RNG_SHARED    : boolean;          -- one generator a column; else one a cell
     STEPS         : positive;         -- steps of a generator in a clock
     BANKS         : positive;         -- sets of seeds
     RESET_BANK    : boolean;          -- a frame restarts the generators
@@ -34,32 +35,32 @@ entity bm1_core is
   );
   port (
     -- system
-    clk_i             : in    std_logic;                                                    -- clock
-    rst_i             : in    std_logic;                                                    -- reset of the board
+    clk_i : in    std_logic; -- clock
+    rst_i : in    std_logic; -- reset of the board
     -- commands, one clock long
-    start_i           : in    std_logic;                                                    -- start a frame
-    resume_i          : in    std_logic;                                                    -- run the frame's next slice
-    reset_i           : in    std_logic;                                                    -- stop and clear
+    start_i  : in    std_logic; -- start a frame
+    resume_i : in    std_logic; -- run the frame's next slice
+    reset_i  : in    std_logic; -- stop and clear
     -- settings
-    target_i          : in    std_logic_vector(COUNTER_BITS - 1 downto 0);                  -- target count
-    max_cycles_i      : in    std_logic_vector(63 downto 0);                                -- most cycles of a frame
-    run_until_i       : in    std_logic_vector(63 downto 0);                                -- end of the slice
-    bank_i            : in    std_logic_vector(bits_for(BANKS) - 1 downto 0);               -- set of seeds
-    halt_i            : in    std_logic_vector(REPLICAS - 1 downto 0);                      -- replicas to halt
+    target_i     : in    std_logic_vector(COUNTER_BITS - 1 downto 0);    -- target count
+    max_cycles_i : in    std_logic_vector(63 downto 0);                  -- most cycles of a frame
+    run_until_i  : in    std_logic_vector(63 downto 0);                  -- end of the slice
+    bank_i       : in    std_logic_vector(bits_for(BANKS) - 1 downto 0); -- set of seeds
+    halt_i       : in    std_logic_vector(REPLICAS - 1 downto 0);        -- replicas to halt
     -- inputs of the frame, replica 0 lowest
-    priors_i          : in    std_logic_vector(REPLICAS * SLOT_BITS - 1 downto 0);          -- addresses of the prior
-    prior_codes_i     : in    std_logic_vector(REPLICAS * LINES * SLOT_BITS - 1 downto 0);  -- written prior
-    inputs_i          : in    std_logic_vector(
-      REPLICAS * SENSORS * inputs_per_column(MODE, LINES) * SLOT_BITS - 1 downto 0);        -- readings
+    priors_i      : in    std_logic_vector(REPLICAS * SLOT_BITS - 1 downto 0);         -- addresses of the prior
+    prior_codes_i : in    std_logic_vector(REPLICAS * LINES * SLOT_BITS - 1 downto 0); -- written prior
+    inputs_i      : in    std_logic_vector(
+      REPLICAS * SENSORS * inputs_per_column(MODE, LINES) * SLOT_BITS - 1 downto 0);   -- readings
     -- outcome
-    running_o         : out   std_logic;                                                    -- the machine runs
-    done_o            : out   std_logic;                                                    -- it stops with this clock
-    has_run_o         : out   std_logic;                                                    -- it has run since the last reset
-    cycles_o          : out   std_logic_vector(63 downto 0);                                -- cycles of the frame
-    reason_o          : out   std_logic_vector(2 downto 0);                                 -- why it stands still
-    ready_o           : out   std_logic_vector(REPLICAS - 1 downto 0);                      -- replicas that can be resumed
-    replica_reasons_o : out   std_logic_vector(3 * REPLICAS - 1 downto 0);                  -- why each one stands still
-    replica_cycles_o  : out   std_logic_vector(64 * REPLICAS - 1 downto 0);                 -- cycles of each one
+    running_o         : out   std_logic;                                                     -- the machine runs
+    done_o            : out   std_logic;                                                     -- it stops with this clock
+    has_run_o         : out   std_logic;                                                     -- it has run since the last reset
+    cycles_o          : out   std_logic_vector(63 downto 0);                                 -- cycles of the frame
+    reason_o          : out   std_logic_vector(2 downto 0);                                  -- why it stands still
+    ready_o           : out   std_logic_vector(REPLICAS - 1 downto 0);                       -- replicas that can be resumed
+    replica_reasons_o : out   std_logic_vector(3 * REPLICAS - 1 downto 0);                   -- why each one stands still
+    replica_cycles_o  : out   std_logic_vector(64 * REPLICAS - 1 downto 0);                  -- cycles of each one
     counts_o          : out   std_logic_vector(REPLICAS * LINES * COUNTER_BITS - 1 downto 0) -- counters
   );
 end entity bm1_core;
@@ -113,16 +114,16 @@ begin
 
   generators_of_board : entity work.bm1_generators
     generic map (
-      GENERATORS   => GENERATORS,
-      KIND         => KIND,
-      STATE_BITS   => STATE_BITS,
-      TAPS         => TAPS,
-      STEPS        => STEPS,
-      BANKS        => BANKS,
-      PROB_BITS    => PROB_BITS,
-      SEED_FILE    => seed_file,
-      TABLE_FILE   => MEMORY_FOLDER & "rng_table.mif",
-      TABLE_LENGTH => TABLE_LENGTH
+      generators   => GENERATORS,
+      kind         => KIND,
+      state_bits   => STATE_BITS,
+      taps         => TAPS,
+      steps        => STEPS,
+      banks        => BANKS,
+      prob_bits    => PROB_BITS,
+      seed_file    => seed_file,
+      table_file   => MEMORY_FOLDER & "rng_table.mif",
+      table_length => TABLE_LENGTH
     )
     port map (
       clk_i     => clk_i,
@@ -137,9 +138,9 @@ begin
 
   control : entity work.bm1_control
     generic map (
-      REPLICAS     => REPLICAS,
-      COUNTER_BITS => COUNTER_BITS,
-      RESET_BANK   => RESET_BANK
+      replicas     => REPLICAS,
+      counter_bits => COUNTER_BITS,
+      reset_bank   => RESET_BANK
     )
     port map (
       clk_i             => clk_i,
@@ -175,16 +176,16 @@ begin
 
     matrix : entity work.bm1_matrix
       generic map (
-        LINES         => LINES,
-        SENSORS       => SENSORS,
-        MODE          => MODE,
-        ADDRESS_BITS  => ADDRESS_BITS,
-        PROB_BITS     => PROB_BITS,
-        PRIOR_BITS    => PRIOR_BITS,
-        WRITTEN       => WRITTEN,
-        COUNTER_BITS  => COUNTER_BITS,
-        RNG_SHARED        => RNG_SHARED,
-        MEMORY_PREFIX => board_prefix
+        lines         => LINES,
+        sensors       => SENSORS,
+        mode          => MODE,
+        address_bits  => ADDRESS_BITS,
+        prob_bits     => PROB_BITS,
+        prior_bits    => PRIOR_BITS,
+        written       => WRITTEN,
+        counter_bits  => COUNTER_BITS,
+        rng_shared    => RNG_SHARED,
+        memory_prefix => board_prefix
       )
       port map (
         clk_i         => clk_i,

@@ -3,6 +3,7 @@
 -- Counts the ones of a line's bitstream and says when the target count is reached.
 -- MIT licence; datasheet: docs/hardware/bm1_counter.md
 -- ================================================================================================
+
 library ieee;
   use ieee.std_logic_1164.all;
   use ieee.numeric_std.all;

@@ -3,6 +3,7 @@
 -- All random number generators of a board, and the chain that loads a bank of seeds into them.
 -- MIT licence; datasheet: docs/hardware/bm1_generators.md
 -- ================================================================================================
+
 library ieee;
   use ieee.std_logic_1164.all;
   use ieee.numeric_std.all;
@@ -25,14 +26,14 @@ entity bm1_generators is
     TABLE_LENGTH : positive          -- how many these are
   );
   port (
-    clk_i     : in    std_logic;                                              -- clock
-    rst_i     : in    std_logic;                                              -- load bank 0
-    restart_i : in    std_logic;                                              -- load the bank
-    bank_i    : in    std_logic_vector(bits_for(BANKS) - 1 downto 0);         -- number of the bank
-    step_i    : in    std_logic;                                              -- a cycle is run
-    ready_o   : out   std_logic;                                              -- all seeds are loaded
-    randoms_o : out   std_logic_vector(GENERATORS * PROB_BITS - 1 downto 0);  -- numbers, generator 0 lowest
-    states_o  : out   std_logic_vector(GENERATORS * STATE_BITS - 1 downto 0)  -- states, generator 0 lowest
+    clk_i     : in    std_logic;                                             -- clock
+    rst_i     : in    std_logic;                                             -- load bank 0
+    restart_i : in    std_logic;                                             -- load the bank
+    bank_i    : in    std_logic_vector(bits_for(BANKS) - 1 downto 0);        -- number of the bank
+    step_i    : in    std_logic;                                             -- a cycle is run
+    ready_o   : out   std_logic;                                             -- all seeds are loaded
+    randoms_o : out   std_logic_vector(GENERATORS * PROB_BITS - 1 downto 0); -- numbers, generator 0 lowest
+    states_o  : out   std_logic_vector(GENERATORS * STATE_BITS - 1 downto 0) -- states, generator 0 lowest
   );
 end entity bm1_generators;
 
@@ -44,11 +45,11 @@ architecture rtl of bm1_generators is
 
   -- seeds(0) is what the memory shows, seeds(g + 1) the state of generator g
   signal chain     : std_logic_vector((GENERATORS + 1) * STATE_BITS - 1 downto 0);
-  signal address   : unsigned(ADDRESS_BITS - 1 downto 0)                     := (others => '0');
-  signal remaining : unsigned(INDEX_BITS - 1 downto 0)                       := (others => '0');
+  signal address   : unsigned(ADDRESS_BITS - 1 downto 0) := (others => '0');
+  signal remaining : unsigned(INDEX_BITS - 1 downto 0)   := (others => '0');
   signal reading   : std_logic;
-  signal shift     : std_logic                                               := '0';
-  signal ready     : std_logic                                               := '0';
+  signal shift     : std_logic                           := '0';
+  signal ready     : std_logic                           := '0';
 
 begin
 
@@ -62,7 +63,7 @@ begin
     if rising_edge(clk_i) then
       shift <= reading;
       if (rst_i = '1' or restart_i = '1') then
-        bank      := 0;
+        bank := 0;
         if (rst_i = '0') then
           bank := to_integer(unsigned(bank_i));
         end if;
@@ -89,12 +90,12 @@ begin
 
   seeds_memory : component bm1_table
     generic map (
-      FILE_NAME    => SEED_FILE,
-      WORD_BITS    => STATE_BITS,
-      DEPTH        => SEEDS,
-      ADDRESS_BITS => ADDRESS_BITS,
-      FIRST_BIT    => 0,
-      DATA_BITS    => STATE_BITS
+      file_name    => SEED_FILE,
+      word_bits    => STATE_BITS,
+      depth        => SEEDS,
+      address_bits => ADDRESS_BITS,
+      first_bit    => 0,
+      data_bits    => STATE_BITS
     )
     port map (
       clk_i     => clk_i,
@@ -109,11 +110,11 @@ begin
 
       generator : entity work.bm1_table_player
         generic map (
-          STATE_BITS => STATE_BITS,
-          PROB_BITS  => PROB_BITS,
-          TABLE_FILE => TABLE_FILE,
-          LENGTH     => TABLE_LENGTH,
-          STEPS      => STEPS
+          state_bits => STATE_BITS,
+          prob_bits  => PROB_BITS,
+          table_file => TABLE_FILE,
+          length     => TABLE_LENGTH,
+          steps      => STEPS
         )
         port map (
           clk_i    => clk_i,
@@ -128,9 +129,9 @@ begin
 
       generator : entity work.bm1_lfsr
         generic map (
-          STATE_BITS => STATE_BITS,
-          TAPS       => TAPS,
-          STEPS      => STEPS
+          state_bits => STATE_BITS,
+          taps       => TAPS,
+          steps      => STEPS
         )
         port map (
           clk_i   => clk_i,
@@ -140,8 +141,7 @@ begin
           state_o => chain((g + 2) * STATE_BITS - 1 downto (g + 1) * STATE_BITS)
         );
 
-      randoms_o((g + 1) * PROB_BITS - 1 downto g * PROB_BITS) <=
-        chain((g + 1) * STATE_BITS + PROB_BITS - 1 downto (g + 1) * STATE_BITS);
+      randoms_o((g + 1) * PROB_BITS - 1 downto g * PROB_BITS) <= chain((g + 1) * STATE_BITS + PROB_BITS - 1 downto (g + 1) * STATE_BITS);
     end generate kind_of_generator;
 
   end generate each_generator;

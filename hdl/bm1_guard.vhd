@@ -3,6 +3,7 @@
 -- Decides whether an access is allowed, and why not: address, state of the board, and value.
 -- MIT licence; datasheet: docs/hardware/bm1_guard.md
 -- ================================================================================================
+
 library ieee;
   use ieee.std_logic_1164.all;
   use ieee.numeric_std.all;
@@ -12,46 +13,46 @@ library work;
 
 entity bm1_guard is
   generic (
-    REPLICAS           : positive; -- machines around the same generators
-    COUNTER_BITS       : positive; -- width of a counter
-    PRIOR_BITS         : natural;  -- width of the prior's address
-    BANKS              : positive; -- sets of seeds
-    SENSORS_DEPTH      : natural;  -- words of SENSORS that exist
-    INPUTS_DEPTH       : natural;  -- words of INPUTS that exist
-    PRIOR_SELECTS_DEPTH : natural; -- words of PRIOR_SELECTS that exist
-    OUTCOMES_DEPTH     : natural;  -- words of OUTCOMES that exist
-    RESULTS_DEPTH      : natural;  -- words of RESULTS that exist
-    PRIOR_CODES_DEPTH  : natural   -- words of PRIOR_CODES that exist
+    REPLICAS            : positive; -- machines around the same generators
+    COUNTER_BITS        : positive; -- width of a counter
+    PRIOR_BITS          : natural;  -- width of the prior's address
+    BANKS               : positive; -- sets of seeds
+    SENSORS_DEPTH       : natural;  -- words of SENSORS that exist
+    INPUTS_DEPTH        : natural;  -- words of INPUTS that exist
+    PRIOR_SELECTS_DEPTH : natural;  -- words of PRIOR_SELECTS that exist
+    OUTCOMES_DEPTH      : natural;  -- words of OUTCOMES that exist
+    RESULTS_DEPTH       : natural;  -- words of RESULTS that exist
+    PRIOR_CODES_DEPTH   : natural   -- words of PRIOR_CODES that exist
   );
   port (
     -- access
-    write_i      : in    std_logic;                                       -- it writes; else it reads
-    address_i    : in    std_logic_vector(BAR_ADDRESS_BITS - 1 downto 0); -- in bytes
-    strobe_i     : in    std_logic_vector(3 downto 0);                    -- bytes that are written
-    data_i       : in    std_logic_vector(31 downto 0);                   -- data to write
+    write_i   : in    std_logic;                                       -- it writes; else it reads
+    address_i : in    std_logic_vector(BAR_ADDRESS_BITS - 1 downto 0); -- in bytes
+    strobe_i  : in    std_logic_vector(3 downto 0);                    -- bytes that are written
+    data_i    : in    std_logic_vector(31 downto 0);                   -- data to write
     -- state
-    running_i    : in    std_logic;                                       -- the machine runs
-    can_resume_i : in    std_logic;                                       -- it stands at the end of a slice
-    ready_i      : in    std_logic_vector(REPLICAS - 1 downto 0);         -- replicas that can be resumed
-    done_i       : in    std_logic_vector(31 downto 0);                   -- number of the last start or resume that has stopped
-    cycles_i     : in    std_logic_vector(63 downto 0);                   -- cycles of the frame
+    running_i    : in    std_logic;                               -- the machine runs
+    can_resume_i : in    std_logic;                               -- it stands at the end of a slice
+    ready_i      : in    std_logic_vector(REPLICAS - 1 downto 0); -- replicas that can be resumed
+    done_i       : in    std_logic_vector(31 downto 0);           -- number of the last start or resume that has stopped
+    cycles_i     : in    std_logic_vector(63 downto 0);           -- cycles of the frame
     -- settings
-    target_i     : in    std_logic_vector(31 downto 0);                   -- target count
-    max_cycles_i : in    std_logic_vector(63 downto 0);                   -- most cycles
-    run_until_i  : in    std_logic_vector(63 downto 0);                   -- end of the slice
-    bank_i       : in    std_logic_vector(31 downto 0);                   -- set of seeds
-    prior_i      : in    std_logic_vector(31 downto 0);                   -- prior select of a single machine
-    halt_i       : in    std_logic_vector(255 downto 0);                  -- replicas to halt
-    bad_input_i  : in    std_logic;                                       -- an input word is too large
+    target_i     : in    std_logic_vector(31 downto 0);  -- target count
+    max_cycles_i : in    std_logic_vector(63 downto 0);  -- most cycles
+    run_until_i  : in    std_logic_vector(63 downto 0);  -- end of the slice
+    bank_i       : in    std_logic_vector(31 downto 0);  -- set of seeds
+    prior_i      : in    std_logic_vector(31 downto 0);  -- prior select of a single machine
+    halt_i       : in    std_logic_vector(255 downto 0); -- replicas to halt
+    bad_input_i  : in    std_logic;                      -- an input word is too large
     -- verdict
-    error_o      : out   std_logic_vector(7 downto 0);                    -- why it is refused; 0: it is not
-    ring_o       : out   std_logic                                        -- it is a doorbell that rings
+    error_o : out   std_logic_vector(7 downto 0); -- why it is refused; 0: it is not
+    ring_o  : out   std_logic                     -- it is a doorbell that rings
   );
 end entity bm1_guard;
 
 architecture rtl of bm1_guard is
 
-  type access_t is (ABSENT, READABLE, WRITABLE);
+  type access_t is (absent, readable, writable);
 
   -- Whether an address lies in the first words of a block.
 
@@ -66,13 +67,13 @@ architecture rtl of bm1_guard is
 
   end function is_in;
 
-  signal kind    : access_t;
-  signal due     : unsigned(31 downto 0);
+  signal kind           : access_t;
+  signal due            : unsigned(31 downto 0);
   signal doorbell_error : natural range 0 to 255;
   signal start_is_bad   : std_logic;
   signal resume_is_bad  : std_logic;
-  signal is_start  : std_logic;
-  signal is_resume : std_logic;
+  signal is_start       : std_logic;
+  signal is_resume      : std_logic;
 
 begin
 
@@ -83,28 +84,30 @@ begin
   begin
 
     address := unsigned(address_i);
-    kind    <= ABSENT;
+    kind    <= absent;
 
     for block_number in BLOCKS'range loop
+
       if (not BLOCKS(block_number).memory
           and is_in(address, BLOCKS(block_number).address, BLOCKS(block_number).words)) then
         if (BLOCKS(block_number).writable) then
-          kind <= WRITABLE;
+          kind <= writable;
         else
-          kind <= READABLE;
+          kind <= readable;
         end if;
       end if;
+
     end loop;
 
     if (is_in(address, SENSORS_ADDRESS, SENSORS_DEPTH)
         or is_in(address, INPUTS_ADDRESS, INPUTS_DEPTH)
         or is_in(address, PRIOR_SELECTS_ADDRESS, PRIOR_SELECTS_DEPTH)
         or is_in(address, PRIOR_CODES_ADDRESS, PRIOR_CODES_DEPTH)) then
-      kind <= WRITABLE;
+      kind <= writable;
     end if;
 
     if (is_in(address, OUTCOMES_ADDRESS, OUTCOMES_DEPTH) or is_in(address, RESULTS_ADDRESS, RESULTS_DEPTH)) then
-      kind <= READABLE;
+      kind <= readable;
     end if;
 
   end process find_block;
@@ -128,9 +131,11 @@ begin
     end if;
 
     for bit_number in COUNTER_BITS to 31 loop
+
       if (target_i(bit_number) = '1') then
         start_is_bad <= '1';
       end if;
+
     end loop;
 
     if (REPLICAS = 1 and (or prior_i(31 downto PRIOR_BITS)) = '1') then
@@ -152,11 +157,15 @@ begin
       if ((or (ready_i and not halt_i(REPLICAS - 1 downto 0))) = '0') then
         resume_is_bad <= '1';
       end if;
+
       for replica in REPLICAS to 255 loop
+
         if (halt_i(replica) = '1') then
           resume_is_bad <= '1';
         end if;
+
       end loop;
+
     end if;
 
   end process check_resume;
@@ -188,10 +197,10 @@ begin
 
     if (address_i(1 downto 0) /= "00" or (write_i = '1' and strobe_i /= "1111")) then
       code := ERROR_CODE_MISALIGNED;
-    elsif (kind = ABSENT) then
+    elsif (kind = absent) then
       code := ERROR_CODE_OUTSIDE;
     elsif (write_i = '1') then
-      if (kind /= WRITABLE) then
+      if (kind /= writable) then
         code := ERROR_CODE_READ_ONLY;
       elsif (running_i = '1'
              and not (unsigned(address_i) = CONTROL_ADDRESS and data_i(CONTROL_RESET_LOW) = '1')) then

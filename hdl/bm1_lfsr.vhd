@@ -3,6 +3,7 @@
 -- Random number generator: a Fibonacci LFSR that makes several steps in a clock.
 -- MIT licence; datasheet: docs/hardware/bm1_lfsr.md
 -- ================================================================================================
+
 library ieee;
   use ieee.std_logic_1164.all;
 
@@ -38,9 +39,13 @@ begin
         state <= seed_i;
       elsif (step_i = '1') then
         following := state;
+
         for step in 1 to STEPS loop
+
           following := following(STATE_BITS - 2 downto 0) & (xor (following and TAPS));
+
         end loop;
+
         state <= following;
       end if;
     end if;

@@ -3,6 +3,7 @@
 -- Lines and columns of one machine: prior elements, tile elements and counters (thesis, figure 2.4).
 -- MIT licence; datasheet: docs/hardware/bm1_matrix.md
 -- ================================================================================================
+
 library ieee;
   use ieee.std_logic_1164.all;
 
@@ -20,27 +21,27 @@ entity bm1_matrix is
     PRIOR_BITS    : natural;         -- width of the prior's address
     WRITTEN       : boolean;         -- the host writes the prior
     COUNTER_BITS  : positive;        -- width of a counter
-    RNG_SHARED        : boolean;         -- one random number a column; else one a cell
+    RNG_SHARED    : boolean;         -- one random number a column; else one a cell
     MEMORY_PREFIX : string           -- path and board of the MIFs
   );
   port (
-    clk_i         : in    std_logic; -- clock
+    clk_i : in    std_logic; -- clock
     -- control
-    load_i        : in    std_logic;                                           -- take the frame's codes
-    clear_i       : in    std_logic;                                           -- clear the counters
-    enable_i      : in    std_logic;                                           -- run a cycle
-    target_i      : in    std_logic_vector(COUNTER_BITS - 1 downto 0);         -- target count
-    overflow_o    : out   std_logic;                                           -- a counter is at the target
-    impossible_o  : out   std_logic;                                           -- every line has a code 0
+    load_i       : in    std_logic;                                   -- take the frame's codes
+    clear_i      : in    std_logic;                                   -- clear the counters
+    enable_i     : in    std_logic;                                   -- run a cycle
+    target_i     : in    std_logic_vector(COUNTER_BITS - 1 downto 0); -- target count
+    overflow_o   : out   std_logic;                                   -- a counter is at the target
+    impossible_o : out   std_logic;                                   -- every line has a code 0
     -- inputs of the frame
-    prior_i       : in    std_logic_vector(SLOT_BITS - 1 downto 0);            -- address of the prior
-    prior_codes_i : in    std_logic_vector(LINES * SLOT_BITS - 1 downto 0);    -- written prior, line 0 lowest
-    inputs_i      : in    std_logic_vector(SENSORS * inputs_per_column(MODE, LINES) * SLOT_BITS - 1 downto 0); -- column by column
+    prior_i       : in    std_logic_vector(SLOT_BITS - 1 downto 0);                                            -- address of the prior
+    prior_codes_i : in    std_logic_vector(LINES * SLOT_BITS - 1 downto 0);                                    -- written prior, line 0 lowest
+    inputs_i      : in    std_logic_vector(SENSORS * inputs_per_column(MODE, LINES) * SLOT_BITS - 1 downto 0); -- by column
     -- random numbers
-    randoms_i     : in    std_logic_vector(
+    randoms_i : in    std_logic_vector(
       (SENSORS + 1) * (LINES + to_natural(RNG_SHARED) * (1 - LINES)) * PROB_BITS - 1 downto 0); -- generator 0 lowest
     -- results
-    counts_o      : out   std_logic_vector(LINES * COUNTER_BITS - 1 downto 0)  -- counters, line 0 lowest
+    counts_o : out   std_logic_vector(LINES * COUNTER_BITS - 1 downto 0) -- counters, line 0 lowest
   );
 end entity bm1_matrix;
 
@@ -60,12 +61,12 @@ begin
 
     prior_probabilities : component bm1_table
       generic map (
-        FILE_NAME    => MEMORY_PREFIX & "prior.mif",
-        WORD_BITS    => LINES * PROB_BITS,
-        DEPTH        => 2 ** PRIOR_BITS,
-        ADDRESS_BITS => PRIOR_BITS + to_natural(PRIOR_BITS = 0),
-        FIRST_BIT    => 0,
-        DATA_BITS    => LINES * PROB_BITS
+        file_name    => MEMORY_PREFIX & "prior.mif",
+        word_bits    => LINES * PROB_BITS,
+        depth        => 2 ** PRIOR_BITS,
+        address_bits => PRIOR_BITS + to_natural(PRIOR_BITS = 0),
+        first_bit    => 0,
+        data_bits    => LINES * PROB_BITS
       )
       port map (
         clk_i     => clk_i,
@@ -82,12 +83,12 @@ begin
 
       probabilities : component bm1_table
         generic map (
-          FILE_NAME    => MEMORY_PREFIX & "column" & padded(c, SENSORS) & ".mif",
-          WORD_BITS    => LINES * PROB_BITS,
-          DEPTH        => 2 ** ADDRESS_BITS(c),
-          ADDRESS_BITS => ADDRESS_BITS(c),
-          FIRST_BIT    => 0,
-          DATA_BITS    => LINES * PROB_BITS
+          file_name    => MEMORY_PREFIX & "column" & padded(c, SENSORS) & ".mif",
+          word_bits    => LINES * PROB_BITS,
+          depth        => 2 ** ADDRESS_BITS(c),
+          address_bits => ADDRESS_BITS(c),
+          first_bit    => 0,
+          data_bits    => LINES * PROB_BITS
         )
         port map (
           clk_i     => clk_i,
@@ -119,8 +120,8 @@ begin
 
     prior : entity work.bm1_prior_element
       generic map (
-        PROB_BITS => PROB_BITS,
-        WRITTEN   => WRITTEN
+        prob_bits => PROB_BITS,
+        written   => WRITTEN
       )
       port map (
         clk_i    => clk_i,
@@ -152,12 +153,12 @@ begin
 
       tile : entity work.bm1_tile_element
         generic map (
-          PROB_BITS    => PROB_BITS,
-          MODE         => MODE,
-          ADDRESS_BITS => ADDRESS_BITS(c),
-          TABLE_FILE   => MEMORY_PREFIX & "column" & padded(c, SENSORS) & ".mif",
-          LINES        => LINES,
-          LINE         => l
+          prob_bits    => PROB_BITS,
+          mode         => MODE,
+          address_bits => ADDRESS_BITS(c),
+          table_file   => MEMORY_PREFIX & "column" & padded(c, SENSORS) & ".mif",
+          lines        => LINES,
+          line         => l
         )
         port map (
           clk_i    => clk_i,
@@ -174,7 +175,7 @@ begin
 
     counter : entity work.bm1_counter
       generic map (
-        COUNTER_BITS => COUNTER_BITS
+        counter_bits => COUNTER_BITS
       )
       port map (
         clk_i    => clk_i,

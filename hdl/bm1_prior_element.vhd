@@ -3,6 +3,7 @@
 -- First cell of a line: makes the stochastic bitstream of P(S) (thesis, figure 2.1).
 -- MIT licence; datasheet: docs/hardware/bm1_prior_element.md
 -- ================================================================================================
+
 library ieee;
   use ieee.std_logic_1164.all;
 
@@ -47,7 +48,7 @@ begin
 
   generator : entity work.bm1_stochastic_bitstream_generator
     generic map (
-      PROB_BITS => PROB_BITS
+      prob_bits => PROB_BITS
     )
     port map (
       random_i => random_i,

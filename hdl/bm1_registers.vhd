@@ -3,6 +3,7 @@
 -- The board's register map: guards, stores and answers each access, and rings the machine.
 -- MIT licence; datasheet: docs/hardware/bm1_registers.md
 -- ================================================================================================
+
 library ieee;
   use ieee.std_logic_1164.all;
   use ieee.numeric_std.all;
@@ -24,7 +25,7 @@ entity bm1_registers is
     WRITTEN           : boolean;                        -- the host writes the prior
     COUNTER_BITS      : positive;                       -- width of a counter
     KIND              : rng_kind_t;                     -- generators: LFSR or table
-    RNG_SHARED            : boolean;                        -- one generator a column; else one a cell
+    RNG_SHARED        : boolean;                        -- one generator a column; else one a cell
     STEPS             : positive;                       -- steps of a generator in a clock
     BANKS             : positive;                       -- sets of seeds
     RESET_BANK        : boolean;                        -- a frame restarts the generators
@@ -40,53 +41,53 @@ entity bm1_registers is
   );
   port (
     -- system
-    clk_i             : in    std_logic;                                                      -- clock
-    rst_i             : in    std_logic;                                                      -- reset of the board
-    irq_o             : out   std_logic;                                                      -- one clock: the machine has stopped
+    clk_i : in    std_logic; -- clock
+    rst_i : in    std_logic; -- reset of the board
+    irq_o : out   std_logic; -- one clock: the machine has stopped
     -- access
-    request_i         : in    std_logic;                                                      -- one clock: an access begins
-    write_i           : in    std_logic;                                                      -- it writes; else it reads
-    address_i         : in    std_logic_vector(BAR_ADDRESS_BITS - 1 downto 0);                -- in bytes
-    strobe_i          : in    std_logic_vector(3 downto 0);                                   -- bytes that are written
-    data_i            : in    std_logic_vector(31 downto 0);                                  -- data to write
-    respond_o         : out   std_logic;                                                      -- one clock: it has ended
-    refused_o         : out   std_logic;                                                      -- it was refused
-    data_o            : out   std_logic_vector(31 downto 0);                                  -- data read
+    request_i : in    std_logic;                                       -- one clock: an access begins
+    write_i   : in    std_logic;                                       -- it writes; else it reads
+    address_i : in    std_logic_vector(BAR_ADDRESS_BITS - 1 downto 0); -- in bytes
+    strobe_i  : in    std_logic_vector(3 downto 0);                    -- bytes that are written
+    data_i    : in    std_logic_vector(31 downto 0);                   -- data to write
+    respond_o : out   std_logic;                                       -- one clock: it has ended
+    refused_o : out   std_logic;                                       -- it was refused
+    data_o    : out   std_logic_vector(31 downto 0);                   -- data read
     -- machine: commands and settings
-    start_o           : out   std_logic;                                                      -- start a frame
-    resume_o          : out   std_logic;                                                      -- run the frame's next slice
-    reset_o           : out   std_logic;                                                      -- stop and clear
-    target_o          : out   std_logic_vector(COUNTER_BITS - 1 downto 0);                    -- target count
-    max_cycles_o      : out   std_logic_vector(63 downto 0);                                  -- most cycles of a frame
-    run_until_o       : out   std_logic_vector(63 downto 0);                                  -- end of the slice
-    bank_o            : out   std_logic_vector(bits_for(BANKS) - 1 downto 0);                 -- set of seeds
-    halt_o            : out   std_logic_vector(REPLICAS - 1 downto 0);                        -- replicas to halt
-    priors_o          : out   std_logic_vector(REPLICAS * SLOT_BITS - 1 downto 0);            -- addresses of the prior
-    prior_codes_o     : out   std_logic_vector(REPLICAS * LINES * SLOT_BITS - 1 downto 0);    -- written prior
-    inputs_o          : out   std_logic_vector(
-      REPLICAS * SENSORS * inputs_per_column(MODE, LINES) * SLOT_BITS - 1 downto 0);          -- readings
+    start_o       : out   std_logic;                                                   -- start a frame
+    resume_o      : out   std_logic;                                                   -- run the frame's next slice
+    reset_o       : out   std_logic;                                                   -- stop and clear
+    target_o      : out   std_logic_vector(COUNTER_BITS - 1 downto 0);                 -- target count
+    max_cycles_o  : out   std_logic_vector(63 downto 0);                               -- most cycles of a frame
+    run_until_o   : out   std_logic_vector(63 downto 0);                               -- end of the slice
+    bank_o        : out   std_logic_vector(bits_for(BANKS) - 1 downto 0);              -- set of seeds
+    halt_o        : out   std_logic_vector(REPLICAS - 1 downto 0);                     -- replicas to halt
+    priors_o      : out   std_logic_vector(REPLICAS * SLOT_BITS - 1 downto 0);         -- addresses of the prior
+    prior_codes_o : out   std_logic_vector(REPLICAS * LINES * SLOT_BITS - 1 downto 0); -- written prior
+    inputs_o      : out   std_logic_vector(
+      REPLICAS * SENSORS * inputs_per_column(MODE, LINES) * SLOT_BITS - 1 downto 0);   -- readings
     -- machine: outcome
-    running_i         : in    std_logic;                                                      -- the machine runs
-    done_i            : in    std_logic;                                                      -- it stops with this clock
-    has_run_i         : in    std_logic;                                                      -- it has run since the last reset
-    cycles_i          : in    std_logic_vector(63 downto 0);                                  -- cycles of the frame
-    reason_i          : in    std_logic_vector(2 downto 0);                                   -- why it stands still
-    ready_i           : in    std_logic_vector(REPLICAS - 1 downto 0);                        -- replicas that can be resumed
-    replica_reasons_i : in    std_logic_vector(3 * REPLICAS - 1 downto 0);                    -- why each one stands still
-    replica_cycles_i  : in    std_logic_vector(64 * REPLICAS - 1 downto 0);                   -- cycles of each one
-    counts_i          : in    std_logic_vector(REPLICAS * LINES * COUNTER_BITS - 1 downto 0)  -- counters
+    running_i         : in    std_logic;                                                     -- the machine runs
+    done_i            : in    std_logic;                                                     -- it stops with this clock
+    has_run_i         : in    std_logic;                                                     -- it has run since the last reset
+    cycles_i          : in    std_logic_vector(63 downto 0);                                 -- cycles of the frame
+    reason_i          : in    std_logic_vector(2 downto 0);                                  -- why it stands still
+    ready_i           : in    std_logic_vector(REPLICAS - 1 downto 0);                       -- replicas that can be resumed
+    replica_reasons_i : in    std_logic_vector(3 * REPLICAS - 1 downto 0);                   -- why each one stands still
+    replica_cycles_i  : in    std_logic_vector(64 * REPLICAS - 1 downto 0);                  -- cycles of each one
+    counts_i          : in    std_logic_vector(REPLICAS * LINES * COUNTER_BITS - 1 downto 0) -- counters
   );
 end entity bm1_registers;
 
 architecture rtl of bm1_registers is
 
-  type state_t is (WAITING, CHECKING, READING);
+  type state_t is (waiting, checking, reading);
 
-  constant PLAIN         : boolean := REPLICAS = 1 and MODE = SENSOR_COLUMN;
-  constant SEVERAL       : natural := REPLICAS * to_natural(REPLICAS > 1);
+  constant PLAIN         : boolean  := REPLICAS = 1 and MODE = SENSOR_COLUMN;
+  constant SEVERAL       : natural  := REPLICAS * to_natural(REPLICAS > 1);
   constant RESULT_WORDS  : positive := REPLICAS * LINES;
-  constant WRITTEN_WORDS : natural := RESULT_WORDS * to_natural(WRITTEN);
-  constant INPUT_WORDS   : natural := REPLICAS * SENSORS * inputs_per_column(MODE, LINES);
+  constant WRITTEN_WORDS : natural  := RESULT_WORDS * to_natural(WRITTEN);
+  constant INPUT_WORDS   : natural  := REPLICAS * SENSORS * inputs_per_column(MODE, LINES);
   constant CLOCK_NS      : positive := (1_000_000_000 + CLOCK_HZ / 2) / CLOCK_HZ;
 
   -- Return a number as a register's word.
@@ -111,7 +112,9 @@ architecture rtl of bm1_registers is
   begin
 
     for byte in 0 to 31 loop
+
       turned(8 * byte + 7 downto 8 * byte) := hash(255 - 8 * byte downto 248 - 8 * byte);
+
     end loop;
 
     return turned;
@@ -127,9 +130,11 @@ architecture rtl of bm1_registers is
   begin
 
     for column in 1 to SENSORS loop
+
       if (column <= 64) then
         bytes(8 * column - 1 downto 8 * column - 8) := std_logic_vector(to_unsigned(ADDRESS_BITS(column), 8));
       end if;
+
     end loop;
 
     return bytes;
@@ -146,13 +151,11 @@ architecture rtl of bm1_registers is
 
     found(CAP_MACHINE_KIND_HIGH downto CAP_MACHINE_KIND_LOW) := std_logic_vector(to_unsigned(MACHINE_KIND_BM1, 8));
     -- the kinds of generators have the same order here and in the map, in which 0 is none
-    found(CAP_MACHINE_RNG_HIGH downto CAP_MACHINE_RNG_LOW) :=
-      std_logic_vector(to_unsigned(rng_kind_t'pos(KIND) + 1, 8));
-    found(CAP_MACHINE_SHARED_LOW)        := to_std_logic(RNG_SHARED);
-    found(CAP_MACHINE_FREE_LOW)          := to_std_logic(not RESET_BANK);
-    found(CAP_MACHINE_PRIOR_WRITTEN_LOW) := to_std_logic(WRITTEN);
-    found(CAP_MACHINE_SENSOR_MODE_HIGH downto CAP_MACHINE_SENSOR_MODE_LOW) :=
-      std_logic_vector(to_unsigned(sensor_mode_t'pos(MODE), 2));
+    found(CAP_MACHINE_RNG_HIGH downto CAP_MACHINE_RNG_LOW)                 := std_logic_vector(to_unsigned(rng_kind_t'pos(KIND) + 1, 8));
+    found(CAP_MACHINE_SHARED_LOW)                                          := to_std_logic(RNG_SHARED);
+    found(CAP_MACHINE_FREE_LOW)                                            := to_std_logic(not RESET_BANK);
+    found(CAP_MACHINE_PRIOR_WRITTEN_LOW)                                   := to_std_logic(WRITTEN);
+    found(CAP_MACHINE_SENSOR_MODE_HIGH downto CAP_MACHINE_SENSOR_MODE_LOW) := std_logic_vector(to_unsigned(sensor_mode_t'pos(MODE), 2));
 
     return found;
 
@@ -171,56 +174,56 @@ architecture rtl of bm1_registers is
 
   end function input_widths;
 
-  signal state           : state_t                                         := WAITING;
-  signal write           : std_logic                                       := '0';
-  signal address         : std_logic_vector(BAR_ADDRESS_BITS - 1 downto 0) := (others => '0');
-  signal strobe          : std_logic_vector(3 downto 0)                    := (others => '0');
-  signal data            : std_logic_vector(31 downto 0)                   := (others => '0');
-  signal error_code      : std_logic_vector(7 downto 0)                    := (others => '0');
-  signal done_number     : std_logic_vector(31 downto 0)                   := (others => '0');
-  signal number          : std_logic_vector(31 downto 0)                   := (others => '0');
-  signal compute_ns      : unsigned(63 downto 0)                           := (others => '0');
-  signal verdict         : std_logic_vector(7 downto 0);
-  signal rings           : std_logic;
-  signal allowed         : std_logic;
-  signal write_allowed   : std_logic;
-  signal ring            : std_logic;
-  signal is_register     : std_logic;
-  signal is_inputs       : std_logic;
-  signal is_selects      : std_logic;
-  signal is_codes        : std_logic;
-  signal is_outcomes     : std_logic;
-  signal is_results      : std_logic;
-  signal can_resume      : std_logic;
-  signal bad_input       : std_logic;
-  signal bad_inputs      : std_logic;
-  signal bad_selects     : std_logic;
-  signal bad_codes       : std_logic;
-  signal busy            : std_logic;
-  signal busy_inputs     : std_logic;
-  signal busy_selects    : std_logic;
-  signal busy_codes      : std_logic;
-  signal register_write  : std_logic;
-  signal register_read   : std_logic;
-  signal inputs_write    : std_logic;
-  signal selects_write   : std_logic;
-  signal codes_write     : std_logic;
-  signal register_data   : std_logic_vector(31 downto 0);
-  signal inputs_data     : std_logic_vector(31 downto 0);
-  signal selects_data    : std_logic_vector(31 downto 0);
-  signal codes_data      : std_logic_vector(31 downto 0);
-  signal result_data     : std_logic_vector(31 downto 0);
-  signal outcome_data    : std_logic_vector(31 downto 0);
-  signal liveness        : std_logic_vector(31 downto 0);
-  signal not_liveness    : std_logic_vector(31 downto 0);
-  signal status          : std_logic_vector(31 downto 0);
-  signal control         : std_logic_vector(31 downto 0);
-  signal target          : std_logic_vector(31 downto 0);
-  signal max_cycles      : std_logic_vector(63 downto 0);
-  signal bank            : std_logic_vector(31 downto 0);
-  signal prior_select    : std_logic_vector(31 downto 0);
-  signal run_until       : std_logic_vector(63 downto 0);
-  signal halt            : std_logic_vector(255 downto 0);
+  signal state          : state_t                                         := waiting;
+  signal write          : std_logic                                       := '0';
+  signal address        : std_logic_vector(BAR_ADDRESS_BITS - 1 downto 0) := (others => '0');
+  signal strobe         : std_logic_vector(3 downto 0)                    := (others => '0');
+  signal data           : std_logic_vector(31 downto 0)                   := (others => '0');
+  signal error_code     : std_logic_vector(7 downto 0)                    := (others => '0');
+  signal done_number    : std_logic_vector(31 downto 0)                   := (others => '0');
+  signal number         : std_logic_vector(31 downto 0)                   := (others => '0');
+  signal compute_ns     : unsigned(63 downto 0)                           := (others => '0');
+  signal verdict        : std_logic_vector(7 downto 0);
+  signal rings          : std_logic;
+  signal allowed        : std_logic;
+  signal write_allowed  : std_logic;
+  signal ring           : std_logic;
+  signal is_register    : std_logic;
+  signal is_inputs      : std_logic;
+  signal is_selects     : std_logic;
+  signal is_codes       : std_logic;
+  signal is_outcomes    : std_logic;
+  signal is_results     : std_logic;
+  signal can_resume     : std_logic;
+  signal bad_input      : std_logic;
+  signal bad_inputs     : std_logic;
+  signal bad_selects    : std_logic;
+  signal bad_codes      : std_logic;
+  signal busy           : std_logic;
+  signal busy_inputs    : std_logic;
+  signal busy_selects   : std_logic;
+  signal busy_codes     : std_logic;
+  signal register_write : std_logic;
+  signal register_read  : std_logic;
+  signal inputs_write   : std_logic;
+  signal selects_write  : std_logic;
+  signal codes_write    : std_logic;
+  signal register_data  : std_logic_vector(31 downto 0);
+  signal inputs_data    : std_logic_vector(31 downto 0);
+  signal selects_data   : std_logic_vector(31 downto 0);
+  signal codes_data     : std_logic_vector(31 downto 0);
+  signal result_data    : std_logic_vector(31 downto 0);
+  signal outcome_data   : std_logic_vector(31 downto 0);
+  signal liveness       : std_logic_vector(31 downto 0);
+  signal not_liveness   : std_logic_vector(31 downto 0);
+  signal status         : std_logic_vector(31 downto 0);
+  signal control        : std_logic_vector(31 downto 0);
+  signal target         : std_logic_vector(31 downto 0);
+  signal max_cycles     : std_logic_vector(63 downto 0);
+  signal bank           : std_logic_vector(31 downto 0);
+  signal prior_select   : std_logic_vector(31 downto 0);
+  signal run_until      : std_logic_vector(63 downto 0);
+  signal halt           : std_logic_vector(255 downto 0);
 
 begin
 
@@ -230,32 +233,31 @@ begin
 
     if rising_edge(clk_i) then
       if (rst_i = '1') then
-        state      <= WAITING;
+        state      <= waiting;
         error_code <= (others => '0');
       else
-
         -- no case: GHDL's synthesis makes latches of one over an enumeration
-        if (state = WAITING) then
+        if (state = waiting) then
           if (request_i = '1') then
-            state   <= CHECKING;
+            state   <= checking;
             write   <= write_i;
             address <= address_i;
             strobe  <= strobe_i;
             data    <= data_i;
           end if;
-        elsif (state = CHECKING) then
+        elsif (state = checking) then
           if (busy = '0') then
             if (allowed = '1' and write = '0') then
-              state <= READING;
+              state <= reading;
             else
-              state <= WAITING;
+              state <= waiting;
             end if;
             if (allowed = '0') then
               error_code <= verdict;
             end if;
           end if;
         else
-          state <= WAITING;
+          state <= waiting;
         end if;
 
         if (control(CONTROL_RESET_LOW) = '1') then
@@ -268,16 +270,16 @@ begin
 
   guard : entity work.bm1_guard
     generic map (
-      REPLICAS            => REPLICAS,
-      COUNTER_BITS        => COUNTER_BITS,
-      PRIOR_BITS          => PRIOR_BITS,
-      BANKS               => BANKS,
-      SENSORS_DEPTH       => INTERFACE_INPUTS * to_natural(PLAIN),
-      INPUTS_DEPTH        => INTERFACE_INPUTS * to_natural(not PLAIN),
-      PRIOR_SELECTS_DEPTH => SEVERAL,
-      OUTCOMES_DEPTH      => 4 * SEVERAL,
-      RESULTS_DEPTH       => INTERFACE_RESULTS,
-      PRIOR_CODES_DEPTH   => WRITTEN_WORDS
+      replicas            => REPLICAS,
+      counter_bits        => COUNTER_BITS,
+      prior_bits          => PRIOR_BITS,
+      banks               => BANKS,
+      sensors_depth       => INTERFACE_INPUTS * to_natural(PLAIN),
+      inputs_depth        => INTERFACE_INPUTS * to_natural(not PLAIN),
+      prior_selects_depth => SEVERAL,
+      outcomes_depth      => 4 * SEVERAL,
+      results_depth       => INTERFACE_RESULTS,
+      prior_codes_depth   => WRITTEN_WORDS
     )
     port map (
       write_i      => write,
@@ -307,12 +309,12 @@ begin
 
   allowed       <= '1' when unsigned(verdict) = ERROR_CODE_NONE else
                    '0';
-  write_allowed <= '1' when state = CHECKING and busy = '0' and allowed = '1' and write = '1' else
+  write_allowed <= '1' when state = checking and busy = '0' and allowed = '1' and write = '1' else
                    '0';
   ring          <= write_allowed and rings;
-  respond_o     <= '1' when state = READING or (state = CHECKING and busy = '0' and (allowed = '0' or write = '1')) else
+  respond_o     <= '1' when state = reading or (state = checking and busy = '0' and (allowed = '0' or write = '1')) else
                    '0';
-  refused_o     <= '1' when state = CHECKING and allowed = '0' else
+  refused_o     <= '1' when state = checking and allowed = '0' else
                    '0';
 
   -- Which block it is: a guarded address needs no exact decoding.
@@ -333,9 +335,9 @@ begin
   -- a doorbell of 0 does nothing, and must not be read back
   register_write <= '1' when write_allowed = '1' and is_register = '1'
                              and (rings = '1'
-                                  or (unsigned(address) /= START_ADDRESS and unsigned(address) /= RESUME_ADDRESS)) else
+                          or (unsigned(address) /= START_ADDRESS and unsigned(address) /= RESUME_ADDRESS)) else
                     '0';
-  register_read  <= '1' when state = CHECKING and busy = '0' and allowed = '1' and write = '0' and is_register = '1' else
+  register_read  <= '1' when state = checking and busy = '0' and allowed = '1' and write = '0' and is_register = '1' else
                     '0';
   inputs_write   <= write_allowed and is_inputs;
   selects_write  <= write_allowed and is_selects;
@@ -397,10 +399,10 @@ begin
       board_state := BOARD_STATE_IDLE;
     end if;
 
-    status                                                     <= (others => '0');
-    status(STATUS_STATE_HIGH downto STATUS_STATE_LOW)          <= std_logic_vector(to_unsigned(board_state, 4));
+    status                                                           <= (others => '0');
+    status(STATUS_STATE_HIGH downto STATUS_STATE_LOW)                <= std_logic_vector(to_unsigned(board_state, 4));
     status(STATUS_STOP_REASON_LOW + 2 downto STATUS_STOP_REASON_LOW) <= reason_i;
-    status(STATUS_ERROR_HIGH downto STATUS_ERROR_LOW)          <= error_code;
+    status(STATUS_ERROR_HIGH downto STATUS_ERROR_LOW)                <= error_code;
 
   end process join_status;
 
@@ -449,13 +451,13 @@ begin
 
   reading_words : entity work.bm1_words
     generic map (
-      DEPTH         => INTERFACE_INPUTS,
-      USED          => INPUT_WORDS,
-      WIDTHS        => input_widths,
-      PER_COLUMN    => inputs_per_column(MODE, LINES),
-      INITIAL_FILE  => "",
-      INITIAL_WORDS => 1,
-      INITIAL_BITS  => 1
+      depth         => INTERFACE_INPUTS,
+      used          => INPUT_WORDS,
+      widths        => input_widths,
+      per_column    => inputs_per_column(MODE, LINES),
+      initial_file  => "",
+      initial_words => 1,
+      initial_bits  => 1
     )
     port map (
       clk_i    => clk_i,
@@ -473,13 +475,13 @@ begin
 
     select_words : entity work.bm1_words
       generic map (
-        DEPTH         => REPLICAS,
-        USED          => REPLICAS,
-        WIDTHS        => (1 to 1 => PRIOR_BITS),
-        PER_COLUMN    => REPLICAS,
-        INITIAL_FILE  => "",
-        INITIAL_WORDS => 1,
-        INITIAL_BITS  => 1
+        depth         => REPLICAS,
+        used          => REPLICAS,
+        widths        => (1 to 1 => PRIOR_BITS),
+        per_column    => REPLICAS,
+        initial_file  => "",
+        initial_words => 1,
+        initial_bits  => 1
       )
       port map (
         clk_i    => clk_i,
@@ -504,13 +506,13 @@ begin
 
     code_words : entity work.bm1_words
       generic map (
-        DEPTH         => RESULT_WORDS,
-        USED          => RESULT_WORDS,
-        WIDTHS        => (1 to 1 => PROB_BITS),
-        PER_COLUMN    => RESULT_WORDS,
-        INITIAL_FILE  => MEMORY_FOLDER & "board" & integer'image(BOARD) & "_prior.mif",
-        INITIAL_WORDS => LINES,
-        INITIAL_BITS  => PROB_BITS
+        depth         => RESULT_WORDS,
+        used          => RESULT_WORDS,
+        widths        => (1 to 1 => PROB_BITS),
+        per_column    => RESULT_WORDS,
+        initial_file  => MEMORY_FOLDER & "board" & integer'image(BOARD) & "_prior.mif",
+        initial_words => LINES,
+        initial_bits  => PROB_BITS
       )
       port map (
         clk_i    => clk_i,
@@ -533,9 +535,9 @@ begin
 
   readout : entity work.bm1_readout
     generic map (
-      RESULTS      => RESULT_WORDS,
-      COUNTER_BITS => COUNTER_BITS,
-      REPLICAS     => REPLICAS
+      results      => RESULT_WORDS,
+      counter_bits => COUNTER_BITS,
+      replicas     => REPLICAS
     )
     port map (
       clk_i     => clk_i,

@@ -3,6 +3,7 @@
 -- Turns a probability code into a random bit by comparing it with a random number.
 -- MIT licence; datasheet: docs/hardware/bm1_stochastic_bitstream_generator.md
 -- ================================================================================================
+
 library ieee;
   use ieee.std_logic_1164.all;
   use ieee.numeric_std.all;

@@ -3,6 +3,7 @@
 -- Read-only memory whose contents come from a MIF; one clock from address to data.
 -- MIT licence; datasheet: docs/hardware/bm1_table.md
 -- ================================================================================================
+
 library ieee;
   use ieee.std_logic_1164.all;
 

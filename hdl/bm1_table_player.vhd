@@ -3,6 +3,7 @@
 -- Random number generator: plays a table of recorded random numbers in a ring.
 -- MIT licence; datasheet: docs/hardware/bm1_table_player.md
 -- ================================================================================================
+
 library ieee;
   use ieee.std_logic_1164.all;
   use ieee.numeric_std.all;
@@ -74,12 +75,12 @@ begin
   -- The memory is read at the next place, so that its output always belongs to this one.
   numbers : component bm1_table
     generic map (
-      FILE_NAME    => TABLE_FILE,
-      WORD_BITS    => PROB_BITS,
-      DEPTH        => LENGTH,
-      ADDRESS_BITS => STATE_BITS,
-      FIRST_BIT    => 0,
-      DATA_BITS    => PROB_BITS
+      file_name    => TABLE_FILE,
+      word_bits    => PROB_BITS,
+      depth        => LENGTH,
+      address_bits => STATE_BITS,
+      first_bit    => 0,
+      data_bits    => PROB_BITS
     )
     port map (
       clk_i     => clk_i,

@@ -3,6 +3,7 @@
 -- Cell of a sensor column: multiplies the line's bitstream by that of P(K | S) (thesis, figure 2.2).
 -- MIT licence; datasheet: docs/hardware/bm1_tile_element.md
 -- ================================================================================================
+
 library ieee;
   use ieee.std_logic_1164.all;
 
@@ -40,6 +41,7 @@ architecture rtl of bm1_tile_element is
 begin
 
   -- a chain of conditions: GHDL's synthesis does not know case generates
+
   source : if MODE = SENSOR_COLUMN generate
     -- The tables of a column see the same address: they lie side by side in one memory outside.
     code <= given_i(PROB_BITS - 1 downto 0);
@@ -47,12 +49,12 @@ begin
 
     probabilities : component bm1_table
       generic map (
-        FILE_NAME    => TABLE_FILE,
-        WORD_BITS    => LINES * PROB_BITS,
-        DEPTH        => 2 ** ADDRESS_BITS,
-        ADDRESS_BITS => ADDRESS_BITS,
-        FIRST_BIT    => LINE * PROB_BITS,
-        DATA_BITS    => PROB_BITS
+        file_name    => TABLE_FILE,
+        word_bits    => LINES * PROB_BITS,
+        depth        => 2 ** ADDRESS_BITS,
+        address_bits => ADDRESS_BITS,
+        first_bit    => LINE * PROB_BITS,
+        data_bits    => PROB_BITS
       )
       port map (
         clk_i     => clk_i,
@@ -78,7 +80,7 @@ begin
 
   generator : entity work.bm1_stochastic_bitstream_generator
     generic map (
-      PROB_BITS => PROB_BITS
+      prob_bits => PROB_BITS
     )
     port map (
       random_i => random_i,

@@ -3,6 +3,7 @@
 -- Functions on sizes and widths that several units of the BM1 share.
 -- MIT licence; datasheet: docs/hardware/README.md
 -- ================================================================================================
+
 library ieee;
   use ieee.std_logic_1164.all;
 
@@ -15,27 +16,32 @@ package bm1_utilities is
   constant SLOT_BITS : positive := 16;
 
   -- Return the bits that hold 0 to COUNT - 1, at least one.
+
   function bits_for (
     count : positive
   ) return positive;
 
   -- Return the number of cells of a column that have an input of their own.
+
   function inputs_per_column (
     mode  : sensor_mode_t;
     lines : positive
   ) return positive;
 
   -- Return 1 for true and 0 for false.
+
   function to_natural (
     condition : boolean
   ) return natural;
 
   -- Return '1' for true and '0' for false.
+
   function to_std_logic (
     condition : boolean
   ) return std_logic;
 
   -- Return a decimal number with leading zeros, as wide as the digits of HIGHEST.
+
   function padded (
     number  : natural;
     highest : natural
@@ -74,7 +80,9 @@ package body bm1_utilities is
   begin
 
     while 2 ** bits < count loop
+
       bits := bits + 1;
+
     end loop;
 
     return bits;
@@ -126,8 +134,8 @@ package body bm1_utilities is
     highest : natural
   ) return string is
 
-    constant DIGITS : string := integer'image(number);
-    constant WIDEST : string := integer'image(highest);
+    constant DIGITS : string                                     := integer'image(number);
+    constant WIDEST : string                                     := integer'image(highest);
     constant ZEROS  : string(1 to WIDEST'length - DIGITS'length) := (others => '0');
 
   begin

@@ -3,6 +3,7 @@
 -- Memory of words that the host writes; the machine sees all of them at once, and whether one is too large.
 -- MIT licence; datasheet: docs/hardware/bm1_words.md
 -- ================================================================================================
+
 library ieee;
   use ieee.std_logic_1164.all;
   use ieee.numeric_std.all;
@@ -22,32 +23,33 @@ entity bm1_words is
     INITIAL_BITS  : positive         -- width of these words
   );
   port (
-    clk_i    : in    std_logic;                                      -- clock
-    rst_i    : in    std_logic;                                      -- write the initial words
-    busy_o   : out   std_logic;                                      -- they are being written
-    write_i  : in    std_logic;                                      -- write the word
-    index_i  : in    std_logic_vector(bits_for(DEPTH) - 1 downto 0); -- number of the word
-    data_i   : in    std_logic_vector(31 downto 0);                  -- data to write
-    data_o   : out   std_logic_vector(31 downto 0);                  -- the word, a clock after its number
+    clk_i    : in    std_logic;                                       -- clock
+    rst_i    : in    std_logic;                                       -- write the initial words
+    busy_o   : out   std_logic;                                       -- they are being written
+    write_i  : in    std_logic;                                       -- write the word
+    index_i  : in    std_logic_vector(bits_for(DEPTH) - 1 downto 0);  -- number of the word
+    data_i   : in    std_logic_vector(31 downto 0);                   -- data to write
+    data_o   : out   std_logic_vector(31 downto 0);                   -- the word, a clock after its number
     values_o : out   std_logic_vector(USED * SLOT_BITS - 1 downto 0); -- words as the machine sees them, word 0 lowest
-    bad_o    : out   std_logic                                       -- a word that is used is too large
+    bad_o    : out   std_logic                                        -- a word that is used is too large
   );
 end entity bm1_words;
 
 architecture rtl of bm1_words is
 
-  constant INDEX_BITS   : positive := bits_for(DEPTH);
+  constant INDEX_BITS           : positive := bits_for(DEPTH);
   constant INITIAL_ADDRESS_BITS : positive := bits_for(INITIAL_WORDS);
 
   -- a power of two: the address of another block may stand at the index
+
   type memory_t is array (0 to 2 ** INDEX_BITS - 1) of std_logic_vector(31 downto 0);
 
-  signal memory        : memory_t                                       := (others => (others => '0'));
-  signal next_initial  : unsigned(INDEX_BITS downto 0)                  := (others => '0');
-  signal place         : unsigned(INITIAL_ADDRESS_BITS - 1 downto 0)    := (others => '0');
-  signal initial_valid : std_logic                                      := '0';
-  signal initial_index : unsigned(INDEX_BITS - 1 downto 0)              := (others => '0');
-  signal initial_word  : std_logic_vector(31 downto 0)                  := (others => '0');
+  signal memory        : memory_t                                    := (others => (others => '0'));
+  signal next_initial  : unsigned(INDEX_BITS downto 0)               := (others => '0');
+  signal place         : unsigned(INITIAL_ADDRESS_BITS - 1 downto 0) := (others => '0');
+  signal initial_valid : std_logic                                   := '0';
+  signal initial_index : unsigned(INDEX_BITS - 1 downto 0)           := (others => '0');
+  signal initial_word  : std_logic_vector(31 downto 0)               := (others => '0');
   signal filling       : std_logic;
   signal write         : std_logic;
   signal index         : unsigned(INDEX_BITS - 1 downto 0);
@@ -86,12 +88,12 @@ begin
 
     initial_words_memory : component bm1_table
       generic map (
-        FILE_NAME    => INITIAL_FILE,
-        WORD_BITS    => INITIAL_BITS,
-        DEPTH        => INITIAL_WORDS,
-        ADDRESS_BITS => INITIAL_ADDRESS_BITS,
-        FIRST_BIT    => 0,
-        DATA_BITS    => INITIAL_BITS
+        file_name    => INITIAL_FILE,
+        word_bits    => INITIAL_BITS,
+        depth        => INITIAL_WORDS,
+        address_bits => INITIAL_ADDRESS_BITS,
+        first_bit    => 0,
+        data_bits    => INITIAL_BITS
       )
       port map (
         clk_i     => clk_i,

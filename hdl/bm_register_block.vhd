@@ -4,6 +4,7 @@
 -- Generated from hdl/bm_registers.rdl by scripts/registers: change that file, not this one.
 -- MIT licence; datasheet: docs/hardware/bm_register_block.md
 -- ================================================================================================
+
 library ieee;
   use ieee.std_logic_1164.all;
   use ieee.numeric_std.all;
@@ -13,63 +14,63 @@ library work;
 
 entity bm_register_block is
   port (
-    clk_i   : in    std_logic; -- clock
-    rst_i   : in    std_logic; -- reset of the board
-    write_i : in    std_logic; -- write the word; it must be allowed
-    read_i  : in    std_logic; -- read the word
-    word_i  : in    std_logic_vector(7 downto 0); -- number of the word: address / 4
-    data_i  : in    std_logic_vector(31 downto 0); -- data to write
-    data_o  : out   std_logic_vector(31 downto 0); -- data read, a clock after read_i
-    liveness_i : in    std_logic_vector(31 downto 0); -- Liveness, as read
-    liveness_o : out   std_logic_vector(31 downto 0); -- Liveness, as written
-    programmed_i : in    std_logic_vector(31 downto 0); -- Programmings, as read
-    map_hash_i : in    std_logic_vector(255 downto 0); -- Hash of the map's definition, as read
-    image_hash_i : in    std_logic_vector(255 downto 0); -- Hash of the image, as read
-    cap_machine_i : in    std_logic_vector(31 downto 0); -- Machine, as read
-    cap_lines_i : in    std_logic_vector(31 downto 0); -- Lines on this board, as read
-    cap_total_lines_i : in    std_logic_vector(31 downto 0); -- Lines of the whole model, as read
-    cap_line_offset_i : in    std_logic_vector(31 downto 0); -- First line of this board, as read
-    cap_partition_i : in    std_logic_vector(31 downto 0); -- Partition, as read
-    cap_sensors_i : in    std_logic_vector(31 downto 0); -- Sensor columns, as read
-    cap_widths_i : in    std_logic_vector(31 downto 0); -- Widths, as read
-    cap_banks_i : in    std_logic_vector(31 downto 0); -- RNG banks, as read
-    cap_replicas_i : in    std_logic_vector(31 downto 0); -- Replicas, as read
-    cap_interface_i : in    std_logic_vector(31 downto 0); -- Interface, as read
-    cap_speed_i : in    std_logic_vector(31 downto 0); -- Speed, as read
-    cap_steps_i : in    std_logic_vector(31 downto 0); -- Steps of the RNGs, as read
+    clk_i             : in    std_logic;                      -- clock
+    rst_i             : in    std_logic;                      -- reset of the board
+    write_i           : in    std_logic;                      -- write the word; it must be allowed
+    read_i            : in    std_logic;                      -- read the word
+    word_i            : in    std_logic_vector(7 downto 0);   -- number of the word: address / 4
+    data_i            : in    std_logic_vector(31 downto 0);  -- data to write
+    data_o            : out   std_logic_vector(31 downto 0);  -- data read, a clock after read_i
+    liveness_i        : in    std_logic_vector(31 downto 0);  -- Liveness, as read
+    liveness_o        : out   std_logic_vector(31 downto 0);  -- Liveness, as written
+    programmed_i      : in    std_logic_vector(31 downto 0);  -- Programmings, as read
+    map_hash_i        : in    std_logic_vector(255 downto 0); -- Hash of the map's definition, as read
+    image_hash_i      : in    std_logic_vector(255 downto 0); -- Hash of the image, as read
+    cap_machine_i     : in    std_logic_vector(31 downto 0);  -- Machine, as read
+    cap_lines_i       : in    std_logic_vector(31 downto 0);  -- Lines on this board, as read
+    cap_total_lines_i : in    std_logic_vector(31 downto 0);  -- Lines of the whole model, as read
+    cap_line_offset_i : in    std_logic_vector(31 downto 0);  -- First line of this board, as read
+    cap_partition_i   : in    std_logic_vector(31 downto 0);  -- Partition, as read
+    cap_sensors_i     : in    std_logic_vector(31 downto 0);  -- Sensor columns, as read
+    cap_widths_i      : in    std_logic_vector(31 downto 0);  -- Widths, as read
+    cap_banks_i       : in    std_logic_vector(31 downto 0);  -- RNG banks, as read
+    cap_replicas_i    : in    std_logic_vector(31 downto 0);  -- Replicas, as read
+    cap_interface_i   : in    std_logic_vector(31 downto 0);  -- Interface, as read
+    cap_speed_i       : in    std_logic_vector(31 downto 0);  -- Speed, as read
+    cap_steps_i       : in    std_logic_vector(31 downto 0);  -- Steps of the RNGs, as read
     cap_sensor_bits_i : in    std_logic_vector(511 downto 0); -- Widths of the sensors' addresses, as read
-    control_o : out   std_logic_vector(31 downto 0); -- Control, as written
-    target_count_o : out   std_logic_vector(31 downto 0); -- Target count, as written
-    max_cycles_o : out   std_logic_vector(63 downto 0); -- Most cycles of a frame, as written
-    bank_o : out   std_logic_vector(31 downto 0); -- RNG bank, as written
-    prior_select_o : out   std_logic_vector(31 downto 0); -- Prior select, as written
-    run_until_o : out   std_logic_vector(63 downto 0); -- End of the slice, as written
-    start_o : out   std_logic_vector(31 downto 0); -- Start, as written
-    resume_o : out   std_logic_vector(31 downto 0); -- Resume, as written
-    done_i : in    std_logic_vector(31 downto 0); -- Done, as read
-    status_i : in    std_logic_vector(31 downto 0); -- Status, as read
-    cycles_i : in    std_logic_vector(63 downto 0); -- Cycles, as read
-    compute_ns_i : in    std_logic_vector(63 downto 0); -- Time computed, as read
-    halt_o : out   std_logic_vector(255 downto 0) -- Replicas to halt, as written
+    control_o         : out   std_logic_vector(31 downto 0);  -- Control, as written
+    target_count_o    : out   std_logic_vector(31 downto 0);  -- Target count, as written
+    max_cycles_o      : out   std_logic_vector(63 downto 0);  -- Most cycles of a frame, as written
+    bank_o            : out   std_logic_vector(31 downto 0);  -- RNG bank, as written
+    prior_select_o    : out   std_logic_vector(31 downto 0);  -- Prior select, as written
+    run_until_o       : out   std_logic_vector(63 downto 0);  -- End of the slice, as written
+    start_o           : out   std_logic_vector(31 downto 0);  -- Start, as written
+    resume_o          : out   std_logic_vector(31 downto 0);  -- Resume, as written
+    done_i            : in    std_logic_vector(31 downto 0);  -- Done, as read
+    status_i          : in    std_logic_vector(31 downto 0);  -- Status, as read
+    cycles_i          : in    std_logic_vector(63 downto 0);  -- Cycles, as read
+    compute_ns_i      : in    std_logic_vector(63 downto 0);  -- Time computed, as read
+    halt_o            : out   std_logic_vector(255 downto 0)  -- Replicas to halt, as written
   );
 end entity bm_register_block;
 
 architecture rtl of bm_register_block is
 
-  signal liveness : std_logic_vector(31 downto 0) := x"00000000";
-  signal control : std_logic_vector(31 downto 0) := x"00000000";
-  signal target_count : std_logic_vector(31 downto 0) := x"00000000";
-  signal max_cycles : std_logic_vector(63 downto 0) := x"00000000" & x"00000000";
-  signal bank : std_logic_vector(31 downto 0) := x"00000000";
-  signal prior_select : std_logic_vector(31 downto 0) := x"00000000";
-  signal run_until : std_logic_vector(63 downto 0) := x"00000000" & x"00000000";
-  signal start : std_logic_vector(31 downto 0) := x"00000000";
-  signal resume : std_logic_vector(31 downto 0) := x"00000000";
-  signal cycles_high : std_logic_vector(31 downto 0) := (others => '0');
-  signal cycles_held : std_logic := '0';
-  signal compute_ns_high : std_logic_vector(31 downto 0) := (others => '0');
-  signal compute_ns_held : std_logic := '0';
-  signal halt : std_logic_vector(255 downto 0) := x"00000000" & x"00000000" & x"00000000" & x"00000000" & x"00000000" & x"00000000" & x"00000000" & x"00000000";
+  signal liveness        : std_logic_vector(31 downto 0)  := (others => '0');
+  signal control         : std_logic_vector(31 downto 0)  := (others => '0');
+  signal target_count    : std_logic_vector(31 downto 0)  := (others => '0');
+  signal max_cycles      : std_logic_vector(63 downto 0)  := (others => '0');
+  signal bank            : std_logic_vector(31 downto 0)  := (others => '0');
+  signal prior_select    : std_logic_vector(31 downto 0)  := (others => '0');
+  signal run_until       : std_logic_vector(63 downto 0)  := (others => '0');
+  signal start           : std_logic_vector(31 downto 0)  := (others => '0');
+  signal resume          : std_logic_vector(31 downto 0)  := (others => '0');
+  signal cycles_high     : std_logic_vector(31 downto 0)  := (others => '0');
+  signal cycles_held     : std_logic                      := '0';
+  signal compute_ns_high : std_logic_vector(31 downto 0)  := (others => '0');
+  signal compute_ns_held : std_logic                      := '0';
+  signal halt            : std_logic_vector(255 downto 0) := (others => '0');
 
 begin
 
@@ -136,31 +137,31 @@ begin
         halt(255 downto 224) <= data_i(31 downto 0);
       end if;
       if (rst_i = '1') then
-        liveness <= x"00000000";
-        control <= x"00000000";
-        target_count <= x"00000000";
-        max_cycles <= x"00000000" & x"00000000";
-        bank <= x"00000000";
-        prior_select <= x"00000000";
-        run_until <= x"00000000" & x"00000000";
-        start <= x"00000000";
-        resume <= x"00000000";
-        halt <= x"00000000" & x"00000000" & x"00000000" & x"00000000" & x"00000000" & x"00000000" & x"00000000" & x"00000000";
+        liveness     <= (others => '0');
+        control      <= (others => '0');
+        target_count <= (others => '0');
+        max_cycles   <= (others => '0');
+        bank         <= (others => '0');
+        prior_select <= (others => '0');
+        run_until    <= (others => '0');
+        start        <= (others => '0');
+        resume       <= (others => '0');
+        halt         <= (others => '0');
       end if;
     end if;
 
   end process store;
 
-  liveness_o <= liveness;
-  control_o <= control;
+  liveness_o     <= liveness;
+  control_o      <= control;
   target_count_o <= target_count;
-  max_cycles_o <= max_cycles;
-  bank_o <= bank;
+  max_cycles_o   <= max_cycles;
+  bank_o         <= bank;
   prior_select_o <= prior_select;
-  run_until_o <= run_until;
-  start_o <= start;
-  resume_o <= resume;
-  halt_o <= halt;
+  run_until_o    <= run_until;
+  start_o        <= start;
+  resume_o       <= resume;
+  halt_o         <= halt;
 
   -- Reading a low word holds the high one until that is read, so that the pair is never torn.
   hold_high_words : process (clk_i) is

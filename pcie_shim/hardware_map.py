@@ -28,6 +28,7 @@ _HEAD: Final = """\
 -- Generated from hdl/bm_registers.rdl by scripts/registers: change that file, not this one.
 -- MIT licence; datasheet: docs/hardware/bm_register_block.md
 -- ================================================================================================
+
 library ieee;
   use ieee.std_logic_1164.all;
 """
@@ -121,24 +122,27 @@ def _register(node: Any) -> Register:
 def package_text(register_map: RegisterMap) -> str:
     """Return the VHDL package `bm_register_map`: addresses, sizes, fields and encodings."""
     lines = [_HEAD.format(name="bm_register_map", title="The boards' register map as constants.")]
-    lines += ["package bm_register_map is", ""]
-    lines += [f"  constant BAR_ADDRESS_BITS : positive := {(register_map.bar_size - 1).bit_length()};", ""]
     digest = register_map.hash.upper()
+    lines += ["package bm_register_map is", ""]
+    lines += _constants([("BAR_ADDRESS_BITS", "positive", str((register_map.bar_size - 1).bit_length()))])
+    lines += ["", "  -- SHA-256 of the map's definition, first byte in the highest bits"]
+    lines += _constants([("MAP_SHA256", "std_logic_vector(255 downto 0)", f'x"{digest}"')])
     lines += [
-        "  -- SHA-256 of the map's definition, first byte in the highest bits",
-        f'  constant MAP_SHA256 : std_logic_vector(255 downto 0) := x"{digest}";',
         "",
         "  -- registers and memories: address in bytes, number of 32-bit words, what software may do",
     ]
+    rows = []
     for block in register_map.blocks:
-        lines += [
-            f"  constant {block.name}_ADDRESS  : natural := 16#{block.address:05X}#;",
-            f"  constant {block.name}_WORDS    : positive := {block.words};",
-            f"  constant {block.name}_WRITABLE : boolean := {str('w' in block.access).lower()};",
+        rows += [
+            (f"{block.name}_ADDRESS", "natural", f"16#{block.address:05X}#"),
+            (f"{block.name}_WORDS", "positive", str(block.words)),
+            (f"{block.name}_WRITABLE", "boolean", str("w" in block.access).lower()),
         ]
+    lines += _constants(rows)
     lines += [
         "",
         "  -- all of these; a memory's words exist as far as the board implements them",
+        "",
         "  type block_t is record",
         "    address  : natural;",
         "    words    : positive;",
@@ -157,19 +161,29 @@ def package_text(register_map: RegisterMap) -> str:
             f"    {at} => ({block.name}_ADDRESS, {block.name}_WORDS, {block.name}_WRITABLE, {memory}){comma}"
         )
     lines += ["  );", "", "  -- fields of registers that have several: lowest and highest bit"]
+    rows = []
     for block in register_map.blocks:
         if len(block.fields) > 1:
             for field in block.fields:
-                lines.append(f"  constant {block.name}_{field.name}_LOW  : natural := {field.low};")
-                lines.append(f"  constant {block.name}_{field.name}_HIGH : natural := {field.high};")
+                rows += [
+                    (f"{block.name}_{field.name}_LOW", "natural", str(field.low)),
+                    (f"{block.name}_{field.name}_HIGH", "natural", str(field.high)),
+                ]
+    lines += _constants(rows)
     for encoding in register_map.encodings:
         lines += ["", f"  -- {_title(encoding)}"]
         prefix = encoding.name.upper()
-        lines += [
-            f"  constant {prefix}_{member.name} : natural := {member.value};" for member in encoding.members
-        ]
+        lines += _constants(
+            [(f"{prefix}_{member.name}", "natural", str(member.value)) for member in encoding.members]
+        )
     lines += ["", "end package bm_register_map;", ""]
     return "\n".join(lines)
+
+
+def _constants(rows: list[tuple[str, str, str]]) -> list[str]:
+    """Return the declarations of constants, aligned: name, type and value."""
+    names, types = max(len(row[0]) for row in rows), max(len(row[1]) for row in rows)
+    return [f"  constant {name:{names}} : {kind:{types}} := {value};" for name, kind, value in rows]
 
 
 def _title(encoding: Encoding) -> str:
@@ -178,13 +192,22 @@ def _title(encoding: Encoding) -> str:
 
 def block_text(registers: tuple[Register, ...]) -> str:
     """Return the VHDL entity `bm_register_block`: what software writes is stored, what it reads is selected."""
-    ports = []
+    word = "std_logic_vector(31 downto 0)"
+    ports = [
+        ("clk_i", "in ", "std_logic", "clock"),
+        ("rst_i", "in ", "std_logic", "reset of the board"),
+        ("write_i", "in ", "std_logic", "write the word; it must be allowed"),
+        ("read_i", "in ", "std_logic", "read the word"),
+        ("word_i", "in ", "std_logic_vector(7 downto 0)", "number of the word: address / 4"),
+        ("data_i", "in ", word, "data to write"),
+        ("data_o", "out", word, "data read, a clock after read_i"),
+    ]
     for register in registers:
         size = f"std_logic_vector({register.bits - 1} downto 0)"
         if register.driven:
-            ports.append((f"{register.name}_i : in    {size}", f"{register.title}, as read"))
+            ports.append((f"{register.name}_i", "in ", size, f"{register.title}, as read"))
         if register.written:
-            ports.append((f"{register.name}_o : out   {size}", f"{register.title}, as written"))
+            ports.append((f"{register.name}_o", "out", size, f"{register.title}, as written"))
     return "\n".join(
         [
             _HEAD.format(
@@ -198,17 +221,7 @@ def block_text(registers: tuple[Register, ...]) -> str:
             "",
             "entity bm_register_block is",
             "  port (",
-            "    clk_i   : in    std_logic; -- clock",
-            "    rst_i   : in    std_logic; -- reset of the board",
-            "    write_i : in    std_logic; -- write the word; it must be allowed",
-            "    read_i  : in    std_logic; -- read the word",
-            "    word_i  : in    std_logic_vector(7 downto 0); -- number of the word: address / 4",
-            "    data_i  : in    std_logic_vector(31 downto 0); -- data to write",
-            "    data_o  : out   std_logic_vector(31 downto 0); -- data read, a clock after read_i",
-            *(
-                f"    {port}{';' if at < len(ports) - 1 else ''} -- {comment}"
-                for at, (port, comment) in enumerate(ports)
-            ),
+            *_aligned_ports(ports),
             "  );",
             "end entity bm_register_block;",
             "",
@@ -230,20 +243,31 @@ def _literal(value: int) -> str:
     return f'x"{value:08X}"'
 
 
+def _aligned_ports(ports: list[tuple[str, str, str, str]]) -> list[str]:
+    """Return the lines of a list of ports: name, direction, type and comment."""
+    names, types = max(len(port[0]) for port in ports), max(len(port[2]) for port in ports)
+    return [
+        f"    {name:{names}} : {direction}   {kind}{' ' if at == len(ports) - 1 else ';'}{'':{types - len(kind)}} -- {comment}"
+        for at, (name, direction, kind, comment) in enumerate(ports)
+    ]
+
+
 def _signals(registers: tuple[Register, ...]) -> list[str]:
-    lines = []
+    signals = []
     for register in registers:
         if register.written:
-            lines.append(
-                f"  signal {register.name} : std_logic_vector({register.bits - 1} downto 0) := {_reset(register)};"
-            )
+            size = f"std_logic_vector({register.bits - 1} downto 0)"
+            signals.append((register.name, size, _reset(register)))
         if register.latched:
-            lines.append(f"  signal {register.name}_high : std_logic_vector(31 downto 0) := (others => '0');")
-            lines.append(f"  signal {register.name}_held : std_logic := '0';")
-    return lines
+            signals.append((f"{register.name}_high", "std_logic_vector(31 downto 0)", "(others => '0')"))
+            signals.append((f"{register.name}_held", "std_logic", "'0'"))
+    names, types = max(len(each[0]) for each in signals), max(len(each[1]) for each in signals)
+    return [f"  signal {name:{names}} : {kind:{types}} := {value};" for name, kind, value in signals]
 
 
 def _reset(register: Register) -> str:
+    if not register.reset:
+        return "(others => '0')"
     return " & ".join([_literal(register.reset)] * register.words)
 
 
@@ -253,6 +277,7 @@ def _writes(registers: tuple[Register, ...]) -> list[str]:
     Every word is decided by itself: GHDL 2.0 writes a case without what holds otherwise into its Verilog, which makes latches.
     """
     written = [register for register in registers if register.written]
+    width = max(len(register.name) for register in written)
     lines = ["  store : process (clk_i) is", "  begin", "", "    if rising_edge(clk_i) then"]
     for register in written:
         lines += [f"      {register.name}({bit}) <= '0';" for bit in _bits(register.pulsed)]
@@ -265,9 +290,9 @@ def _writes(registers: tuple[Register, ...]) -> list[str]:
             ]
             lines.append("      end if;")
     lines += ["      if (rst_i = '1') then"]
-    lines += [f"        {register.name} <= {_reset(register)};" for register in written]
+    lines += [f"        {register.name:{width}} <= {_reset(register)};" for register in written]
     lines += ["      end if;", "    end if;", "", "  end process store;", ""]
-    lines += [f"  {register.name}_o <= {register.name};" for register in written]
+    lines += [f"  {f'{register.name}_o':{width + 2}} <= {register.name};" for register in written]
     return [*lines, ""]
 
 

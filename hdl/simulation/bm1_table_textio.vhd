@@ -3,6 +3,7 @@
 -- Reads the MIF when the design is elaborated.
 -- MIT licence; datasheet: docs/hardware/bm1_table.md
 -- ================================================================================================
+
 library ieee;
   use ieee.std_logic_1164.all;
   use ieee.numeric_std.all;
@@ -30,23 +31,31 @@ architecture textio of bm1_table is
   begin
 
     while not endfile(source) loop
+
       readline(source, row);
       next when row'length = 0;
+
       if (not inside) then
         inside := row'length >= 7 and row.all(1 to 7) = "CONTENT";
         next;
       end if;
+
       exit when row.all = "END;";
       place := 0;
+
       loop
+
         read(row, digit);
         exit when digit = ' ';
+
         if (digit >= 'A') then
           place := 16 * place + character'pos(digit) - character'pos('A') + 10;
         else
           place := 16 * place + character'pos(digit) - character'pos('0');
         end if;
+
       end loop;
+
       read(row, digit);
       hread(row, word, good);
       assert good and place < DEPTH
@@ -54,6 +63,7 @@ architecture textio of bm1_table is
                & integer'image(WORD_BITS) & " bits in canonical form"
         severity failure;
       found(place) := word(FIRST_BIT + DATA_BITS - 1 downto FIRST_BIT);
+
     end loop;
 
     return found;

@@ -3,6 +3,7 @@
 -- A small machine whose tables and seeds are left open: a proof holds for whatever they hold.
 -- MIT licence; datasheet: docs/hardware/verification.md
 -- ================================================================================================
+
 library ieee;
   use ieee.std_logic_1164.all;
 
@@ -43,25 +44,25 @@ begin
 
   core : entity work.bm1_core
     generic map (
-      LINES         => 2,
-      SENSORS       => 1,
-      REPLICAS      => REPLICAS,
-      MODE          => SENSOR_COLUMN,
-      ADDRESS_BITS  => (1 => 2),
-      PROB_BITS     => 2,
-      PRIOR_BITS    => 0,
-      WRITTEN       => false,
-      COUNTER_BITS  => 3,
-      KIND          => RNG_LFSR8,
-      STATE_BITS    => 8,
-      TAPS          => x"B8",
-      RNG_SHARED    => true,
-      STEPS         => 2,
-      BANKS         => 1,
-      RESET_BANK    => true,
-      TABLE_LENGTH  => 1,
-      MEMORY_FOLDER => "",
-      BOARD         => 0
+      lines         => 2,
+      sensors       => 1,
+      replicas      => REPLICAS,
+      mode          => SENSOR_COLUMN,
+      address_bits  => (1 => 2),
+      prob_bits     => 2,
+      prior_bits    => 0,
+      written       => false,
+      counter_bits  => 3,
+      kind          => RNG_LFSR8,
+      state_bits    => 8,
+      taps          => x"B8",
+      rng_shared    => true,
+      steps         => 2,
+      banks         => 1,
+      reset_bank    => true,
+      table_length  => 1,
+      memory_folder => "",
+      board         => 0
     )
     port map (
       clk_i             => clk_i,

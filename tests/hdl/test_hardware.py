@@ -1,0 +1,73 @@
+"""The VHDL in short: sessions of three machines, the units' benches and a proof; scripts/verify hdl has all of them."""
+
+import shutil
+
+import pytest
+
+from hdl.test.mutants import MUTANTS
+from hdl.test.random_machines import MOST_CELLS, random_case
+from hdl.test.simulation import HDL, SOURCES
+from hdl.test.verification import Check, formal, units
+
+needs_ghdl = pytest.mark.skipif(
+    shutil.which("ghdl") is None, reason="ghdl is not installed (Debian: apt-get install ghdl)"
+)
+
+SESSIONS = (8, 15, 25)
+"""One machine; a threshold machine with several banks; replicas with an address for each cell."""
+
+
+@needs_ghdl
+@pytest.mark.parametrize(
+    "check", [Check("session", str(seed)) for seed in SESSIONS], ids=lambda check: check.name
+)
+def test_the_hardware_answers_as_the_emulated_board(check):
+    assert check.failure(frames=3) is None
+
+
+@needs_ghdl
+@pytest.mark.parametrize(
+    "check", [*units(), *(each for each in formal() if each.what == "guard")], ids=lambda check: check.name
+)
+def test_units_keep_their_promises(check):
+    assert check.failure() is None
+
+
+@needs_ghdl
+def test_a_broken_machine_is_found(tmp_path):
+    shutil.copytree(HDL, tmp_path / "hdl")
+    counter = tmp_path / "hdl" / "bm1_counter.vhd"
+    text = counter.read_text()
+    assert text.count("count <= count + 1;") == 1
+    counter.write_text(text.replace("count <= count + 1;", "count <= count + 2;"))
+    why = Check("proof", "core of one machine").failure(tmp_path / "hdl")
+    assert why == "a property does not hold"
+
+
+def test_every_unit_is_in_the_list_of_sources():
+    found = {path.name for path in HDL.glob("*.vhd")}
+    assert found == set(SOURCES)
+
+
+def test_every_mutant_changes_its_file_in_one_place():
+    assert len({mutant.name for mutant in MUTANTS}) == len(MUTANTS) >= 12
+    for mutant in MUTANTS:
+        assert (HDL / mutant.file).read_text().count(mutant.right) == 1, mutant.name
+        assert mutant.right != mutant.wrong
+
+
+def test_the_matrix_has_every_mode():
+    machines = [random_case(seed).image.machine for seed in range(60)]
+    parameters = [machine.parameters for machine in machines]
+    assert {each.rng for each in parameters} == {"lfsr8", "lfsr16", "lfsr24", "lfsr32", "table"}
+    assert {each.sensor_mode for each in parameters} == {"column", "cell", "threshold"}
+    assert {each.shared for each in parameters} == {True, False}
+    assert {each.prior_mode for each in parameters} == {"table", "written"}
+    assert {each.rng_reset for each in parameters} == {"bank", "free"}
+    assert {each.sensors for each in parameters} == set(range(7))
+    assert max(each.lines for each in parameters) == 64
+    assert {1, 2, 3, 5, 40} <= {each.replicas for each in parameters}
+    assert {1, 32} <= {each.counter_bits for each in parameters}
+    assert {1, 16} <= {each.prob_bits for each in parameters}
+    assert any(each.prior_bits for each in parameters)
+    assert all(each.replicas * each.lines * each.columns <= MOST_CELLS for each in parameters)
