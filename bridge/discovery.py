@@ -1,11 +1,11 @@
-"""Finding rosbridge servers by name on the local network: multicast DNS, as Bonjour and Avahi speak it.
+"""Discovery of rosbridge servers on the local network by multicast DNS, as in Bonjour and Avahi.
 
-A server announces itself as an instance of the service ``_rosbridge._tcp.local.``, under the robot's name, with what
-a client must know in its properties: ``path`` of the URL, ``tls``, ``token`` and ``ros`` (1 or 2). All of them may be
-missing, so that a line in Avahi's configuration announces a rosbridge server that knows nothing of this.
+A server announces itself as an instance of the service `_rosbridge._tcp.local.`, under the robot's name. Its
+properties are `path` of the URL, `tls`, `token` and `ros` (1 or 2). All of them are optional, so that a line in Avahi's
+configuration suffices to announce any rosbridge server.
 
-``zeroconf`` is an extra (``pip install zeroconf``), imported when one of these functions is called.
-What comes from the network is anybody's: it is bounded, and fit to be printed.
+`zeroconf` is an extra (`pip install zeroconf`), imported when one of these functions is called.
+Data from the network is not trusted: it is bounded and printable.
 
 Source: RFC 6762 and 6763.
 """
@@ -28,36 +28,36 @@ if TYPE_CHECKING:
     from zeroconf.asyncio import AsyncServiceInfo, AsyncZeroconf
 
 SERVICE_TYPE: Final = "_rosbridge._tcp.local."
-#: Robots that are told of at most; a network with more than this is no robots' network.
 MAX_ROBOTS: Final = 256
-#: Bytes of a name at most (RFC 6763, section 4.1.1).
+"""Limit of robots listed."""
 _LONGEST_NAME: Final = 63
+"""Longest name in bytes (RFC 6763, section 4.1.1)."""
 _PATH: Final = re.compile(r"/[A-Za-z0-9._~/-]{0,200}")
 _HOST: Final = re.compile(r"[A-Za-z0-9.-]{1,253}")
 _LAST_PORT: Final = 65535
-#: Seconds within which who has a name already says so.
 _TAKEN_TIME: Final = 3.0
+"""Seconds to wait for another owner of a name."""
 
 
 class DiscoveryError(BridgeError):
-    """Raised when robots cannot be looked for, or announced; without ``zeroconf``, or without a network."""
+    """Raised when discovery is impossible, without `zeroconf` or without a network."""
 
     exit_code: ClassVar[int] = 2
 
 
 class UnknownRobotError(BridgeError):
-    """Raised when nobody of a name announces a rosbridge server."""
+    """Raised when no robot of a name announces a rosbridge server."""
 
 
 @dataclass(frozen=True, slots=True)
 class Robot:
-    """A rosbridge server that announced itself.
+    """An announced rosbridge server.
 
     Attributes:
-        name: of the robot.
-        uri: of the server.
-        ros_version: which ROS it speaks for, None if it does not say.
-        token: whether it wants one.
+        name: Name of the robot.
+        uri: URI of the server.
+        ros_version: Its ROS version, None if it is not announced.
+        token: Whether clients need a token.
     """
 
     name: str
@@ -71,17 +71,17 @@ async def discover(
     *,
     interfaces: Sequence[str] | None = None,
 ) -> list[Robot]:
-    """Look for rosbridge servers.
+    """Find rosbridge servers.
 
     Args:
-        timeout: seconds to wait for answers; nobody says when all have come.
-        interfaces: addresses of this machine's to ask at; None asks at all.
+        timeout: Seconds to wait for answers; it is always used up.
+        interfaces: Addresses of this machine to ask on; None for all.
 
     Returns:
-        Those that answered, by name.
+        The servers that answered, sorted by name.
 
     Raises:
-        DiscoveryError: ``zeroconf`` is not installed, or there is no network to ask.
+        DiscoveryError: `zeroconf` is not installed, or there is no network.
     """
     from_name: dict[str, Robot] = {}
     async with _zeroconf(interfaces) as zeroconf:
@@ -122,16 +122,16 @@ async def resolve(
     *,
     interfaces: Sequence[str] | None = None,
 ) -> str:
-    """The URI of the rosbridge server that a robot announces.
+    """Return the URI of the rosbridge server that a robot announces.
 
     Args:
-        name: the robot's.
-        timeout: seconds to wait for its answer.
-        interfaces: addresses of this machine's to ask at; None asks at all.
+        name: Name of the robot.
+        timeout: Seconds to wait for its answer.
+        interfaces: Addresses of this machine to ask on; None for all.
 
     Raises:
-        UnknownRobotError: nobody of that name answers in time.
-        DiscoveryError: ``zeroconf`` is not installed, there is no network to ask, or no robot has such a name.
+        UnknownRobotError: No robot of that name answers in time.
+        DiscoveryError: `zeroconf` is not installed, there is no network, or the name is invalid.
     """
     _check_name(name)
     async with _zeroconf(interfaces) as zeroconf:
@@ -155,26 +155,25 @@ async def announced(
     token: bool = False,
     interfaces: Sequence[str] | None = None,
 ) -> AsyncIterator[None]:
-    """Announce a rosbridge server as long as the context is open.
+    """Announce a rosbridge server while the context is open.
 
     Args:
-        name: the robot's, unique on the network.
-        host: the address that the server listens on; ``0.0.0.0`` and ``::`` are all of this machine's. One of
-            loopback is announced to this machine alone.
-        port: of the server.
-        ros_version: which ROS it speaks for.
-        tls: whether it wants TLS; its clients are sent to this machine's own name then, which its certificate
-            must bear.
-        token: whether it wants one.
-        interfaces: addresses of this machine's to answer at; None answers at all.
+        name: Name of the robot, unique on the network.
+        host: Address that the server listens on; `0.0.0.0` and `::` stand for all addresses of this machine. A
+            loopback address is announced to this machine only.
+        port: Port of the server.
+        ros_version: Its ROS version.
+        tls: Whether it uses TLS; clients then get this machine's host name, which has to be in its certificate.
+        token: Whether clients need a token.
+        interfaces: Addresses of this machine to answer on; None for all.
 
     Raises:
-        DiscoveryError: ``zeroconf`` is not installed, there is no network, or another server has the name.
+        DiscoveryError: `zeroconf` is not installed, there is no network, or another server has the name.
     """
     _check_name(name)
     addresses = _addresses(host, interfaces)
     if interfaces is None and all(ipaddress.ip_address(address).is_loopback for address in addresses):
-        interfaces = ("127.0.0.1",)  # nobody else on the network reaches it
+        interfaces = ("127.0.0.1",)  # no other machine reaches it
     async with _zeroconf(interfaces) as zeroconf:
         from zeroconf.asyncio import AsyncServiceInfo
 
@@ -211,7 +210,7 @@ def _check_name(name: str) -> None:
 
 
 def _addresses(host: str, interfaces: Sequence[str] | None) -> list[str]:
-    """The addresses that a server on ``host`` is reached at."""
+    """Return the addresses of a server that listens on `host`."""
     if interfaces is not None:
         return list(interfaces)
     try:
@@ -248,7 +247,7 @@ async def _zeroconf(interfaces: Sequence[str] | None) -> AsyncIterator[AsyncZero
 
 
 async def _ask(zeroconf: AsyncZeroconf, full_name: str, patience: float) -> Robot | None:
-    """What a robot says of itself; None if it does not in time, or says nothing of use."""
+    """Query a robot; None if it does not answer in time, or its answer is unusable."""
     from zeroconf import BadTypeInNameException
     from zeroconf.asyncio import AsyncServiceInfo
 
@@ -260,12 +259,12 @@ async def _ask(zeroconf: AsyncZeroconf, full_name: str, patience: float) -> Robo
 
 
 def _robot(info: AsyncServiceInfo) -> Robot | None:
-    """A robot of what its server announces; None for what cannot be one."""
+    """Return the robot of an announcement; None if the announcement is unusable."""
     name = info.name.removesuffix(f".{SERVICE_TYPE}")
     properties = info.decoded_properties
     addresses = sorted(info.parsed_addresses(), key=lambda address: (":" in address, address))
     tls = properties.get("tls") == "1"
-    # A certificate bears a name, hardly ever an address.
+    # A certificate contains a name, hardly ever an address.
     host = (info.server or "").rstrip(".") if tls else addresses[0] if addresses else ""
     path = properties.get("path") or "/"
     if not name or not name.isprintable() or not host or not 1 <= (info.port or 0) <= _LAST_PORT:

@@ -1,37 +1,37 @@
-"""Everything that can go wrong between this host and a rosbridge server, each as one sentence for the user.
+"""Errors between this host and a rosbridge server, each with one sentence for the user.
 
-``str(error)`` says what happened, where, what was expected and, where it helps, what to do. ``exit_code`` is
-what a command ends with when the error ends it.
+`str(error)` states what happened, where, what was expected and, where it helps, what to do. `exit_code` is the exit code
+of a command that the error ends.
 
 * `BridgeError`
     * `UriError`, `NameFormError`, `TypeConflictError`, `PathError`, `OptionError`,
       `ConcurrentReadError`, `EncodeError` (2: usage)
-    * `UnreachableError`, `NotRosbridgeError`, `DisconnectedError` (3: the server is not there)
-    * `AccessRefusedError` (2: it is there, and wants a token or a certificate)
-    * `NoMessageError`, `NoAnswerError`, `SlowPeerError`, `StateTimeoutError` (3: a wait was in vain)
-    * `ServiceError`, `GoalError` (3: a service or an action said no)
+    * `UnreachableError`, `NotRosbridgeError`, `DisconnectedError` (3: the server cannot be reached)
+    * `AccessRefusedError` (2: the server wants a token or a certificate)
+    * `NoMessageError`, `NoAnswerError`, `SlowPeerError`, `StateTimeoutError` (3: a timeout)
+    * `ServiceError`, `GoalError` (3: a service or an action refused)
     * `DefinitionError` (2: a message's type is not known here, or rosbags is missing)
-    * `DecodeError` (3: what arrived is no message)
-    * `FieldMissingError`, `FieldAmbiguousError` (4: a variable cannot be found in a message)
+    * `DecodeError` (3: received bytes are not a message)
+    * `FieldMissingError`, `FieldAmbiguousError` (4: a variable was not found in a message)
 """
 
 from typing import ClassVar
 
 
 class BridgeError(Exception):
-    """Root of all errors of ``bridge``."""
+    """Root of all errors of `bridge`."""
 
     exit_code: ClassVar[int] = 3
 
 
 class UriError(BridgeError):
-    """Raised when a URI is not one of a WebSocket (``ws://host:port`` or ``wss://host:port``)."""
+    """Raised when a URI is not one of a WebSocket (`ws://host:port` or `wss://host:port`)."""
 
     exit_code = 2
 
 
 class NameFormError(BridgeError):
-    """Raised when the name of a topic, a service or a type cannot be one in ROS."""
+    """Raised when the name of a topic, a service or a type is invalid in ROS."""
 
     exit_code = 2
 
@@ -49,19 +49,19 @@ class OptionError(BridgeError):
 
 
 class ConcurrentReadError(BridgeError):
-    """Raised when two tasks wait on one subscription: each message would reach only one of them."""
+    """Raised when two tasks wait on one subscription, so that each message would reach only one of them."""
 
     exit_code = 2
 
 
 class EncodeError(BridgeError):
-    """Raised when an object cannot leave as JSON (or CBOR): its type, a NaN, an infinity, its depth or its size."""
+    """Raised when an object cannot be encoded: its type, a NaN, an infinity, its depth or its size."""
 
     exit_code = 2
 
 
 class DecodeError(BridgeError):
-    """Raised when bytes that arrived are no message within the limits of size and depth."""
+    """Raised when received bytes are not a message within the limits of size and depth."""
 
 
 class UnreachableError(BridgeError):
@@ -73,7 +73,7 @@ class NotRosbridgeError(BridgeError):
 
 
 class AccessRefusedError(BridgeError):
-    """Raised when a server refuses this client: it wants a token or a certificate, or another one."""
+    """Raised when a server refuses this client for its token or certificate."""
 
     exit_code = 2
 
@@ -83,7 +83,7 @@ class DisconnectedError(BridgeError):
 
 
 class StateTimeoutError(BridgeError):
-    """Raised when a connection did not reach an awaited state in time."""
+    """Raised when a connection did not reach a state in time."""
 
 
 class NoMessageError(BridgeError):
@@ -95,18 +95,18 @@ class NoAnswerError(BridgeError):
 
 
 class SlowPeerError(BridgeError):
-    """Raised when the server does not take what is published in time, or too much waits for it."""
+    """Raised when the server does not accept messages in time, or too many wait for it."""
 
 
 class ServiceError(BridgeError):
-    """Raised when a service answers ``result: false``, and raised by a handler that wants to answer so.
+    """Raised when a service answers `result: false`, and by a handler to answer so.
 
     Attributes:
-        reason: the text that the service gave (or is to give), as it was.
+        reason: The unchanged text of the answer.
     """
 
     def __init__(self, reason: str, service: str = "") -> None:
-        """Keep the reason apart from the sentence: a served handler's reason goes onto the wire as it is."""
+        """Store the reason apart from the sentence: a handler's reason is sent unchanged."""
         self.reason = reason
         self.service = service
         where = f"service {service} refused the call" if service else "the call was refused"
@@ -114,32 +114,32 @@ class ServiceError(BridgeError):
 
 
 class GoalError(BridgeError):
-    """Raised when an action takes no goal, or its goal ended without a result.
+    """Raised when an action refuses a goal, or the goal ends without a result.
 
     Attributes:
-        reason: the text that the server gave.
+        reason: Text of the server.
     """
 
     def __init__(self, reason: str, action: str) -> None:
-        """Keep the reason apart from the sentence."""
+        """Store the reason apart from the sentence."""
         self.reason = reason
         super().__init__(f"action {action} has no result: {reason or 'it gave no reason'}")
 
 
 class DefinitionError(BridgeError):
-    """Raised when serialised bytes cannot be read: no definition of their type is known, or no library is there."""
+    """Raised when serialised bytes cannot be read: their type is unknown, or rosbags is not installed."""
 
     exit_code = 2
 
 
 class PathError(BridgeError):
-    """Raised when the path of a variable (``pose.position.x``, ``ranges[3]``) is not well-formed."""
+    """Raised when the path of a variable (`pose.position.x`, `ranges[3]`) is not well-formed."""
 
     exit_code = 2
 
 
 class FieldMissingError(BridgeError):
-    """Raised when a message has not got the field; the sentence lists what it has."""
+    """Raised when a message does not have the field; the sentence lists its fields."""
 
     exit_code = 4
 

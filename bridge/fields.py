@@ -1,11 +1,10 @@
-"""Finding a variable in a ROS message: by its bare name wherever that is, or by a path.
+"""Search for variables in ROS messages, by bare name or by path.
 
-The rules of ``deployment.toml``'s variables: a name with ``.`` or ``[`` is a path (``pose.position.x``,
-``ranges[3]``). A bare name is searched in the whole message, depth first, not inside arrays; it may be there
-only once, and the place found first is kept, so that later messages cost no search.
+The rules of `deployment.toml`'s variables: a name with `.` or `[` is a path (`pose.position.x`,
+`ranges[3]`). A bare name is searched in the whole message, depth first, not inside arrays. It may occur only
+once, and its place in the first message is kept for later ones.
 
-An index reaches into whatever a server's form of delivery makes of an array: a list, a NumPy array, bytes, and the
-base64 text that JSON has for ``uint8[]``.
+An index works on every form of an array: a list, a NumPy array, bytes, and the base64 text of `uint8[]` in JSON.
 """
 
 import base64
@@ -14,23 +13,23 @@ from typing import Any, Final
 
 from bridge.errors import FieldAmbiguousError, FieldMissingError, PathError
 
-#: A place in a message: keys of objects and indices of arrays, from outside to inside.
 Place = tuple[str | int, ...]
+"""Place in a message: keys of objects and indices of arrays, from outside to inside."""
 
-#: Fields that an error lists at most.
 MAX_LISTED: Final = 24
-#: Characters of each of them.
+"""Limit of fields listed in an error."""
 MAX_SHOWN: Final = 80
+"""Limit of characters of each of them."""
 
 _STEP = re.compile(r"([A-Za-z_][A-Za-z0-9_]*)|\[([0-9]{1,9})\]")
 
 
 class Field:
-    """One variable's place in the messages of one topic.
+    """Place of one variable in the messages of one topic.
 
     Attributes:
-        name: the bare name or path, as configured.
-        place: where it is; of a bare name None until a message had it.
+        name: The configured bare name or path.
+        place: Its place; for a bare name None until it is found in a message.
     """
 
     __slots__ = ("_is_path", "name", "place")
@@ -39,23 +38,23 @@ class Field:
         """Read a bare name or a path.
 
         Raises:
-            PathError: it is neither.
+            PathError: It is neither.
         """
         self.name = name
         self._is_path = "." in name or "[" in name
         self.place: Place | None = parse_path(name) if self._is_path else None
         if not self._is_path and _STEP.fullmatch(name) is None:
             raise PathError(
-                f"{name[:MAX_SHOWN]!r} is no name of a field: letters, digits and _ (example: D1), or a path "
+                f"{name[:MAX_SHOWN]!r} is not a field name: letters, digits and _ (example: D1), or a path "
                 "(examples: pose.position.x, ranges[3])"
             )
 
     def locate(self, message: dict[str, Any]) -> Place:
-        """Find the place in a message, and keep it.
+        """Return the place in a message, and keep it.
 
         Raises:
-            FieldMissingError: the message has not got it; the sentence lists what it has.
-            FieldAmbiguousError: a bare name is there more than once; the sentence lists the places.
+            FieldMissingError: The message does not have it; the sentence lists its fields.
+            FieldAmbiguousError: A bare name occurs more than once; the sentence lists the places.
         """
         present, _value = self.value(message)
         if not present or self.place is None:
@@ -66,10 +65,10 @@ class Field:
         """Look the variable up.
 
         Returns:
-            Whether the message has it, and its value as it is (None for JSON's null, and if it is not there).
+            Whether the message has it, and its unchanged value (None if it is missing or null).
 
         Raises:
-            FieldAmbiguousError: a bare name, not found before, is there more than once.
+            FieldAmbiguousError: A bare name, not found before, occurs more than once.
         """
         place = self.place
         if place is None:
@@ -80,7 +79,7 @@ class Field:
                 shown = ", ".join(map(_show, places[:MAX_LISTED]))
                 raise FieldAmbiguousError(
                     f"the message has {len(places)} fields named {self.name!r} ({shown}): "
-                    "give the path of the one that is meant"
+                    "give the path of one of them"
                 )
             self.place = place = places[0]
         value: Any = message
@@ -101,7 +100,7 @@ class Field:
         return True, value
 
     def missing(self, message: dict[str, Any]) -> FieldMissingError:
-        """The error that says that a message has not got the variable, and what it has instead."""
+        """Return the error for a message without the variable, which lists its fields."""
         if self.place is None:
             listed = _list_fields(message)
             return FieldMissingError(f"the message has no field {self.name!r}; it has {listed}")
@@ -114,14 +113,14 @@ class Field:
                 if length is None:
                     reason = f"{before!r} is {_kind(value)}, not an array"
                 elif step >= length:
-                    reason = f"{before!r} has {length} elements, the index {step} is none of theirs"
+                    reason = f"{before!r} has {length} elements, so there is no index {step}"
                 else:
                     value = _element(value, step)
                     continue
             elif not isinstance(value, dict):
                 reason = f"{before!r} is {_kind(value)}, not an object"
             elif step not in value:
-                reason = f"it has no {step!r}{where}; there it has {_list_fields(value)}"
+                reason = f"it has no {step!r}{where}; it has {_list_fields(value)}"
             else:
                 value = value[step]
                 continue
@@ -133,15 +132,15 @@ def find_field(message: dict[str, Any], name: str) -> Any:
     """Look a variable up once.
 
     Args:
-        message: a ROS message.
-        name: bare name or path.
+        message: A ROS message.
+        name: A bare name or path.
 
     Returns:
-        The value as it is.
+        The unchanged value.
 
     Raises:
-        PathError: the name is no name and no path.
-        FieldMissingError: it is not there.
+        PathError: The name is malformed.
+        FieldMissingError: The message does not have it.
         FieldAmbiguousError: a bare name is there more than once.
     """
     field = Field(name)
@@ -155,7 +154,7 @@ def parse_path(path: str) -> Place:
     """Read a path: names joined by dots, whole numbers from 0 in brackets.
 
     Raises:
-        PathError: it is not well-formed; the sentence says where.
+        PathError: It is malformed; the sentence names the position.
     """
     steps: list[str | int] = []
     at = 0
@@ -178,7 +177,7 @@ def parse_path(path: str) -> Place:
 
 
 def format_place(place: Place) -> str:
-    """Write a place as the path that names it."""
+    """Return the path of a place."""
     text = ""
     for step in place:
         text += f"[{step}]" if isinstance(step, int) else f".{step}" if text else step
@@ -186,7 +185,7 @@ def format_place(place: Place) -> str:
 
 
 def find_places(message: dict[str, Any], name: str) -> list[Place]:
-    """All places of a bare name, depth first in the message's order, not inside arrays."""
+    """Return all places of a bare name, depth first in the message's order, not inside arrays."""
     places: list[Place] = []
     inner: list[tuple[Place, dict[str, Any]]] = [((), message)]
     while inner:
@@ -202,7 +201,7 @@ def find_places(message: dict[str, Any], name: str) -> list[Place]:
 
 
 def _list_fields(message: dict[str, Any]) -> str:
-    """The paths of all that a message holds, arrays with their lengths."""
+    """List the paths of all fields, arrays with their lengths."""
     listed: list[str] = []
     inner: list[tuple[Place, Any]] = [((key,), value) for key, value in reversed(message.items())]
     while inner:
@@ -219,7 +218,7 @@ def _list_fields(message: dict[str, Any]) -> str:
 
 
 def _show(place: Place) -> str:
-    """A place for an error's sentence: what a message holds may be as long and odd as it likes."""
+    """Return a place for an error's sentence, shortened and printable."""
     text = format_place(place)
     if len(text) > MAX_SHOWN:
         text = text[: MAX_SHOWN - 3] + "..."
@@ -227,9 +226,9 @@ def _show(place: Place) -> str:
 
 
 def _length(value: Any) -> int | None:
-    """How many elements an array has, in whatever form it came; None if it is none."""
+    """Return the length of an array in any form; None if the value is not an array."""
     if isinstance(value, str):
-        # Four characters are three bytes, fewer where = stands for what is missing.
+        # Four characters are three bytes, less one for each =.
         return None if len(value) % 4 or not value else len(value) // 4 * 3 - value[-2:].count("=")
     if isinstance(value, list | bytes) or getattr(value, "ndim", 0) == 1:
         return len(value)
@@ -237,7 +236,7 @@ def _length(value: Any) -> int | None:
 
 
 def _element(value: Any, index: int) -> Any:
-    """One element; None of a text that is no base64 there."""
+    """Return one element; None if the text is not base64 there."""
     if isinstance(value, str):
         four = value[index // 3 * 4 : index // 3 * 4 + 4]
         try:

@@ -1,4 +1,4 @@
-"""Names of ROS topics, services and types: ``pkg/Type`` of ROS 1 and ``pkg/msg/Type`` of ROS 2 alike.
+"""Names of ROS topics, services and types: `pkg/Type` of ROS 1 and `pkg/msg/Type` of ROS 2 alike.
 
 Sources: http://wiki.ros.org/Names, https://design.ros2.org/articles/topic_and_service_names.html.
 """
@@ -11,8 +11,8 @@ from bridge.errors import NameFormError
 
 Kind = Literal["msg", "srv", "action"]
 
-#: Characters in a name at most. ROS 2 allows 255 for a topic; nothing sensible is longer.
 MAX_NAME = 255
+"""Longest name in characters; ROS 2 allows 255 for a topic."""
 
 _TYPE = re.compile(r"([A-Za-z][A-Za-z0-9_]*)/(?:(msg|srv|action)/)?([A-Za-z][A-Za-z0-9_]*)")
 _TOPIC = re.compile(r"[~/]?[A-Za-z_][A-Za-z0-9_]*(?:/[A-Za-z_][A-Za-z0-9_]*)*")
@@ -21,13 +21,13 @@ _EDGE_NAME_SIZE = 1024
 
 @lru_cache(maxsize=_EDGE_NAME_SIZE)
 def split_type(name: str) -> tuple[str, str, str]:
-    """Take a type's name apart.
+    """Split a type's name.
 
     Args:
-        name: ``std_msgs/String``, ``std_msgs/msg/String`` or ``std_srvs/srv/SetBool``.
+        name: `std_msgs/String`, `std_msgs/msg/String` or `std_srvs/srv/SetBool`.
 
     Returns:
-        Package, kind (``msg``, ``srv``, ``action``, or nothing in the ROS 1 form) and the type's own name.
+        Package, kind (`msg`, `srv`, `action`, or nothing in the ROS 1 form) and the type's own name.
 
     Raises:
         NameFormError: the name has neither form.
@@ -42,19 +42,19 @@ def split_type(name: str) -> tuple[str, str, str]:
 
 
 def ros1_type(name: str) -> str:
-    """The ROS 1 form of a type's name: ``std_msgs/String``."""
+    """Return the ROS 1 form of a type's name: `std_msgs/String`."""
     package, _kind, own = split_type(name)
     return f"{package}/{own}"
 
 
 def ros2_type(name: str, kind: Kind = "msg") -> str:
-    """The ROS 2 form of a type's name, ``std_msgs/msg/String``; ``kind`` serves where the name has none."""
+    """Return the ROS 2 form of a type's name, `std_msgs/msg/String`, with `kind` if the name has none."""
     package, its_kind, own = split_type(name)
     return f"{package}/{its_kind or kind}/{own}"
 
 
 def same_type(one: str, other: str) -> bool:
-    """Whether two names in any form mean one type. Malformed names are the same only if they are equal."""
+    """Return whether two names of any form mean one type. Malformed names have to be equal."""
     if one == other:
         return True
     try:
@@ -66,7 +66,7 @@ def same_type(one: str, other: str) -> bool:
 
 
 def ros_version_of_type(name: str) -> Literal[1, 2] | None:
-    """Which ROS writes a type like this, None for what is no type's name."""
+    """Return the ROS version of a type's form, or None if the name is malformed."""
     try:
         return 2 if split_type(name)[1] else 1
     except NameFormError:
@@ -74,13 +74,13 @@ def ros_version_of_type(name: str) -> Literal[1, 2] | None:
 
 
 def check_name(name: str) -> str:
-    """Refuse what can't be the name of a topic or a service.
+    """Refuse an invalid name of a topic or a service.
 
     Returns:
-        The name as it was: a relative one stays so, the server resolves it.
+        The unchanged name; the server resolves a relative one.
 
     Raises:
-        NameFormError: empty, too long, or with characters that ROS does not allow.
+        NameFormError: It is empty or too long, or has characters that ROS does not allow.
     """
     if len(name) > MAX_NAME:
         raise NameFormError(
@@ -95,5 +95,5 @@ def check_name(name: str) -> str:
 
 
 def absolute(name: str) -> str:
-    """The name with its leading slash: some clients leave it out, and both name the same topic."""
+    """Return the name with a leading slash, which some clients omit."""
     return name if name.startswith("/") else "/" + name

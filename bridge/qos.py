@@ -1,7 +1,7 @@
-"""Quality of service of a ROS 2 topic, as servers take it in ``advertise`` and ``subscribe`` (field ``qos``).
+"""Quality of service of a ROS 2 topic, as servers take it in `advertise` and `subscribe` (field `qos`).
 
-Newer servers of ROS 2 read it; those of ROS 1 and older ones pass over it without a word. What is left out is left
-to the server, which for a subscription looks at what the publishers offer.
+Newer servers of ROS 2 read it; older ones and those of ROS 1 ignore it silently. Omitted settings are up to the server,
+which adapts a subscription to its publishers.
 """
 
 import math
@@ -19,15 +19,15 @@ _CHOICES: Final = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Qos:
-    """What is wanted of a topic's transport between ROS nodes.
+    """Quality of service of a topic between ROS nodes.
 
     Attributes:
-        history: whether the last ``depth`` messages are kept for a slow reader, or all.
-        depth: how many messages are kept.
-        reliability: whether lost messages are sent again.
-        durability: whether a late subscriber gets what was published before (``transient_local``).
-        deadline: seconds within which the next message is expected; infinity for none.
-        lifespan: seconds after which a message is not delivered any more; infinity for none.
+        history: Whether the last `depth` messages are kept for a slow reader, or all.
+        depth: Number of messages that are kept.
+        reliability: Whether lost messages are sent again.
+        durability: Whether a late subscriber gets earlier messages (`transient_local`).
+        deadline: Longest expected time between messages in seconds; infinity for none.
+        lifespan: Seconds after which a message expires; infinity for never.
     """
 
     history: Literal["keep_last", "keep_all"] | None = None
@@ -38,7 +38,7 @@ class Qos:
     lifespan: float | None = None
 
     def __post_init__(self) -> None:
-        """Refuse what servers would refuse, most of them without a word."""
+        """Refuse settings that servers would refuse, most of them silently."""
         for name, choices in _CHOICES.items():
             value = getattr(self, name)
             if value is not None and value not in choices:
@@ -51,7 +51,7 @@ class Qos:
                 raise OptionError(f"qos {name} must be seconds from 0 up, not {value!r}")
 
     def as_operation(self) -> dict[str, Any]:
-        """The value of the field ``qos`` of an operation."""
+        """Return the value of an operation's field `qos`."""
         wanted: dict[str, Any] = {
             name: value
             for name in ("history", "depth", "reliability", "durability")

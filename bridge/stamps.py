@@ -1,4 +1,4 @@
-"""Time in messages: ``secs``/``nsecs`` of ROS 1 and ``sec``/``nanosec`` of ROS 2, built and read."""
+"""Time in messages: `secs`/`nsecs` of ROS 1 and `sec`/`nanosec` of ROS 2, built and read."""
 
 from collections.abc import Mapping
 from typing import Any, Final, Literal
@@ -8,14 +8,14 @@ _KEYS: Final = (("sec", "nanosec", 2), ("secs", "nsecs", 1))
 
 
 def stamp(time_ns: int, ros_version: Literal[1, 2] | None = None) -> dict[str, int]:
-    """A ROS time.
+    """Return a ROS time.
 
     Args:
-        time_ns: nanoseconds since 1970, as ``time.time_ns()`` gives them.
-        ros_version: whose keys to use; None uses both pairs, which servers of either ROS take.
+        time_ns: nanoseconds since 1970, as `time.time_ns()` gives them.
+        ros_version: ROS version of the keys; None uses both pairs, which all servers accept.
 
     Returns:
-        The time as a message's ``stamp`` has it.
+        The time as a message's `stamp` has it.
     """
     seconds, nanoseconds = divmod(time_ns, _NS)
     time: dict[str, int] = {}
@@ -27,18 +27,18 @@ def stamp(time_ns: int, ros_version: Literal[1, 2] | None = None) -> dict[str, i
 
 
 def header(time_ns: int, frame_id: str = "", ros_version: Literal[1, 2] | None = None) -> dict[str, Any]:
-    """A ``std_msgs/Header``. It has no ``seq``: ROS 1 fills it in, ROS 2 refuses it."""
+    """Return a `std_msgs/Header` without `seq`, which ROS 1 fills in and ROS 2 refuses."""
     return {"stamp": stamp(time_ns, ros_version), "frame_id": frame_id}
 
 
 def stamp_ns(time: object) -> int | None:
-    """Nanoseconds since 1970 of a message's time.
+    """Return the nanoseconds since 1970 of a message's time.
 
     Args:
-        time: the time's object in the keys of either ROS; a nanosecond key that is not there counts as 0.
+        time: The time's object with the keys of either ROS; missing nanoseconds count as 0.
 
     Returns:
-        The nanoseconds; None if it is no time.
+        The nanoseconds; None if the object is not a time.
     """
     if not isinstance(time, Mapping):
         return None
@@ -52,13 +52,13 @@ def stamp_ns(time: object) -> int | None:
 
 
 def header_stamp_ns(msg: Mapping[str, Any]) -> int | None:
-    """Nanoseconds since 1970 of a message's ``header.stamp``; None if there is none, or it is zero."""
+    """Return the nanoseconds since 1970 of a message's `header.stamp`; None if it is missing or zero."""
     head = msg.get("header")
     return (stamp_ns(head.get("stamp")) or None) if isinstance(head, Mapping) else None
 
 
 def ros_version_of_message(msg: Mapping[str, Any]) -> Literal[1, 2] | None:
-    """Which ROS a message with a header comes from; None without one, or with keys of both."""
+    """Return the ROS version of a message with a header; None without one, or with the keys of both."""
     head = msg.get("header")
     time = head.get("stamp") if isinstance(head, Mapping) else None
     if not isinstance(time, Mapping) or ("sec" in time) == ("secs" in time):

@@ -1,4 +1,4 @@
-"""Goals of ROS 2 actions as their sender holds them: feedback to be read, a result to be waited for, a way to cancel."""
+"""Goals of ROS 2 actions for their sender: feedback, result and cancelling."""
 
 import asyncio
 import time
@@ -11,17 +11,17 @@ from bridge.client.protocol.events import GoalEnded, GoalFeedback, GoalStatus
 from bridge.client.session import Session
 from bridge.errors import ConcurrentReadError, DisconnectedError, GoalError, NoAnswerError
 
-#: Feedback that waits for its reader; then the oldest is dropped.
 FEEDBACK_QUEUE_SIZE: Final = 64
+"""Limit of queued feedback; beyond it the oldest is dropped."""
 
 
 @dataclass(frozen=True, slots=True)
 class GoalResult:
-    """How a goal ended.
+    """Result of a goal.
 
     Attributes:
-        status: succeeded, canceled or aborted.
-        values: the result's fields.
+        status: Succeeded, canceled or aborted.
+        values: Fields of the result.
     """
 
     status: GoalStatus
@@ -29,14 +29,14 @@ class GoalResult:
 
 
 class Goal:
-    """One goal on its way: ``async for feedback in goal``, then ``await goal.result(timeout)``.
+    """One active goal: `async for feedback in goal`, then `await goal.result(timeout)`.
 
-    The iteration ends with the goal. If the connection is lost meanwhile, iteration and result fail: a server
-    forgets whose goal it was, so that its end will not be told.
+    The iteration ends with the goal. If the connection is lost meanwhile, iteration and result fail, because a server
+    forgets the sender of a goal and never reports its end.
 
     Attributes:
-        action: the action's name.
-        lost: how much feedback was dropped because its reader was too slow.
+        action: Name of the action.
+        lost: Number of feedback messages dropped because the reader was too slow.
     """
 
     def __init__(
@@ -46,7 +46,7 @@ class Goal:
         self.action = action
         self.lost = 0
         self._session = session
-        self._sent = time.monotonic()
+        self._sent_at = time.monotonic()
         self._feedback: deque[dict[str, Any]] = deque(maxlen=FEEDBACK_QUEUE_SIZE)
         self._reader: asyncio.Future[None] | None = None
         self._ended: asyncio.Future[GoalEnded] = asyncio.get_running_loop().create_future()
@@ -55,7 +55,7 @@ class Goal:
         session.flush()
 
     def receive(self, event: GoalFeedback | GoalEnded) -> None:
-        """Take what the server says of this goal."""
+        """Handle an event of this goal."""
         if isinstance(event, GoalFeedback):
             if len(self._feedback) == FEEDBACK_QUEUE_SIZE:
                 self.lost += 1
@@ -65,10 +65,10 @@ class Goal:
         self._wake()
 
     def fail(self, reason: str) -> None:
-        """Take note that nothing more will be heard of it."""
+        """End the goal without a result."""
         if not self._ended.done():
-            self._ended.set_exception(DisconnectedError(f"{reason} while {self.action} had a goal"))
-            self._ended.exception()  # nobody needs to ask for it
+            self._ended.set_exception(DisconnectedError(f"{reason} during a goal of {self.action}"))
+            self._ended.exception()  # marked as retrieved: nobody has to await it
         self._wake()
 
     def _wake(self) -> None:
@@ -77,27 +77,27 @@ class Goal:
 
     @property
     def done(self) -> bool:
-        """Whether it is over."""
+        """Whether the goal has ended."""
         return self._ended.done()
 
     async def cancel(self) -> None:
-        """Ask for it to be given up; `result` tells whether it was. Nothing happens if it is over."""
+        """Ask the server to cancel the goal; `result` returns whether it did. Ignore a goal that has ended."""
         self._session.core.goals.cancel(self._identity)
         self._session.flush()
 
     async def result(self, timeout: float) -> GoalResult:  # noqa: ASYNC109  # part of the error
-        """Wait for its end. May be called again.
+        """Wait for the end of the goal. It may be called repeatedly.
 
         Args:
-            timeout: seconds.
+            timeout: Timeout in seconds.
 
         Returns:
-            Its status and result, also of one that was canceled or aborted.
+            Status and result, even if it was canceled or aborted.
 
         Raises:
-            GoalError: the action refused the goal, or is not there.
-            NoAnswerError: it did not end in time; it goes on all the same.
-            DisconnectedError: the connection was lost before it ended.
+            GoalError: The action refused the goal, or does not exist.
+            NoAnswerError: It did not end in time, but is still active.
+            DisconnectedError: The connection was lost before it ended.
         """
         try:
             async with asyncio.timeout(timeout):
@@ -105,7 +105,7 @@ class Goal:
         except TimeoutError:
             raise NoAnswerError(
                 f"the goal of action {self.action} at {self._session.uri} did not end within {timeout:g} s"
-                f"{self._session.said_since(self._sent)}"
+                f"{self._session.context_since(self._sent_at)}"
             ) from None
         if not ended.ok:
             raise GoalError(ended.values, f"{self.action} at {self._session.uri}")
@@ -121,7 +121,9 @@ class Goal:
                     raise error
                 raise StopAsyncIteration
             if self._reader is not None:
-                raise ConcurrentReadError(f"another task waits for feedback of this goal of {self.action}")
+                raise ConcurrentReadError(
+                    f"another task already waits for feedback of this goal of {self.action}"
+                )
             self._reader = asyncio.get_running_loop().create_future()
             try:
                 await self._reader
@@ -133,7 +135,7 @@ class Goal:
         return self
 
     async def __aexit__(self, *_exception: object) -> None:
-        """Cancel it if it is not over; nobody is left who would read of it."""
+        """Cancel the goal unless it has ended."""
         if not self.done:
             await self.cancel()
         self._session.goals.pop(self._identity, None)

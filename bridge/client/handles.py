@@ -1,4 +1,4 @@
-"""What a program holds of a client: subscriptions that it reads, publications it writes, services it serves."""
+"""Handles that a program holds: subscriptions to read, publications to write, services to serve."""
 
 import asyncio
 import logging
@@ -23,12 +23,12 @@ from bridge.errors import (
 from bridge.names import absolute, same_type
 from bridge.qos import Qos
 
-#: Messages that wait in a subscription for their reader, unless it says otherwise.
 QUEUE_SIZE: Final = 64
-#: Publications of one topic that may wait for a slow server, unless it says otherwise.
+"""Default limit of messages queued for a subscription's reader."""
 PUBLISH_QUEUE_SIZE: Final = 100
-#: Seconds that finding out why a topic is silent may take.
+"""Default limit of messages of one topic that wait for a slow server."""
 EXPLAIN_TIMEOUT: Final = 0.5
+"""Seconds in which the reason of a topic's silence is looked up."""
 
 Handler = Callable[[dict[str, Any]], Awaitable[Mapping[str, Any] | None]]
 
@@ -36,7 +36,7 @@ _log = logging.getLogger("bridge")
 
 
 class _Handle:
-    """Something that is closed once: by itself, by leaving its ``async with``, or with its client."""
+    """Something that is closed once: explicitly, by leaving its `async with`, or with its client."""
 
     def __init__(self, session: Session) -> None:
         if session.state is State.CLOSED:
@@ -44,25 +44,25 @@ class _Handle:
         self._session = session
         self._closed = False
 
-    def _begin(self) -> None:
-        """Take note that the server has been told: from now on there is something to close."""
+    def _register(self) -> None:
+        """Have the handle closed with its client, and send its operation."""
         self._session.on_closed.add(self.end)
         self._session.flush()
 
     def end(self) -> None:
-        """Take note that the client was closed: nothing more comes or goes."""
+        """End without sending anything: the client was closed."""
         self._closed = True
 
-    def _take_back(self) -> None:
-        """Tell the server that this is not wanted any more."""
+    def _withdraw(self) -> None:
+        """Withdraw the operation from the server."""
         raise NotImplementedError
 
     async def close(self) -> None:
-        """Tell the server that this is not wanted any more. May be called again."""
+        """Withdraw this from the server. Repeating it does nothing."""
         if not self._closed:
             self.end()
             self._session.on_closed.discard(self.end)
-            self._take_back()
+            self._withdraw()
             self._session.flush()
 
     async def __aenter__(self) -> Self:
@@ -73,16 +73,15 @@ class _Handle:
 
 
 class Subscription(_Handle):
-    """The messages of one topic, to be read by one task: ``async for message in subscription``.
+    """The messages of one topic, to be read by one task: `async for message in subscription`.
 
-    If the reader is too slow the oldest messages are dropped, and nothing else slows down. A lost connection does
-    not end the iteration, messages go on after the reconnection; closing this or the client does.
+    If the reader is too slow the oldest messages are dropped, and nothing else slows down. The iteration survives
+    a lost connection, and ends when the subscription or the client is closed.
 
     Attributes:
-        topic: what was subscribed to.
-        lost: how many messages were dropped because the queue was full.
-        blind_seconds: how long, all in all, nothing could be heard because the connection was lost; each
-            message says how long it was just before it.
+        topic: Name of the topic.
+        lost: Number of messages dropped because the queue was full.
+        blind_seconds: Total time without connection; each message has the time just before it.
     """
 
     def __init__(
@@ -117,8 +116,8 @@ class Subscription(_Handle):
         )
         session.receivers[self._number] = self._receive
         session.on_blind.add(self._note_blind)
-        self._begin()
-        session.ask_later()
+        self._register()
+        session.schedule_retry()
 
     def _receive(self, message: Message) -> None:
         queue = self._queue
@@ -139,13 +138,13 @@ class Subscription(_Handle):
         self.blind_seconds += seconds
 
     def _keep_blind(self, message: Message) -> Message:
-        """The message that comes next says how long it was dark before the one that is dropped now."""
+        """Move the blind seconds of the message that is dropped now to the one after it."""
         queue = self._queue
-        heir = queue[1] if self._size > 1 else message
-        heir = heir._replace(blind_seconds=heir.blind_seconds + queue[0].blind_seconds)
+        successor = queue[1] if self._size > 1 else message
+        successor = successor._replace(blind_seconds=successor.blind_seconds + queue[0].blind_seconds)
         if self._size == 1:
-            return heir
-        queue[1] = heir
+            return successor
+        queue[1] = successor
         return message
 
     def __aiter__(self) -> Self:
@@ -171,8 +170,8 @@ class Subscription(_Handle):
     def _check_alone(self) -> None:
         if self._waiter is not None:
             raise ConcurrentReadError(
-                f"another task waits for messages of {self.topic} already: a second reader needs a "
-                "subscription of its own"
+                f"another task already waits for messages of {self.topic}: give the second reader its "
+                "own subscription"
             )
 
     def _wake(self) -> None:
@@ -180,10 +179,10 @@ class Subscription(_Handle):
             self._waiter.set_result(None)
 
     def _set_alarm(self, now: float) -> None:
-        """See that whoever waits is woken at the deadline.
+        """Have the reader woken at its deadline.
 
-        An alarm that was set before and rings earlier serves too: it is set again then. So one is set now and then, not
-        for each message: that would take longer than all the rest.
+        An alarm that is due earlier is kept, and set again when it is due: setting one for each message would take longer
+        than everything else.
         """
         if self._alarm is not None:
             if self._rings <= self._deadline:
@@ -205,13 +204,13 @@ class Subscription(_Handle):
         """Wait for one message.
 
         Args:
-            timeout: seconds.
+            timeout: Timeout in seconds.
 
         Raises:
-            NoMessageError: none came in time; the sentence names topic, server and time, and what the server
-                knows about the topic if it can be asked (which takes half a second more at most).
-            DisconnectedError: subscription or client are closed.
-            ConcurrentReadError: another task waits here.
+            NoMessageError: None arrived in time; the sentence names topic, server and time, and the server's
+                information about the topic if rosapi has any (which takes at most half a second more).
+            DisconnectedError: The subscription or the client is closed.
+            ConcurrentReadError: Another task waits here.
         """
         queue = self._queue
         if queue:
@@ -237,30 +236,30 @@ class Subscription(_Handle):
         )
 
     async def _why_silent(self, begun: float) -> str:
-        """What can be known about the topic's silence since a time, as the end of a sentence."""
+        """Return the end of an error's sentence: why the topic was silent since a time."""
         session = self._session
         if session.state is not State.CONNECTED:
             return f"; the connection is {session.state}: {session.last_error}"
         try:
             async with asyncio.timeout(EXPLAIN_TIMEOUT):
                 known = await ask_rosapi(session, "topic_type", {"topic": self.topic}, EXPLAIN_TIMEOUT)
-                its_type = known.get("type")
-                if its_type == "":
+                known_type = known.get("type")
+                if known_type == "":
                     return "; the server does not know the topic"
                 if (
-                    isinstance(its_type, str)
+                    isinstance(known_type, str)
                     and self._type is not None
-                    and not same_type(its_type, self._type)
+                    and not same_type(known_type, self._type)
                 ):
-                    return f"; the server knows it as {its_type[:80]}, not as {self._type}"
+                    return f"; the server knows it as {known_type[:80]}, not as {self._type}"
                 found = await ask_rosapi(session, "publishers", {"topic": self.topic}, EXPLAIN_TIMEOUT)
                 if found.get("publishers") == []:
                     return "; nobody publishes it"
-        except TimeoutError:  # a server without rosapi says so at once
-            return session.said_since(begun) or (
+        except TimeoutError:  # a server without rosapi answers that at once
+            return session.context_since(begun) or (
                 f"; nor did it answer a call of rosapi within {EXPLAIN_TIMEOUT:g} s: is it a rosbridge server?"
             )
-        return session.said_since(begun)
+        return session.context_since(begun)
 
     def end(self) -> None:
         """End the iteration, after what waits in the queue."""
@@ -270,7 +269,7 @@ class Subscription(_Handle):
             self._alarm = None
         self._wake()
 
-    def _take_back(self) -> None:
+    def _withdraw(self) -> None:
         del self._session.receivers[self._number]
         self._session.on_blind.discard(self._note_blind)
         self._session.core.subscriptions.unsubscribe(self._number)
@@ -280,7 +279,7 @@ class Publication(_Handle):
     """One advertised topic.
 
     Attributes:
-        topic: its name.
+        topic: Name of the topic.
     """
 
     def __init__(
@@ -304,22 +303,22 @@ class Publication(_Handle):
         self._number = self._publications.advertise(
             topic, type_name, latch=latch, queue_size=queue_size, qos=qos
         )
-        self._begin()
+        self._register()
 
     async def publish(self, msg: Mapping[str, Any], *, timeout: float = 5.0) -> None:  # noqa: ASYNC109  # as above
-        """Send one message; returns when the socket has it.
+        """Send one message, and return when the socket has it.
 
-        It goes out at once while the server keeps up; if not, it waits for its turn. Nothing is kept for later
-        over a lost connection: old readings are worth nothing after it.
+        It is sent at once while the server keeps up; otherwise it waits for its turn. Nothing is kept over a lost
+        connection: old readings are worthless after it.
 
         Args:
-            msg: the ROS message; values may be NumPy arrays.
-            timeout: seconds that it may wait for a slow server.
+            msg: The ROS message; values may be NumPy arrays.
+            timeout: Timeout in seconds for a slow server.
 
         Raises:
-            DisconnectedError: there is no connection now, or the publication or the client are closed.
-            SlowPeerError: the server did not take it in time, or as many as ``queue_size`` wait already.
-            EncodeError: it cannot be sent as JSON; a NaN or infinity is named with its place.
+            DisconnectedError: There is no connection now, or the publication or the client is closed.
+            SlowPeerError: The server did not accept it in time, or `queue_size` messages wait already.
+            EncodeError: It cannot be sent as JSON; a NaN or infinity is named with its place.
         """
         session = self._session
         if session.must_wait():
@@ -332,46 +331,46 @@ class Publication(_Handle):
                 await session.wait_turn(f"a message of {self.topic}", timeout)
             finally:
                 self._waiting -= 1
-        session.send_now(self._written(msg))
-        if session.is_others_turn():
+        session.send_now(self._encode(msg))
+        if session.should_yield():
             await asyncio.sleep(0)
 
     @property
     def must_wait(self) -> bool:
-        """Whether a message would have to wait now: for a slow server, or for a connection."""
+        """Whether a message would have to wait for a slow server, or for a connection."""
         session = self._session
         return session.state is not State.CONNECTED or not session.is_open or session.must_wait()
 
     async def ready(self, timeout: float = 5.0) -> None:  # noqa: ASYNC109  # as above
-        """Wait until the server has taken what was sent before.
+        """Wait until the server has accepted what was sent before.
 
         Raises:
-            DisconnectedError: there is no connection now, or it was lost meanwhile.
-            SlowPeerError: the server did not take it within ``timeout`` seconds.
+            DisconnectedError: There is no connection now, or it was lost meanwhile.
+            SlowPeerError: The server did not within `timeout` seconds.
         """
         if self._session.must_wait():
             await self._session.wait_turn(f"a message of {self.topic}", timeout)
 
     def publish_nowait(self, msg: Mapping[str, Any]) -> None:
-        """Send one message at once or not at all: for who must not wait.
+        """Send one message at once or not at all.
 
         Raises:
-            SlowPeerError: the server has not taken what was sent before; nothing was sent.
-            DisconnectedError, EncodeError: as `publish`.
+            SlowPeerError: The server has not accepted what was sent before; nothing was sent.
+            DisconnectedError, EncodeError: As in `publish`.
         """
         session = self._session
         if session.must_wait():
             raise SlowPeerError(
                 f"{session.uri} does not keep up: a message of {self.topic} would have to wait for its turn"
             )
-        session.send_now(self._written(msg))
+        session.send_now(self._encode(msg))
 
-    def _written(self, msg: Mapping[str, Any]) -> bytes:
+    def _encode(self, msg: Mapping[str, Any]) -> bytes:
         if self._closed:
             raise DisconnectedError(f"{self.topic} is not advertised any more: its publication was closed")
         return self._publications.publish(self._number, msg)
 
-    def _take_back(self) -> None:
+    def _withdraw(self) -> None:
         self._publications.unadvertise(self._number)
 
 
@@ -379,7 +378,7 @@ class Service(_Handle):
     """One service that this client serves.
 
     Attributes:
-        name: the service's name.
+        name: Name of the service.
     """
 
     def __init__(
@@ -392,10 +391,10 @@ class Service(_Handle):
         self._limit = handler_timeout
         session.core.services.advertise(name, type_name)
         session.servers[absolute(name)] = self._serve
-        self._begin()
+        self._register()
 
     async def _serve(self, request: ServiceRequested) -> None:
-        """Answer one request, whatever its handler does."""
+        """Answer one request, whatever happens in its handler."""
         values: Mapping[str, Any] | str
         ok = False
         try:
@@ -417,13 +416,13 @@ class Service(_Handle):
             answer(request.ticket, f"the answer cannot be sent: {error}", ok=False)
         self._session.flush()
 
-    def _take_back(self) -> None:
+    def _withdraw(self) -> None:
         del self._session.servers[absolute(self.name)]
         self._session.core.services.unadvertise(self.name)
 
 
 async def ask_rosapi(session: Session, name: str, args: Mapping[str, Any], limit: float) -> dict[str, Any]:
-    """A rosapi service's answer; nothing where there is none: rosapi is an extra that many servers lack."""
+    """Call a rosapi service; return nothing if it fails, since many servers lack rosapi."""
     try:
         answer = await session.call(f"/rosapi/{name}", args, limit)
     except BridgeError:

@@ -1,11 +1,10 @@
-"""The asyncio rosbridge client: topics and services over one connection that comes back by itself.
+"""The asyncio rosbridge client: topics, services and actions over one connection that reconnects by itself.
 
     async with connect("ws://127.0.0.1:9090") as ros:
         async for message in ros.subscribe("/boat/sensors", "boat_msgs/Sensors"):
             print(message.msg)
 
-Everything that waits has a limit, everything that queues has a size, and what is lost is counted
-(``docs/how-to/bridge.md``).
+Every wait has a timeout, every queue has a size, and losses are counted (`docs/how-to/bridge.md`).
 """
 
 import asyncio
@@ -38,17 +37,17 @@ from bridge.qos import Qos
 
 __all__ = ["Goal", "Message", "Publication", "Qos", "Ros", "Service", "State", "Subscription", "connect"]
 
-#: Seconds that finding out the server's ROS version may take.
 DETECT_TIMEOUT: Final = 2.0
-#: Seconds that a server may take to show, before the client goes, that it has read everything.
+"""Seconds in which the server's ROS version is looked up."""
 FAREWELL_TIMEOUT: Final = 0.3
+"""Seconds that a server has, before the client disconnects, to show that it has read everything."""
 
 
 class Ros:
-    """A client of one rosbridge server; `connect` makes it, ``async with`` opens and closes it, once."""
+    """A client of one rosbridge server, made by `connect`, and opened and closed once by `async with`."""
 
     def __init__(self, session: Session) -> None:
-        """Stand on a session that is not open yet."""
+        """Use a session that is not open yet."""
         self._session = session
         self._publishes = False
 
@@ -60,63 +59,63 @@ class Ros:
         await self.close()
 
     async def close(self) -> None:
-        """Close the connection; what was published before still goes out. Everything that waits is ended.
+        """Close the connection after what was published before, and end everything that waits.
 
-        There are servers that drop what they have not yet read when a client goes. So a client that published
-        first waits for an answer, which comes after all that it sent before; a third of a second at most.
+        Some servers drop what they have not yet read when a client disconnects. So a client that has published waits
+        for an answer, which follows everything that it sent; a third of a second at most.
         """
         try:
             if self._publishes and self._session.state is State.CONNECTED:
                 await ask_rosapi(self._session, "get_time", {}, FAREWELL_TIMEOUT)
-        finally:  # who is cancelled meanwhile is closed too
+        finally:  # a cancelled client is closed too
             await self._session.close()
 
     def together(self) -> AbstractContextManager[None]:
-        """Have what is published inside leave in one piece: ``with ros.together(): ...``.
+        """Send everything published inside the block in one piece: `with ros.together(): ...`.
 
-        Messages that belong together cost the server one awakening instead of one each. Nothing goes out before the
-        block ends, so nothing else should be waited for in it.
+        Messages that belong together then wake the server once. Nothing is sent before the block ends, so it should not
+        wait for anything else.
         """
         return self._session.together()
 
-    # How it stands
+    # State
 
     @property
     def uri(self) -> str:
-        """The server's URI."""
+        """URI of the server."""
         return self._session.uri
 
     @property
     def state(self) -> State:
-        """Where the connection stands."""
+        """State of the connection."""
         return self._session.state
 
     @property
     def reconnections(self) -> int:
-        """How often the connection was lost and came back."""
+        """Number of completed reconnections."""
         return self._session.reconnections
 
     @property
     def last_error(self) -> str:
-        """Why the connection was lost last, or why the last attempt to reconnect failed; empty if never."""
+        """Why the connection was lost, or why the last attempt to reconnect failed; empty if never."""
         return self._session.last_error
 
     @property
     def unusable(self) -> int:
-        """How many messages arrived that no client can use."""
+        """Number of received messages that no client can use."""
         return self._session.unusable
 
     @property
     def statuses(self) -> tuple[StatusReceived, ...]:
-        """What the server said of itself lately, newest last. Most servers never do."""
+        """Latest status messages of the server, newest last. Most servers send none."""
         return tuple(self._session.statuses)
 
     async def wait_for_state(self, state: State, timeout: float) -> None:  # noqa: ASYNC109  # part of the error
-        """Wait until the connection reaches a state; at once if it is there.
+        """Wait until the connection is in a state.
 
         Raises:
-            StateTimeoutError: it did not in time.
-            DisconnectedError: the client is or was closed meanwhile.
+            StateTimeoutError: It was not in time.
+            DisconnectedError: The client is closed.
         """
         await self._session.wait_for_state(state, timeout)
 
@@ -131,24 +130,24 @@ class Ros:
         *,
         qos: Qos | None = None,
     ) -> Publication:
-        """Announce that messages will be published on a topic.
+        """Advertise a topic.
 
-        A server over a real ROS tells its network first: subscribers there may miss what is published in the
-        first tenths of a second.
+        A server of a real ROS informs its network first: subscribers there may miss messages in the first tenths of a
+        second.
 
         Args:
-            topic: its name.
-            type: the messages' type, in the form of ROS 1 or ROS 2.
-            latch: whether the server keeps the last message for those who subscribe later; it is sent again
-                after a reconnection.
-            queue_size: how many messages may wait here for a slow server; told to the server too, for ROS.
-            qos: what the server is to ask of ROS 2; older servers pass over it.
+            topic: Name of the topic.
+            type: Type in the form of ROS 1 or ROS 2.
+            latch: Whether the server keeps the last message for later subscribers; it is sent again after a
+                reconnection.
+            queue_size: Limit of messages that wait for a slow server; the server gets it too, for ROS.
+            qos: Quality of service in ROS 2; older servers ignore it.
 
         Raises:
-            NameFormError: of topic or type.
-            TypeConflictError: this client advertises the topic already, as something else.
-            OptionError: the queue has no room.
-            DisconnectedError: the client was closed.
+            NameFormError: The name or the type is malformed.
+            TypeConflictError: This client already advertises the topic with other options.
+            OptionError: The queue size is not positive.
+            DisconnectedError: The client was closed.
         """
         self._publishes = True
         return Publication(self._session, topic, type, latch=latch, queue_size=queue_size, qos=qos)
@@ -169,25 +168,24 @@ class Ros:
         """Subscribe to a topic.
 
         Args:
-            topic: its name.
-            type: the messages' type; None leaves it to the server, which is asked again every two seconds
-                until a message comes, since servers forget subscriptions of topics they do not know yet.
-            throttle_rate: milliseconds between two messages at least; the server drops what is between.
-            queue_length: how many messages the server keeps instead of dropping them.
-            queue_size: how many messages wait here for their reader; then the oldest is dropped and counted.
-            compression: ``cbor`` brings long arrays at a tenth of JSON's time, ``cbor-raw`` the serialised
-                bytes alone (`Message.raw`), ``png`` is for thin lines to servers of ROS 1. A server that does
-                not know it sends JSON, or nothing.
-            arrays: what arrays of numbers are in a message: ``list``, or ``numpy`` for NumPy's, read-only if
-                they came as CBOR.
-            fragment_size: characters of what the server may send in one piece.
-            qos: what the server is to ask of ROS 2; older servers pass over it.
+            topic: Name of the topic.
+            type: Type of the messages; None leaves it to the server. The subscription is then repeated every two
+                seconds until a message arrives, since servers forget subscriptions to unknown topics.
+            throttle_rate: Minimum of milliseconds between two messages; the server drops others.
+            queue_length: Number of throttled messages that the server keeps.
+            queue_size: Limit of messages queued here; beyond it the oldest is dropped and counted.
+            compression: `cbor` for long arrays in a tenth of JSON's time, `cbor-raw` for the serialised bytes
+                alone (`Message.raw`), `png` for servers of ROS 1 over slow networks. A server that does not know
+                it sends JSON, or nothing.
+            arrays: Python type of arrays of numbers: `list`, or `numpy` for NumPy arrays, read-only from CBOR.
+            fragment_size: Limit of characters that the server sends in one piece.
+            qos: Quality of service in ROS 2; older servers ignore it.
 
         Raises:
-            NameFormError: of topic or type.
-            TypeConflictError: this client subscribes to the topic already, as another type or in another form.
-            OptionError: a number is out of its range.
-            DisconnectedError: the client was closed.
+            NameFormError: The name or the type is malformed.
+            TypeConflictError: This client already subscribes to the topic with another type or delivery.
+            OptionError: A number is out of its range.
+            DisconnectedError: The client was closed.
         """
         return Subscription(
             self._session,
@@ -210,19 +208,19 @@ class Ros:
         """Call a service.
 
         Args:
-            service: its name.
-            args: the request's fields.
-            timeout: seconds for all of it.
+            service: Name of the service.
+            args: Fields of the request.
+            timeout: Timeout in seconds.
 
         Returns:
-            The answer's fields.
+            Fields of the answer.
 
         Raises:
-            ServiceError: it answered that it failed; with the server's text.
-            NoAnswerError: it did not answer in time.
-            SlowPeerError: the server did not even take the call in time.
-            DisconnectedError: there is no connection, or it was lost meanwhile.
-            EncodeError: the arguments cannot be sent as JSON.
+            ServiceError: It answered that it failed; with the server's text.
+            NoAnswerError: It did not answer in time.
+            SlowPeerError: The server did not accept the call in time.
+            DisconnectedError: There is no connection, or it was lost meanwhile.
+            EncodeError: The arguments cannot be sent as JSON.
         """
         return await self._session.call(service, args or {}, timeout)
 
@@ -237,17 +235,17 @@ class Ros:
         """Serve a service.
 
         Args:
-            service: its name.
-            type: its type, in the form of ROS 1 or ROS 2.
-            handler: is awaited with each request's fields and returns the answer's. If it raises `ServiceError`,
-                the caller gets its reason; anything else is logged, and the caller gets the error's name.
-                Requests are handled at the same time, 64 at most.
-            handler_timeout: seconds that the handler may take for one request.
+            service: Name of the service.
+            type: Its type, in the form of ROS 1 or ROS 2.
+            handler: Awaited with the fields of each request; returns the fields of the answer. If it raises
+                `ServiceError`, the caller gets its reason; any other error is logged, and the caller gets its name.
+                Up to 64 requests are handled concurrently.
+            handler_timeout: Timeout of the handler in seconds.
 
         Raises:
-            NameFormError: of service or type.
-            TypeConflictError: this client serves it already.
-            DisconnectedError: the client was closed.
+            NameFormError: The name or the type is malformed.
+            TypeConflictError: This client already serves it.
+            DisconnectedError: The client was closed.
         """
         return Service(self._session, service, type, handler, handler_timeout)
 
@@ -265,45 +263,45 @@ class Ros:
         """Send a goal to an action of ROS 2.
 
         Args:
-            action: its name.
-            type: its type: ``example_interfaces/action/Fibonacci``, or without the middle.
-            goal: the goal's fields.
-            feedback: whether to be told how far it is.
-            timeout: seconds that the server may take to read it.
+            action: Name of the action.
+            type: Its type: `example_interfaces/action/Fibonacci`, or without the middle.
+            goal: Fields of the goal.
+            feedback: Whether to receive feedback.
+            timeout: Timeout in seconds for a slow server.
 
         Returns:
-            The goal on its way: ``async for feedback in goal``, ``await goal.result(timeout)``, and
-            ``async with goal`` cancels it where it is left before its end.
+            The active goal: `async for feedback in goal`, `await goal.result(timeout)`, and `async with goal`, which
+            cancels it at the end of the block.
 
         Raises:
-            NameFormError: of action or type.
-            SlowPeerError: the server did not take it in time, or too many goals are under way.
-            DisconnectedError: there is no connection.
-            EncodeError: the goal cannot be sent as JSON.
+            NameFormError: The name or the type is malformed.
+            SlowPeerError: The server did not accept it in time, or too many goals are active.
+            DisconnectedError: There is no connection.
+            EncodeError: The goal cannot be sent as JSON.
         """
         if self._session.must_wait():
             await self._session.wait_turn(f"a goal of {action}", timeout)
         return Goal(self._session, action, type, goal or {}, feedback=feedback)
 
-    # Finding out about the server
+    # Information about the server
 
     @property
     def ros_version(self) -> RosVersion | None:
-        """Which ROS the server speaks for: as told, as detected, or as header stamps show; None if unknown."""
+        """ROS version of the server: configured, detected, or seen in header stamps; None if unknown."""
         return self._session.core.ros_version
 
     async def detect_ros_version(self, timeout: float = DETECT_TIMEOUT) -> RosVersion | None:  # noqa: ASYNC109  # all of it
-        """Find out which ROS the server speaks for, if it can be found out.
+        """Detect the ROS version of the server, if possible.
 
-        What was told to `connect` counts first, then the stamps of messages received so far, then rosapi: the
-        version itself, or the form of the type of ``/rosout``. Later advertisements and subscriptions, and those
-        restored after a reconnection, use type names of the form found.
+        The option of `connect` comes first, then the stamps of received messages, then rosapi: the version itself, or the
+        form of the type of `/rosout`. Later advertisements and subscriptions, and those restored after a reconnection,
+        use type names of the detected form.
 
         Args:
-            timeout: seconds for all of it.
+            timeout: Timeout in seconds.
 
         Returns:
-            1 or 2, None if it cannot be known: there is no rosapi, and no message with a header came yet.
+            1 or 2; None without rosapi and without a message with a header.
         """
         if self.ros_version is None:
             questions = [
@@ -326,8 +324,8 @@ class Ros:
         return 1 if version == 1 else 2 if version == 2 else None
 
     async def _ask_rosout_type(self, limit: float) -> RosVersion | None:
-        its_type = (await ask_rosapi(self._session, "topic_type", {"topic": "/rosout"}, limit)).get("type")
-        return ros_version_of_type(its_type) if isinstance(its_type, str) else None
+        rosout_type = (await ask_rosapi(self._session, "topic_type", {"topic": "/rosout"}, limit)).get("type")
+        return ros_version_of_type(rosout_type) if isinstance(rosout_type, str) else None
 
 
 def connect(
@@ -347,33 +345,33 @@ def connect(
     ping_timeout: float = 5.0,
     on_state: StateCallback | None = None,
 ) -> Ros:
-    """Make a client of a rosbridge server, which ``async with`` opens and closes.
+    """Make a client of a rosbridge server, which `async with` opens and closes.
 
-    Entering fails if the first connection does, with `UnreachableError` or `NotRosbridgeError`. A connection lost
-    later is opened again, first after 0.1 s, then after twice as long each time, 5 s at most, and everything that
-    was advertised, subscribed and served is so again.
+    Entering fails if the first connection does, with `UnreachableError` or `NotRosbridgeError`. A connection that is
+    lost later is opened again, with a back-off from 0.1 s to 5 s, and everything that was advertised, subscribed and
+    served is restored.
 
     Args:
-        uri: ``ws://host:port``, or ``wss://`` for TLS, whose certificate is always checked.
-        connect_timeout: seconds for the first connection.
-        ros_version: whose form type names have on the wire. ``auto`` uses that of ROS 1, which servers of ROS 2
-            take as well, until `Ros.detect_ros_version` has found it.
-        token: is sent as ``Authorization: Bearer TOKEN``; like all headers it is in no log and no repr.
-        headers: are sent when connecting.
-        ca_file: certificates (PEM) that vouch for the server, instead of the system's.
-        client_certificate: certificate and key (PEM) that this client shows, in one file or in two.
-        tls: all of TLS, instead of these two.
-        proxy: ``http://proxy:3128``, ``https://`` or ``socks5h://`` (with the package python-socks), or
-            ``environment`` for the one that HTTPS_PROXY and the like name. None asks no proxy.
-        max_size: bytes of one message at most, both ways. A larger one that arrives ends the connection.
-        fragment_size: characters beyond which a message leaves in fragments; None for never.
-        ping_interval: seconds of silence after which the server is asked for a sign of life.
-        ping_timeout: seconds that it then has, before the connection counts as lost.
-        on_state: is called with each new state and its reason.
+        uri: `ws://host:port`, or `wss://` for TLS, whose certificate is always checked.
+        connect_timeout: Timeout of the first connection in seconds.
+        ros_version: ROS version of type names on the wire. `auto` uses ROS 1, which servers of ROS 2 accept
+            too, until `Ros.detect_ros_version` has detected it.
+        token: Sent as `Authorization: Bearer TOKEN`; like all headers it is never logged.
+        headers: Additional headers of the handshake.
+        ca_file: Certificate authorities (PEM) for the server, instead of the system's.
+        client_certificate: Certificate and key (PEM) of this client, in one file or in two.
+        tls: Complete TLS settings, instead of these two.
+        proxy: `http://proxy:3128`, `https://` or `socks5h://` (with the package python-socks), or
+            `environment` for the one in HTTPS_PROXY etc. None connects directly.
+        max_size: Largest message in bytes, in both directions. A larger one that arrives ends the connection.
+        fragment_size: Characters beyond which a message is sent in fragments; None for never.
+        ping_interval: Seconds of silence after which the server is pinged.
+        ping_timeout: Seconds that it then has, before the connection counts as lost.
+        on_state: Called with each new state and its reason.
 
     Raises:
-        UriError: the URI is none of a WebSocket.
-        OptionError: an option is out of its range, or a file cannot be read.
+        UriError: It is not a WebSocket URI.
+        OptionError: An option is out of its range, or a file cannot be read.
     """
     if ros_version not in {"auto", "1", "2"}:
         raise OptionError(f"ros_version must be auto, 1 or 2, not {ros_version!r}")
@@ -383,7 +381,7 @@ def connect(
         ping_interval=ping_interval,
         ping_timeout=ping_timeout,
     )
-    told: RosVersion | None = None if ros_version == "auto" else 1 if ros_version == "1" else 2
+    configured_version: RosVersion | None = None if ros_version == "auto" else 1 if ros_version == "1" else 2
     parsed = check_uri(uri)
     route = make_route(
         parsed,
@@ -394,6 +392,6 @@ def connect(
         tls=tls,
         proxy=proxy,
     )
-    core = ClientCore(ros_version=told, max_size=max_size, fragment_size=fragment_size)
-    parsed = replace(parsed, username=None, password=None)  # the route has them
+    core = ClientCore(ros_version=configured_version, max_size=max_size, fragment_size=fragment_size)
+    parsed = replace(parsed, username=None, password=None)  # they are in the route
     return Ros(Session(parsed, shown(uri), core, limits, on_state, route=route))

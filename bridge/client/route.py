@@ -1,6 +1,7 @@
-"""How a connection reaches its server: TLS and its certificates, headers and tokens, a proxy on the way.
+"""Route of a connection to its server: TLS and certificates, headers and tokens, proxies.
 
-Nothing secret is in what is shown: a `Route`'s repr has no headers, `shown` takes credentials and queries out of a URI.
+Secrets stay out of logs and errors: the repr of a `Route` has no headers, and `shown` removes credentials and queries from
+a URI.
 """
 
 import asyncio
@@ -21,8 +22,8 @@ from websockets.uri import WebSocketURI
 
 from bridge.errors import OptionError, UnreachableError
 
-#: The proxy that the environment names (``HTTPS_PROXY``, ``ALL_PROXY`` and the like, ``NO_PROXY``).
 FROM_ENVIRONMENT: Final = "environment"
+"""Use the proxy from the environment (`HTTPS_PROXY`, `ALL_PROXY`, `NO_PROXY` ...)."""
 
 _log = logging.getLogger("bridge")
 
@@ -36,18 +37,18 @@ _ConnectionT = TypeVar("_ConnectionT", bound=asyncio.Protocol)
 
 
 def shown(uri: str) -> str:
-    """A URI as it may be read by anyone: without user, password and query."""
+    """Return a URI without user, password and query."""
     return _QUERY.sub("?***", _CREDENTIALS.sub(r"\1", uri))
 
 
 @dataclass(frozen=True, slots=True)
 class Route:
-    """The way to a server.
+    """The route to a server.
 
     Attributes:
-        tls: what certificates are checked with and shown; None for ``ws://``.
-        headers: what is said beside the WebSocket's own headers.
-        proxy: who is asked to connect, None for nobody.
+        tls: TLS settings; None for `ws://`.
+        headers: Headers of the handshake beside the WebSocket's own.
+        proxy: The proxy, or None for a direct connection.
     """
 
     tls: ssl.SSLContext | None = None
@@ -65,31 +66,31 @@ def make_route(
     tls: ssl.SSLContext | None = None,
     proxy: str | None = None,
 ) -> Route:
-    """Read what a user says of the way (see `bridge.client.connect`); a user in the URI becomes a header.
+    """Check a user's options of the route (see `bridge.client.connect`); a user in the URI becomes a header.
 
     Raises:
-        OptionError: something of it cannot be; the sentence names the option, never a secret.
+        OptionError: An option is unusable; the sentence names it, but no secret.
     """
-    said = dict(headers or {})
-    if uri.user_info is not None and not any(name.lower() == "authorization" for name in said):
+    fields = dict(headers or {})
+    if uri.user_info is not None and not any(name.lower() == "authorization" for name in fields):
         if token is not None:
             raise OptionError("token and a user in the URI exclude each other")
-        said["Authorization"] = build_authorization_basic(*uri.user_info)
+        fields["Authorization"] = build_authorization_basic(*uri.user_info)
     if token is not None:
-        if any(name.lower() == "authorization" for name in said):
+        if any(name.lower() == "authorization" for name in fields):
             raise OptionError("token and an Authorization header exclude each other")
         if not token or not token.isascii() or not token.isprintable() or " " in token:
             raise OptionError("token must be printable ASCII characters without spaces")
-        said["Authorization"] = f"Bearer {token}"
-    for name, value in said.items():
+        fields["Authorization"] = f"Bearer {token}"
+    for name, value in fields.items():
         if _HEADER_NAME.fullmatch(name) is None:
-            raise OptionError(f"{name!r} is no name of a header")
+            raise OptionError(f"{name!r} is not a header name")
         if not isinstance(value, str) or _HEADER_VALUE.fullmatch(value) is None:
-            raise OptionError(f"the value of header {name} has characters that no header can have")
-    secret = any(name.lower() == "authorization" for name in said)
+            raise OptionError(f"the value of header {name} has characters that are not allowed in headers")
+    secret = any(name.lower() == "authorization" for name in fields)
     if secret and not uri.secure and not _is_loopback(uri.host):
-        _log.warning("what lets this client in is sent to %s unencrypted: wss:// would protect it", uri.host)
-    return Route(_tls(uri, ca_file, client_certificate, tls), tuple(said.items()), _proxy(uri, proxy))
+        _log.warning("credentials are sent to %s unencrypted: wss:// would protect them", uri.host)
+    return Route(_tls(uri, ca_file, client_certificate, tls), tuple(fields.items()), _proxy(uri, proxy))
 
 
 def _tls(
@@ -102,7 +103,7 @@ def _tls(
     given = [name for name, value in options.items() if value is not None]
     if not uri.secure:
         if given or tls is not None:
-            raise OptionError(f"{(*given, 'tls')[0]} is of use with wss:// only")
+            raise OptionError(f"{(*given, 'tls')[0]} requires wss://")
         return None
     if tls is not None:
         if given:
@@ -111,7 +112,7 @@ def _tls(
     try:
         context = ssl.create_default_context(cafile=None if ca_file is None else fspath(ca_file))
     except (OSError, ssl.SSLError) as error:
-        raise OptionError(f"ca_file {fspath(ca_file or '')} cannot be used: {_say(error)}") from None
+        raise OptionError(f"ca_file {fspath(ca_file or '')} cannot be used: {_reason(error)}") from None
     if client_certificate is not None:
         certificate, key = (
             client_certificate if isinstance(client_certificate, tuple) else (client_certificate, None)
@@ -121,7 +122,7 @@ def _tls(
             context.load_cert_chain(certificate, key, password=lambda: b"")
         except (OSError, ssl.SSLError, ValueError) as error:
             named = fspath(certificate) + (f" and {fspath(key)}" if key is not None else "")
-            raise OptionError(f"client_certificate {named} cannot be used: {_say(error)}") from None
+            raise OptionError(f"client_certificate {named} cannot be used: {_reason(error)}") from None
     return context
 
 
@@ -133,7 +134,7 @@ def _proxy(uri: WebSocketURI, proxy: str | None) -> Proxy | None:
     try:
         return parse_proxy(proxy)
     except (InvalidProxy, ValueError) as error:
-        reason = error.msg if isinstance(error, InvalidProxy) else "it is no URL"
+        reason = error.msg if isinstance(error, InvalidProxy) else "it is not a URL"
         raise OptionError(
             f"proxy {shown(proxy)!r} cannot be used ({reason}): it must be like http://proxy:3128"
         ) from None
@@ -142,18 +143,18 @@ def _proxy(uri: WebSocketURI, proxy: str | None) -> Proxy | None:
 async def connect_along(
     route: Route, uri: WebSocketURI, shown_uri: str, factory: Callable[[], _ConnectionT]
 ) -> _ConnectionT:
-    """Open the transport under a WebSocket connection.
+    """Open the transport of a WebSocket connection.
 
     Args:
-        route: the way.
-        uri: where to.
-        shown_uri: the same for the errors.
-        factory: makes the connection, which is told of its transport.
+        route: The route.
+        uri: The server.
+        shown_uri: The same for errors.
+        factory: Makes the connection.
 
     Raises:
-        UnreachableError: the proxy does not let through.
-        OptionError: a proxy that needs a package which is not installed.
-        OSError: what the system says.
+        UnreachableError: The proxy refuses or fails.
+        OptionError: The proxy needs a package that is not installed.
+        OSError: The connection failed.
     """
     loop = asyncio.get_running_loop()
     hostname = uri.host if route.tls is not None else None
@@ -180,7 +181,9 @@ async def connect_along(
             f"{error.response.reason_phrase[:80]})"
         ) from None
     except (InvalidHandshake, OSError) as error:
-        raise UnreachableError(f"{shown_uri} is unreachable: the proxy {name} fails: {_say(error)}") from None
+        raise UnreachableError(
+            f"{shown_uri} is unreachable: the proxy {name} fails: {_reason(error)}"
+        ) from None
     if proxy.scheme.startswith("socks"):
         _transport, connection = await loop.create_connection(
             factory, sock=sock, ssl=route.tls, server_hostname=hostname
@@ -207,7 +210,7 @@ def _is_loopback(host: str) -> bool:
         return host == "localhost" or host.endswith(".localhost")
 
 
-def _say(error: Exception) -> str:
+def _reason(error: Exception) -> str:
     if isinstance(error, ssl.SSLError):
-        return error.reason or "OpenSSL does not take it"
+        return error.reason or "OpenSSL refuses it"
     return (error.strerror if isinstance(error, OSError) else None) or str(error)

@@ -1,4 +1,4 @@
-"""A connection to a rosbridge server that comes back by itself: states, sending in turn, and who gets what arrives."""
+"""A rosbridge connection that reconnects by itself: its states, sending in order, and dispatch of what arrives."""
 
 import asyncio
 import logging
@@ -37,25 +37,25 @@ from bridge.errors import (
     StateTimeoutError,
 )
 
-#: Seconds before the first attempt to reconnect, and at most before any.
 FIRST_DELAY: Final = 0.1
+"""First and longest delay in seconds before an attempt to reconnect."""
 MAX_DELAY: Final = 5.0
-#: Seconds that one attempt to reconnect may take.
 ATTEMPT_TIMEOUT: Final = 5.0
-#: Seconds that a connection must last for the next reconnection to begin with the first delay again.
+"""Seconds that one attempt to reconnect may take."""
 STEADY: Final = 5.0
-#: Seconds between two requests for a topic of unknown type that has brought nothing yet.
-ASK_AGAIN: Final = 2.0
-#: Status messages of the server that are kept.
+"""Seconds that a connection must last to reset the back-off."""
+UNTYPED_RETRY: Final = 2.0
+"""Seconds between two subscriptions to a topic of unknown type without messages."""
 KEPT_STATUSES: Final = 16
-# So many messages go out in a row before other tasks get their turn.
-_IN_A_ROW: Final = 32
+"""Latest status messages of the server that are kept."""
+# Messages that are sent in a row before other tasks get their turn.
+_LONGEST_BURST: Final = 32
 
 _log = logging.getLogger("bridge")
 
 
 class State(StrEnum):
-    """Where a connection stands."""
+    """State of a connection."""
 
     CONNECTING = "connecting"
     CONNECTED = "connected"
@@ -68,25 +68,25 @@ Server = Callable[[ServiceRequested], Coroutine[Any, Any, None]]
 
 
 class GoalReceiver(Protocol):
-    """Who is told of a goal of an action."""
+    """Receiver of the events of one action goal."""
 
     def receive(self, event: GoalFeedback | GoalEnded) -> None:
-        """Take what the server says of it."""
+        """Handle an event of the goal."""
 
     def fail(self, reason: str) -> None:
-        """Take note that nothing more will be heard of it."""
+        """End the goal without a result."""
 
 
 class Message(NamedTuple):
     """One message of a topic.
 
     Attributes:
-        topic: as the server names it.
-        msg: the ROS message; shared by all subscriptions of the topic, so not to be changed.
-        received_ns: ``time.time_ns()`` at its arrival, the same for all that the socket brought at once.
-        received_monotonic_ns: ``time.monotonic_ns()`` then.
-        blind_seconds: for how long, before this message, nothing could be heard because the connection was lost;
-            0 but for the first message after a reconnection.
+        topic: Name of the topic in the server's spelling.
+        msg: The ROS message; shared by all subscriptions of the topic, so not to be changed.
+        received_ns: `time.time_ns()` at its arrival, the same for all messages that arrive together.
+        received_monotonic_ns: `time.monotonic_ns()` at the same time.
+        blind_seconds: How long the connection was lost just before this message; 0 except in the first message
+            after a reconnection.
     """
 
     topic: str
@@ -97,10 +97,10 @@ class Message(NamedTuple):
 
     @property
     def raw(self) -> bytes:
-        """The serialised message, of a subscription with ``cbor-raw``.
+        """The serialised bytes of a message of a `cbor-raw` subscription.
 
         Raises:
-            DecodeError: the message has no bytes: it came another way, or the server does not know cbor-raw.
+            DecodeError: It has none: it was subscribed otherwise, or the server does not know cbor-raw.
         """
         data = self.msg.get("bytes")
         if type(data) is not bytes:
@@ -113,7 +113,7 @@ class Message(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Limits:
-    """What a connection may take, in seconds and bytes (see ``bridge.client.connect``)."""
+    """Limits of a connection in seconds and bytes (see `bridge.client.connect`)."""
 
     connect_timeout: float
     max_size: int
@@ -121,7 +121,7 @@ class Limits:
     ping_timeout: float
 
     def __post_init__(self) -> None:
-        """Refuse what is no limit."""
+        """Refuse limits that are not positive."""
         for limit in fields(self):
             value = getattr(self, limit.name)
             if not value > 0:
@@ -132,18 +132,18 @@ class Session:
     """The one connection of a client, over all of its WebSockets.
 
     Attributes:
-        uri: the server's, without secrets.
-        core: what is wanted of the server.
-        state: where the connection stands.
-        reconnections: how often the connection was lost and came back.
-        last_error: why the connection was lost, or why the last attempt failed.
-        unusable: how many messages arrived that no client can use.
-        statuses: what the server said of itself lately, newest last.
-        receivers: by subscription, who takes its messages.
-        on_blind: are told after a reconnection how many seconds nothing could be heard.
-        servers: by service of this client, who answers its requests.
-        goals: by identity, who is told of a goal of an action.
-        on_closed: are called once, when the connection is closed for good.
+        uri: URI of the server, without secrets.
+        core: The protocol's state: everything that was advertised, subscribed and called.
+        state: State of the connection.
+        reconnections: Number of completed reconnections.
+        last_error: Why the connection was lost, or why the last attempt failed.
+        unusable: Number of messages that no client can use.
+        statuses: Latest status messages of the server, newest last.
+        receivers: Callbacks for messages, by number of the subscription.
+        on_blind: Callbacks for the seconds without connection, after a reconnection.
+        servers: Handlers of requests, by service of this client.
+        goals: Receivers of events, by identity of the action goal.
+        on_closed: Callbacks for the final close.
     """
 
     def __init__(
@@ -156,7 +156,7 @@ class Session:
         *,
         route: Route,
     ) -> None:
-        """Prepare; `open` connects."""
+        """Prepare the session; `open` connects."""
         self.uri = shown_uri
         self.core = core
         self._wire = core.wire
@@ -167,7 +167,7 @@ class Session:
         self.statuses: deque[StatusReceived] = deque(maxlen=KEPT_STATUSES)
         self._status_at = 0.0
         self._lost_at = 0.0
-        self._said = 0
+        self._status_count = 0
         self.receivers: dict[int, Callable[[Message], None]] = {}
         self.on_blind: set[Callable[[float], None]] = set()
         self.servers: dict[str, Server] = {}
@@ -183,9 +183,9 @@ class Session:
         self._connected_at = 0.0
         self._delay = FIRST_DELAY
         self._reconnecting: asyncio.Task[None] | None = None  # the last one, done or not
-        self._asking: asyncio.TimerHandle | None = None
-        self._in_a_row = 0
-        self._turn = asyncio.Lock()  # fair: who waits longer comes first
+        self._retry_timer: asyncio.TimerHandle | None = None
+        self._burst = 0
+        self._turn = asyncio.Lock()  # fair: first come, first served
         self._waiting = 0
         self._serving: set[asyncio.Task[None]] = set()
         self._calls: dict[str, asyncio.Future[CallAnswered]] = {}
@@ -197,9 +197,9 @@ class Session:
         """Connect for the first time.
 
         Raises:
-            UnreachableError: nothing answers at the URI.
-            NotRosbridgeError: something answers, but not as a WebSocket server.
-            DisconnectedError: it was opened before.
+            UnreachableError: Nothing answers at the URI.
+            NotRosbridgeError: Something answers, but not as a WebSocket server.
+            DisconnectedError: It was opened before.
         """
         if self._entered:
             raise DisconnectedError(f"this client of {self.uri} was opened before: connect() makes a new one")
@@ -211,20 +211,20 @@ class Session:
             raise
 
     async def close(self, reason: str = "closed by this client") -> None:
-        """Close the connection; what was sent before still goes out. Everything that waits is ended."""
+        """Close the connection after what was sent before, and end everything that waits."""
         if self.state is State.CLOSED:
             return
         websocket, self._websocket = self._websocket, None
         self.core.lost()
-        # all but the one that closes: a service's handler may
+        # except the current task: a service's handler may close the client
         ending = {*self._serving, *([self._reconnecting] if self._reconnecting is not None else [])}
         ending -= {asyncio.current_task()}
         for task in ending:
             task.cancel()
         self._fail_calls(f"the client of {self.uri} was closed")
         self._set_state(State.CLOSED, reason)
-        for end in self.on_closed:
-            end()
+        for callback in self.on_closed:
+            callback()
         self.on_closed.clear()
         if websocket is not None:
             try:
@@ -250,17 +250,17 @@ class Session:
         self._connected_at = time.monotonic()
         if self.state is State.RECONNECTING:
             self.reconnections += 1
-            self._tell_blind(time.monotonic())
+            self._report_blind(time.monotonic())
         self.core.restore()
         self.flush()
-        self.ask_later()
+        self.schedule_retry()
         self._set_state(State.CONNECTED, "")
 
-    def _tell_blind(self, now: float) -> None:
+    def _report_blind(self, now: float) -> None:
         if self._blind_since is not None:
             seconds, self._blind_since = now - self._blind_since, None
-            for tell in self.on_blind:
-                tell(seconds)
+            for callback in self.on_blind:
+                callback(seconds)
 
     def _lost(self, websocket: WebSocket, reason: str) -> None:
         if websocket is not self._websocket:
@@ -279,7 +279,7 @@ class Session:
 
     async def _reconnect(self) -> None:
         while True:
-            # Up to a fifth earlier, so that many clients of one server do not come back in step.
+            # Up to a fifth earlier, so that the clients of one server do not all reconnect at once.
             await asyncio.sleep(self._delay * random.uniform(0.8, 1.0))
             self._delay = min(2 * self._delay, MAX_DELAY)
             try:
@@ -301,7 +301,7 @@ class Session:
         calls, self._calls = self._calls, {}
         for call, future in calls.items():
             if not future.done():
-                future.set_exception(DisconnectedError(f"{reason} while {call.split(':')[1]} was to answer"))
+                future.set_exception(DisconnectedError(f"{reason} during a call of {call.split(':')[1]}"))
 
     # States
 
@@ -324,11 +324,11 @@ class Session:
                 _log.exception("on_state failed")
 
     async def wait_for_state(self, state: State, limit: float) -> None:
-        """Wait until the connection reaches a state; at once if it is there.
+        """Wait until the connection is in a state.
 
         Raises:
-            StateTimeoutError: it did not within ``limit`` seconds.
-            DisconnectedError: it is or was closed, and will not reach it.
+            StateTimeoutError: It was not within `limit` seconds.
+            DisconnectedError: It is closed, and will not reach it.
         """
         if self.state is state:
             return
@@ -351,27 +351,27 @@ class Session:
 
     @property
     def is_open(self) -> bool:
-        """Whether there is a connection that takes messages."""
+        """Whether there is a connection that accepts messages."""
         return self._websocket is not None and self._websocket.is_open
 
     def must_wait(self) -> bool:
-        """Whether what is to be sent has to wait for its turn.
+        """Return whether a message has to wait for its turn.
 
         Raises:
-            DisconnectedError: there is no connection.
+            DisconnectedError: There is no connection.
         """
         websocket = self._websocket
         if websocket is None or not websocket.is_open:
-            websocket = self._open_websocket()
+            websocket = self._connected()
         return websocket.paused or self._waiting > 0
 
-    def _open_websocket(self) -> WebSocket:
+    def _connected(self) -> WebSocket:
         websocket = self._websocket
         if websocket is None or not websocket.is_open:
-            raise DisconnectedError(f"there is no connection to {self.uri} now: {self._why_none()}")
+            raise DisconnectedError(f"{self.uri} is not connected: {self._why_disconnected()}")
         return websocket
 
-    def _why_none(self) -> str:
+    def _why_disconnected(self) -> str:
         if self.state is State.CLOSED:
             return "this client was closed"
         if self.state is State.CONNECTING:
@@ -382,78 +382,78 @@ class Session:
         """Hand a message to the socket.
 
         Raises:
-            DisconnectedError: there is no connection.
+            DisconnectedError: There is no connection.
         """
         websocket = self._websocket
         if websocket is None or not websocket.is_open:
-            websocket = self._open_websocket()
+            websocket = self._connected()
         if self._wire.fragment_size is None:
             websocket.send((data,))
         else:
             websocket.send(tuple(self._wire.pieces(data)))
 
-    def is_others_turn(self) -> bool:
-        """Whether so many messages were sent in a row that other tasks are to get their turn. Ask after each."""
-        self._in_a_row += 1
-        if self._in_a_row < _IN_A_ROW:
+    def should_yield(self) -> bool:
+        """Count a sent message, and return whether other tasks should get their turn."""
+        self._burst += 1
+        if self._burst < _LONGEST_BURST:
             return False
-        self._in_a_row = 0
+        self._burst = 0
         return True
 
     def together(self) -> AbstractContextManager[None]:
-        """Have what is sent inside leave in one piece (see `bridge.client.Ros.together`)."""
+        """Send everything inside the block in one piece (see `bridge.client.Ros.together`)."""
         websocket = self._websocket
         return nullcontext() if websocket is None else websocket.together()
 
     async def wait_turn(self, what: str, limit: float) -> None:
-        """Wait until the server has taken what waits before.
+        """Wait until the server has accepted everything that was sent before.
 
         Args:
-            what: is named in the errors.
-            limit: seconds to wait at most.
+            what: Description of the message, for errors.
+            limit: Timeout in seconds.
 
         Raises:
-            SlowPeerError: the turn did not come in time.
-            DisconnectedError: the connection was lost.
+            SlowPeerError: It did not in time.
+            DisconnectedError: The connection was lost.
         """
         self._waiting += 1
         try:
             async with asyncio.timeout(limit), self._turn:
-                while (websocket := self._open_websocket()).paused:
+                while (websocket := self._connected()).paused:
                     await websocket.drain()
         except TimeoutError:
-            raise SlowPeerError(f"{self.uri} did not take {what} within {limit:g} s") from None
+            raise SlowPeerError(f"{self.uri} did not accept {what} within {limit:g} s") from None
         finally:
             self._waiting -= 1
 
     def flush(self) -> None:
-        """Send what the core wants to be sent: small, seldom and in order, so it never waits."""
+        """Send the core's output, which is small and rare enough never to wait."""
         data = self.core.data_to_send()
         websocket = self._websocket
         if websocket is not None and websocket.is_open:
             for message in data:
                 websocket.send(tuple(self._wire.pieces(message)))
 
-    def ask_later(self) -> None:
-        """Ask again in a while for topics of unknown type, as long as they bring nothing."""
-        if self._asking is None and self._websocket is not None:
-            self._asking = asyncio.get_running_loop().call_later(ASK_AGAIN, self._ask_again)
+    def schedule_retry(self) -> None:
+        """Repeat subscriptions to topics of unknown type until they have messages."""
+        if self._retry_timer is None and self._websocket is not None:
+            self._retry_timer = asyncio.get_running_loop().call_later(UNTYPED_RETRY, self._retry_untyped)
 
-    def _ask_again(self) -> None:
-        self._asking = None
-        if self.core.subscriptions.ask_again():
+    def _retry_untyped(self) -> None:
+        self._retry_timer = None
+        if self.core.subscriptions.retry_untyped():
             self.flush()
-            self.ask_later()
+            self.schedule_retry()
 
     async def call(self, service: str, args: Mapping[str, Any], limit: float) -> Any:
         """Call a service and wait for its answer.
 
         Raises:
-            ServiceError: it answered that it failed.
-            NoAnswerError: it did not answer within ``limit`` seconds.
-            SlowPeerError: the server did not even take the call.
-            DisconnectedError: there is no connection, or it was lost meanwhile.
-            EncodeError: the arguments cannot be sent as JSON.
+            ServiceError: It answered that it failed.
+            NoAnswerError: It did not answer within `limit` seconds.
+            SlowPeerError: The server did not accept the call.
+            DisconnectedError: There is no connection, or it was lost meanwhile.
+            EncodeError: The arguments cannot be sent as JSON.
         """
         if self.must_wait():
             await self.wait_turn(f"a call of {service}", limit)
@@ -466,7 +466,7 @@ class Session:
                 answer = await future
         except TimeoutError:
             raise NoAnswerError(
-                f"service {service} at {self.uri} did not answer within {limit:g} s{self.said_since(begun)}"
+                f"service {service} at {self.uri} did not answer within {limit:g} s{self.context_since(begun)}"
             ) from None
         finally:
             self._calls.pop(call, None)
@@ -475,11 +475,11 @@ class Session:
             raise ServiceError(answer.values, f"{service} at {self.uri}")
         return answer.values
 
-    def said_since(self, since: float) -> str:
-        """What the server said last, or how it was lost, if after ``since`` (``time.monotonic()``): the end of a sentence."""
+    def context_since(self, since: float) -> str:
+        """Return the end of an error's sentence: how the server was lost, or its last status, if after `since`."""
         if self._lost_at > since:
             return f"; meanwhile the connection was lost: {self.last_error}"
-        return f"; the server said: {self.statuses[-1].text[:200]}" if self._status_at > since else ""
+        return f"; the server reported: {self.statuses[-1].text[:200]}" if self._status_at > since else ""
 
     # Receiving
 
@@ -516,14 +516,14 @@ class Session:
             case StatusReceived():
                 self.statuses.append(event)
                 self._status_at = time.monotonic()
-                self._said += 1
-                if self._said <= KEPT_STATUSES or self._said & (self._said - 1) == 0:
+                self._status_count += 1
+                if self._status_count <= KEPT_STATUSES or self._status_count & (self._status_count - 1) == 0:
                     level = logging.WARNING if event.level in {"error", "warning"} else logging.INFO
-                    _log.log(level, "%s says (%.20s): %.500s", self.uri, event.level, event.text)
+                    _log.log(level, "%s reports (%.20s): %.500s", self.uri, event.level, event.text)
             case Unusable():
                 self.unusable += 1
-                # The 1st, 2nd, 4th, 8th ...: a server that goes mad does not fill the log (as with statuses).
+                # The 1st, 2nd, 4th, 8th ...: a faulty server does not fill the log (as with statuses).
                 if self.unusable & (self.unusable - 1) == 0:
                     _log.warning("%s, %d so far: %s", self.uri, self.unusable, event.reason)
             case _:
-                self.flush()  # a request may have been refused on the spot
+                self.flush()  # a request may have been refused at once

@@ -495,7 +495,7 @@ class Play:
     def look(self) -> None:
         """Time goes by."""
         self.now += 20 * (self.source.byte() % 2)
-        self.core.subscriptions.ask_again()
+        self.core.subscriptions.retry_untyped()
 
 
 def fuzz_core(data: bytes) -> None:

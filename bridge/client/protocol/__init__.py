@@ -1,10 +1,10 @@
-"""The rosbridge client as a state machine: objects in, events and bytes out, no socket and no clock anywhere.
+"""The rosbridge client as a state machine: objects in, events and bytes out, without sockets and clocks.
 
-What a client wants (advertisements, subscriptions, served services) is kept here, so that `ClientCore.restore` can
-say it all again to a server that has forgotten it.
+It keeps the client's advertisements, subscriptions and services, so that `ClientCore.restore` can repeat them to a server
+that has lost them.
 
-Source: the rosbridge protocol, version 2 (https://github.com/RobotWebTools/rosbridge_suite), and what its
-servers really do (``docs/reference/rosbridge-differences.md``).
+Source: the rosbridge protocol, version 2 (https://github.com/RobotWebTools/rosbridge_suite), and
+its servers' deviations from it (`docs/reference/rosbridge-differences.md`).
 """
 
 from bridge.client.protocol.client_core import ClientCore

@@ -1,4 +1,4 @@
-"""The calls of services that a client waits for."""
+"""A client's service calls that wait for answers."""
 
 from collections.abc import Mapping
 from typing import Any, Final
@@ -9,15 +9,15 @@ from bridge.codecs.json_codec import excerpt, text_of
 from bridge.errors import SlowPeerError
 from bridge.names import check_name
 
-#: Calls that may wait for their answers at once.
 MAX_CALLS: Final = 1000
+"""Limit of calls that wait for answers."""
 
 
 class Calls:
-    """The calls under way, by their identities on the wire."""
+    """The waiting calls, by identity on the wire."""
 
     def __init__(self, wire: Wire) -> None:
-        """Begin with none."""
+        """Start without calls."""
         self._wire = wire
         self._waiting: set[str] = set()
 
@@ -28,11 +28,11 @@ class Calls:
         """Call a service.
 
         Returns:
-            The call's identity, which its `CallAnswered` bears.
+            Identity of the call in its `CallAnswered`.
 
         Raises:
-            NameFormError: of the service.
-            EncodeError: the arguments cannot leave as JSON.
+            NameFormError: The name of the service is malformed.
+            EncodeError: The arguments cannot be encoded as JSON.
             SlowPeerError: `MAX_CALLS` calls wait already.
         """
         check_name(service)
@@ -41,20 +41,20 @@ class Calls:
                 f"{MAX_CALLS} service calls wait for answers already, {service} is not called"
             )
         call = f"call_service:{service}:{self._wire.number()}"
-        self._wire.say(op="call_service", id=call, service=service, args=args)
+        self._wire.write(op="call_service", id=call, service=service, args=args)
         self._waiting.add(call)
         return call
 
     def forget(self, call: str) -> None:
-        """Wait no longer for an answer; one that comes all the same is passed over."""
+        """Stop waiting for an answer; a late one is ignored."""
         self._waiting.discard(call)
 
     def lost(self) -> None:
-        """Take note that the connection is gone: none of them will be answered."""
+        """Forget the calls of a lost connection."""
         self._waiting.clear()
 
     def receive(self, operation: dict[str, Any], data: bytes | str) -> CallAnswered | Unusable | None:
-        """Take what claims to be an answer; None if nobody waits for it."""
+        """Handle an answer; None if no call waits for it."""
         call = operation.get("id")
         if not isinstance(call, str):
             return Unusable(f"a service_response without the id of a call arrived: {excerpt(data)}")
@@ -62,7 +62,7 @@ class Calls:
             return None
         self._waiting.discard(call)
         values = operation.get("values")
-        # Some servers leave `result` out when all went well.
+        # Some servers omit `result` on success.
         if operation.get("result", True) is False:
             return CallAnswered(call, ok=False, values=text_of(values))
         return CallAnswered(call, ok=True, values={} if values is None else values)

@@ -1,7 +1,7 @@
-"""A client's whole state: what it wants of the server, what it waits for, and what the server's messages mean to it.
+"""The whole state of a client: its requests to the server, and the meaning of the server's messages.
 
-Bytes to send gather in an outbox that the shell empties with `ClientCore.data_to_send`; while there is no connection
-nothing gathers, what is wanted is only remembered.
+Messages to send collect in an outbox that the session empties with `ClientCore.data_to_send`. Nothing collects while there
+is no connection.
 """
 
 from typing import Any
@@ -20,17 +20,17 @@ from bridge.errors import DecodeError
 
 
 class ClientCore:
-    """All that a rosbridge client has to remember, and what its messages mean.
+    """State of a rosbridge client.
 
-    Numbers that name an advertisement, a subscription or a ticket are never used twice.
+    Numbers of advertisements, subscriptions and tickets are never reused.
 
     Attributes:
-        wire: what leaves, and in which form.
-        publications: the topics that are advertised.
-        subscriptions: the topics that are listened to.
-        calls: the calls of services that wait for answers.
-        goals: the goals of actions under way.
-        services: the services that are served.
+        wire: The outbox.
+        publications: The advertised topics.
+        subscriptions: The subscribed topics.
+        calls: The service calls that wait for answers.
+        goals: The active goals.
+        services: The services of this client.
     """
 
     def __init__(
@@ -41,16 +41,16 @@ class ClientCore:
         max_depth: int = MAX_DEPTH,
         fragment_size: int | None = None,
     ) -> None:
-        """Begin with no connection and nothing wanted.
+        """Start without connection.
 
         Args:
-            ros_version: which ROS the server speaks for, where that is known.
-            max_size: bytes of a message at most, both ways.
-            max_depth: objects and arrays within each other at most, both ways.
-            fragment_size: characters of a message beyond which `Wire.pieces` cuts it, None for never.
+            ros_version: ROS version of the server, if it is known.
+            max_size: Largest message in bytes, in both directions.
+            max_depth: Deepest nesting of a message, in both directions.
+            fragment_size: Characters beyond which `Wire.pieces` splits a message; None for never.
 
         Raises:
-            OptionError: the size of fragments is no whole number from 1 up.
+            OptionError: The fragment size is not a positive integer.
         """
         self.wire = wire = Wire(
             ros_version=ros_version, max_size=max_size, max_depth=max_depth, fragment_size=fragment_size
@@ -66,11 +66,11 @@ class ClientCore:
 
     @property
     def ros_version(self) -> RosVersion | None:
-        """Which ROS the server speaks for: as it was told, or as its messages show; None while nobody knows."""
+        """ROS version of the server, as configured or as its messages show; None while unknown."""
         return self.wire.ros_version or self.subscriptions.seen_version
 
     def restore(self) -> None:
-        """Take up a new connection: everything wanted goes into the outbox, advertisements first."""
+        """Start a new connection: put all registrations into the outbox, advertisements first."""
         self.wire.connected = True
         self.wire.clear()
         self.publications.restore()
@@ -78,7 +78,7 @@ class ClientCore:
         self.subscriptions.restore()
 
     def lost(self) -> None:
-        """Take note that the connection is gone: its calls and requests will not be answered."""
+        """Drop calls, goals and requests of a lost connection."""
         self.wire.connected = False
         self.wire.clear()
         self.calls.lost()
@@ -87,27 +87,27 @@ class ClientCore:
         self._fragments.clear()
 
     def data_to_send(self) -> list[bytes]:
-        """Empty the outbox: whole messages, in order."""
+        """Empty the outbox, and return its messages in order."""
         return self.wire.take()
 
     def receive(self, data: bytes | str, now: float) -> Event | None:
-        """Take one WebSocket message.
+        """Handle one WebSocket message.
 
         Args:
-            data: the message, whatever it may be.
-            now: seconds of any clock that never goes back, for throttled subscriptions.
+            data: The message, with any content.
+            now: Monotonic seconds, for throttled subscriptions.
 
         Returns:
-            What it means; None for what was answered here, or comes too late to mean anything (a topic or a
-            call given up).
+            Its meaning; None for requests that were refused here, and for messages of topics or calls that were
+            given up.
         """
         if type(data) is bytes:
             subscriptions = self.subscriptions
             if subscriptions.envelopes:
-                event = subscriptions.receive_again(data)
+                event = subscriptions.receive_known(data)
                 if event is not None:
                     return event
-            if subscriptions.binary and data[:1] >= b"\x80":  # no JSON begins so, a map of CBOR does
+            if subscriptions.binary and data[:1] >= b"\x80":  # a map of CBOR begins so, but no JSON
                 return self._receive_cbor(data, now)
         try:
             operation = decode(data, max_size=self._max_size, max_depth=self._max_depth)
@@ -132,14 +132,14 @@ class ClientCore:
             return Unusable(str(error))
         if operation.get("op") == "publish":
             return self.subscriptions.receive(operation, now, data, from_cbor=True)
-        return Unusable(f"a message in CBOR arrived that is none of a topic: {excerpt(data)}")
+        return Unusable(f"a CBOR message other than publish arrived: {excerpt(data)}")
 
     def _receive_wrapped(self, operation: dict[str, Any], now: float, data: bytes | str) -> Event | None:
-        """Take a fragment or a picture: the message is in it, perhaps one in the other."""
+        """Handle a fragment or a PNG, which contain a message, perhaps one inside the other."""
         wrapped = ["fragment", "png"]
         try:
             while (op := operation.get("op")) in wrapped:
-                wrapped.remove(op)  # each once
+                wrapped.remove(op)  # each at most once
                 whole = self._unwrapped(operation, now)
                 if whole is None:
                     return None
@@ -172,6 +172,6 @@ class ClientCore:
             case "action_feedback" | "action_result":
                 return self.goals.receive(operation, data)
             case str():
-                return Unusable(f"a message with an op that was not asked for arrived: {excerpt(data)}")
+                return Unusable(f"a message with an unknown op arrived: {excerpt(data)}")
             case _:
                 return Unusable(f"a message without an op arrived: {excerpt(data)}")

@@ -1,4 +1,4 @@
-"""What a server's message means to a client: the events that the protocol core hands out."""
+"""Events of the protocol core: the meaning of a server's messages."""
 
 from dataclasses import dataclass
 from enum import IntEnum
@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 
 class MessageReceived(NamedTuple):
-    """A message of a subscribed topic: for which of this client's subscriptions (a tuple: made in a third of the time)."""
+    """A message of a subscribed topic: for these of this client's subscriptions (a tuple is made in a third of the time)."""
 
     topic: str
     msg: dict[str, Any]
@@ -15,7 +15,7 @@ class MessageReceived(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class CallAnswered:
-    """A service answered: its values, or the text with which it refused."""
+    """A service answered: its values, or the text of its refusal."""
 
     call: str
     ok: bool
@@ -24,7 +24,7 @@ class CallAnswered:
 
 @dataclass(frozen=True, slots=True)
 class ServiceRequested:
-    """Someone calls a service of this client; `ClientCore.answer` takes the ticket back."""
+    """A request to a service of this client; `Services.answer` takes its ticket."""
 
     service: str
     args: dict[str, Any]
@@ -33,7 +33,7 @@ class ServiceRequested:
 
 @dataclass(frozen=True, slots=True)
 class StatusReceived:
-    """The server says something about an operation (few servers do)."""
+    """A status message about an operation (few servers send them)."""
 
     level: str
     text: str
@@ -41,13 +41,13 @@ class StatusReceived:
 
 @dataclass(frozen=True, slots=True)
 class Unusable:
-    """Something arrived that no client can use: one sentence says what."""
+    """A message that no client can use, and the reason as a sentence."""
 
     reason: str
 
 
 class GoalStatus(IntEnum):
-    """How a goal of an action ended (``action_msgs/msg/GoalStatus``)."""
+    """Status of an action goal (`action_msgs/msg/GoalStatus`)."""
 
     UNKNOWN = 0
     ACCEPTED = 1
@@ -60,7 +60,7 @@ class GoalStatus(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class GoalFeedback:
-    """An action tells how far a goal of this client is."""
+    """Feedback of an action on a goal of this client."""
 
     goal: str
     values: Any
@@ -68,7 +68,7 @@ class GoalFeedback:
 
 @dataclass(frozen=True, slots=True)
 class GoalEnded:
-    """A goal of this client is over: its status and result, or the text that says why there is none."""
+    """The end of a goal of this client: its status and result, or the text of the failure."""
 
     goal: str
     ok: bool

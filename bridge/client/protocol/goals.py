@@ -1,4 +1,4 @@
-"""The goals of ROS 2 actions that a client has under way."""
+"""A client's active goals of ROS 2 actions."""
 
 from collections.abc import Mapping
 from typing import Any, Final
@@ -9,15 +9,15 @@ from bridge.codecs.json_codec import excerpt, text_of
 from bridge.errors import SlowPeerError
 from bridge.names import check_name, ros2_type
 
-#: Goals of actions that may be under way at once.
 MAX_GOALS: Final = 100
+"""Limit of active goals."""
 
 
 class Goals:
-    """The goals under way: their actions by their identities on the wire."""
+    """Actions of the active goals, by identity on the wire."""
 
     def __init__(self, wire: Wire) -> None:
-        """Begin with none."""
+        """Start without goals."""
         self._wire = wire
         self._actions: dict[str, str] = {}
 
@@ -28,24 +28,24 @@ class Goals:
         """Send a goal to an action of ROS 2.
 
         Args:
-            action: its name.
-            type_name: its type, in any form.
-            goal: the goal's fields.
-            feedback: whether to be told how far it is.
+            action: Name of the action.
+            type_name: Its type, in any form.
+            goal: Fields of the goal.
+            feedback: Whether to receive feedback.
 
         Returns:
-            The goal's identity, which its events bear.
+            Identity of the goal in its events.
 
         Raises:
-            NameFormError: of action or type.
-            EncodeError: the goal cannot leave as JSON.
-            SlowPeerError: `MAX_GOALS` goals are under way already.
+            NameFormError: The name or the type is malformed.
+            EncodeError: The goal cannot be encoded as JSON.
+            SlowPeerError: `MAX_GOALS` goals are active already.
         """
         check_name(action)
         if len(self._actions) >= MAX_GOALS:
-            raise SlowPeerError(f"{MAX_GOALS} goals are under way already, {action} gets none")
+            raise SlowPeerError(f"{MAX_GOALS} goals are active already, so none was sent to {action}")
         identity = f"send_action_goal:{action}:{self._wire.number()}"
-        self._wire.say(
+        self._wire.write(
             op="send_action_goal",
             id=identity,
             action=action,
@@ -57,26 +57,26 @@ class Goals:
         return identity
 
     def cancel(self, goal: str) -> None:
-        """Ask for a goal to be given up; its end tells whether it was. Nothing happens if it is over."""
+        """Ask the server to cancel a goal; its end shows whether it did. Ignore a goal that has ended."""
         action = self._actions.get(goal)
         if action is not None:
-            self._wire.say(op="cancel_action_goal", id=goal, action=action)
+            self._wire.write(op="cancel_action_goal", id=goal, action=action)
 
     def forget(self, goal: str) -> None:
-        """Be told no more of a goal."""
+        """Ignore further events of a goal."""
         self._actions.pop(goal, None)
 
     def lost(self) -> None:
-        """Take note that the connection is gone: a server forgets whose goals they were."""
+        """Forget the goals of a lost connection: servers forget their senders."""
         self._actions.clear()
 
     def receive(
         self, operation: dict[str, Any], data: bytes | str
     ) -> GoalFeedback | GoalEnded | Unusable | None:
-        """Take what the server says of a goal; None if it is none of these."""
+        """Handle an event of a goal; None if the goal is unknown."""
         goal = operation.get("id")
         if not isinstance(goal, str):
-            return Unusable(f"something about an action's goal arrived without its id: {excerpt(data)}")
+            return Unusable(f"an action's message without the id of a goal arrived: {excerpt(data)}")
         if goal not in self._actions:
             return None
         values = operation.get("values")

@@ -1,4 +1,4 @@
-"""What a client publishes: several advertisements of one topic share one on the wire."""
+"""A client's advertised topics: several advertisements of one topic share one on the wire."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -13,7 +13,7 @@ from bridge.qos import Qos
 
 @dataclass(slots=True)
 class _Advertised:
-    """One topic as advertised on the wire, for one or more advertisements of this client."""
+    """One topic on the wire, for one or more advertisements of this client."""
 
     topic: str
     type: str
@@ -21,16 +21,16 @@ class _Advertised:
     queue_size: int
     qos: Qos | None
     wire_id: str
-    prefix: bytes  # of its messages on the wire; a brace completes them
+    prefix: bytes  # of its messages on the wire, which end with a brace
     holders: set[int] = field(default_factory=set)
-    latched: bytes | None = None  # the last message, said again after a reconnection
+    latched: bytes | None = None  # the last message, repeated after a reconnection
 
 
 class Publications:
-    """All that a client advertises."""
+    """All advertisements of a client."""
 
     def __init__(self, wire: Wire) -> None:
-        """Begin with nothing advertised."""
+        """Start without advertisements."""
         self._wire = wire
         self._max_size = wire.max_size
         self._max_depth = wire.max_depth
@@ -38,11 +38,11 @@ class Publications:
         self._advertisements: dict[int, _Advertised] = {}
 
     def restore(self) -> None:
-        """Say all of it to a server that has heard none of it, and each latched topic's last message."""
+        """Advertise everything on a new connection, and repeat the last message of latched topics."""
         for advertised in self._advertised.values():
-            self._say(advertised)
+            self._send_advertise(advertised)
             if advertised.latched is not None:
-                self._wire.put(advertised.latched)
+                self._wire.write_bytes(advertised.latched)
 
     def advertise(
         self,
@@ -53,21 +53,21 @@ class Publications:
         queue_size: int = 100,
         qos: Qos | None = None,
     ) -> int:
-        """Want to publish on a topic.
+        """Advertise a topic.
 
         Args:
-            topic: its name.
-            type_name: in the form of ROS 1 or of ROS 2.
-            latch: the server keeps the last message for those who subscribe later.
-            queue_size: messages that the server holds for ROS's transport.
-            qos: what the server is to ask of ROS 2.
+            topic: Name of the topic.
+            type_name: Type in the form of ROS 1 or ROS 2.
+            latch: Whether the server keeps the last message for later subscribers.
+            queue_size: Queue length of the server's ROS publisher.
+            qos: Quality of service in ROS 2.
 
         Returns:
-            The advertisement's number, for `publish` and `unadvertise`.
+            Number of the advertisement, for `publish` and `unadvertise`.
 
         Raises:
-            NameFormError: of topic or type.
-            TypeConflictError: this client advertises the topic already, as something else.
+            NameFormError: The name or the type is malformed.
+            TypeConflictError: This client already advertises the topic with other options.
         """
         check_name(topic)
         split_type(type_name)
@@ -79,7 +79,7 @@ class Publications:
             wire_id = f"advertise:{topic}:{number}"
             advertised = _Advertised(topic, type_name, latch, queue_size, qos, wire_id, prefix)
             self._advertised[key] = advertised
-            self._say(advertised)
+            self._send_advertise(advertised)
         elif not same_type(advertised.type, type_name) or advertised.latch != latch or advertised.qos != qos:
             raise TypeConflictError(
                 f"topic {topic} is already advertised as {advertised.type}, latch={advertised.latch}, "
@@ -89,9 +89,9 @@ class Publications:
         self._advertisements[number] = advertised
         return number
 
-    def _say(self, advertised: _Advertised) -> None:
+    def _send_advertise(self, advertised: _Advertised) -> None:
         qos = {} if advertised.qos is None else {"qos": advertised.qos.as_operation()}
-        self._wire.say(
+        self._wire.write(
             op="advertise",
             id=advertised.wire_id,
             topic=advertised.topic,
@@ -102,10 +102,10 @@ class Publications:
         )
 
     def publish(self, advertisement: int, msg: Mapping[str, Any]) -> bytes:
-        """Write one message of an advertised topic; the bytes are for the wire at once, not for the outbox.
+        """Return the bytes of a message of an advertised topic, which bypass the outbox.
 
         Raises:
-            EncodeError: the message cannot leave as JSON; a NaN or an infinity is named with its place.
+            EncodeError: It cannot be encoded as JSON; a NaN or an infinity is named with its place.
         """
         advertised = self._advertisements[advertisement]
         prefix = advertised.prefix
@@ -124,9 +124,9 @@ class Publications:
         return data
 
     def unadvertise(self, advertisement: int) -> None:
-        """Stop wanting to publish; the last advertisement of a topic takes it off the wire."""
+        """End an advertisement; the last one of a topic withdraws it from the server."""
         advertised = self._advertisements.pop(advertisement)
         advertised.holders.discard(advertisement)
         if not advertised.holders:
             del self._advertised[absolute(advertised.topic)]
-            self._wire.say(op="unadvertise", id=advertised.wire_id, topic=advertised.topic)
+            self._wire.write(op="unadvertise", id=advertised.wire_id, topic=advertised.topic)

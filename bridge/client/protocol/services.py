@@ -1,4 +1,4 @@
-"""The services that a client serves, and the requests to them that wait for answers."""
+"""A client's services, and the requests to them that wait for answers."""
 
 from collections.abc import Mapping
 from typing import Any, Final
@@ -9,15 +9,15 @@ from bridge.codecs.json_codec import excerpt
 from bridge.errors import TypeConflictError
 from bridge.names import absolute, check_name, split_type
 
-#: Requests to services of this client that may wait for their answers at once; more are refused.
 MAX_REQUESTS: Final = 64
+"""Limit of requests that wait for answers; more are refused."""
 
 
 class Services:
-    """What a client serves: types by names, and requests by their tickets, which are never used twice."""
+    """Types of the services by name, and requests by ticket; tickets are never reused."""
 
     def __init__(self, wire: Wire) -> None:
-        """Begin with none."""
+        """Start without services."""
         self._wire = wire
         self._types: dict[str, str] = {}
         self._requests: dict[int, tuple[str, Any]] = {}
@@ -27,24 +27,24 @@ class Services:
 
     @property
     def waiting(self) -> int:
-        """How many requests wait for their answers."""
+        """Number of requests that wait for answers."""
         return len(self._requests)
 
     def restore(self) -> None:
-        """Say all of it to a server that has heard none of it."""
+        """Advertise all services on a new connection."""
         for service, type_name in self._types.items():
-            self._say(service, type_name)
+            self._send_advertise(service, type_name)
 
     def lost(self) -> None:
-        """Take note that the connection is gone, and with it who asked."""
+        """Forget the requests of a lost connection."""
         self._requests.clear()
 
     def advertise(self, service: str, type_name: str) -> None:
-        """Want to serve a service.
+        """Serve a service.
 
         Raises:
-            NameFormError: of service or type.
-            TypeConflictError: this client serves it already.
+            NameFormError: The name or the type is malformed.
+            TypeConflictError: This client already serves it.
         """
         check_name(service)
         split_type(type_name)
@@ -52,38 +52,38 @@ class Services:
         if key in self._types:
             raise TypeConflictError(f"service {service} is already served by this client")
         self._types[key] = type_name
-        self._say(key, type_name)
+        self._send_advertise(key, type_name)
 
-    def _say(self, service: str, type_name: str) -> None:
-        self._wire.say(op="advertise_service", service=service, type=self._wire.type_name(type_name, "srv"))
+    def _send_advertise(self, service: str, type_name: str) -> None:
+        self._wire.write(op="advertise_service", service=service, type=self._wire.type_name(type_name, "srv"))
 
     def unadvertise(self, service: str) -> None:
         """Stop serving a service."""
         key = absolute(service)
         del self._types[key]
-        self._wire.say(op="unadvertise_service", service=key)
+        self._wire.write(op="unadvertise_service", service=key)
 
     def answer(self, ticket: int, values: Mapping[str, Any] | str, *, ok: bool = True) -> None:
-        """Answer a request; one whose connection is gone needs no answer any more.
+        """Answer a request, unless its connection was lost.
 
         Args:
-            ticket: the request's.
-            values: the answer's fields, or with ``ok=False`` the reason as text.
-            ok: whether the service did it.
+            ticket: Ticket of the request.
+            values: Fields of the answer, or with `ok=False` the reason as text.
+            ok: Whether the service succeeded.
 
         Raises:
-            EncodeError: the values cannot leave as JSON; the request still waits for an answer.
+            EncodeError: The values cannot be encoded as JSON; the request still waits for an answer.
         """
         request = self._requests.get(ticket)
         if request is None:
             return
         service, wire_id = request
         identity = {} if wire_id is None else {"id": wire_id}
-        self._wire.say(op="service_response", service=service, values=values, result=ok, **identity)
+        self._wire.write(op="service_response", service=service, values=values, result=ok, **identity)
         del self._requests[ticket]
 
     def receive(self, operation: dict[str, Any], data: bytes | str) -> ServiceRequested | Unusable | None:
-        """Take a request; None for one that was refused on the spot."""
+        """Handle a request; None if it was refused here."""
         service = operation.get("service")
         args = operation.get("args")
         wire_id = operation.get("id")

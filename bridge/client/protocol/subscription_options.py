@@ -1,4 +1,4 @@
-"""How the messages of a topic are to come: their form, their arrays, their fragments, and what ROS 2 is asked for."""
+"""Options of a subscription: encoding, arrays, fragments and quality of service."""
 
 from dataclasses import dataclass
 from typing import Literal, get_args
@@ -12,15 +12,15 @@ Compression = Literal["none", "png", "cbor", "cbor-raw"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Delivery:
-    """How the messages of a topic are to come; all subscriptions of one topic by one client have it in common.
+    """Delivery of a topic's messages, shared by all subscriptions of one client to one topic.
 
     Attributes:
-        compression: ``cbor`` for long arrays, ``cbor-raw`` for the serialised bytes alone, ``png`` for servers of
-            ROS 1 on thin lines. Many servers pass over what they do not know, and send JSON.
-        arrays: what arrays of numbers become, whatever the server sends.
-        fragment_size: characters of a message in one fragment at most; None for whole messages. Servers keep
-            the last one that a client asked for and use it for all they send to it.
-        qos: what the server is to ask of ROS 2.
+        compression: `cbor` for long arrays, `cbor-raw` for the serialised bytes alone, `png` for servers of
+            ROS 1 over slow networks. Many servers ignore an unknown one, and send JSON.
+        arrays: Python type of arrays of numbers, whatever the server sends.
+        fragment_size: Limit of characters in one fragment; None for whole messages. Servers apply the last one
+            that a client requested to everything they send to it.
+        qos: Quality of service in ROS 2.
     """
 
     compression: Compression = "none"
@@ -29,20 +29,20 @@ class Delivery:
     qos: Qos | None = None
 
     def __post_init__(self) -> None:
-        """Refuse what servers would pass over without a word."""
+        """Refuse options that servers would silently ignore."""
         for name, choices in (("compression", get_args(Compression)), ("arrays", get_args(Arrays))):
             if getattr(self, name) not in choices:
                 raise OptionError(f"{name} must be one of {', '.join(choices)}, not {getattr(self, name)!r}")
         check_fragment_size(self.fragment_size)
         if self.compression == "cbor-raw" and self.arrays == "numpy":
-            raise OptionError("cbor-raw brings bytes, no arrays: leave arrays out")
+            raise OptionError("cbor-raw has bytes instead of arrays: omit arrays")
 
 
 def check_fragment_size(size: int | None) -> None:
-    """Refuse what is no size of a fragment.
+    """Refuse an invalid size of fragments.
 
     Raises:
-        OptionError: it is neither None nor a whole number from 1 up.
+        OptionError: It is neither None nor a positive integer.
     """
     if size is not None and (type(size) is not int or size < 1):
         raise OptionError(f"fragment_size must be a whole number from 1 up, or None, not {size!r}")

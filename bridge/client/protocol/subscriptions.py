@@ -1,6 +1,6 @@
-"""What a client listens to: several subscriptions of one topic share one on the wire, and each message is for some of them.
+"""A client's subscriptions: several of one topic share one on the wire.
 
-There are servers that deliver a first message twice, or not at all, to a client that subscribes twice.
+Some servers deliver a first message twice, or not at all, to a client that subscribes twice.
 """
 
 from dataclasses import dataclass, field
@@ -18,15 +18,15 @@ from bridge.errors import OptionError, TypeConflictError
 from bridge.names import absolute, check_name, same_type, split_type
 from bridge.stamps import ros_version_of_message
 
-#: Keys of an operation whose envelope can be known again: op, topic and msg.
 _OF_ENVELOPE: Final = 3
-#: Envelopes of one topic that are looked at: a server that never says the same twice is not tried on and on.
+"""Keys of an operation with a recognisable envelope: op, topic and msg."""
 _ENVELOPES: Final = 8
+"""Limit of envelopes tried for one topic: some servers never repeat one."""
 
 
 @dataclass(slots=True)
 class _Wanted:
-    """What one subscription asked for; ``due`` is when its throttle lets the next message through."""
+    """Options of one subscription; `due` is when its throttle passes the next message."""
 
     throttle_rate: int
     queue_length: int
@@ -35,7 +35,7 @@ class _Wanted:
 
 @dataclass(slots=True)
 class _Subscribed:
-    """One topic as subscribed on the wire, for one or more subscriptions of this client."""
+    """One topic on the wire, for one or more subscriptions of this client."""
 
     topic: str
     type: str | None
@@ -44,36 +44,36 @@ class _Subscribed:
     wanted: dict[int, _Wanted] = field(default_factory=dict)
     throttle_rate: int = 0
     queue_length: int = 0
-    everyone: tuple[int, ...] = ()
-    someone_is_slower: bool = False
-    heard: bool = False
+    all_numbers: tuple[int, ...] = ()
+    has_throttled: bool = False
+    has_messages: bool = False
     envelopes_tried: int = 0
 
-    def settle(self) -> bool:
-        """Find what to ask of the server for all: fastest rate, longest queue. True if that changed."""
+    def combine(self) -> bool:
+        """Combine all options to the fastest rate and the longest queue; return whether that changed."""
         before = (self.throttle_rate, self.queue_length)
         self.throttle_rate = min(w.throttle_rate for w in self.wanted.values())
         self.queue_length = max(w.queue_length for w in self.wanted.values())
-        self.everyone = tuple(self.wanted)
-        self.someone_is_slower = any(w.throttle_rate > self.throttle_rate for w in self.wanted.values())
+        self.all_numbers = tuple(self.wanted)
+        self.has_throttled = any(w.throttle_rate > self.throttle_rate for w in self.wanted.values())
         return before != (self.throttle_rate, self.queue_length)
 
     def receivers(self, now: float) -> tuple[int, ...]:
-        """The subscriptions that a message arriving ``now`` is for."""
-        if not self.someone_is_slower:
-            return self.everyone
-        through = []
+        """Return the numbers of the subscriptions that receive a message at `now`."""
+        if not self.has_throttled:
+            return self.all_numbers
+        numbers = []
         for number, wanted in self.wanted.items():
             if wanted.throttle_rate > self.throttle_rate:
                 if now < wanted.due:
                     continue
                 wanted.due = now + wanted.throttle_rate / 1000
-            through.append(number)
-        return tuple(through)
+            numbers.append(number)
+        return tuple(numbers)
 
 
 class _Known(NamedTuple):
-    """An envelope that came before, and whose messages stand after it; ``topic`` is as the server names it."""
+    """A known envelope and its topic, in the server's spelling."""
 
     envelope: bytes
     size: int
@@ -81,22 +81,22 @@ class _Known(NamedTuple):
     subscribed: _Subscribed
 
 
-#: In place of an envelope, before the first is known: nothing begins so.
 _UNKNOWN: Final = _Known(b"\xff", 0, "", _Subscribed("", None, Delivery(), ""))
+"""Placeholder before the first envelope is known: no message begins so."""
 
 
 class Subscriptions:
-    """All that a client subscribes to.
+    """All subscriptions of a client.
 
     Attributes:
-        seen_version: what the header stamps of received messages say about the server's ROS.
-        binary: whether some topic is to come as CBOR.
-        numpy: whether some topic's arrays are wanted as NumPy's.
-        envelopes: what stood before messages that came, and whose they were.
+        seen_version: ROS version of the server according to header stamps in its messages.
+        binary: Whether any topic is subscribed as CBOR.
+        numpy: Whether any topic is subscribed with NumPy arrays.
+        envelopes: The known envelopes of messages.
     """
 
     def __init__(self, wire: Wire) -> None:
-        """Begin with nothing subscribed."""
+        """Start without subscriptions."""
         self.seen_version: RosVersion | None = None
         self.binary = False
         self.numpy = False
@@ -109,11 +109,11 @@ class Subscriptions:
         self._subscriptions: dict[int, _Subscribed] = {}
 
     def restore(self) -> None:
-        """Say all of it to a server that has heard none of it."""
+        """Subscribe to everything on a new connection."""
         self.forget_envelopes()
         for subscribed in self._subscribed.values():
-            subscribed.heard = False
-            self._say(subscribed)
+            subscribed.has_messages = False
+            self._send_subscribe(subscribed)
 
     def subscribe(
         self,
@@ -124,26 +124,26 @@ class Subscriptions:
         queue_length: int = 0,
         delivery: Delivery | None = None,
     ) -> int:
-        """Want the messages of a topic.
+        """Subscribe to a topic.
 
-        The server is asked for the fastest rate and the longest queue that any subscription of this client
-        wants of the topic; who wants fewer messages is served at its own rate from those.
+        The server gets the fastest rate and the longest queue of all this client's subscriptions to the topic;
+        slower subscriptions are throttled here.
 
         Args:
-            topic: its name.
-            type_name: in the form of ROS 1 or of ROS 2; None leaves it to the server (see `ask_again`).
-            throttle_rate: milliseconds between two messages at least.
-            queue_length: messages that the server keeps while the throttle holds them back; 0 drops them.
-            delivery: how they are to come; None is as usual.
+            topic: Name of the topic.
+            type_name: Type in the form of ROS 1 or ROS 2; None leaves it to the server (see `retry_untyped`).
+            throttle_rate: Minimum of milliseconds between two messages.
+            queue_length: Throttled messages that the server keeps; 0 drops them.
+            delivery: Delivery options; None for the defaults.
 
         Returns:
-            The subscription's number.
+            Number of the subscription.
 
         Raises:
-            NameFormError: of topic or type.
-            TypeConflictError: this client subscribes to the topic already, as another type or in another form.
-            OptionError: a rate or length that is no whole number from 0 up (servers drop a subscription
-                with a float here without a word).
+            NameFormError: The name or the type is malformed.
+            TypeConflictError: This client already subscribes to the topic with another type or delivery.
+            OptionError: A rate or length is not an integer from 0 up (servers silently drop a subscription with
+                a float here).
         """
         check_name(topic)
         if type_name is not None:
@@ -179,11 +179,11 @@ class Subscriptions:
         subscribed.wanted[number] = _Wanted(throttle_rate, queue_length)
         self._subscriptions[number] = subscribed
         self.forget_envelopes()
-        if subscribed.settle() or new:
-            self._say(subscribed)
+        if subscribed.combine() or new:
+            self._send_subscribe(subscribed)
         return number
 
-    def _say(self, subscribed: _Subscribed) -> None:
+    def _send_subscribe(self, subscribed: _Subscribed) -> None:
         operation: dict[str, Any] = {"op": "subscribe", "id": subscribed.wire_id, "topic": subscribed.topic}
         if subscribed.type is not None:
             operation["type"] = self._wire.type_name(subscribed.type)
@@ -194,7 +194,7 @@ class Subscriptions:
             operation["fragment_size"] = delivery.fragment_size
         if delivery.qos is not None:
             operation["qos"] = delivery.qos.as_operation()
-        self._wire.say(
+        self._wire.write(
             **operation, throttle_rate=subscribed.throttle_rate, queue_length=subscribed.queue_length
         )
 
@@ -204,33 +204,33 @@ class Subscriptions:
         self.numpy = any(delivery.arrays == "numpy" for delivery in deliveries)
 
     def unsubscribe(self, subscription: int) -> None:
-        """Stop wanting messages; the last subscription of a topic takes it off the wire."""
+        """End a subscription; the last one of a topic withdraws it from the server."""
         subscribed = self._subscriptions.pop(subscription)
         del subscribed.wanted[subscription]
         self.forget_envelopes()
         if subscribed.wanted:
-            if subscribed.settle():
-                self._say(subscribed)
+            if subscribed.combine():
+                self._send_subscribe(subscribed)
         else:
             del self._subscribed[absolute(subscribed.topic)]
             self._note_deliveries()
-            self._wire.say(op="unsubscribe", id=subscribed.wire_id, topic=subscribed.topic)
+            self._wire.write(op="unsubscribe", id=subscribed.wire_id, topic=subscribed.topic)
 
-    def ask_again(self) -> bool:
-        """Ask again for topics of unknown type that have brought nothing yet.
+    def retry_untyped(self) -> bool:
+        """Repeat subscriptions without a type to topics that have no messages yet.
 
-        A server that does not know the topic yet forgets such a subscription, most without a word.
+        Servers forget such a subscription if they do not know the topic yet, most of them silently.
 
         Returns:
-            Whether there are such topics, so that it is worth asking once more later.
+            Whether there are such topics, so that another retry makes sense.
         """
-        waiting = [s for s in self._subscribed.values() if s.type is None and not s.heard]
+        waiting = [s for s in self._subscribed.values() if s.type is None and not s.has_messages]
         for subscribed in waiting:
-            self._say(subscribed)
+            self._send_subscribe(subscribed)
         return bool(waiting)
 
-    def receive_again(self, data: bytes) -> MessageReceived | None:
-        """Take a message whose envelope is known; None if it is none such, or needs a closer look."""
+    def receive_known(self, data: bytes) -> MessageReceived | None:
+        """Handle a message with a known envelope; None if `receive` has to handle it."""
         known = self._known
         if not data.startswith(known.envelope):
             found = self.envelopes.get(envelope_of(data))
@@ -238,7 +238,7 @@ class Subscriptions:
                 return None
             self._known = known = found
         subscribed = known.subscribed
-        if data[-1] != BRACE or len(data) > self._max_size or subscribed.someone_is_slower:
+        if data[-1] != BRACE or len(data) > self._max_size or subscribed.has_throttled:
             return None
         message = data[known.size : -1]
         try:
@@ -249,11 +249,11 @@ class Subscriptions:
             return None
         if self.numpy and subscribed.delivery.arrays == "numpy":
             msg = with_arrays(msg)
-        # What a named tuple's own constructor does takes three times as long.
-        return tuple.__new__(MessageReceived, (known.topic, msg, subscribed.everyone))
+        # A named tuple's own constructor takes three times as long.
+        return tuple.__new__(MessageReceived, (known.topic, msg, subscribed.all_numbers))
 
     def _learn_envelope(self, data: bytes, topic: str, subscribed: _Subscribed) -> None:
-        """Remember what stands before a topic's messages, if no more than that must be known of the next one."""
+        """Remember the envelope of a topic's messages if it identifies the next one."""
         envelope = envelope_of(data)
         if envelope not in self.envelopes:
             subscribed.envelopes_tried += 1
@@ -261,7 +261,7 @@ class Subscriptions:
                 self.envelopes[envelope] = _Known(envelope, len(envelope), topic, subscribed)
 
     def forget_envelopes(self) -> None:
-        """Look at all messages closely again: who hears them may have changed, or the server."""
+        """Forget the known envelopes, since subscriptions or the server have changed."""
         self.envelopes.clear()
         self._known = _UNKNOWN
         for subscribed in self._subscribed.values():
@@ -270,13 +270,13 @@ class Subscriptions:
     def receive(
         self, operation: dict[str, Any], now: float, data: bytes | str, *, from_cbor: bool = False
     ) -> MessageReceived | Unusable | None:
-        """Take a publish; None for one that nobody wants, or not so often.
+        """Handle a publish; None if it is not subscribed, or throttled.
 
         Args:
-            operation: the message as decoded, its arrays lists or NumPy's.
-            now: seconds of any clock that never goes back, for throttled subscriptions.
-            data: the message as it came.
-            from_cbor: whether it came as CBOR, with arrays as `numpy` says.
+            operation: The decoded message, with lists or NumPy arrays.
+            now: Monotonic seconds, for throttled subscriptions.
+            data: The message as received.
+            from_cbor: Whether it is CBOR, with arrays according to `numpy`.
         """
         topic = operation.get("topic")
         msg = operation.get("msg")
@@ -285,8 +285,8 @@ class Subscriptions:
         subscribed = self._subscribed.get(topic) or self._subscribed.get(absolute(topic))
         if subscribed is None:
             return None
-        if not subscribed.heard:
-            subscribed.heard = True
+        if not subscribed.has_messages:
+            subscribed.has_messages = True
             self.seen_version = self.seen_version or ros_version_of_message(msg)
         if (
             type(data) is bytes

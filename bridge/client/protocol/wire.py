@@ -1,4 +1,4 @@
-"""What leaves: whole messages in order, in the form of the server's ROS, and only while there is a connection."""
+"""The outbox of a client: whole messages, in order, while there is a connection."""
 
 from collections.abc import Callable, Iterator
 from itertools import count
@@ -13,21 +13,21 @@ RosVersion = Literal[1, 2]
 
 
 class Wire:
-    """The outbox of a client, which all parts of its core write to.
+    """The outbox that all parts of a client's core write to.
 
     Attributes:
-        connected: whether what is said gathers; without a connection it is dropped, for it is said again to the next.
-        ros_version: which ROS the server speaks for, None while nobody knows.
-        fragment_size: characters of a message beyond which `pieces` cuts it, None for never.
-        max_size: bytes of a message at most.
-        max_depth: objects and arrays within each other at most.
-        number: gives a number that was never given before.
+        connected: Whether messages are kept; without a connection they are dropped, since `restore` repeats them.
+        ros_version: ROS version of the server, None while unknown.
+        fragment_size: Characters beyond which `pieces` splits a message; None for never.
+        max_size: Largest message in bytes.
+        max_depth: Deepest nesting of a message.
+        number: Returns a new number at each call.
     """
 
     def __init__(
         self, *, ros_version: RosVersion | None, max_size: int, max_depth: int, fragment_size: int | None
     ) -> None:
-        """Begin without a connection."""
+        """Start without connection."""
         check_fragment_size(fragment_size)
         self.connected = False
         self.ros_version: RosVersion | None = ros_version
@@ -38,35 +38,35 @@ class Wire:
         self.number: Callable[[], int] = count(1).__next__
 
     def type_name(self, name: str, kind: Kind = "msg") -> str:
-        """A type's name as the server's ROS has it; as ROS 1 while nobody knows, which ROS 2 servers take too."""
+        """Return a type's name in the server's ROS version; if unknown, in that of ROS 1, which all servers accept."""
         return ros2_type(name, kind) if self.ros_version == 2 else ros1_type(name)
 
-    def say(self, **operation: Any) -> None:
+    def write(self, **operation: Any) -> None:
         """Write an operation.
 
         Raises:
-            EncodeError: it cannot leave as JSON; a NaN or an infinity is named with its place.
+            EncodeError: It cannot be encoded as JSON; a NaN or an infinity is named with its place.
         """
         data = encode(operation, nonfinite="refuse", max_size=self.max_size, max_depth=self.max_depth)
         if self.connected:
             self._outbox.append(data)
 
-    def put(self, data: bytes) -> None:
-        """Have a whole message sent."""
+    def write_bytes(self, data: bytes) -> None:
+        """Write an encoded message."""
         if self.connected:
             self._outbox.append(data)
 
     def take(self) -> list[bytes]:
-        """Empty the outbox: whole messages, in order."""
+        """Empty the outbox, and return its messages in order."""
         data, self._outbox = self._outbox, []
         return data
 
     def clear(self) -> None:
-        """Drop what was not sent."""
+        """Drop everything that was not sent."""
         self._outbox.clear()
 
     def pieces(self, data: bytes) -> Iterator[bytes]:
-        """A whole message as it goes onto the wire: itself, or its fragments if it is larger than one may be."""
+        """Yield a message, or its fragments if it is too large for one."""
         if self.fragment_size is None or len(data) <= self.fragment_size:
             yield data
         else:

@@ -17,7 +17,7 @@ from bridge.client.protocol.events import GoalEnded, GoalFeedback, GoalStatus, M
 from bridge.client.protocol.goals import MAX_GOALS
 from bridge.codecs import cbor_codec, png
 from bridge.codecs.fragments import split
-from bridge.errors import OptionError, TypeConflictError
+from bridge.errors import OptionError, SlowPeerError, TypeConflictError
 from bridge.qos import Qos
 
 CBOR = Delivery(compression="cbor")
@@ -317,7 +317,7 @@ def test_how_a_goal_may_end(answer, ended):
 def test_goals_are_bounded_and_forgotten_with_the_connection():
     core = connected()
     goals = [goal_of(core) for _ in range(MAX_GOALS)]
-    with pytest.raises(Exception, match="goals are under way already"):
+    with pytest.raises(SlowPeerError):
         goal_of(core)
     core.goals.forget(goals[0])
     goal_of(core)

@@ -215,19 +215,19 @@ def test_what_would_kill_a_subscription_is_refused(option, bad):
 def test_a_topic_of_unknown_type_is_asked_for_until_it_brings_something():
     core = connected()
     core.subscriptions.subscribe("/typed", "p/T")
-    assert not core.subscriptions.ask_again()
+    assert not core.subscriptions.retry_untyped()
     core.subscriptions.subscribe("/a")
     sent(core)
     for _ in range(3):
-        assert core.subscriptions.ask_again()
+        assert core.subscriptions.retry_untyped()
         assert [operation["topic"] for operation in sent(core)] == ["/a"]
     tell(core, op="publish", topic="/a", msg={})
-    assert not core.subscriptions.ask_again()
+    assert not core.subscriptions.retry_untyped()
     assert sent(core) == []
     core.lost()
     core.restore()
     sent(core)
-    assert core.subscriptions.ask_again(), "the server may have forgotten it"
+    assert core.subscriptions.retry_untyped(), "the server may have forgotten it"
 
 
 @pytest.mark.parametrize(
@@ -623,7 +623,7 @@ class Wishes(RuleBasedStateMachine):
 
     @rule()
     def ask_again(self) -> None:
-        self.core.subscriptions.ask_again()
+        self.core.subscriptions.retry_untyped()
 
     @rule(name=st.text(max_size=3), rate=st.sampled_from([-1, 0.5, None]))
     def want_nonsense(self, name: str, rate: Any) -> None:

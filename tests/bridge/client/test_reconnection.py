@@ -101,7 +101,7 @@ async def test_nothing_is_published_into_the_void():
         publication = await ros.advertise("/a", "p/T")
         await fake.vanish()
         await ros.wait_for_state(State.RECONNECTING, 30)
-        with pytest.raises(DisconnectedError, match=f"there is no connection to {fake.uri} now"):
+        with pytest.raises(DisconnectedError, match=fake.uri):
             await publication.publish({"n": 1})
         with pytest.raises(DisconnectedError):
             await ros.call("/s")
@@ -215,7 +215,7 @@ async def test_a_quiet_server_that_answers_pings_is_kept():
 async def test_a_sleep_of_this_process_is_not_the_servers_silence():
     async with FakeRosbridge() as fake, connect(fake.uri, ping_interval=0.1, ping_timeout=1.0) as ros:
         fake.freeze()
-        while ros._session._open_websocket()._pinged_at is None:
+        while ros._session._connected()._pinged_at is None:
             await asyncio.sleep(0)
         fake.thaw()
         time.sleep(2.5)  # noqa: ASYNC251  # the whole process stands still while the answer is on its way

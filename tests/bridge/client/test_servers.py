@@ -84,7 +84,7 @@ async def test_a_compression_that_the_server_refuses_is_told():
     async with Double("R") as double, connect(double.uri) as ros:
         double.known.remove("png")
         subscription = ros.subscribe("/a", TYPE, compression="png")
-        with pytest.raises(NoMessageError, match="the server said: unsupported compression png"):
+        with pytest.raises(NoMessageError, match="unsupported compression png$"):
             await subscription.next(0.5)
         assert [status.level for status in ros.statuses] == ["error"]
 
@@ -153,7 +153,7 @@ async def test_no_operation_of_the_client_makes_a_server_deaf(server):
 
 async def test_a_server_without_actions_says_so_or_nothing():
     """What is not known is silence on A, and a status from R."""
-    for server, said in (("A", "did not end within 0.3 s$"), ("R", "the server said: unknown operation")):
+    for server, said in (("A", "did not end within 0.3 s$"), ("R", "unknown operation")):
         async with Double(server) as double, connect(double.uri) as ros:
             goal = await ros.send_goal("/fly", "p/Fly")
             with pytest.raises(NoAnswerError, match=said):

@@ -73,7 +73,7 @@ async def test_a_lost_connection_fails_what_waits():
         call = asyncio.create_task(ros.call("/mute", timeout=30))
         await fake.wait_for_op("call_service")
         await fake.cut()
-        with pytest.raises(DisconnectedError, match=r"was lost .* while /mute was to answer"):
+        with pytest.raises(DisconnectedError, match="/mute"):
             await asyncio.wait_for(call, 120)
 
 

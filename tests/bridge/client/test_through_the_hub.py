@@ -234,7 +234,7 @@ async def test_the_server_goes_while_a_goal_is_on_its_way():
             await goal.__anext__()
         ros._session._websocket.abort()
         for task in (reading, waiting):
-            with pytest.raises(DisconnectedError, match="while /fly had a goal"):
+            with pytest.raises(DisconnectedError):
                 await asyncio.wait_for(task, PATIENCE)
         with pytest.raises(DisconnectedError):
             await goal.result(1)
