@@ -1,4 +1,5 @@
-# docs/reference/boards.md says what is: every error, misbehaviour and operation, and bytes that are the encoder's.
+"""docs/reference/boards.md: every error, misbehaviour and operation is described, and its bytes are the encoder's."""
+
 import inspect
 from pathlib import Path
 

@@ -40,8 +40,8 @@ def memories(
 ) -> None:
     """Write the parameters and memory files again; with --model also the boards' images, for a model with new numbers.
 
-    For example `toolchain regenerate memories build/boat --model casestudies/boat`. Topics, endpoints and everything
-    else in deployment.toml that says nothing of the tables stays as it is.
+    For example `toolchain regenerate memories build/boat --model casestudies/boat`. Everything in deployment.toml that
+    does not concern the tables, such as topics and endpoints, stays as it is.
     """
     from toolchain.building.build import build_date
     from toolchain.building.regenerate import regenerate_memories
@@ -71,7 +71,7 @@ def project(directory: Directory) -> None:
     changes = regenerate_project(directory)
     _print_changes(changes)
     if not changes:
-        typer.echo("rng = ideal exists emulated only, so there is no project", err=True)
+        typer.echo("rng = ideal exists only emulated, so there is no project", err=True)
 
 
 def deployment(
@@ -106,7 +106,7 @@ def deployment(
     """Write deployment.toml with other topics, or variables in another order; edits by hand are kept.
 
     For example `toolchain regenerate deployment build/boat --order D2,D1,D3,B1,B2,B3` where the first two readings were
-    mixed up. No image, memory or board is touched. What is left out stays as it is.
+    mixed up. No image, memory or board is touched. Flags that are left out change nothing.
     """
     from toolchain.building.edits import DeploymentEdits
     from toolchain.building.regenerate import regenerate_deployment

@@ -1,4 +1,4 @@
-"""The resource estimator beside a synthesis of machines that it was not calibrated on, tables left out."""
+"""The resource estimator against a synthesis of machines that it was not calibrated on, tables left out."""
 
 import pytest
 

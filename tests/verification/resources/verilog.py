@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from machines.bm1 import BM1Machine
 
 MAX_CELLS: Final = 2048
-"""Text of a larger machine helps nobody: a table a cell."""
+"""A larger machine's text is too long to be of use, with a table for each cell."""
 
 CYCLE_BITS: Final = 64
 """Width of the cycle counter and of the limits it is compared with, as in the register map."""
@@ -112,7 +112,7 @@ def verilog(machine: BM1Machine, *, tables: bool) -> str:
             everything but them.
 
     Raises:
-        BuildError: Generators that are no LFSRs, or more than `MAX_CELLS` cells.
+        BuildError: Generators that are not LFSRs, or more than `MAX_CELLS` cells.
     """
     parameters = machine.parameters
     if parameters.rng.lfsr_bits is None:

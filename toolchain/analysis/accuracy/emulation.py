@@ -91,7 +91,7 @@ class EmulatedBoards:
         return sum(machine.parameters.lines for machine in self.machines)
 
     def run(self, addresses: Inputs, prior_address: int, bank: int) -> FrameRun:
-        """Run a frame as the host does: slices that end at 256 * 2^k, until a board overflows; or each board by itself."""
+        """Run a frame as the host does: in slices that end at 256 * 2^k until a board overflows, or each board alone."""
         end = first_slice(self.target_count) if self.stop is Stop.SLICES else 0
         if end >= self.max_cycles:
             end = 0

@@ -43,8 +43,8 @@ class Sweep:
         prob_bits: Widths of codes.
         target_counts: Counts that stop a machine; each with the narrowest counter that holds it.
         rngs: Kinds of generators.
-        scales: What is divided by its maximum before quantising.
-        sensor_modes: What cells are given; machines whose cells have inputs of their own are not made with scale `address`.
+        scales: Scalings before quantising.
+        sensor_modes: Inputs of cells; scale `address` is left out where cells have inputs of their own.
         replicas: Machines on a board.
         steps_per_clock: Steps of a generator in a cycle; 0 for as many as give fresh bits.
         partitions: Boards.

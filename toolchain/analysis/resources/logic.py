@@ -68,7 +68,7 @@ class Cost:
 
 # Least squares over 47 synthesised machines (yosys 0.23, synth_intel_alm, Cyclone V: the same ALM as a Stratix V's), of 1
 # to 48 lines, 1 to 6 sensors, codes of 4 to 16 bits, up to 32 replicas, inputs of all kinds: relative errors up to 9 %.
-# Negative costs are none; what a cell's AND takes can't be told from its comparator.
+# Negative costs are set to 0; the cost of a cell's AND can't be separated from its comparator's.
 COSTS: Final[Mapping[Of, Cost]] = {
     Of.CONTROL: Cost(178.5, 110.3),
     Of.CODE_BIT: Cost(0.891, 0.579),
