@@ -1,6 +1,6 @@
 """The register map for hardware and for C: a VHDL package, the VHDL register block, and the C header.
 
-`scripts/registers` writes all three from the SystemRDL file, beside the constants module (`map_generator`).
+`scripts/registers` writes all three from the SystemRDL file, beside the constants module (`generator`).
 
 The register block is written here and not by peakrdl-regblock-vhdl, which was tried:
 
@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
-    from pcie_shim.map_generator import Encoding, RegisterMap
+    from scripts.register_maps.generator import Encoding, RegisterMap
 
 _HEAD: Final = """\
 -- ================================================================================================

@@ -1,4 +1,4 @@
-"""Makes the constants module and the register documentation from the SystemRDL file (`scripts/registers`).
+"""Generator of the constants module and the register documentation from the SystemRDL file (`scripts/registers`).
 
 Only development needs it: the constants module is committed, so that run time needs no SystemRDL
 tools. The hash of the map covers the definition (names, addresses, sizes, fields, access, resets,
@@ -14,12 +14,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from pcie_shim import hardware_map
+from scripts.register_maps import hardware
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-ROOT: Final = Path(__file__).resolve().parent.parent
+ROOT: Final = Path(__file__).resolve().parents[2]
 SOURCE: Final = ROOT / "hdl" / "bm_registers.rdl"
 MODULE: Final = ROOT / "pcie_shim" / "register_map.py"
 DOCUMENT: Final = ROOT / "docs" / "reference" / "registers.md"
@@ -152,7 +152,7 @@ def read_map(source: Path = SOURCE) -> RegisterMap:
 def _field(node: object) -> Field:
     from systemrdl.node import FieldNode
 
-    assert isinstance(node, FieldNode)  # noqa: S101 - systemrdl is untyped; this is for the type checker alone
+    assert isinstance(node, FieldNode)
     encode = node.get_property("encode")
     encoding = None
     if encode is not None:
@@ -289,13 +289,13 @@ def _size(block: Block) -> str:
 
 def generated_files(register_map: RegisterMap) -> dict[Path, str]:
     """Return the text of every file that is made from the SystemRDL file."""
-    registers = hardware_map.read_registers(SOURCE)
+    registers = hardware.read_registers(SOURCE)
     return {
         MODULE: module_text(register_map),
         DOCUMENT: document_text(register_map),
-        PACKAGE: hardware_map.package_text(register_map),
-        REGISTER_BLOCK: hardware_map.block_text(registers),
-        HEADER: hardware_map.header_text(SOURCE),
+        PACKAGE: hardware.package_text(register_map),
+        REGISTER_BLOCK: hardware.block_text(registers),
+        HEADER: hardware.header_text(SOURCE),
     }
 
 
