@@ -1,6 +1,6 @@
 """The rosbridge server without sockets: messages of clients in, messages for clients out.
 
-The owner of sockets and clocks calls `Broker.connect`, `Broker.receive_all`, `Broker.wake` and
+The owner of sockets and clocks calls `Broker.connect`, `Broker.receive_turn`, `Broker.wake` and
 `Broker.disconnect`, then drains the outboxes of the clients that `Broker.take_ready` returns. The broker never waits,
 does not read the monotonic clock, and does not raise for anything that a client sends.
 
@@ -114,7 +114,9 @@ class Broker:
 
     def connect(self, address: str) -> Client:
         """Admit a client from `address`, after checking `full`."""
-        client = Client(next(self._client_numbers), address, Outbox(self.limits.client_bytes))
+        client = Client(
+            next(self._client_numbers), address, Outbox(self.limits.client_bytes, self.limits.message_bytes)
+        )
         self.graph.clients[client.number] = client
         return client
 
@@ -155,11 +157,6 @@ class Broker:
         except BridgeError as error:
             self._refuse(client, str(error), self._operation_id, with_status=client.wants_status)
 
-    def receive_all(self, client: Client, messages: list[bytes], now: float) -> None:
-        """Perform messages of a client in order, as `receive` does one."""
-        while messages:
-            messages = messages[self.receive_turn(client, messages, now) :]
-
     def receive_turn(self, client: Client, messages: list[bytes], now: float) -> int:
         """Perform messages of a client in order, as many as one turn allows.
 
@@ -169,14 +166,14 @@ class Broker:
             now: Monotonic seconds.
 
         Returns:
-            How many were performed. The others need another turn, after the definitions are loaded if
-            `definitions.pending` is true.
+            How many were performed. The others need another turn, once the client has read its answers if its outbox is
+            congested, and once the definitions are loaded if `definitions.pending` is true.
         """
         self._now, self._operation_id = now, None
         dispatcher, publish_again = self._dispatcher, self._topics.publish_again
         dispatcher.work = 0
         for number, data in enumerate(messages):
-            if dispatcher.work > TURN_WORK:
+            if dispatcher.work > TURN_WORK or client.outbox.congested:
                 return number
             if publish_again(client, data, now):
                 dispatcher.work += _OPERATION_WORK + (len(data) >> 7)

@@ -46,7 +46,10 @@ _SWEEP: Final = 1.0
 _CLOSE_TIMEOUT: Final = 2.0
 """Seconds that a client has to end a connection which the hub closed."""
 _HANDSHAKES: Final = 64
-"""Connections in their handshake, beyond the clients."""
+"""Connections in their opening or closing handshake; the oldest is aborted for another."""
+_LOG_LINES: Final = 10
+_LOG_PERIOD: Final = 10.0
+"""Seconds in which at most `_LOG_LINES` lines are logged about refused and closed connections."""
 _LAST_PORT: Final = 65535
 
 
@@ -132,15 +135,20 @@ class _Hub:
         self.broker = Broker(limits, ros_version=ros_version)
         self.door = door
         self.connections: set[_Connection] = set()
+        self.handshakes: dict[_Connection, None] = {}  # in the order in which they began
         self._by_client: dict[Client, _Connection] = {}
         self._timer: asyncio.TimerHandle | None = None
         self._timer_deadline = inf
         self._sweeper: asyncio.TimerHandle | None = None
         self._swept = time.monotonic()
         self._nobody_left = asyncio.Event()
+        self._log_lines = 0
+        self._log_since = -inf
+        self.broker.definitions.load_in_background = self._load_definitions
 
     def admit(self, connection: "_Connection", address: str) -> Client:
         client = self.broker.connect(address)
+        self.handshakes.pop(connection, None)
         self._by_client[client] = connection
         return client
 
@@ -149,10 +157,39 @@ class _Hub:
         self.broker.disconnect(client)
         self.serve()
 
+    def begin(self, connection: "_Connection") -> None:
+        self.connections.add(connection)
+        self.handshakes[connection] = None
+        if len(self.handshakes) > _HANDSHAKES:
+            oldest = next(iter(self.handshakes))
+            del self.handshakes[oldest]
+            oldest.abort()
+
     def forget(self, connection: "_Connection") -> None:
         self.connections.discard(connection)
+        self.handshakes.pop(connection, None)
         if not self.connections:
             self._nobody_left.set()
+
+    def warn(self, message: str, *args: object) -> None:
+        """Log a line about a connection, unless there were many lately."""
+        now = time.monotonic()
+        if now > self._log_since + _LOG_PERIOD:
+            if self._log_lines > _LOG_LINES:
+                log.warning("%d more lines about connections were left out", self._log_lines - _LOG_LINES)
+            self._log_lines, self._log_since = 0, now
+        self._log_lines += 1
+        if self._log_lines <= _LOG_LINES:
+            log.warning(message, *args)
+
+    def _load_definitions(self) -> None:
+        loaded = asyncio.get_running_loop().run_in_executor(None, self.broker.definitions.load)
+        loaded.add_done_callback(self._definitions_loaded)
+
+    def _definitions_loaded(self, loaded: asyncio.Future[None]) -> None:
+        for connection in list(self.connections):
+            connection.proceed()
+        loaded.result()
 
     def sweep(self) -> None:
         """Look after those who say nothing and take nothing, now and then."""
@@ -225,6 +262,17 @@ class _Connection(WebSocketTransport):
         self._pinged_at: float | None = None
         self._stuck_since: float | None = None
         self._close_by = inf
+        self._flushing = False
+
+    @property
+    def is_blocked(self) -> bool:
+        """Return whether the client must read its answers first, or needs definitions that are being loaded."""
+        client = self._client
+        return client is not None and (
+            client.outbox.congested
+            or self._pongs_unread
+            or (bool(self._postponed) and self._hub.broker.definitions.pending)
+        )
 
     # --- calls of the event loop
 
@@ -233,10 +281,7 @@ class _Connection(WebSocketTransport):
         super().connection_made(transport)
         peer = transport.get_extra_info("peername")
         self._address = str(peer[0]) if peer else "?"
-        self._hub.connections.add(self)
-        if len(self._hub.connections) > self._hub.limits.clients + _HANDSHAKES:
-            self.abort()
-            return
+        self._hub.begin(self)
         transport.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
 
     def pause_writing(self) -> None:
@@ -248,8 +293,8 @@ class _Connection(WebSocketTransport):
 
     def resume_writing(self) -> None:
         """Write what waited."""
-        super().resume_writing()
         self._stuck_since = None
+        super().resume_writing()
         self.flush()
 
     # --- calls of the transport
@@ -274,23 +319,28 @@ class _Connection(WebSocketTransport):
             if not self.paused:
                 self._client.outbox.wire = []
         else:
-            log.warning("a connection from %s was refused: HTTP %d", self._address, response.status_code)
+            self._hub.warn("a connection from %s was refused: HTTP %d", self._address, response.status_code)
 
     def messages_received(self, messages: list[bytes]) -> None:
         """Have the broker handle the messages, and send what follows from them."""
         if self._client is not None:
-            self._hub.broker.receive_all(self._client, messages, self.last_heard)
+            performed = self._hub.broker.receive_turn(self._client, messages, self.last_heard)
+            if performed < len(messages):
+                self.postpone(messages[performed:])
             self._hub.serve()
 
     def close_expected(self) -> None:
         """Give the client a limited time to end the connection."""
+        error = self._server_protocol.parser_exc
+        if error is not None and self._client is not None and not isinstance(error, EOFError):
+            self._hub.warn("the connection from %s is closed: %s", self._address, error)
         self._close_by = time.monotonic() + _CLOSE_TIMEOUT
         self._leave()
 
     def ended(self, _exc: Exception | None) -> None:
         """Forget the client."""
-        self._hub.forget(self)
         self._leave()
+        self._hub.forget(self)
 
     # --- calls of the hub
 
@@ -307,15 +357,28 @@ class _Connection(WebSocketTransport):
             self.send(outbox.take_wire())
         if outbox.wire is None or not outbox.empty:
             self._flush_backlog(outbox)
+        self.proceed()
 
     def _flush_backlog(self, outbox: Outbox) -> None:
-        """Write what waited while the socket took nothing, and what goes in fragments."""
-        while not self.paused and not outbox.empty:
-            message = outbox.pop()
-            if message is not None:
-                self.send((message,))
-        if not self.paused and outbox.wire is None:
+        """Write a turn's worth of the queue, and leave the rest until other tasks had their turn."""
+        messages: list[bytes] = []
+        size = 0
+        while not self.paused and size < _TURN_BYTES and (message := outbox.pop()) is not None:
+            messages.append(message)
+            size += len(message)
+        if messages:
+            self.send(messages)
+        if self.paused:
+            return
+        if outbox.wire is None:
             outbox.wire = []
+        if not outbox.empty and not self._flushing:
+            self._flushing = True
+            asyncio.get_running_loop().call_soon(self._continue_flush)
+
+    def _continue_flush(self) -> None:
+        self._flushing = False
+        self.flush()
 
     def sweep(self, now: float) -> None:
         """Close the connection if it is too silent or too slow at `now`."""
@@ -327,6 +390,8 @@ class _Connection(WebSocketTransport):
                 self.abort()
         elif self._stuck_since is not None and now > self._stuck_since + limits.stuck_timeout:
             self._give_up(f"its socket took nothing for {limits.stuck_timeout:g} s")
+        elif self.is_blocked:
+            self.last_heard = now  # nothing is read from it
         elif self._pinged_at is None:
             if now > self.last_heard + limits.ping_interval and self.is_open:
                 self._pinged_at = now
@@ -347,9 +412,10 @@ class _Connection(WebSocketTransport):
     def _leave(self) -> None:
         client, self._client = self._client, None
         if client is not None:
+            self._hub.handshakes[self] = None
             self._hub.dismiss(client)
 
     def _give_up(self, why: str) -> None:
         if not self.is_closing:
-            log.warning("the connection from %s is closed: %s", self._address, why)
+            self._hub.warn("the connection from %s is closed: %s", self._address, why)
             self.abort()

@@ -75,6 +75,10 @@ class WebSocketTransport(asyncio.Protocol):
         self._wanted = 0
         self._fragments: bytearray | None = None
         self._held: list[bytes] | None = None
+        self._postponed: list[bytes] = []
+        self._interrupted: tuple[bytes, int] | None = None
+        self._pongs_unread = False
+        self._is_scheduled = False
         self._ends = False
         self._writable = asyncio.Event()
         self._writable.set()
@@ -104,6 +108,11 @@ class WebSocketTransport(asyncio.Protocol):
     def is_connected(self) -> bool:
         """Whether there is, or was, a socket."""
         return self._transport is not None
+
+    @property
+    def is_blocked(self) -> bool:
+        """Return whether nothing may be read now: the peer causes output and does not read it."""
+        return self._pongs_unread
 
     @property
     def is_closing(self) -> bool:
@@ -176,6 +185,7 @@ class WebSocketTransport(asyncio.Protocol):
         if data and transport is not None and not transport.is_closing():
             if whole := b"".join(data):
                 transport.write(whole)
+                self._pongs_unread = self._is_server and self.paused
             if not data[-1]:
                 # Closing both halves could cost the last frame on its way, but TLS has no halves.
                 (transport.write_eof if transport.can_write_eof() else transport.close)()
@@ -199,14 +209,13 @@ class WebSocketTransport(asyncio.Protocol):
                 return
             begun = bytes(rest)
             rest.clear()
-            if at == len(data):
-                data, at = begun, 0
-            else:
-                self._read(begun, 0)
+            data, at = begun + data[at:], 0
         elif self._quick and self._fragments is None:
             message = frames.only_message(data, masked=self._is_server, largest=self._max_size)
             if message is not None:  # nearly always, unless messages come in floods
                 self.messages_received([message])
+                if self._postponed or self.is_blocked:
+                    self._interrupt(b"", 0)
                 return
         elif self._in_handshake:
             self._read_handshake(data)
@@ -233,8 +242,9 @@ class WebSocketTransport(asyncio.Protocol):
 
     def resume_writing(self) -> None:
         """Let writers go on."""
-        self.paused = False
+        self.paused = self._pongs_unread = False
         self._writable.set()
+        self.proceed()
 
     # Reading
 
@@ -257,20 +267,43 @@ class WebSocketTransport(asyncio.Protocol):
     def _read_turn(self, data: bytes, at: int) -> None:
         """Handle bytes for one turn; the rest is handled after other tasks had theirs."""
         at = self._read(data, at)
-        transport = self._transport
-        if at < len(data) and transport is not None and not transport.is_closing():
-            transport.pause_reading()
-            asyncio.get_running_loop().call_soon(self._resume, transport, data, at)
+        if at < len(data) or self._postponed or self.is_blocked:
+            self._interrupt(data, at)
 
-    def _resume(self, transport: asyncio.Transport, data: bytes, at: int) -> None:
-        if not transport.is_closing():
-            transport.resume_reading()
-            self._read_turn(data, at)
+    def postpone(self, messages: list[bytes]) -> None:
+        """Handle these messages in a later turn, before everything that follows them."""
+        self._postponed = messages
+
+    def _interrupt(self, data: bytes, at: int) -> None:
+        """Stop reading until other tasks had their turn, and nothing blocks any more."""
+        if not self.is_closing:
+            cast("asyncio.Transport", self._transport).pause_reading()
+            self._interrupted = data, at
+            self.proceed()
+
+    def proceed(self) -> None:
+        """Continue an interrupted turn after other tasks had theirs, unless something still blocks."""
+        if self._interrupted is not None and not self._is_scheduled and not self.is_blocked:
+            self._is_scheduled = True
+            asyncio.get_running_loop().call_soon(self._proceed)
+
+    def _proceed(self) -> None:
+        self._is_scheduled = False
+        if self._interrupted is None or self.is_closing or self.is_blocked:
+            return
+        (data, at), self._interrupted = self._interrupted, None
+        cast("asyncio.Transport", self._transport).resume_reading()
+        postponed, self._postponed = self._postponed, []
+        if postponed:
+            self.messages_received(postponed)
+        self._read_turn(data, at)
 
     def _read(self, data: bytes, at: int) -> int:
         """Handle a turn's frames and keep an incomplete one; return where the turn ended."""
         size, count, turn_end, masked = len(data), 0, at + self.turn_bytes, self._is_server
         while at < size and count < self.turn_frames and at < turn_end:
+            if self._postponed or self.is_blocked:
+                break
             if not self._quick:
                 end = min(at + self.slice_bytes, size)
                 self._give_library(data[at:end])

@@ -73,8 +73,10 @@ class Outbox:
         "_fragments",
         "_gaps",
         "_holding",
+        "_largest",
         "_max_bytes",
         "_numbers",
+        "_undroppable",
         "_wire_bytes",
         "deadline",
         "overflowed",
@@ -82,9 +84,11 @@ class Outbox:
         "wire",
     )
 
-    def __init__(self, max_bytes: int) -> None:
-        """Bound the queue to `max_bytes`."""
+    def __init__(self, max_bytes: int, largest: int = 0) -> None:
+        """Bound the queue to `max_bytes`; a single payload has at most `largest`."""
         self._max_bytes = max_bytes
+        self._largest = largest
+        self._undroppable = 0
         self._entries: deque[_Entry] = deque()
         self._droppable: deque[_Entry] = deque()
         self._gaps = 0
@@ -110,6 +114,11 @@ class Outbox:
         """Return whether nothing is queued for the socket."""
         return not self._entries and self._fragments is None
 
+    @property
+    def congested(self) -> bool:
+        """Return whether one more answer could overflow it, so that its client must read before it asks again."""
+        return self._undroppable > 0 and self._undroppable + self._largest > self._max_bytes
+
     def take_wire(self) -> list[bytes]:
         """Return and remove the payloads for the socket's next write."""
         payloads, self.wire, self._wire_bytes = self.wire or [], [], 0
@@ -122,6 +131,7 @@ class Outbox:
         if self._make_room(len(payload)):
             self._entries.append(_Entry(payload, None, fragment_size))
             self.size += len(payload)
+            self._undroppable += len(payload)
         else:
             self.overflowed = True
 
@@ -155,7 +165,9 @@ class Outbox:
             if payload is None:
                 self._gaps -= 1
                 continue
-            if entry.lane is not None:
+            if entry.lane is None:
+                self._undroppable -= len(payload)
+            else:
                 entry.lane.queued.popleft()  # this very entry: a lane has the outbox's order
                 entry.payload = None
                 while self._droppable and self._droppable[0].payload is None:

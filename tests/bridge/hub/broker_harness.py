@@ -162,7 +162,8 @@ class Harness:
         )
         assert len(outbox) == len(entries)
         held = sum(len(payload) for lane in lanes for payload in lane.held)
-        assert outbox.size == sum(len(entry.payload or b"") for entry in entries) + held
+        cutting = outbox._cutting if outbox._fragments is not None else 0
+        assert outbox.size == sum(len(entry.payload or b"") for entry in entries) + held + cutting
         assert outbox.size <= self.broker.limits.client_bytes
         assert outbox.deadline <= min((lane.next_time for lane in lanes if lane.held), default=inf)
         for lane in lanes:

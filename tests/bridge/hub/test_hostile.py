@@ -420,17 +420,6 @@ async def test_connections_without_a_handshake_do_not_fill_the_hub(quick_sweeps:
                 await asyncio.sleep(0.01)
 
 
-async def test_connections_without_a_handshake_are_counted() -> None:
-    limits = HubLimits(clients=3, handshake_timeout=1000)
-    async with _hub_and_witness(limits) as (port, _witness):
-        crowd = [await RawClient.connect(port, handshake=False) for _ in range(100)]
-        for raw in crowd[3 + 64 - 1 :]:
-            assert await raw.ended() == b""
-        assert not crowd[0].reader.at_eof()
-        for raw in crowd:
-            raw.cut()
-
-
 async def test_a_server_that_hangs_up_during_a_call_fails_it() -> None:
     async with _hub_and_witness() as (port, witness):
         server = await RawClient.connect(port)

@@ -33,7 +33,7 @@ class Hub:
 
     def say(self, data: bytes) -> None:
         if self.knowing:
-            self.broker.receive_all(self.publisher, [data], 0.0)
+            assert self.broker.receive_turn(self.publisher, [data], 0.0) == 1
         else:
             self.broker.receive(self.publisher, data, 0.0)
 
