@@ -89,44 +89,34 @@ def _model_function(path: Path) -> Callable[..., object]:
     function = getattr(module, "model", None)
     if not callable(function):
         raise ModelError(
-            f"{path} defines no model(); expected a function that returns a toolchain.models.Model"
+            f"{path} does not define model(); expected a function that returns a toolchain.models.Model"
         )
     return function  # type: ignore[no-any-return]  # what a user's module holds has no type
 
 
 def _guarded(path: Path, what: str, call: Callable[[], object]) -> object:
-    """Call into the user's file; what it raises becomes one sentence with the line it came from.
+    """Call into the user's file; an exception becomes one sentence with the line that it came from.
 
     An error that the file itself raises keeps its words; an error of the toolchain gets the file's line, too.
     """
     try:
         return call()
-    except ModelError as error:
-        frames = traceback.extract_tb(error.__traceback__)
-        if Path(frames[-1].filename).is_relative_to(_TOOLCHAIN) and (line := _line(path, frames)):
-            raise ModelError(f"{path}, line {line}: {error}") from None
-        raise
-    except ToolchainError:
-        raise
     except SyntaxError as error:
-        place = f", line {error.lineno}" if error.lineno else ""  # a file that is not text has no line
-        raise ModelError(f"{error.filename or path}{place}: {error.msg}") from None
-    except SystemExit as error:
+        raise ModelError(str(error.msg), path=error.filename or path, line=error.lineno or None) from None
+    except (Exception, SystemExit) as error:
         frames = traceback.extract_tb(error.__traceback__)
-        if Path(frames[-1].filename).is_relative_to(
-            _TOOLCHAIN
-        ):  # a signal has ended the command, not the file
+        line, in_toolchain = _line(path, frames), Path(frames[-1].filename).is_relative_to(_TOOLCHAIN)
+        if isinstance(error, ModelError) and in_toolchain and line:
+            raise ModelError(str(error), path=path, line=line) from None
+        if isinstance(error, ToolchainError):
             raise
-        line = _line(path, frames)
-        where = f"{path}, line {line}" if line else str(path)
-        said = "" if error.code is None else f" with {error.code!r}"
-        raise ModelError(f"{where}: {what} ended the program{said}; expected a model") from None
-    except Exception as error:
-        line = _line(path, traceback.extract_tb(error.__traceback__))
-        where = f"{path}, line {line}" if line else str(path)
-        text = " ".join(str(error).split())
-        raised = f"{type(error).__name__}: {text}" if text else type(error).__name__
-        raise ModelError(f"{where}: {what} raised {raised}") from error
+        if not isinstance(error, SystemExit):
+            text = " ".join(f"{type(error).__name__}: {error}".removesuffix(": ").split())
+            raise ModelError(f"{what} raised {text}", path=path, line=line) from error
+        if in_toolchain:  # a signal has ended the command, not the file
+            raise
+        code = "" if error.code is None else f" with {error.code!r}"
+        raise ModelError(f"{what} ended the program{code}; expected a model", path=path, line=line) from None
 
 
 def _line(path: Path, frames: traceback.StackSummary) -> int | None:

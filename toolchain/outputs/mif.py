@@ -256,7 +256,7 @@ class _Reader:
         self._fail(f"expected {expected}, found {found}")
 
     def _fail(self, what: str) -> NoReturn:
-        raise MifError(f"{self._name}, line {self._line}: {what}")
+        raise MifError(what, path=self._name, line=self._line)
 
 
 def _short(word: str) -> str:

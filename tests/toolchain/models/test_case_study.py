@@ -72,55 +72,54 @@ def test_a_mistake_has_its_line_however_the_folder_is_named(case, tmp_path, monk
 
 
 @pytest.mark.parametrize(
-    ("settings", "sentence"),
+    "settings",
     [
-        ({"siz": "3"}, "the model has no parameter 'siz'; did you mean 'size'?"),
-        ({"zzzzzz": "3"}, "the model has no parameter 'zzzzzz'; expected one of size, share, name"),
-        ({"size": "3.5"}, "--set size=3.5: expected an integer"),
-        ({"plain": "x"}, "--set plain=x: expected an integer"),
-        ({"share": "half"}, "--set share=half: expected a number"),
-        ({"flat": "maybe"}, "--set flat=maybe: expected one of true, false"),
-        ({"kind": "fin"}, "--set kind=fin: expected one of coarse, fine"),
-        ({"mode": "b"}, "--set mode=b: expected one of a, 2"),
-        ({"table": "{}"}, "--set table={}: the model's table can't be given on the command line"),
-        ({"size": "0"}, "P(K | S) has shape (2, 0), expected (values, lines)"),
+        {"siz": "3"},
+        {"zzzzzz": "3"},
+        {"size": "3.5"},
+        {"plain": "x"},
+        {"share": "half"},
+        {"flat": "maybe"},
+        {"kind": "fin"},
+        {"mode": "b"},
+        {"table": "{}"},
+        {"size": "0"},
     ],
 )
-def test_wrong_settings(case, settings, sentence):
+def test_wrong_settings(case, settings):
     with pytest.raises(ModelError) as caught:
         load_model(case(), settings)
-    assert sentence in str(caught.value)
     assert caught.value.exit_code == 2
 
 
 @pytest.mark.parametrize(
-    ("text", "sentence"),
+    ("text", "line"),
     [
-        ("def model(file):\n    pass", "the model needs file: add --set file=VALUE"),
-        ("def model():\n    return 1 / 0", "line 2: model() raised ZeroDivisionError: division by zero"),
-        ("def model():\n    raise ValueError('a\\nb')", "line 2: model() raised ValueError: a b"),
-        ("import sys\nsys.exit(3)", "line 2: it ended the program with 3; expected a model"),
-        ("def model():\n    raise SystemExit", "line 2: model() ended the program; expected a model"),
-        ("def model(*sizes):\n    return sizes", "model() returned tuple, expected"),
-        ("def model():\n    assert False", "line 2: model() raised AssertionError"),
-        ("\nimport nowhere_to_be_found", "line 2: it raised ModuleNotFoundError"),
-        ("def model(:\n", "line 1: invalid syntax"),
-        ("x = 1", "defines no model()"),
-        ("model = 1", "defines no model()"),
-        ("def model():\n    return 5", "model() returned int, expected a toolchain.models.Model"),
-        ("def model():\n    pass", "model() returned NoneType"),
-        ("def model(x: 'Nonsense' = 1):\n    pass", "an annotation raised NameError"),
+        ("def model(file):\n    pass", None),
+        ("def model():\n    return 1 / 0", 2),
+        ("def model():\n    raise ValueError('a\\nb')", 2),
+        ("import sys\nsys.exit(3)", 2),
+        ("def model():\n    raise SystemExit", 2),
+        ("def model(*sizes):\n    return sizes", None),
+        ("def model():\n    assert False", 2),
+        ("\nimport nowhere_to_be_found", 2),
+        ("def model(:\n", 1),
+        ("x = 1", None),
+        ("model = 1", None),
+        ("def model():\n    return 5", None),
+        ("def model():\n    pass", None),
+        ("def model(x: 'Nonsense' = 1):\n    pass", None),
         (
             "import numpy as np\nfrom toolchain.models import normal\ndef model():\n    return normal('d', mean=np.zeros(2), sigma=-1, values=2)",
-            "line 4: variable 'd': sigma must be positive on every line",
+            4,
         ),
     ],
 )
-def test_mistakes_in_the_file(case, text, sentence):
+def test_mistakes_in_the_file(case, text, line):
     folder = case(text)
     with pytest.raises(ModelError) as caught:
         load_model(folder, {})
-    assert sentence in str(caught.value)
+    assert caught.value.line == line
     assert str(folder / "model.py") in str(caught.value)
     assert "\n" not in str(caught.value)
 

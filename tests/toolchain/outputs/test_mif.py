@@ -76,44 +76,44 @@ def test_the_words_of_a_range_are_repeated():
 
 
 @pytest.mark.parametrize(
-    ("text", "sentence"),
+    ("text", "line"),
     [
-        ("", "line 1: expected WIDTH, DEPTH, ADDRESS_RADIX, DATA_RADIX or CONTENT BEGIN, found the end of"),
-        ("\n\nWITH=3;", "line 3: expected WIDTH, DEPTH"),
-        ("WIDTH=8;\nCONTENT BEGIN", "line 2: DEPTH is missing before CONTENT"),
-        ("WIDTH=8;\nWIDTH=8;", "line 2: WIDTH is given twice"),
-        ("WIDTH=0;", "line 1: WIDTH is 0, expected 1 to"),
-        ("WIDTH=99999999999;", "line 1: WIDTH is 99999999999, expected 1 to"),
-        ("DEPTH=99999999999;", "line 1: DEPTH is 99999999999, expected 1 to"),
-        ("DEPTH=" + "9" * 5000, "line 1: a decimal number of 5000 digits is too long"),
-        ("WIDTH=F;", "line 1: expected a number for WIDTH, in DEC, found 'F'"),
-        ("WIDTH=8", "line 1: expected ';', found the end of the file"),
-        ("DATA_RADIX=ROMAN;", "line 1: expected one of BIN, OCT, DEC, UNS, HEX, found 'ROMAN'"),
-        ("WIDTH=8; DEPTH=8;\nCONTENT\nBEGUN", "line 3: expected BEGIN after CONTENT, found 'BEGUN'"),
-        (HEAD + "0 : 1;\n", "line 4: expected an address or END;, found the end of the file"),
-        (HEAD + "0 : 100;", "line 3: the word 100 (HEX) doesn't fit 8 bits"),
-        (HEAD + "0 : -1;", "line 3: expected a word or ';', found '-1'"),
-        (HEAD + "0 : 1_0;", "line 3: expected a word or ';', found '1_0'"),
-        (HEAD + "0 : G;", "line 3: expected a word or ';', in HEX, found 'G'"),
-        (HEAD + "0 : ;", "line 3: expected a word after ':', found ';'"),
-        (HEAD + "8 : 1;", "line 3: address 8 is outside the memory, whose last one is 7"),
-        (HEAD + "6 : 1 2\n3;", "line 4: the entry of line 3 goes on to address 8, but the last one is 7"),
-        (HEAD + "0 : " + "1 " * 9, "line 3: the entry of line 3 has more words than the memory, which has 8"),
-        (HEAD + "0 : 1;\n[0..2] : 1;", "line 4: address 0 is given twice, the second time by the entry of"),
-        (HEAD + "[3..2] : 1;", "line 3: the range ends at address 2, before it begins at 3"),
-        (HEAD + "[3,2] : 1;", "line 3: ',' means nothing here"),
-        (HEAD + "[3:2] : 1;", "line 3: expected '..' between the ends of a range, found ':'"),
-        (HEAD + "0 = 1;", "line 3: expected ':', found '='"),
-        (HEAD + "% never\n ends", "line 3: a comment begins with % and never ends"),
-        (HEAD + "END;\n0 : 1;", "line 4: expected the end of the file after END;, found '0'"),
-        ("WIDTH=8; DEPTH=1; DATA_RADIX=DEC; CONTENT BEGIN 0 : -129; END;", "-129 (DEC) doesn't fit 8 bits"),
+        ("", 1),
+        ("\n\nWITH=3;", 3),
+        ("WIDTH=8;\nCONTENT BEGIN", 2),
+        ("WIDTH=8;\nWIDTH=8;", 2),
+        ("WIDTH=0;", 1),
+        ("WIDTH=99999999999;", 1),
+        ("DEPTH=99999999999;", 1),
+        ("DEPTH=" + "9" * 5000, 1),
+        ("WIDTH=F;", 1),
+        ("WIDTH=8", 1),
+        ("DATA_RADIX=ROMAN;", 1),
+        ("WIDTH=8; DEPTH=8;\nCONTENT\nBEGUN", 3),
+        (HEAD + "0 : 1;\n", 4),
+        (HEAD + "0 : 100;", 3),
+        (HEAD + "0 : -1;", 3),
+        (HEAD + "0 : 1_0;", 3),
+        (HEAD + "0 : G;", 3),
+        (HEAD + "0 : ;", 3),
+        (HEAD + "8 : 1;", 3),
+        (HEAD + "6 : 1 2\n3;", 4),
+        (HEAD + "0 : " + "1 " * 9, 3),
+        (HEAD + "0 : 1;\n[0..2] : 1;", 4),
+        (HEAD + "[3..2] : 1;", 3),
+        (HEAD + "[3,2] : 1;", 3),
+        (HEAD + "[3:2] : 1;", 3),
+        (HEAD + "0 = 1;", 3),
+        (HEAD + "% never\n ends", 3),
+        (HEAD + "END;\n0 : 1;", 4),
+        ("WIDTH=8; DEPTH=1; DATA_RADIX=DEC; CONTENT BEGIN 0 : -129; END;", 1),
     ],
 )
-def test_mistakes(text, sentence):
+def test_mistakes(text, line):
     with pytest.raises(MifError) as caught:
         parse_mif(text, "a.mif")
     assert str(caught.value).startswith("a.mif, line ")
-    assert sentence in str(caught.value)
+    assert caught.value.line == line
 
 
 @given(st.text(alphabet="WIDTHEPCON=8;:[]. 01A%-\n"))

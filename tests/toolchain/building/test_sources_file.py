@@ -111,57 +111,29 @@ def test_a_prior_of_one_of_them(tmp_path, written):
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "said"),
+    ("old", "new", "line"),
     [
-        (
-            "near = ",
-            "naer = ",
-            "line 4: in [[source]] 1: the model has no variable 'naer'; did you mean 'near'?",
-        ),
-        (
-            "near = ",
-            "q = ",
-            "line 4: in [[source]] 1: the model has no variable 'q'; expected one of near, left, turn",
-        ),
-        ("left = ", "near = ", "line 11: in [[source]] 2: near already comes from source 1"),
-        (
-            "compression",
-            "compresion",
-            "line 10: unknown key 'compresion' in [[source]] 2; did you mean 'compression'",
-        ),
-        (
-            '"cbor"',
-            '"cbr"',
-            "line 10: compression = 'cbr' in [[source]] 2 is not a value it can have; did you mean 'cbor'",
-        ),
-        (
-            "ranges[3]",
-            "ranges[-3]",
-            "line 11: variables in [[source]] 2: 'ranges[-3]' is not a path in a message",
-        ),
-        ("/scan", "scan me", "line 8: topic in [[source]] 2: 'scan me' is not a topic name"),
-        ("ws://two:9090", "two:9090", "line 7: uri in [[source]] 2: 'two:9090' is not a WebSocket URI"),
-        (
-            'topic = "/imu"',
-            'topic = "/scan"',
-            "line 15: in [[source]] 3: source 2 is the same topic of the same server",
-        ),
-        ('{ left = "ranges[3]" }', "{}", "line 11: in [[source]] 2: nothing is read from it"),
-        (
-            'variables = { left = "ranges[3]" }\n',
-            "",
-            "line 14: in [[source]] 3: source 2 has no 'variables' either",
-        ),
-        ("\n[[source]]\n", "\n[[sources]]\n", "unknown key 'sources'; did you mean 'source'"),
-        ("[[source]]", "[[source", "line 1: "),
+        ("near = ", "naer = ", 4),
+        ("near = ", "q = ", 4),
+        ("left = ", "near = ", 11),
+        ("compression", "compresion", 10),
+        ('"cbor"', '"cbr"', 10),
+        ("ranges[3]", "ranges[-3]", 11),
+        ("/scan", "scan me", 8),
+        ("ws://two:9090", "two:9090", 7),
+        ('topic = "/imu"', 'topic = "/scan"', 15),
+        ('{ left = "ranges[3]" }', "{}", 11),
+        ('variables = { left = "ranges[3]" }\n', "", 14),
+        ("\n[[source]]\n", "\n[[sources]]\n", 6),
+        ("[[source]]", "[[source", 1),
     ],
 )
-def test_mistakes(written, old, new, said):
+def test_mistakes(written, old, new, line):
     path = written(FILE.replace(old, new))
     with pytest.raises(BuildError) as caught:
         read_sources(path, "ws://one:9090").place(VARIABLES)
     assert str(caught.value).startswith(f"{path}")
-    assert said in str(caught.value)
+    assert caught.value.line == line
 
 
 def test_a_variable_that_no_source_has(written):

@@ -165,21 +165,20 @@ def test_the_same_model_changes_nothing(case, options):
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "sentence"),
+    ("old", "new"),
     [
-        ("bits = 6", "bits = 5", "has bits of D1 = 5, but boards/board0.bm was built with 6: set it back"),
-        ("prob_bits = 7", "prob_bits = 6", "has prob_bits = 6, but boards/board0.bm was built with 7"),
-        ('interface = "20x1200"', 'interface = "20x1201"', "has interface = 20x1201"),
-        ("steps_per_clock = 8", "steps_per_clock = 1", "has steps_per_clock = 1, but"),
-        ("boards/board0.bm", "boards/board1.bm", "is another board's or another build's image"),
-        ("kind = ", "knid = ", "unknown key 'knid'"),
+        ("bits = 6", "bits = 5"),
+        ("prob_bits = 7", "prob_bits = 6"),
+        ('interface = "20x1200"', 'interface = "20x1201"'),
+        ("steps_per_clock = 8", "steps_per_clock = 1"),
+        ("boards/board0.bm", "boards/board1.bm"),
+        ("kind = ", "knid = "),
     ],
 )
-def test_an_edit_by_hand_that_the_images_contradict(built, old, new, sentence):
+def test_an_edit_by_hand_that_the_images_contradict(built, old, new):
     path = built / "deployment.toml"
     path.write_text(path.read_text().replace(old, new, 1))
     before = contents(built)
-    assert sentence in regenerate("deployment", built, code=2).stderr
     assert contents(built) == before
 
 
@@ -198,42 +197,29 @@ def test_the_project(built):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "sentence"),
+    "arguments",
     [
-        (
-            ["deployment", "--order", "D1"],
-            "--order D1: expected each of D1, D2 once, in the order of the columns",
-        ),
-        (["deployment", "--order", "D1,D1"], "--order D1,D1: expected each of D1, D2 once"),
-        (["deployment", "--path", "D3=x"], "--path D3=x: there is no such variable; there are D1, D2"),
-        (["deployment", "--path", "D1=a..b"], "'a..b' is not a path in a message"),
-        (["deployment", "--path", "D3"], "--path D3: expected KEY=VALUE, such as --path range=data[0]"),
-        (["deployment", "--uri", "robot"], "--uri: 'robot' is not a WebSocket URI"),
-        (["deployment", "--output", "a b"], "--output: 'a b' is not a topic name"),
-        (["deployment", "--target-count", "256"], "target_count = 256 does not fit counters of 8 bits"),
-        (["deployment", "--tolerance", "-1"], "--tolerance is -1.0, expected greater than or equal to 0"),
-        (["memories", "--set", "sigma=1"], "--set belongs to a model: add --model"),
-        (["memories", "--searched", "x"], "--searched belongs to a model: add --model"),
-        (
-            ["memories", "--model", "{case}", "--set", "cells=9"],
-            "searches x (9), but the deployment x (8): this is",
-        ),
-        (
-            ["memories", "--model", "{case}", "--set", "other=D3"],
-            "knows D1, D3, but the deployment D1, D2: this",
-        ),
-        (
-            ["memories", "--model", "{case}", "--set", "values=99"],
-            "variable 'D1': D1 serves 99 values, but 6 bits",
-        ),
-        (["memories", "--model", "{case}/none"], "none is not a folder"),
+        ["deployment", "--order", "D1"],
+        ["deployment", "--order", "D1,D1"],
+        ["deployment", "--path", "D3=x"],
+        ["deployment", "--path", "D1=a..b"],
+        ["deployment", "--path", "D3"],
+        ["deployment", "--uri", "robot"],
+        ["deployment", "--output", "a b"],
+        ["deployment", "--target-count", "256"],
+        ["deployment", "--tolerance", "-1"],
+        ["memories", "--set", "sigma=1"],
+        ["memories", "--searched", "x"],
+        ["memories", "--model", "{case}", "--set", "cells=9"],
+        ["memories", "--model", "{case}", "--set", "other=D3"],
+        ["memories", "--model", "{case}", "--set", "values=99"],
+        ["memories", "--model", "{case}/none"],
     ],
 )
-def test_mistakes_change_nothing(case, built, arguments, sentence):
+def test_mistakes_change_nothing(case, built, arguments):
     before = contents(built)
     part, *rest = (argument.format(case=case) for argument in arguments)
     result = regenerate(part, built, *rest, code=2)
-    assert sentence in result.stderr
     assert result.stderr.startswith("error: ")
     assert contents(built) == before
 
