@@ -15,7 +15,7 @@ import numpy as np
 from cocotb.triggers import Timer
 
 from hdl.test.guard_generics import REPLICAS
-from hdl.test.project import ErrorCode, following
+from hdl.test.project import ErrorCode, next_doorbell
 from hdl.test.project import register_map as rm
 
 _GOOD: Final = {
@@ -51,7 +51,7 @@ async def judged(dut: Any, **others: int) -> tuple[ErrorCode, bool]:
 async def doorbells_are_numbers_that_go_round(dut: Any) -> None:
     """Ring with every number around the one that is due, up to 2^32 - 1 and from 1 again."""
     for done in (0, 1, 2, 0x7FFFFFFF, 0xFFFFFFFE, 0xFFFFFFFF):
-        due = following(done)
+        due = next_doorbell(done)
         for number in {done, due, (due + 1) % 2**32, 1, 0xFFFFFFFF} - {0}:
             for doorbell in (rm.START, rm.RESUME):
                 expected = ErrorCode.NONE if number == due else ErrorCode.DOORBELL
