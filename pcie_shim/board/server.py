@@ -15,6 +15,7 @@ import socket
 import struct
 import time
 from contextlib import suppress
+from functools import partial
 from typing import TYPE_CHECKING, Final
 
 from pcie_shim import framing, register_map
@@ -40,6 +41,10 @@ KEEPALIVE_S: Final = 5
 PROGRAMMING_SILENCE_S: Final = 10.0
 """Seconds without a frame of a loader, after which another may program the board."""
 
+MAX_SILENT_HOSTS: Final = 16
+"""Most connections without a request, which do not hold the board; a further one ends the oldest."""
+
+_HELD: Final = "another host has it; one host drives a board at a time"
 _READABLE: Final = select.EPOLLIN | select.EPOLLHUP | select.EPOLLERR
 
 
@@ -173,7 +178,7 @@ class _Connection:
 
 
 class _Host(_Connection):
-    """The link to the host that holds the board."""
+    """A link to a host, which holds the board from its first request on."""
 
     def __init__(self, connection: socket.socket, programmed: int) -> None:
         super().__init__(connection)
@@ -212,6 +217,7 @@ class _Server:
         self._faults = 0
         self.board = EmulatedBoard()
         self._host: _Host | None = None
+        self._silent_hosts: dict[int, _Host] = {}
         self._loader: _Loader | None = None
         self._epoll = select.epoll()
         for descriptor in (stop.fileno(), registers.fileno(), programming.fileno()):
@@ -231,16 +237,20 @@ class _Server:
                     board.step()
                     self._interrupt_if_done()
                     if self._host is not None and not self._host.open:
-                        self._drop_host()
+                        self._drop_host(self._host)
                 self._drop_silent_loader()
         finally:
-            self._drop_host()
+            for host in [*self._silent_hosts.values(), self._host]:
+                if host is not None:
+                    self._drop_host(host)
             self._drop_loader()
             epoll.close()
 
     def _serve(self, descriptor: int) -> None:
         host, loader = self._host, self._loader
-        if host is not None and descriptor == host.socket.fileno():
+        if descriptor in self._silent_hosts:
+            self._serve_host(self._silent_hosts[descriptor])
+        elif host is not None and descriptor == host.socket.fileno():
             self._serve_host(host)
         elif loader is not None and descriptor == loader.socket.fileno():
             self._serve_loader(loader)
@@ -257,12 +267,13 @@ class _Server:
         except OSError:
             return  # the peer has disconnected already
         if self._is_held():
-            _refuse(connection, "another host has it; one host drives a board at a time")
+            _refuse(connection, _HELD)
             return
-        self._host = host = _Host(connection, self.board.programmed)
+        if len(self._silent_hosts) == MAX_SILENT_HOSTS:
+            self._drop_host(next(iter(self._silent_hosts.values())))
+        host = self._silent_hosts[connection.fileno()] = _Host(connection, self.board.programmed)
         self._epoll.register(connection.fileno(), _READABLE)
         host.send(self._greeting(host.token))
-        _LOG.info("board %d: a host opened it", self._index)
 
     def _is_held(self) -> bool:
         """Return whether a host holds the board; the last frames of one that has just left are handled first."""
@@ -272,9 +283,9 @@ class _Server:
         if host.stalled:
             host.open = not _has_left(host.socket)
         while host.open and host.receive():
-            host.answer(self._access)
+            host.answer(partial(self._access, host))
         if not host.open:
-            self._drop_host()
+            self._drop_host(host)
         return self._host is not None
 
     def _serve_host(self, host: _Host) -> None:
@@ -284,9 +295,9 @@ class _Server:
             time.sleep(0.01)
         else:
             host.receive()
-            host.answer(self._access)
+            host.answer(partial(self._access, host))
         if not host.open:
-            self._drop_host()
+            self._drop_host(host)
 
     def _greeting(self, token: bytes) -> bytes:
         map_hash = register_map.MAP_SHA256
@@ -303,12 +314,15 @@ class _Server:
             )
         )
 
-    def _access(self, frame: Frame) -> None:
-        """Handle a frame of the host."""
+    def _access(self, host: _Host, frame: Frame) -> None:
+        """Handle a frame of a host, which takes the board if it is free."""
         operation, flags, sequence, address, count, payload = frame
-        board, host = self.board, self._host
-        if host is None:
-            return
+        board = self.board
+        if host is not self._host:
+            if self._host is not None:
+                raise RefusedError(ErrorCode.HELD, _HELD)
+            self._host = self._silent_hosts.pop(host.socket.fileno())
+            _LOG.info("board %d: a host opened it", self._index)
         if host.programmed != board.programmed:
             raise RefusedError(ErrorCode.STALE, "the board was programmed after it was opened")
         if operation == framing.READ:
@@ -335,13 +349,15 @@ class _Server:
         host.interrupts = (host.interrupts + 1) & ALL_ONES
         self._send(host, framing.IRQ, 0, host.interrupts, register_map.DONE, board.interrupt_words())
 
-    def _drop_host(self) -> None:
-        host, self._host = self._host, None
-        if host is not None:
+    def _drop_host(self, host: _Host) -> None:
+        if host is self._host:
+            self._host = None
             self.board.release()
-            self._epoll.unregister(host.socket.fileno())
-            host.socket.close()
             _LOG.info("board %d: its host has gone", self._index)
+        else:
+            del self._silent_hosts[host.socket.fileno()]
+        self._epoll.unregister(host.socket.fileno())
+        host.socket.close()
 
     # ---- misbehaving ----------------------------------------------------------------------------------
 

@@ -3,6 +3,7 @@
 import dataclasses
 import hashlib
 import json
+import math
 import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
@@ -153,9 +154,10 @@ def test_a_model_larger_than_the_interface_is_refused() -> None:
         dataclasses.replace(image(machine(1)), interface_results=7)
 
 
-def _section(shape: object, **others: object) -> Callable[[dict], None]:
-    """Return a change of the manifest's first section, which then has no data."""
-    changed = {"shape": shape, "sha256": hashlib.sha256(b"").hexdigest(), **others}
+def _section(shape: list[int], **others: object) -> Callable[[dict], None]:
+    """Return a change of the manifest's first section, whose hash is right where it has no data or one code."""
+    data = MACHINES[0].prior.astype("<u2").tobytes()[: 2 * abs(math.prod(shape))]
+    changed = {"shape": shape, "sha256": hashlib.sha256(data).hexdigest(), **others}
     return lambda identity: identity["sections"][0].update(changed)
 
 
@@ -163,7 +165,7 @@ def _section(shape: object, **others: object) -> Callable[[dict], None]:
     "change",
     [
         _section([0, 10**30]),
-        _section([0, 2**31]),
+        _section([0, 2**31, 2**31, 2**31]),
         _section([0, 8]),
         _section([-1, 8]),
         _section([1] * 100),

@@ -160,15 +160,30 @@ def test_a_running_board_answers_and_can_be_reset(start_board: StartBoard) -> No
 def test_a_second_host_is_refused_and_the_first_goes_on(start_board: StartBoard) -> None:
     board = start_board()
     program(board.endpoint, image(never_stopping()))
-    with open_link(board) as link:
-        with pytest.raises(HeldError):
-            open_link(board)
+    with open_link(board) as silent, open_link(board) as link:
+        # the first connection made no request, and so does not hold the board
+        assert link.read32(rm.ID) == rm.ID_VALUE
+        for attempt in (open_link, lambda _: silent.read32(rm.ID)):
+            with pytest.raises(HeldError):
+                attempt(board)
         run_for_minutes(link)
         with pytest.raises(HeldError):
             open_link(board)
         assert link.read32(rm.STATUS) & 15 == BoardState.RUNNING
     with open_link(board) as link:
         assert link.read32(rm.ID) == rm.ID_VALUE
+
+
+def test_silent_connections_are_bounded_and_keep_nobody_out(start_board: StartBoard) -> None:
+    board = start_board()
+    silent = [open_link(board) for _ in range(board_module.MAX_SILENT_HOSTS + 1)]
+    with pytest.raises(LinkClosedError):
+        silent[0].read32(rm.ID)
+    with open_link(board) as link:
+        assert link.read32(rm.ID) == rm.ID_VALUE
+    for each in silent[2:]:
+        assert each.read32(rm.ID) == rm.ID_VALUE
+        each.close()
 
 
 def test_a_host_that_vanishes_leaves_the_board_well(start_board: StartBoard) -> None:
@@ -201,7 +216,6 @@ def test_a_host_that_has_just_left_does_not_hold_the_board(folder: Path) -> None
             decoder = framing.FrameDecoder()
             decoder.received(second.recv_into(decoder.room()))
             assert decoder.next_frame().operation == framing.GREET
-    server._drop_host()
     server._drop_loader()
     stop.close()
 
@@ -345,6 +359,7 @@ def test_the_loader_is_refused_while_a_host_holds_the_board(start_board: StartBo
     board = start_board()
     program(board.endpoint, image(MACHINE))
     with open_link(board) as link:
+        assert link.read32(rm.PROGRAMMED) == 1
         with pytest.raises(HeldError):
             program(board.endpoint, image(machine(2)))
         assert link.read32(rm.PROGRAMMED) == 1
