@@ -62,8 +62,12 @@ class FitFile(Section):
     method: Literal["normals", "counts"]
     model: str
     floor: float = Field(default=0.0, ge=0, lt=1)
-    recordings: Sequence[FittedRecording] = Field(default=(), validation_alias="recording")
-    variables: Sequence[FittedVariable] = Field(default=(), validation_alias="variable")
+    recordings: Sequence[FittedRecording] = Field(
+        default=(), validation_alias="recording", serialization_alias="recording"
+    )
+    variables: Sequence[FittedVariable] = Field(
+        default=(), validation_alias="variable", serialization_alias="variable"
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -181,20 +185,16 @@ def write_fit(path: Path, fit: Fit) -> None:
     Raises:
         ModelError: The file's suffix is not the method's, or it can't be written.
     """
-    content: dict[str, Any] = fit.file.model_dump(mode="json", exclude_defaults=False)
     suffix = ".toml" if fit.file.method == "normals" else ".npz"
     if path.suffix != suffix:
         raise ModelError(f"{path}: the method {fit.file.method} writes a file that ends in {suffix}")
     with whole_file(path, ModelError) as partial:
         path.parent.mkdir(parents=True, exist_ok=True)
         if fit.file.method == "normals":
-            renamed = {
-                {"recordings": "recording", "variables": "variable"}.get(key, key): value
-                for key, value in content.items()
-            }
-            partial.write_text(_HEADER + tomli_w.dumps(renamed), encoding="utf-8")
+            content = fit.file.model_dump(mode="json", by_alias=True)
+            partial.write_text(_HEADER + tomli_w.dumps(content), encoding="utf-8")
         else:
-            _write_tables(partial, content, fit.tables)
+            _write_tables(partial, fit.file.model_dump(mode="json"), fit.tables)
 
 
 def read_fit(path: Path) -> Fit:
@@ -230,11 +230,7 @@ def _read_tables(path: Path) -> Fit:
             if sum(entry.file_size for entry in archive.infolist()) > MAX_BYTES:
                 raise ModelError(f"{path} is larger than {MAX_BYTES} bytes, unpacked; the most that is read")
             content = json.loads(_member(archive, _META, _MAX_META_BYTES))
-            content = {
-                {"recordings": "recording", "variables": "variable"}.get(key, key): value
-                for key, value in content.items()
-            }
-            file = FitFile.model_validate(content, by_alias=True, by_name=False)
+            file = FitFile.model_validate(content, by_alias=False, by_name=True)
             counted = file.variables if file.method == "counts" else ()
             tables = {
                 variable.name: _array(archive, f"table{number}.npy")

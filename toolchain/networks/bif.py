@@ -72,14 +72,7 @@ def _variable(text: Scanner, builder: NetworkBuilder) -> None:
 
 
 def _probability(text: Scanner, builder: NetworkBuilder) -> None:
-    text.sign("(")
-    child = text.word("a variable's name")
-    parents: list[str] = []
-    separator = text.next()
-    if separator == "|":
-        parents = text.words(")", "parents", MAX_PARENTS)
-    elif separator != ")":
-        raise text.error(f"expected '|' or ')', found {separator[:40]!r}")
+    child, parents = text.scope("a variable's name", MAX_PARENTS)
     shape = builder.shape((child, *parents), text)
     rows = math.prod(shape[1:])
     values = np.full((shape[0], rows), np.nan)

@@ -73,14 +73,7 @@ def _node(text: Scanner, builder: NetworkBuilder) -> None:
 
 
 def _potential(text: Scanner, builder: NetworkBuilder) -> None:
-    text.sign("(")
-    child = text.word("a node's name")
-    separator = text.next()
-    parents: list[str] = []
-    if separator == "|":
-        parents = text.words(")", "parents", MAX_PARENTS)
-    elif separator != ")":
-        raise text.error(f"expected '|' or ')', found {separator[:40]!r}: a potential of one node is read")
+    child, parents = text.scope("a node's name", MAX_PARENTS)
     shape = builder.shape((*parents, child), text)
     values = None
     text.sign("{")

@@ -117,6 +117,19 @@ class Scanner:
                 raise self.error(f"more than {most} of {what}")
             found.append(piece)
 
+    def scope(self, what: str, most: int) -> tuple[str, list[str]]:
+        """Take `( CHILD | PARENTS )` or `( CHILD )`; `what` names the child in errors.
+
+        Raises:
+            NetworkFileError: The next tokens are others, or there are more parents than `most`.
+        """
+        self.sign("(")
+        child = self.word(what)
+        separator = self.next()
+        if separator not in {"|", ")"}:
+            raise self.error(f"expected '|' or ')', found {_shown(separator)}")
+        return child, self.words(")", "parents", most) if separator == "|" else []
+
     def count(self, what: str, most: int) -> int:
         """Take a whole number from 0.
 
