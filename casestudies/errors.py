@@ -1,4 +1,4 @@
-"""What the case studies' processes refuse, each as one sentence for the user."""
+"""Errors of the case studies, each with one sentence for the user."""
 
 from typing import ClassVar
 
@@ -10,4 +10,4 @@ class CaseStudyError(Exception):
 
 
 class DataFileError(CaseStudyError):
-    """A file of recorded data that is not there, or is another kind of file."""
+    """A file of recorded data is missing, or is not such a file."""

@@ -1,4 +1,4 @@
-"""A rectangle cut into cells: which cell a point lies in, and where a cell's centre is."""
+"""A rectangle cut into cells."""
 
 import math
 from collections.abc import Sequence
@@ -26,7 +26,7 @@ class Grid:
 
     @property
     def cells(self) -> int:
-        """How many cells there are."""
+        """The number of cells."""
         return self.width * self.height
 
     @property
@@ -40,21 +40,21 @@ class Grid:
         return (self.y_high - self.y_low) / self.height
 
     def cell(self, x: float, y: float) -> tuple[int, int]:
-        """The (column, row) of the cell around a point; points outside belong to the nearest border cell."""
+        """Return the (column, row) of the cell around a point; points outside belong to the nearest border cell."""
         column = math.floor((x - self.x_low) / self.cell_width)
         row = math.floor((y - self.y_low) / self.cell_height)
         return min(max(column, 0), self.width - 1), min(max(row, 0), self.height - 1)
 
     def line(self, x: float, y: float) -> int:
-        """The machine's line of the cell around a point."""
+        """Return the machine's line of the cell around a point."""
         column, row = self.cell(x, y)
         return row * self.width + column
 
     def centre(self, line: int) -> tuple[float, float]:
-        """The centre (x, y) of a line's cell, in the map's units.
+        """Return the centre (x, y) of a line's cell, in the map's units.
 
         Raises:
-            IndexError: there is no such line.
+            IndexError: The line does not exist.
         """
         if not 0 <= line < self.cells:
             raise IndexError(f"line {line} of a grid of {self.cells} cells")
@@ -62,13 +62,13 @@ class Grid:
         return self.x_low + (column + 0.5) * self.cell_width, self.y_low + (row + 0.5) * self.cell_height
 
     def mean(self, posterior: Sequence[float]) -> tuple[float, float]:
-        """The mean position (x, y) of a posterior over the cells' centres, in the map's units.
+        """Return the mean position (x, y) of a posterior over the cells' centres, in the map's units.
 
         Args:
             posterior: float[cells], row-major, not negative; it need not sum to 1.
 
         Raises:
-            ValueError: another length, or nothing in it.
+            ValueError: The length is wrong, or all values are 0.
         """
         if len(posterior) != self.cells:
             raise ValueError(f"a posterior of {len(posterior)} values for a grid of {self.cells} cells")

@@ -1,4 +1,4 @@
-"""Hears the result topics of one rosbridge server, and the true positions, and hands out frames with all that belongs to them."""
+"""A listener to results and true positions, which yields frames with their truth."""
 
 import asyncio
 import contextlib
@@ -14,18 +14,18 @@ from posteriors.listening import Posteriors, posteriors
 
 _QUEUE_SIZE: Final = 256
 _PATIENCE_S: Final = 1.0
-"""So long a frame waits for a truth that does not come."""
+"""Seconds that a frame waits for its truth."""
 
 
 class Listener:
-    """The frames heard so far that nobody has taken yet; `listen` makes it.
+    """The frames received and not yet taken; made by `listen`.
 
     Attributes:
-        route: the true positions heard, the newest last.
+        route: The true positions received, the newest last.
     """
 
     def __init__(self, heard: Posteriors, truths: Truths) -> None:
-        """Give these frames their truths."""
+        """Take the source of frames and the store of truths."""
         self.route: deque[Truth] = deque(maxlen=100_000)
         self._heard = heard
         self._truths = truths
@@ -35,15 +35,15 @@ class Listener:
 
     @property
     def announced_only(self) -> int:
-        """How many frames were announced on `/bm/frame` whose result never came."""
+        """The number of frames that `/bm/frame` announced and whose result never came."""
         return self._heard.announced_only
 
     async def next(self, limit_s: float) -> Instance:
         """Wait for the next frame.
 
         Raises:
-            NoResultError: none came within the limit, in seconds.
-            BadResultError: something else than a result came.
+            NoResultError: No frame came within the limit, in seconds.
+            BadResultError: A message was not a result.
         """
         now = asyncio.get_running_loop().time
         end, flushing = now() + limit_s, now() + _PATIENCE_S
@@ -62,7 +62,7 @@ class Listener:
         return self._ready.popleft()
 
     async def follow_frames(self) -> None:
-        """Take all that is heard of frames, until the client is closed."""
+        """Collect frames until the client is closed."""
         while True:
             try:
                 self._ready.extend(self._truths.add_frame(await self._heard.next_frame(None)))
@@ -73,7 +73,7 @@ class Listener:
             self._news.set()
 
     async def follow_truths(self, subscription: Subscription) -> None:
-        """Take the truth's topic, until it is closed."""
+        """Collect true positions until the subscription is closed."""
         async for message in subscription:
             try:
                 truth = read_truth(message.msg, message.topic)
@@ -89,12 +89,12 @@ class Listener:
 async def listen(
     ros: Ros, *, truth_topic: str | None = None, truth_tolerance_s: float = 0.0
 ) -> AsyncIterator[Listener]:
-    """Subscribe to `/bm/frame`, `/BMresults` and, if it is named, the truth's topic.
+    """Subscribe to `/bm/frame`, `/BMresults` and, if given, the truth's topic.
 
     Args:
-        ros: the open client.
-        truth_topic: of geometry_msgs/PoseStamped with the stamps of the readings; None for no truth.
-        truth_tolerance_s: how much older than a frame's stamp a true pose may be, in seconds.
+        ros: The open client.
+        truth_topic: A topic of geometry_msgs/PoseStamped with the readings' stamps; None for no truth.
+        truth_tolerance_s: Seconds by which a true pose may be older than the frame's stamp.
     """
     async with contextlib.AsyncExitStack() as stack:
         heard = await stack.enter_async_context(posteriors(ros, queue_size=_QUEUE_SIZE))

@@ -1,8 +1,4 @@
-"""True positions, and which of them belongs to which frame.
-
-No connection is in here. A posterior's report has the stamp of its reading, which the true pose of a simulator carries
-too.
-"""
+"""True positions, matched with frames by their stamps."""
 
 from collections import deque
 from dataclasses import dataclass
@@ -32,10 +28,10 @@ class Truth:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Instance:
-    """A frame: what was heard of it, and its truth.
+    """A frame's outcome and its truth.
 
-    `truth` is None where no true pose belongs to the stamp. `truth_age_ns` is how much older than the frame's stamp
-    the true pose is: 0 where the stamps are equal.
+    `truth` is None if no true pose matches the stamp. `truth_age_ns` is the age of the true pose relative to the
+    frame's stamp, 0 if the stamps are equal.
     """
 
     heard: FrameOutcome
@@ -44,12 +40,12 @@ class Instance:
 
     @property
     def posterior(self) -> Posterior | None:
-        """None for a frame without one."""
+        """The posterior, or None for a frame without one."""
         return self.heard if isinstance(self.heard, Posterior) else None
 
     @property
     def report(self) -> FrameReport | None:
-        """None for a posterior that no `/bm/frame` announced."""
+        """The report, or None for a posterior that no `/bm/frame` announced."""
         return self.heard.report if isinstance(self.heard, Posterior) else self.heard
 
 
@@ -76,10 +72,10 @@ class _PoseStamped(_Part):
 
 
 def read_truth(message: dict[str, Any], topic: str) -> Truth:
-    """A geometry_msgs/PoseStamped as a true position.
+    """Return a geometry_msgs/PoseStamped as a true position.
 
     Raises:
-        BadResultError: it has no stamp or no position.
+        BadResultError: The message has no stamp or no position.
     """
     try:
         pose = _PoseStamped.model_validate(message)
@@ -92,11 +88,11 @@ def read_truth(message: dict[str, Any], topic: str) -> Truth:
 
 
 class Truths:
-    """Gives frames their true positions, whatever order they are handed over in.
+    """Frames and true positions, matched in whatever order they arrive.
 
-    A frame waits for its truth until a newer truth or the next frame shows that it won't come. Without a truth of
-    exactly its stamp a frame takes the newest older one, if it is not older than `tolerance_ns`: messages without a
-    header (an array of numbers) get their stamp only when they reach the host.
+    A frame waits for its truth until a newer truth or the next frame arrives. Without a truth of exactly its stamp a
+    frame takes the newest older one, if that is at most `tolerance_ns` older: a message without a header is stamped
+    only when it reaches the host.
     """
 
     def __init__(self, *, tolerance_ns: int = 0) -> None:
@@ -106,21 +102,21 @@ class Truths:
 
     @property
     def waits(self) -> bool:
-        """Whether there is a frame that waits for its truth."""
+        """Whether a frame waits for its truth."""
         return bool(self._untrue)
 
     def add_frame(self, heard: FrameOutcome) -> list[Instance]:
-        """Take what was heard of a frame; returns the instances that are complete now."""
+        """Add a frame's outcome and return the instances that are now complete."""
         self._untrue.append(Instance(heard=heard))
         return self._resolve()
 
     def add_truth(self, truth: Truth) -> list[Instance]:
-        """Take a true position; returns the instances that are complete now."""
+        """Add a true position and return the instances that are now complete."""
         self._truths.append(truth)
         return self._resolve()
 
     def flush(self) -> list[Instance]:
-        """The frames that still wait for a truth: nothing more will come."""
+        """Return the frames that still wait for a truth, which will not come."""
         ended = [self._with_truth(instance) for instance in self._untrue]
         self._untrue.clear()
         return ended

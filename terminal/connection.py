@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 from typing import TYPE_CHECKING
 
+from terminal.logs import log_libraries
 from terminal.output import say
 
 if TYPE_CHECKING:
@@ -16,6 +18,8 @@ def report_connection(uri: str) -> Callable[[str, str], None]:
     Args:
         uri: The server's, for the sentences.
     """
+    # the client logs warnings of the same losses
+    log_libraries(logging.ERROR, "%(name)s: %(message)s")
     lost = False
 
     def on_state(state: str, reason: str) -> None:

@@ -1,4 +1,4 @@
-"""How good posteriors are: against the truth, and against float64 fusion of the same readings."""
+"""Figures of a posterior's quality, against the truth and against float64 fusion of the same readings."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -31,7 +31,7 @@ class Correctness:
 
 
 def in_region(true_lines: ArrayLike, posteriors: ArrayLike, mass: float = REGION_MASS) -> NDArray[np.bool_]:
-    """Which frames' true cells lie in the smallest region that holds that much of the posterior.
+    """Return for each frame whether its true cell lies in the smallest region that holds this much of the posterior.
 
     The region takes the most probable cells first; cells of equal probability enter together, so that the
     answer does not depend on the order of lines.
@@ -52,7 +52,7 @@ def in_region(true_lines: ArrayLike, posteriors: ArrayLike, mass: float = REGION
 
 
 def means(posteriors: ArrayLike, width: int) -> NDArray[np.float64]:
-    """Mean (column, row) of each posterior, in cells; a cell's centre is its whole number.
+    """Return the mean (column, row) of each posterior, in cells; a cell's centre is its whole number.
 
     Args:
         posteriors: float64[frames, lines], row-major.
@@ -67,14 +67,14 @@ def means(posteriors: ArrayLike, width: int) -> NDArray[np.float64]:
 
 
 def total_variation(posteriors: ArrayLike, exact: ArrayLike) -> NDArray[np.float64]:
-    """Half the sum of absolute differences, a frame each: float64[frames], 0..1."""
+    """Return half the sum of absolute differences of each frame: float64[frames], 0..1."""
     differences: NDArray[np.float64] = np.abs(_two_dimensional(posteriors) - _two_dimensional(exact))
     halves: NDArray[np.float64] = 0.5 * differences.sum(axis=1)
     return halves
 
 
 def correctness(true_lines: ArrayLike, posteriors: ArrayLike, exact: ArrayLike, *, width: int) -> Correctness:
-    """All figures of the machine's posteriors.
+    """Return all figures of the machine's posteriors.
 
     Args:
         true_lines: int[frames], the lines of the true cells.
@@ -83,7 +83,7 @@ def correctness(true_lines: ArrayLike, posteriors: ArrayLike, exact: ArrayLike, 
         width: cells in a row of the grid.
 
     Raises:
-        ValueError: shapes that do not belong together, or no frame at all.
+        ValueError: The shapes do not match, or there is no frame.
     """
     lines = np.asarray(true_lines)
     ours, theirs = _two_dimensional(posteriors), _two_dimensional(exact)

@@ -1,4 +1,4 @@
-"""The boat's map: beacons, what a sensor sees from where, and how noisy it is.
+"""The boat's map: beacons, readings at a position, and their noise.
 
 The boat localisation problem of thesis 2.1.2.1 with the numbers of its published version (Bessiere et al.,
 Bayesian Programming, ch. 7). Distances are in map units, bearings in degrees.
@@ -25,21 +25,21 @@ BEARING_SIGMA: Final = 10.0
 
 
 def map_grid(width: int = 32, height: int = 32) -> Grid:
-    """The map cut into cells; 32 x 32 is what the thesis ran on four boards (4.2)."""
+    """Return the map cut into cells; 32 x 32 is what the thesis ran on four boards (4.2)."""
     return Grid(x_low=MAP_LOW, x_high=MAP_HIGH, y_low=MAP_LOW, y_high=MAP_HIGH, width=width, height=height)
 
 
 def distance(x: float, y: float, beacon: tuple[float, float]) -> float:
-    """The distance from (x, y) to a beacon."""
+    """Return the distance from (x, y) to a beacon."""
     return math.hypot(x - beacon[0], y - beacon[1])
 
 
 def bearing(x: float, y: float, beacon: tuple[float, float]) -> float:
-    """The absolute bearing of (x, y) as seen from a beacon, in degrees, 0 <= bearing < 360, 0 along +x."""
+    """Return the absolute bearing of (x, y) as seen from a beacon, in degrees, 0 <= bearing < 360, 0 along +x."""
     degrees = math.degrees(math.atan2(y - beacon[1], x - beacon[0])) % 360.0
     return degrees if degrees < 360.0 else 0.0  # a tiny negative angle rounds up to 360 in the modulo
 
 
 def distance_sigma(true_distance: float) -> float:
-    """Standard deviation of a distance reading where the true distance is this, in map units."""
+    """Return the standard deviation of a distance reading at this true distance, in map units."""
     return true_distance / 10.0 + 5.0

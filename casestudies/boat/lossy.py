@@ -1,4 +1,4 @@
-"""A publication that may lose messages: a sensor goes on measuring while the server is away or slow."""
+"""A publication that drops messages while the server is away or slow, as a sensor does."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -9,15 +9,15 @@ from terminal.output import say
 
 
 class LossyPublication:
-    """Drops messages while the server is away, which is said elsewhere, or does not keep up, which it says once each time."""
+    """A publication that drops messages while the server is away, or is slow, which it reports once each time."""
 
     def __init__(self, publication: Publication) -> None:
-        """Publish through this publication."""
+        """Wrap a publication."""
         self._publication = publication
         self._slow = False
 
     async def publish(self, message: Mapping[str, Any]) -> bool:
-        """Publish the message, or drop it where nobody takes it; whether it was published."""
+        """Publish the message or drop it, and return whether it was published."""
         try:
             await self._publication.publish(message)
         except DisconnectedError:

@@ -45,11 +45,11 @@ uint16 B3
 
 
 class BadReadingError(CaseStudyError):
-    """A message on the raw topic that holds no six numbers."""
+    """A message on the raw topic does not hold six numbers."""
 
 
 def true_pose(x: float, y: float, head: dict[str, Any]) -> dict[str, Any]:
-    """A geometry_msgs/PoseStamped at (x, y), turned nowhere."""
+    """Return a geometry_msgs/PoseStamped at (x, y), without rotation."""
     return {
         "header": head,
         "pose": {
@@ -62,7 +62,7 @@ def true_pose(x: float, y: float, head: dict[str, Any]) -> dict[str, Any]:
 def readings_message(
     values: Sequence[float], head: Mapping[str, Any] | None, *, array: bool
 ) -> dict[str, Any]:
-    """Six readings in the order of `SENSOR_NAMES` as a message.
+    """Return six readings in the order of `SENSOR_NAMES` as a message.
 
     Args:
         values: the readings.
@@ -84,10 +84,10 @@ def readings_message(
 def read_raw(
     message: Mapping[str, Any], *, array: bool
 ) -> tuple[tuple[float, ...], Mapping[str, Any] | None]:
-    """The six raw readings of a message in the order of `SENSOR_NAMES`, and its header if it has one.
+    """Return the six raw readings of a message in the order of `SENSOR_NAMES`, and its header if it has one.
 
     Raises:
-        BadReadingError: a reading is missing, or is no finite number.
+        BadReadingError: A reading is missing, or is not a finite number.
     """
     if array:
         data = message.get("data")
@@ -107,5 +107,5 @@ def read_raw(
 
 
 def is_distance(name: str) -> bool:
-    """Whether a sensor measures a distance; else it measures a bearing."""
+    """Return whether a sensor measures a distance; the others measure bearings."""
     return name in DISTANCE_NAMES

@@ -48,11 +48,9 @@ def model(
         ModelError: A grid without cells, or a step that does not fit.
     """
     if not 1 <= distance_step <= LONGEST_DISTANCE:
-        message = f"distance_step is {distance_step}, expected 1 to {LONGEST_DISTANCE}"
-        raise ModelError(message)
+        raise ModelError(f"distance_step is {distance_step}, expected 1 to {LONGEST_DISTANCE}")
     if bearing_step < 1 or TURN % bearing_step:
-        message = f"bearing_step is {bearing_step}, expected a number of degrees that divides {TURN}"
-        raise ModelError(message)
+        raise ModelError(f"bearing_step is {bearing_step}, expected a number of degrees that divides {TURN}")
     rows = interval("y", MAP_LOW, MAP_HIGH, cells=height)
     columns = interval("x", MAP_LOW, MAP_HIGH, cells=width)
     y, x = cell_centres(rows, columns)

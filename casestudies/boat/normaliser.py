@@ -1,4 +1,4 @@
-"""Makes the boat's raw readings fit the machine's columns: whole numbers in range (thesis chapter 4)."""
+"""Normaliser of the boat's raw readings into whole numbers in the machine's ranges (thesis chapter 4)."""
 
 import math
 from typing import Annotated
@@ -26,17 +26,17 @@ from terminal.signals import run_async
 
 
 def normalise_distance(raw: float) -> int:
-    """A distance in map units as a whole number 0..100, halves up; the ends hold the tails."""
+    """Return a distance as whole map units 0..100, halves up; values beyond the range are clamped."""
     return min(max(math.floor(raw + 0.5), 0), LONGEST_DISTANCE)
 
 
 def normalise_bearing(raw: float) -> int:
-    """A bearing in radians as whole degrees 0..359, halves up."""
+    """Return a bearing in radians as whole degrees 0..359, halves up."""
     return math.floor(math.degrees(raw) + 0.5) % 360
 
 
 def normalise(raw: tuple[float, ...]) -> tuple[int, ...]:
-    """Raw readings in the order of `SENSOR_NAMES` as the machine's."""
+    """Return raw readings in the order of `SENSOR_NAMES` as the machine's."""
     return tuple(
         normalise_distance(value) if is_distance(name) else normalise_bearing(value)
         for name, value in zip(SENSOR_NAMES, raw, strict=True)
@@ -44,18 +44,18 @@ def normalise(raw: tuple[float, ...]) -> tuple[int, ...]:
 
 
 async def serve(uri: str, *, raw_topic: str, sensors_topic: str, array: bool) -> None:
-    """Normalise what arrives until cancelled.
+    """Normalise messages until cancelled.
 
-    A message without six finite numbers is dropped, and each cause is said once.
+    A message without six finite numbers is dropped, and each cause is reported once.
 
     Raises:
-        BridgeError: no rosbridge server answers at the URI.
+        BridgeError: No rosbridge server answers at the URI.
     """
     from bridge.client import connect
     from casestudies.boat.lossy import LossyPublication
     from casestudies.readiness import Readiness, readiness_served
 
-    said: set[str] = set()
+    reported: set[str] = set()
     readiness = Readiness("a reading was normalised")
     async with (
         readiness_served("boat-normaliser", readiness),
@@ -67,9 +67,9 @@ async def serve(uri: str, *, raw_topic: str, sensors_topic: str, array: bool) ->
             try:
                 values, head = read_raw(message.msg, array=array)
             except BadReadingError as error:
-                if str(error) not in said:
+                if str(error) not in reported:
                     say(f"warning: a message on {raw_topic} is dropped: {error}")
-                    said.add(str(error))
+                    reported.add(str(error))
                 continue
             if await sensors.publish(readings_message(normalise(values), head, array=array)):
                 readiness.did()
@@ -81,8 +81,8 @@ app = CommandLine()
 @app.command(epilog="Example: `boat-normaliser --uri ws://127.0.0.1:9090`")
 def boat_normaliser(
     uri: Annotated[str, typer.Option(envvar="BM_URI", help="The rosbridge server.")] = "ws://127.0.0.1:9090",
-    raw_topic: Annotated[str, typer.Option(help="Where the raw readings come from.")] = RAW_TOPIC,
-    sensors_topic: Annotated[str, typer.Option(help="Where the whole numbers go.")] = SENSORS_TOPIC,
+    raw_topic: Annotated[str, typer.Option(help="Topic of the raw readings.")] = RAW_TOPIC,
+    sensors_topic: Annotated[str, typer.Option(help="Topic of the normalised readings.")] = SENSORS_TOPIC,
     array: Annotated[
         bool, typer.Option("--array", help="std_msgs/Float64MultiArray in and out instead of boat_msgs.")
     ] = False,

@@ -1,4 +1,4 @@
-"""The pictures: posteriors beside the truth (thesis figure 4.4), and shares of time (figure 4.5)."""
+"""Pictures of posteriors beside the truth (thesis figure 4.4) and of shares of time (figure 4.5)."""
 
 import math
 from collections.abc import Iterable, Sequence
@@ -14,7 +14,7 @@ from posteriors.posterior import Posterior
 from terminal.errors import OutputError
 
 POSITIONS_SHOWN: Final = 4
-"""As many as the thesis shows."""
+"""The number that the thesis shows."""
 
 _PART_COLOURS: Final = {
     Part.ROSBRIDGE: "#4477aa",
@@ -25,11 +25,11 @@ _PART_COLOURS: Final = {
 _TRUTH_COLOUR: Final = "#ff4d4d"
 _DPI: Final = 130
 _EDGE: Final = 0.2
-"""So much of the map's width lies too near its edge for a label that is centred."""
+"""Share of the map's width at each edge where a label is not centred."""
 
 
 def check_pictures_possible() -> None:
-    """Find out before a long run that its pictures cannot be drawn.
+    """Check before a long run that its pictures can be drawn.
 
     Raises:
         OutputError: matplotlib is not installed.
@@ -42,10 +42,10 @@ def check_pictures_possible() -> None:
 
 
 def far_apart(instances: Iterable[Instance], count: int = POSITIONS_SHOWN) -> tuple[Instance, ...]:
-    """Results whose true positions lie far from each other, in the order of time.
+    """Return results whose true positions lie far from each other, in the order of time.
 
-    The first one is kept, and then, again and again, the one that is furthest from all that are kept. Results
-    without a truth are shown only if there is none with one.
+    The first one is kept, then repeatedly the one that is furthest from all kept ones. Results without a truth
+    are used only if there are no others.
     """
     results = [instance for instance in instances if instance.posterior is not None]
     candidates = [instance for instance in results if instance.truth is not None] or results
@@ -65,7 +65,7 @@ def draw_positions(path: Path, instances: Sequence[Instance], *, route: Sequence
         route: all true positions in the order of time, drawn faintly.
 
     Raises:
-        OutputError: no matplotlib, a posterior that is no picture, or a file that cannot be written.
+        OutputError: matplotlib is missing, a posterior is not two-dimensional, or the file cannot be written.
     """
     figure_class = _figure_class()
     across = 2 if len(instances) > 1 else 1
@@ -103,7 +103,7 @@ def draw_shares(path: Path, shares: Sequence[StageShare], *, frames: int) -> Non
         frames: how many frames the means are of.
 
     Raises:
-        OutputError: no matplotlib, or a file that cannot be written.
+        OutputError: matplotlib is missing, or the file cannot be written.
     """
     figure = _figure_class()(figsize=(8.4, 1.5 + 0.42 * max(len(shares), 1)), layout="constrained")
     axes = figure.subplots()
@@ -136,10 +136,10 @@ def draw_shares(path: Path, shares: Sequence[StageShare], *, frames: int) -> Non
 
 
 def posterior_grid(posterior: Posterior) -> Grid:
-    """The map cut as finely as the posterior is.
+    """Return the map cut into the posterior's cells.
 
     Raises:
-        OutputError: the posterior has not two dimensions.
+        OutputError: The posterior does not have two dimensions.
     """
     if len(posterior.sizes) != 2:
         raise OutputError(
@@ -272,7 +272,7 @@ def _apart(instances: Sequence[Instance], one: int, other: int) -> float:
 
 
 def _figure_class() -> Any:
-    """Matplotlib's Figure, without pyplot: it needs no display and keeps no state."""
+    """Return matplotlib's Figure, without pyplot, which would need a display and keep state."""
     check_pictures_possible()
     from matplotlib.figure import Figure
 

@@ -1,4 +1,4 @@
-"""Where a frame's time goes: the mean of each stage and its share, as in the thesis's figure 4.5."""
+"""Shares of a frame's time: the mean of each stage, as in the thesis's figure 4.5."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ class Part(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StageShare:
-    """One stage of a frame's way: its mean over the frames that know it, and its share of all stages."""
+    """One stage of a frame: its mean over the frames that report it, and its share of all stages."""
 
     name: str
     part: Part
@@ -51,10 +51,9 @@ _STAGES: Final[tuple[tuple[str, Part, Callable[[Instance], float | None]], ...]]
 
 
 def stage_shares(instances: Iterable[Instance]) -> tuple[StageShare, ...]:
-    """The stages in the order of a frame's way; those that no published frame knows are left out.
+    """Return the stages in order; those that no published frame reports are left out.
 
-    `rosbridge out` is measured here, from the sending of a result to its arrival; the others are what
-    `/bm/frame` says.
+    `rosbridge out` is measured here, from the sending of a result to its arrival; `/bm/frame` has the others.
     """
     published = [instance for instance in instances if instance.posterior is not None]
     means: list[tuple[str, Part, float]] = []

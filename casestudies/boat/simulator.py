@@ -1,4 +1,4 @@
-"""Stands for Gazebo: a boat that sails from waypoint to waypoint and publishes what its sensors measure."""
+"""Simulator in place of Gazebo: a boat that sails between waypoints and publishes its sensors' readings."""
 
 import asyncio
 import math
@@ -39,15 +39,15 @@ _SEEDS = 1_000_000
 class Boat:
     """A boat that starts in the middle of the map and is driven along random waypoints (thesis 4.1).
 
-    Two boats with one seed sail the same way and measure the same, step by step.
+    Two boats with the same seed take the same route and the same measurements.
     """
 
     def __init__(self, seed: int, speed: float) -> None:
         """Put the boat into the middle of the map.
 
         Args:
-            seed: of the waypoints and of the noise.
-            speed: in map units a second.
+            seed: The seed of waypoints and noise.
+            speed: Map units per second.
         """
         self._random = random.Random(seed)
         self._speed = speed
@@ -56,7 +56,7 @@ class Boat:
         self._waypoint = self._next_waypoint()
 
     def sail(self, seconds: float) -> None:
-        """Go on towards the waypoint, and from there to the next one, for that long."""
+        """Sail along the waypoints for this many seconds."""
         left = self._speed * seconds
         while left > 0:
             to_go = math.dist((self.x, self.y), self._waypoint)
@@ -69,10 +69,9 @@ class Boat:
             self._waypoint = self._next_waypoint()
 
     def measure(self) -> tuple[float, ...]:
-        """Noisy readings D1, D2, D3 (map units) and B1, B2, B3 (radians), with the model's noise.
+        """Return noisy readings D1, D2, D3 (map units) and B1, B2, B3 (radians), with the model's noise.
 
-        A distance may come out negative or off the scale, a bearing outside one turn: making them fit is the
-        normaliser's work.
+        A distance may be negative or too long, a bearing outside one turn; the normaliser corrects that.
         """
         ranges = [distance(self.x, self.y, beacon) for beacon in BEACONS]
         distances = [self._random.gauss(true, distance_sigma(true)) for true in ranges]
@@ -96,21 +95,22 @@ async def simulate(
     array: bool = False,
     count: int | None = None,
 ) -> None:
-    """Sail and publish until `count` readings are out (None: for ever).
+    """Sail and publish `count` readings, or without end.
 
-    Each step publishes the true pose first and then the readings, with the same stamp. While the server is
-    away the boat sails on unheard.
+    Each step publishes the true pose and then the readings, with the same stamp. While the server is away the boat
+    sails on.
+
 
     Args:
-        uri: the rosbridge server's.
-        boat: which boat.
-        rate: steps a second.
-        topic: of the raw readings.
-        array: publish std_msgs/Float64MultiArray instead of `boat_msgs/Raw`.
-        count: how many readings; None for no end.
+        uri: The rosbridge server's.
+        boat: The boat.
+        rate: Steps per second.
+        topic: The topic of the raw readings.
+        array: Publish std_msgs/Float64MultiArray instead of `boat_msgs/Raw`.
+        count: The number of readings; None for no end.
 
     Raises:
-        BridgeError: no rosbridge server answers at the URI.
+        BridgeError: No rosbridge server answers at the URI.
     """
     from bridge.client import connect
     from bridge.stamps import header
@@ -144,12 +144,12 @@ app = CommandLine()
 def boat_simulator(
     uri: Annotated[str, typer.Option(envvar="BM_URI", help="The rosbridge server.")] = "ws://127.0.0.1:9090",
     seed: Annotated[
-        int | None, typer.Option(min=0, help="Of route and noise; by default one is chosen and printed.")
+        int | None, typer.Option(min=0, help="Seed of route and noise; by default one is chosen and printed.")
     ] = None,
     rate: Annotated[float, typer.Option(min=0.01, max=10_000, help="Readings a second.")] = 10.0,
-    topic: Annotated[str, typer.Option(help="Where the raw readings go.")] = RAW_TOPIC,
-    speed: Annotated[float, typer.Option(min=0.0, help="Of the boat, in map units a second.")] = 60.0,
-    count: Annotated[int | None, typer.Option(min=1, help="End after so many readings.")] = None,
+    topic: Annotated[str, typer.Option(help="Topic of the raw readings.")] = RAW_TOPIC,
+    speed: Annotated[float, typer.Option(min=0.0, help="The boat's speed, in map units per second.")] = 60.0,
+    count: Annotated[int | None, typer.Option(min=1, help="End after this many readings.")] = None,
     array: Annotated[
         bool, typer.Option("--array", help="Publish std_msgs/Float64MultiArray instead of boat_msgs/Raw.")
     ] = False,

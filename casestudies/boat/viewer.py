@@ -1,4 +1,4 @@
-"""Shows the boat's posteriors beside the truth: hears three topics, and knows nothing else of the stack."""
+"""Viewer of the boat's posteriors beside the truth, which subscribes to three topics and needs nothing else."""
 
 import math
 import sys
@@ -27,16 +27,16 @@ if TYPE_CHECKING:
 POSITIONS_PICTURE: Final = "figure-4.4.png"
 SHARES_PICTURE: Final = "figure-4.5.png"
 KEPT: Final = 2000
-"""Frames kept for pictures and numbers by a viewer that runs without end: a robot's may run for weeks."""
+"""Frames kept for pictures and numbers by a viewer that runs without end."""
 HEADING: Final = "frame     true cell  estimated mean  distance     cycles   time (ms)"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Line:
-    """What is said of one frame. Cells are (column, row) from the lower left corner; None is not known.
+    """The line printed for a frame. Cells are (column, row) from the lower left corner; None is unknown.
 
-    `mean` is in cells too, a cell's centre being its whole number, and `distance` is that of the posterior's
-    mean to the centre of the true cell, in cells.
+    `mean` is in cells, with a cell's centre at its whole number, and `distance` is the distance in cells from the
+    posterior's mean to the centre of the true cell.
     """
 
     frame: int | None
@@ -48,7 +48,7 @@ class Line:
     outcome: str
 
     def __str__(self) -> str:
-        """The line as it is printed, in the columns of `HEADING`."""
+        """Return the line in the columns of `HEADING`."""
         frame = "-" if self.frame is None else str(self.frame)
         cell = "not known" if self.true_cell is None else "({:2d}, {:2d})".format(*self.true_cell)
         if self.mean is None:
@@ -61,10 +61,10 @@ class Line:
 
 
 def line_of(instance: "Instance") -> Line:
-    """What there is to say of a frame.
+    """Return the line for a frame.
 
     Raises:
-        OutputError: its posterior is not one over a map.
+        OutputError: Its posterior is not over a map.
     """
     from casestudies.boat.geometry import map_grid
     from casestudies.boat.pictures import posterior_grid
@@ -89,17 +89,17 @@ def line_of(instance: "Instance") -> Line:
 
 
 class Viewer:
-    """Collects frames, says a line of each, and draws the pictures at the end.
+    """The frames of a run, with a line for each, and the pictures at the end.
 
     Attributes:
-        instances: the frames, the newest last: all of them, or without an end to wait for the last `KEPT`.
-        lines: what was said of each.
-        frames: how many there were.
-        results: how many of them had a posterior.
+        instances: The frames, the newest last; the last `KEPT` if the viewer runs without end.
+        lines: The line of each.
+        frames: The number of frames.
+        results: The number of frames with a posterior.
     """
 
     def __init__(self, count: int | None) -> None:
-        """Be done after so many results; None: never."""
+        """Take the number of results to wait for; None for no end."""
         self.count = count
         kept = KEPT if count is None else None
         self.instances: deque[Instance] = deque(maxlen=kept)
@@ -110,11 +110,11 @@ class Viewer:
 
     @property
     def done(self) -> bool:
-        """Whether all results that were asked for have come."""
+        """Whether all requested results have come."""
         return self.count is not None and self.results >= self.count
 
     def add(self, instance: "Instance") -> Line:
-        """Take a frame; returns what there is to say of it."""
+        """Add a frame and return its line."""
         line = line_of(instance)
         self.instances.append(instance)
         self.lines.append(line)
@@ -131,12 +131,12 @@ class Viewer:
         first_limit_s: float,
         limit_s: float,
     ) -> None:
-        """Listen until all results have come, and print a line of each frame.
+        """Listen until all results have come, and print a line for each frame.
 
         Raises:
-            NoResultError: nothing came in time.
-            BadResultError: something else than a result came.
-            BridgeError: no rosbridge server answers at the URI.
+            NoResultError: No result came in time.
+            BadResultError: A message was not a result.
+            BridgeError: No rosbridge server answers at the URI.
         """
         from bridge.client import connect
         from casestudies.listening import listen
@@ -164,15 +164,13 @@ class Viewer:
                 finally:
                     self.route = tuple(listener.route)
                     if listener.announced_only:
-                        say(
-                            f"warning: results that never came after their /bm/frame: {listener.announced_only}"
-                        )
+                        say(f"warning: frames on /bm/frame without their result: {listener.announced_only}")
 
     def draw(self, folder: Path) -> tuple[Path, ...]:
-        """Write the two pictures; returns their paths.
+        """Write the two pictures and return their paths.
 
         Raises:
-            OutputError: no matplotlib, or a folder that refuses.
+            OutputError: matplotlib is missing, or the folder cannot be written to.
         """
         from casestudies.boat.pictures import draw_positions, draw_shares, far_apart
         from casestudies.boat.shares import stage_shares
@@ -190,7 +188,7 @@ class Viewer:
         """Write the frames and the shares of time as one JSON object.
 
         Raises:
-            OutputError: the file cannot be written.
+            OutputError: The file cannot be written.
         """
         from casestudies.boat.shares import stage_shares
 
@@ -211,7 +209,7 @@ class Viewer:
 
 
 class _Shown:
-    """Lines on stdout; on a terminal, a bar below them counts the results."""
+    """Lines on standard output; on a terminal, a progress bar below them."""
 
     def __init__(self, count: int | None) -> None:
         self._progress: Progress | None = None
@@ -240,13 +238,13 @@ class _Shown:
             self._progress.console.print(text, markup=False, highlight=False, soft_wrap=True)
 
     def count(self, results: int) -> None:
-        """Move the bar."""
+        """Update the progress bar."""
         if self._progress is not None and self._task is not None:
             self._progress.update(self._task, completed=results)
 
 
 def _frame_numbers(line: Line, instance: "Instance") -> dict[str, object]:
-    """A frame as a JSON object."""
+    """Return a frame as a JSON object."""
     truth, report = instance.truth, instance.report
     return {
         "frame": line.frame,
@@ -269,7 +267,7 @@ def _frame_numbers(line: Line, instance: "Instance") -> dict[str, object]:
 
 
 def _stage_numbers(stage: "StageShare") -> dict[str, object]:
-    """A stage as a JSON object."""
+    """Return a stage as a JSON object."""
     return {"stage": stage.name, "part": stage.part.value, "mean_us": stage.mean_us, "share": stage.share}
 
 
@@ -287,7 +285,7 @@ def boat_viewer(
         int | None,
         typer.Option(
             min=1,
-            help=f"End after so many results; by default at Ctrl-C, with the last {KEPT} in pictures and numbers.",
+            help=f"End after this many results; by default at Ctrl-C, with the last {KEPT} in pictures and numbers.",
         ),
     ] = None,
     out: Annotated[
@@ -299,19 +297,17 @@ def boat_viewer(
     numbers: Annotated[
         Path | None, typer.Option("--json", help="Write the numbers to this file, as one JSON object.")
     ] = None,
-    truth_topic: Annotated[str, typer.Option(help="Where the true pose comes from.")] = TRUE_POSE_TOPIC,
+    truth_topic: Annotated[str, typer.Option(help="Topic of the true pose.")] = TRUE_POSE_TOPIC,
     truth_tolerance: Annotated[
         float,
-        typer.Option(
-            min=0, help="Seconds that a true pose may be older than the reading, if none is of its time."
-        ),
+        typer.Option(min=0, help="Seconds by which a true pose may be older than the reading."),
     ] = 0.5,
     first_timeout: Annotated[float, typer.Option(min=0.1, help="Seconds until the first result.")] = 60.0,
     timeout: Annotated[float, typer.Option(min=0.1, help="Seconds between two results.")] = 30.0,
 ) -> None:
     """Show each posterior's mean beside the boat's true cell, and draw the thesis's figures 4.4 and 4.5.
 
-    It hears the topics /BMresults, /bm/frame and that of the true pose, and nothing else.
+    It subscribes to /BMresults, /bm/frame and the topic of the true pose, and needs nothing else.
     """
     from casestudies.boat.pictures import check_pictures_possible
 
@@ -339,7 +335,7 @@ def boat_viewer(
 
 
 def _finish(viewer: Viewer, out: Path | None, numbers: Path | None) -> None:
-    """Say and write what came out."""
+    """Print the summary, and write numbers and pictures."""
     if not viewer.results:
         return
     distances = [line.distance for line in viewer.lines if line.distance is not None]

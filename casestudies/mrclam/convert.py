@@ -1,4 +1,4 @@
-"""Makes the case study's CSV files of the data set as it is downloaded: seconds in which a robot stood nearly still.
+"""Conversion of the downloaded data set into CSV files of the seconds in which a robot stood nearly still.
 
 python -m casestudies.mrclam.convert MRCLAM_Dataset1 -o DATA_DIR
 """
@@ -24,12 +24,12 @@ from terminal.errors import OutputError
 from terminal.output import check_writable, say
 
 LARGEST_FILE: Final = 1 << 28
-"""Bytes of a file that are read at most; the largest of the collection have some 20 million."""
+"""Bytes of the largest file that is read; the largest of the collection has some 20 million."""
 LEAST_LANDMARKS: Final = 3
 MOST_MOVED_M: Final = 0.12
 WINDOW_S: Final = 1.0
 _REFERENCE_GAP_S: Final = 0.2
-"""Between two positions further apart than this, a reference is not interpolated."""
+"""Positions further apart than this are not interpolated."""
 _REFERENCE_STD_M: Final = 0.001
 """The motion capture's own precision, as the collection's page gives it."""
 _SUBJECTS: Final = range(1, 21)
@@ -39,7 +39,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Track:
-    """Where a robot was, by motion capture: time (s), x and y (m), heading (rad, without jumps); float64[n] each."""
+    """A robot's positions, by motion capture: time (s), x and y (m), heading (rad, without jumps); float64[n] each."""
 
     time: Floats
     x: Floats
@@ -47,19 +47,19 @@ class Track:
     heading: Floats
 
     def at(self, time: float) -> tuple[float, float, float]:
-        """Position and heading at a time, linearly between two samples."""
+        """Return position and heading at a time, interpolated linearly."""
         x, y, heading = (float(np.interp(time, self.time, each)) for each in (self.x, self.y, self.heading))
         return x, y, heading
 
     def known(self, begin: float, end: float) -> bool:
-        """Whether there are samples all the way from one time to another."""
+        """Return whether there are samples all the way from one time to another."""
         inside = self.time[(self.time > begin) & (self.time < end)]
         around = np.concatenate((self.time[self.time <= begin][-1:], inside, self.time[self.time >= end][:1]))
         ends_known = len(around) > 1 and around[0] <= begin and around[-1] >= end
         return bool(ends_known and np.diff(around).max() <= _REFERENCE_GAP_S)
 
     def moved(self, begin: float, end: float) -> float:
-        """The diagonal of the smallest box around all positions between two times, in metres."""
+        """Return the diagonal of the smallest box around all positions between two times, in metres."""
         inside = (self.time > begin) & (self.time < end)
         (x_0, y_0, _), (x_1, y_1, _) = self.at(begin), self.at(end)
         x, y = np.append(self.x[inside], (x_0, x_1)), np.append(self.y[inside], (y_0, y_1))
@@ -92,19 +92,21 @@ def read_columns(path: Path, names: Sequence[str]) -> Iterator[tuple[str, tuple[
 
     Args:
         path: The file.
-        names: What its columns are.
+        names: The names of its columns.
 
     Yields:
-        Where a line is, for the sentences about it, and its numbers.
+        Each line's place, for error messages, and its numbers.
 
     Raises:
-        DataFileError: it cannot be read, or a line has something else than these numbers.
+        DataFileError: The file cannot be read, or a line does not hold these numbers.
     """
     try:
-        if stat.S_ISFIFO(path.stat().st_mode):  # to open it would wait for who writes into it
-            raise DataFileError(f"{path} is a pipe: it is none of the data set")
+        if stat.S_ISFIFO(path.stat().st_mode):  # opening it would block until something writes to it
+            raise DataFileError(f"{path} is a pipe, not a file of the data set")
         if path.stat().st_size > LARGEST_FILE:
-            raise DataFileError(f"{path} is larger than {LARGEST_FILE >> 20} MiB: it is none of the data set")
+            raise DataFileError(
+                f"{path} is larger than {LARGEST_FILE >> 20} MiB, so it is not a file of the data set"
+            )
         with path.open(encoding="utf-8") as file:
             for number, line in enumerate(file, 1):
                 words = line.split("#", 1)[0].split()
@@ -123,14 +125,14 @@ def read_columns(path: Path, names: Sequence[str]) -> Iterator[tuple[str, tuple[
             f"{path} cannot be read: {error.strerror or error}; name the folder that the data set was unpacked into"
         ) from None
     except UnicodeDecodeError:
-        raise DataFileError(f"{path} is no text: it is none of the data set") from None
+        raise DataFileError(f"{path} is not text, so it is not a file of the data set") from None
 
 
 def read_barcodes(folder: Path) -> dict[int, int]:
-    """Which subject (1 to 5 are robots, 6 to 20 landmarks) has which barcode, from `Barcodes.dat`.
+    """Return the subject of each barcode from `Barcodes.dat`: 1 to 5 are robots, 6 to 20 landmarks.
 
     Raises:
-        DataFileError: no such file, or an unknown subject.
+        DataFileError: The file is missing, or a subject is unknown.
     """
     subjects: dict[int, int] = {}
     for where, (subject, barcode) in read_columns(folder / "Barcodes.dat", ("subject", "barcode")):
@@ -143,10 +145,10 @@ def read_barcodes(folder: Path) -> dict[int, int]:
 
 
 def read_positions(folder: Path) -> dict[int, tuple[float, float]]:
-    """The landmarks' positions in metres, from `Landmark_Groundtruth.dat`.
+    """Return the landmarks' positions in metres, from `Landmark_Groundtruth.dat`.
 
     Raises:
-        DataFileError: no such file, or a line about something else than a landmark.
+        DataFileError: The file is missing, or a line is not about a landmark.
     """
     path = folder / "Landmark_Groundtruth.dat"
     names = ("subject", "x (m)", "y (m)", "deviation of x", "deviation of y")
@@ -161,10 +163,10 @@ def read_positions(folder: Path) -> dict[int, tuple[float, float]]:
 
 
 def read_track(folder: Path, robot: int) -> Track:
-    """A robot's way, from `RobotN_Groundtruth.dat`.
+    """Return a robot's track, from `RobotN_Groundtruth.dat`.
 
     Raises:
-        DataFileError: no such file, no positions in it, or times that do not rise.
+        DataFileError: The file is missing or empty, or its times do not rise.
     """
     path = folder / f"Robot{robot}_Groundtruth.dat"
     names = ("time (s)", "x (m)", "y (m)", "orientation (rad)")
@@ -177,10 +179,10 @@ def read_track(folder: Path, robot: int) -> Track:
 
 
 def read_measured(folder: Path, robot: int, subjects: dict[int, int]) -> tuple[list[Measured], int]:
-    """A robot's sightings of landmarks, from `RobotN_Measurement.dat`, and how many had a barcode of nothing.
+    """Return a robot's sightings of landmarks from `RobotN_Measurement.dat`, and the number of unknown barcodes.
 
     Raises:
-        DataFileError: no such file.
+        DataFileError: The file is missing.
     """
     path = folder / f"Robot{robot}_Measurement.dat"
     found, misread = [], 0
@@ -198,15 +200,15 @@ def read_measured(folder: Path, robot: int, subjects: dict[int, int]) -> tuple[l
 def windows(
     track: Track, measured: Sequence[Measured], *, length_s: float = WINDOW_S
 ) -> tuple[list[Window], Counter[str]]:
-    """Cut a robot's way into windows, and keep those in which it stood nearly still and saw enough landmarks.
+    """Cut a robot's track into windows, and keep those in which it stood nearly still and saw enough landmarks.
 
     Args:
-        track: Where it was.
-        measured: What it saw, in the order of time.
-        length_s: Of a window, in seconds.
+        track: The robot's positions.
+        measured: Its sightings, in the order of time.
+        length_s: A window's length, in seconds.
 
     Returns:
-        The windows, and how many others there are for each reason.
+        The windows, and the number of others for each reason.
     """
     kept: list[Window] = []
     left_out: Counter[str] = Counter()
@@ -232,7 +234,7 @@ def windows(
 
 
 def _medians(track: Track, sightings: Sequence[Measured]) -> dict[int, tuple[float, float]]:
-    """Each landmark's median range and median absolute bearing: measured bearing plus the heading at that moment."""
+    """Return each landmark's median range and median absolute bearing: measured bearing plus the heading at that moment."""
     seen = {}
     for landmark in sorted({each.landmark for each in sightings}):
         own = [each for each in sightings if each.landmark == landmark]
@@ -251,7 +253,7 @@ def write_landmarks(path: Path, positions: dict[int, tuple[float, float]]) -> No
     """Write `landmarks.csv`.
 
     Raises:
-        OutputError: it cannot be written.
+        OutputError: The file cannot be written.
     """
     _write(
         path,
@@ -261,10 +263,10 @@ def write_landmarks(path: Path, positions: dict[int, tuple[float, float]]) -> No
 
 
 def write_recording(path: Path, kept: Sequence[Window], landmarks: Sequence[int]) -> None:
-    """Write a file as `casestudies.mrclam.recording` reads it.
+    """Write a file that `casestudies.mrclam.recording` reads.
 
     Raises:
-        OutputError: it cannot be written.
+        OutputError: The file cannot be written.
     """
     heading = ["time_s", "ref_x_m", "ref_y_m", "ref_std_m", "heading_rad"]
     heading += [name for number in landmarks for name in (f"range_{number}_m", f"bearing_{number}_rad")]
@@ -293,10 +295,10 @@ def _write(path: Path, heading: Sequence[str], rows: Sequence[Sequence[str]]) ->
 
 
 def robots_in(folder: Path) -> list[int]:
-    """The robots that the folder has measurements of.
+    """Return the robots that the folder has measurements of.
 
     Raises:
-        DataFileError: none.
+        DataFileError: There are none.
     """
     found = sorted(
         int(match[1])
@@ -305,13 +307,13 @@ def robots_in(folder: Path) -> list[int]:
     )
     if not found:
         raise DataFileError(
-            f"{folder} holds no RobotN_Measurement.dat: name the folder that the data set was unpacked into"
+            f"{folder} does not hold a RobotN_Measurement.dat: name the folder that the data set was unpacked into"
         )
     return found
 
 
 def prefix_of(folder: Path) -> str:
-    """What the recordings' names begin with: `ds1` for a folder whose name ends in 1."""
+    """Return the prefix of the recordings' names: `ds1` for a folder whose name ends in 1."""
     number = re.search(r"(\d+)$", folder.resolve().name)
     return f"ds{number[1]}" if number else "ds"
 
@@ -335,12 +337,12 @@ def convert(
     ],
     robot: Annotated[
         list[int] | None,
-        typer.Option(help="Which robot; repeat for more. By default all.", metavar="NUMBER"),
+        typer.Option(help="A robot's number; repeat for more. By default all.", metavar="NUMBER"),
     ] = None,
 ) -> None:
-    """Make the case study's CSV files of a data set as it is downloaded.
+    """Convert a downloaded data set into the case study's CSV files.
 
-    A line for each second in which a robot moved less than 0.12 m and saw at least three landmarks.
+    They have a line for each second in which a robot moved less than 0.12 m and saw at least three landmarks.
     """
     subjects, positions = read_barcodes(folder), read_positions(folder)
     robots = robot or robots_in(folder)

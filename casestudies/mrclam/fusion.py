@@ -1,4 +1,4 @@
-"""Unquantised float64 fusion of raw readings: what the machine's posteriors are measured against.
+"""Unquantised float64 fusion of raw readings, against which the machine's posteriors are measured.
 
 Gaussian densities at the cells' centres and the same outlier floor, no bins, no codes, no counts.
 """
@@ -17,7 +17,7 @@ from toolchain.models.model import cell_centres, interval
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reading:
-    """What was seen of one landmark: metres and radians (absolute, any turn); None where nothing was."""
+    """A reading of one landmark: metres and radians (absolute, any turn), or None if it was not seen."""
 
     range_m: float | None = None
     bearing_rad: float | None = None

@@ -30,17 +30,17 @@ def read_landmarks(path: Path) -> tuple[Landmark, ...]:
             for row in rows:
                 found.append(_landmark(row, f"{path}, line {rows.line_num}"))
                 if found[-1].number in {landmark.number for landmark in found[:-1]}:
-                    message = f"{path}, line {rows.line_num}: landmark {found[-1].number} is there twice"
-                    raise ModelError(message)
+                    raise ModelError(
+                        f"{path}, line {rows.line_num}: landmark {found[-1].number} is there twice"
+                    )
     except OSError as reason:
-        message = f"the landmarks' file {path} can't be read: {reason.strerror or reason}"
-        raise ModelError(message) from None
+        raise ModelError(f"the landmarks' file {path} can't be read: {reason.strerror or reason}") from None
     except (UnicodeDecodeError, csv.Error) as reason:
-        message = f"{path} is no CSV of landmarks: {reason}"
-        raise ModelError(message) from None
+        raise ModelError(f"{path} is not a CSV of landmarks: {reason}") from None
     if not found:
-        message = f"{path} holds no landmarks; expected the columns landmark, x_m, y_m and a line for each"
-        raise ModelError(message)
+        raise ModelError(
+            f"{path} does not hold landmarks; expected the columns landmark, x_m, y_m and a line for each"
+        )
     return tuple(found)
 
 
@@ -48,12 +48,9 @@ def _landmark(row: dict[str, str], where: str) -> Landmark:
     try:
         landmark = Landmark(int(row["landmark"]), float(row["x_m"]), float(row["y_m"]))
     except KeyError as missing:
-        message = f"{where}: there is no column {missing}; expected landmark, x_m and y_m"
-        raise ModelError(message) from None
+        raise ModelError(f"{where}: there is no column {missing}; expected landmark, x_m and y_m") from None
     except (TypeError, ValueError) as reason:
-        message = f"{where} is no landmark: {reason}"
-        raise ModelError(message) from None
+        raise ModelError(f"{where} is not a landmark: {reason}") from None
     if landmark.number < 0 or not (math.isfinite(landmark.x) and math.isfinite(landmark.y)):
-        message = f"{where} is no landmark: expected a number from 0 and a finite position"
-        raise ModelError(message)
+        raise ModelError(f"{where} is not a landmark: expected a number from 0 and a finite position")
     return landmark

@@ -30,7 +30,7 @@ def model(
     bearing_values: int = 255,
     fit: Path | None = None,
 ) -> Model:
-    """Return the model of a robot's position, in metres, from what it sees of landmarks.
+    """Return the model of a robot's position, in metres, from its sightings of landmarks.
 
     Args:
         landmarks: A CSV with the columns landmark, x_m, y_m; the data set's README says where to get it.
@@ -47,8 +47,9 @@ def model(
         ModelError: A file that holds no landmarks, or a size that is not positive.
     """
     if bearing_values < 1:
-        message = f"bearing_values is {bearing_values}, expected how many bearings a turn has, from 1"
-        raise ModelError(message)
+        raise ModelError(
+            f"bearing_values is {bearing_values}, expected the number of bearings in a turn, from 1"
+        )
     rows = interval("y", *Y_LIMITS, cells=height)
     columns = interval("x", *X_LIMITS, cells=width)
     y, x = cell_centres(rows, columns)

@@ -1,4 +1,4 @@
-"""Plays a recording through a rosbridge server, frame by frame, and says how far each posterior is off.
+"""Player of a recording through a rosbridge server, which reports each posterior's distance from the reference.
 
 python -m casestudies.mrclam.player DATA_DIR/ds1_robot3.csv --uri ws://127.0.0.1:9090
 """
@@ -38,14 +38,14 @@ if TYPE_CHECKING:
     from posteriors.posterior import Posterior
 
 LOST_DISTANCE: Final = 9.0
-"""What a frame without a result counts as, in metres: the width of the area."""
+"""Distance in metres that a frame without a result counts as: the width of the area."""
 _REPEAT_S: Final = 1.0
-"""The first frame is published again so often, until somebody answers."""
+"""Seconds between publications of the first frame, until a result comes."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlayedFrame:
-    """A recorded frame and what came back: the published posterior, or None and why there is none."""
+    """A recorded frame and its result: the published posterior, or None and the reason."""
 
     frame: RecordedFrame
     posterior: "Posterior | None"
@@ -53,29 +53,29 @@ class PlayedFrame:
     outcome: str
 
     def estimate(self) -> tuple[float, float] | None:
-        """The posterior's mean (x, y), in metres.
+        """Return the posterior's mean (x, y), in metres.
 
         Raises:
-            BadResultError: the posterior is not one over the area.
+            BadResultError: The posterior is not over the area.
         """
         if self.posterior is None:
             return None
         if len(self.posterior.sizes) != 2:
             raise BadResultError(
-                f"the posterior has {' x '.join(map(str, self.posterior.sizes))} values, but one over y and x "
-                "is wanted: is this the deployment of casestudies/mrclam?"
+                f"the posterior has {' x '.join(map(str, self.posterior.sizes))} values instead of one for each cell over "
+                "y and x: is this the deployment of casestudies/mrclam?"
             )
         height, width = self.posterior.sizes
         return area_grid(width, height).mean(self.posterior.probabilities)
 
     def distance(self) -> float:
-        """How far the estimate is from the reference position, in metres; `LOST_DISTANCE` without one."""
+        """Return the distance from the estimate to the reference, in metres; `LOST_DISTANCE` without an estimate."""
         estimate = self.estimate()
         return LOST_DISTANCE if estimate is None else math.dist(estimate, (self.frame.x, self.frame.y))
 
 
 def median_distance(played: Sequence[PlayedFrame]) -> float:
-    """The median distance to the reference position, in metres, over all frames."""
+    """Return the median distance to the reference position over all frames, in metres."""
     return median(frame.distance() for frame in played)
 
 
@@ -90,25 +90,25 @@ async def play(
 ) -> list[PlayedFrame]:
     """Publish each frame and wait for its result before the next one.
 
-    Frames carry the time of their publication, which is how a result is known to be theirs. Until the first one
-    is answered it is published again every second, since nobody may be listening yet; every other frame has
-    one chance.
+    Frames carry the time of their publication, which identifies their results. The first frame is published again
+    every second until its result comes, since the subscriber may not be there yet; every other frame is published
+    once.
 
     Args:
-        uri: the rosbridge server's.
-        frames: what to play.
-        topic: where to.
-        first_timeout_s: seconds that the first answer may take.
-        timeout_s: seconds that any other may take; then the frame has no result.
-        on_frame: is called after each frame.
+        uri: The rosbridge server's.
+        frames: The frames to play.
+        topic: The topic to publish on.
+        first_timeout_s: Seconds until the first result.
+        timeout_s: Seconds until any other result; after them the frame has none.
+        on_frame: A callback after each frame.
 
     Returns:
-        One entry for each frame, in their order.
+        One entry for each frame, in order.
 
     Raises:
-        NoResultError: the first frame was never answered.
-        BadResultError: something else than a result came.
-        BridgeError: no rosbridge server answers at the URI, or it was lost.
+        NoResultError: The first frame had no result.
+        BadResultError: A message was not a result.
+        BridgeError: No rosbridge server answers at the URI, or it was lost.
     """
     from bridge.client import connect
     from casestudies.listening import listen
@@ -125,7 +125,7 @@ async def play(
             )
             if first and instance is None:
                 raise NoResultError(
-                    f"the first frame on {topic} had no answer from {uri} within {first_timeout_s:g} s: "
+                    f"the first frame on {topic} had no result from {uri} within {first_timeout_s:g} s: "
                     "is the master running, with the deployment of casestudies/mrclam?"
                 )
             played.append(_played(frame, instance, timeout_s))
@@ -134,7 +134,7 @@ async def play(
 
 
 class _Turn:
-    """One frame's way there and back."""
+    """The publication of one frame and the wait for its result."""
 
     def __init__(
         self,
@@ -150,7 +150,7 @@ class _Turn:
         self._stamps: set[int] = set()
 
     async def take(self, limit_s: float, *, repeat_s: float) -> "Instance | None":
-        """Publish until answered; the answer, or None if there was none within the limit."""
+        """Publish until a result comes and return it, or None after the limit."""
         end = time.monotonic() + limit_s
         while (left := end - time.monotonic()) > 0:
             await self._publish()
@@ -168,7 +168,7 @@ class _Turn:
         )
 
     async def _answer(self, limit_s: float) -> "Instance":
-        """The next answer to this frame; late ones to earlier frames are passed over."""
+        """Return the next result of this frame, and skip late ones of earlier frames."""
         end = time.monotonic() + limit_s
         while True:
             instance = await self._listener.next(max(end - time.monotonic(), 0.0))
@@ -179,7 +179,7 @@ class _Turn:
 def _played(frame: RecordedFrame, instance: "Instance | None", timeout_s: float) -> PlayedFrame:
     if instance is None or instance.report is None:
         return PlayedFrame(
-            frame=frame, posterior=None, cycles=None, outcome=f"no answer within {timeout_s:g} s"
+            frame=frame, posterior=None, cycles=None, outcome=f"no result within {timeout_s:g} s"
         )
     return PlayedFrame(
         frame=frame,
@@ -190,7 +190,7 @@ def _played(frame: RecordedFrame, instance: "Instance | None", timeout_s: float)
 
 
 def _line(played: PlayedFrame) -> str:
-    """What is said of one frame."""
+    """Return the line that is printed for a frame."""
     frame = played.frame
     seen = len(frame.sightings)
     start = f"{frame.number:>5}  {seen:>4}  ({frame.x:6.3f}, {frame.y:6.3f})"
@@ -224,10 +224,10 @@ def player(
         Path | None, typer.Argument(help="A file like ds1_robot3.csv.", show_default=False)
     ] = None,
     uri: Annotated[str, typer.Option(envvar="BM_URI", help="The rosbridge server.")] = "ws://127.0.0.1:9090",
-    topic: Annotated[str, typer.Option(help="Where the sightings go.")] = SIGHTINGS_TOPIC,
-    count: Annotated[int | None, typer.Option(min=1, help="Play so many frames; by default all.")] = None,
+    topic: Annotated[str, typer.Option(help="Topic of the sightings.")] = SIGHTINGS_TOPIC,
+    count: Annotated[int | None, typer.Option(min=1, help="Play this many frames; by default all.")] = None,
     first_timeout: Annotated[float, typer.Option(min=0.1, help="Seconds until the first result.")] = 30.0,
-    timeout: Annotated[float, typer.Option(min=0.1, help="Seconds that any other result may take.")] = 10.0,
+    timeout: Annotated[float, typer.Option(min=0.1, help="Seconds until any other result.")] = 10.0,
     numbers: Annotated[
         Path | None, typer.Option("--json", help="Write the numbers to this file, as one JSON object.")
     ] = None,
@@ -237,7 +237,7 @@ def player(
 ) -> None:
     """Play a recorded robot's sightings of landmarks, and compare each posterior's mean with the reference.
 
-    The next frame is published when the last one's result has come.
+    Each frame is published after the result of the one before.
     """
     if print_msg:
         print(SIGHTINGS_MSG, end="")

@@ -29,13 +29,13 @@ _REFERENCE_COLUMNS: Final = ("time_s", "ref_x_m", "ref_y_m", "ref_std_m", "headi
 
 
 def area_grid(width: int = 32, height: int = 32) -> Grid:
-    """The area of the experiment cut into cells: x in [-2, 7] m, y in [-7, 7] m."""
+    """Return the area of the experiment cut into cells: x in [-2, 7] m, y in [-7, 7] m."""
     return Grid(x_low=-2.0, x_high=7.0, y_low=-7.0, y_high=7.0, width=width, height=height)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sighting:
-    """One landmark as it was seen: its range in metres, its absolute bearing in radians."""
+    """A sighting of one landmark: its range in metres, its absolute bearing in radians."""
 
     landmark: int
     range_m: float
@@ -44,7 +44,7 @@ class Sighting:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RecordedFrame:
-    """What a robot saw in one second, and where it was: the reference position, in metres."""
+    """The sightings of one second, and the robot's reference position in metres."""
 
     number: int
     time_s: float
@@ -57,7 +57,7 @@ def read_recording(path: Path) -> tuple[RecordedFrame, ...]:
     """Read a file like `ds1_robot3.csv`.
 
     Raises:
-        DataFileError: it cannot be read, is no such file, or a line of it is damaged; the sentence says which.
+        DataFileError: The file cannot be read, is of another kind, or has a damaged line, which is named.
     """
     try:
         with path.open(newline="", encoding="utf-8") as file:
@@ -70,14 +70,14 @@ def read_recording(path: Path) -> tuple[RecordedFrame, ...]:
             f"{path} cannot be read: {error.strerror or error}; the case study's page says where to get the data"
         ) from None
     except (UnicodeDecodeError, csv.Error) as error:
-        raise DataFileError(f"{path} is no CSV file: {error}") from None
+        raise DataFileError(f"{path} is not a CSV file: {error}") from None
     if not frames:
         raise DataFileError(f"{path} has a heading but no frames")
     return frames
 
 
 def sightings_message(frame: RecordedFrame, header: Mapping[str, Any]) -> dict[str, Any]:
-    """A frame as `mrclam_msgs/Sightings`; landmarks that were not seen are absent."""
+    """Return a frame as `mrclam_msgs/Sightings`, without the landmarks that were not seen."""
     message: dict[str, Any] = {"header": dict(header)}
     for sighting in frame.sightings:
         message[f"range_{sighting.landmark}"] = sighting.range_m
@@ -86,13 +86,13 @@ def sightings_message(frame: RecordedFrame, header: Mapping[str, Any]) -> dict[s
 
 
 def _landmarks(path: Path, columns: Sequence[str]) -> tuple[int, ...]:
-    """The landmarks that the file has columns for."""
+    """Return the landmarks that the file has columns for."""
     landmarks = tuple(int(match[1]) for column in columns if (match := _SIGHTING_COLUMN.fullmatch(column)))
     wanted = [*_REFERENCE_COLUMNS, *(f"bearing_{landmark}_rad" for landmark in landmarks)]
     missing = [column for column in wanted if column not in columns]
     if missing or not landmarks:
         raise DataFileError(
-            f"{path} is no recording of sightings: its first line has no column "
+            f"{path} is not a recording of sightings: its first line lacks the column "
             f"{missing[0] if missing else 'range_N_m'}; a file like ds1_robot3.csv is wanted"
         )
     if unknown := set(landmarks) - set(LANDMARKS):

@@ -79,7 +79,7 @@ async def test_a_result_without_a_report_is_handed_out_too(heard):
 
 async def test_silence_is_named(heard):
     fake, listener = heard
-    with pytest.raises(NoResultError, match=f"/bm/frame and /BMresults from {fake.uri} within 0.1 s"):
+    with pytest.raises(NoResultError, match=fake.uri):
         await listener.next(0.1)
     await say_frame(fake, 1)
     assert (await listener.next(30)).report.number == 1
@@ -89,5 +89,5 @@ async def test_silence_is_named(heard):
 async def test_nonsense_is_named(heard, topic):
     fake, listener = heard
     await fake.publish(topic, {"data": "nonsense"})
-    with pytest.raises(BadResultError, match=f"a message on {topic} is not"):
+    with pytest.raises(BadResultError, match=topic):
         await listener.next(30)

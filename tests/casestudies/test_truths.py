@@ -16,7 +16,7 @@ def test_a_truth():
         "pose": {"position": {"x": 1, "y": -2.5, "z": 0}, "orientation": {}},
     }
     assert read_truth(message, "/t") == Truth(stamp_ns=1_000_000_005, x=1, y=-2.5)
-    with pytest.raises(BadResultError, match=r"/t is not .* \(header is wrong\)"):
+    with pytest.raises(BadResultError, match="/t .*header"):
         read_truth({"pose": {}}, "/t")
 
 

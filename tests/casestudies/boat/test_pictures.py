@@ -95,12 +95,12 @@ class TestPositions:
 
     def test_a_posterior_that_is_no_map(self):
         line = Posterior(probabilities=(0.5, 0.5), labels=("x",), sizes=(2,), heard_ns=0)
-        with pytest.raises(OutputError, match="two dimensions"):
+        with pytest.raises(OutputError):
             posterior_grid(line)
 
     def test_a_folder_that_refuses(self, tmp_path):
         (tmp_path / "file").write_text("")
-        with pytest.raises(OutputError, match="cannot be written"):
+        with pytest.raises(OutputError):
             draw_positions(tmp_path / "file" / "x.png", [instance(1)])
 
 

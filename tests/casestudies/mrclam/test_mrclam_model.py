@@ -149,7 +149,7 @@ def test_the_command_lines_settings_reach_it(path):
     folder = mrclam.__path__[0]
     few = load_model(folder, {"landmarks": str(path), "width": "4", "height": "3", "bearing_values": "20"})
     assert (few.lines, few.known[1].values) == (12, 20)
-    with pytest.raises(ModelError, match="the model needs landmarks: add --set landmarks=VALUE"):
+    with pytest.raises(ModelError, match="landmarks"):
         load_model(folder, {})
 
 
@@ -166,26 +166,26 @@ def test_landmarks_are_read_in_the_files_order(path):
 
 
 @pytest.mark.parametrize(
-    ("text", "sentence"),
+    ("text", "place"),
     [
-        ("", "holds no landmarks"),
-        ("landmark,x_m,y_m\n", "holds no landmarks"),
-        ("number,x_m,y_m\n1,2,3\n", "line 2: there is no column 'landmark'"),
-        ("landmark,x_m,y_m\n1,2,3\n1,4,5\n", "line 3: landmark 1 is there twice"),
-        ("landmark,x_m,y_m\n1,2,north\n", "line 2 is no landmark: could not convert"),
-        ("landmark,x_m,y_m\n1,2\n", "line 2 is no landmark"),
-        ("landmark,x_m,y_m\n1,2,nan\n", "line 2 is no landmark: expected a number from 0 and a finite"),
-        ("landmark,x_m,y_m\n-1,2,3\n", "line 2 is no landmark"),
-        ("landmark,x_m,y_m\n1,\xff,3\n", "is no CSV of landmarks"),
+        ("", "landmarks.csv"),
+        ("landmark,x_m,y_m\n", "landmarks.csv"),
+        ("number,x_m,y_m\n1,2,3\n", "line 2.*'landmark'"),
+        ("landmark,x_m,y_m\n1,2,3\n1,4,5\n", "line 3: landmark 1"),
+        ("landmark,x_m,y_m\n1,2,north\n", "line 2"),
+        ("landmark,x_m,y_m\n1,2\n", "line 2"),
+        ("landmark,x_m,y_m\n1,2,nan\n", "line 2"),
+        ("landmark,x_m,y_m\n-1,2,3\n", "line 2"),
+        ("landmark,x_m,y_m\n1,\xff,3\n", "landmarks.csv"),
     ],
 )
-def test_files_that_hold_no_landmarks(tmp_path, text, sentence):
+def test_files_that_hold_no_landmarks(tmp_path, text, place):
     file = tmp_path / "landmarks.csv"
     file.write_bytes(text.encode("latin-1"))
-    with pytest.raises(ModelError, match=sentence):
+    with pytest.raises(ModelError, match=place):
         read_landmarks(file)
 
 
 def test_a_file_that_is_not_there(tmp_path):
-    with pytest.raises(ModelError, match="the landmarks' file .*nowhere.csv can't be read: No such file"):
+    with pytest.raises(ModelError, match="nowhere.csv"):
         read_landmarks(tmp_path / "nowhere.csv")

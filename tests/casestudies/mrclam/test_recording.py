@@ -52,33 +52,33 @@ def test_what_was_not_seen_is_absent_from_the_message(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("lines", "said"),
+    ("lines", "place"),
     [
-        (["landmark,x_m,y_m", "6,5.7093,4.9640"], "no column time_s"),
-        (["time_s,ref_x_m,ref_y_m,ref_std_m,heading_rad", "1,2,3,4,5"], "no column range_N_m"),
-        ([HEADING.replace(",bearing_20_rad", ""), FIRST], "no column bearing_20_rad"),
-        ([HEADING.replace("_6_", "_3_"), FIRST], "landmark 3, but the landmarks are 6 to 20"),
-        ([HEADING], "no frames"),
-        ([""], "no column time_s"),
-        ([HEADING, FIRST, SECOND.replace("6.794", "far")], "line 3: range_6_m must be a number, not 'far'"),
-        ([HEADING, FIRST.replace("4.392", "nan")], "line 2: ref_x_m must be a number"),
-        ([HEADING, FIRST, SECOND[:-3]], "line 3 has 7 values, its heading has 9"),
-        ([HEADING, FIRST.replace("6.712", "")], "landmark 20 has a range or a bearing, but not both"),
+        (["landmark,x_m,y_m", "6,5.7093,4.9640"], "time_s"),
+        (["time_s,ref_x_m,ref_y_m,ref_std_m,heading_rad", "1,2,3,4,5"], "range_N_m"),
+        ([HEADING.replace(",bearing_20_rad", ""), FIRST], "bearing_20_rad"),
+        ([HEADING.replace("_6_", "_3_"), FIRST], "landmark 3"),
+        ([HEADING], "recording.csv"),
+        ([""], "time_s"),
+        ([HEADING, FIRST, SECOND.replace("6.794", "far")], "line 3: range_6_m"),
+        ([HEADING, FIRST.replace("4.392", "nan")], "line 2: ref_x_m"),
+        ([HEADING, FIRST, SECOND[:-3]], "line 3"),
+        ([HEADING, FIRST.replace("6.712", "")], "line 2: landmark 20"),
     ],
 )
-def test_wrong_files_are_refused_with_the_place(tmp_path, lines, said):
-    with pytest.raises(DataFileError, match=said):
+def test_wrong_files_are_refused_with_the_place(tmp_path, lines, place):
+    with pytest.raises(DataFileError, match=place):
         read_recording(file(tmp_path, *lines))
 
 
 def test_files_that_are_no_files(tmp_path):
-    with pytest.raises(DataFileError, match="no-such.csv cannot be read: No such file"):
+    with pytest.raises(DataFileError, match="no-such.csv"):
         read_recording(tmp_path / "no-such.csv")
-    with pytest.raises(DataFileError, match="cannot be read: Is a directory"):
+    with pytest.raises(DataFileError):
         read_recording(tmp_path)
     binary = tmp_path / "picture.csv"
     binary.write_bytes(b"\x89PNG\xff\xfe")
-    with pytest.raises(DataFileError, match="is no CSV file"):
+    with pytest.raises(DataFileError, match="picture.csv"):
         read_recording(binary)
 
 
