@@ -13,7 +13,7 @@ from rich.console import Console, Group
 from rich.live import Live
 from rich.text import Text
 
-from bridge.client import State, connect
+from bridge.client import connect
 from posteriors.errors import BadResultError, LabelError, NoResultError
 from posteriors.listening import posteriors
 from posteriors.pairing import FrameOutcome
@@ -25,6 +25,7 @@ from services.output.posterior_picture import ROWS, Axis, axes_of, in_colour, pi
 from services.settings import LONGEST_S, Settings, load_settings
 from services.sockets.serving import deployment_for
 from terminal.command_line import CommandLine
+from terminal.connection import report_connection
 from terminal.output import put_json, say
 from terminal.signals import run_async
 from toolchain.deployment import Deployment
@@ -81,23 +82,6 @@ def _of_replica(heard: Posterior, at: int, axes: list[Axis]) -> str:
     return f"replica {at} {_best(one, axes)}"
 
 
-class _Told:
-    """What the person at the terminal is told of the connection, and of what is no result."""
-
-    def __init__(self, uri: str) -> None:
-        self._uri = uri
-        self._gone = False
-
-    def state_changed(self, state: State, reason: str) -> None:
-        """Say when the connection is lost, and when it is back."""
-        if state is State.RECONNECTING and not self._gone:
-            self._gone = True
-            say(f"warning: rosbridge at {self._uri} is gone ({reason}); waiting for it")
-        elif state is State.CONNECTED and self._gone:
-            self._gone = False
-            say(f"rosbridge at {self._uri} is connected again")
-
-
 async def hear(
     settings: Settings,
     deployment: Deployment | None,
@@ -126,7 +110,7 @@ async def hear(
             uri,
             connect_timeout=settings.connect_timeout,
             ros_version=settings.ros_version,
-            on_state=_Told(uri).state_changed,
+            on_state=report_connection(uri),
             max_size=MAX_RESULT,
         ) as ros,
         posteriors(
