@@ -170,19 +170,17 @@ class Broker:
             congested, and once the definitions are loaded if `definitions.pending` is true.
         """
         self._now, self._operation_id = now, None
-        dispatcher, publish_again = self._dispatcher, self._topics.publish_again
+        dispatcher, publish_again, outbox = self._dispatcher, self._topics.publish_again, client.outbox
         dispatcher.work = 0
         for number, data in enumerate(messages):
-            if dispatcher.work > TURN_WORK or client.outbox.congested:
+            if dispatcher.work > TURN_WORK or (outbox.undroppable and outbox.congested):
                 return number
-            if publish_again(client, data, now):
-                dispatcher.work += _OPERATION_WORK + (len(data) >> 7)
-                continue
-            try:
-                self.receive(client, data, now)
-            except DefinitionsPendingError as error:
-                messages[number] = error.data or data
-                return number
+            if not publish_again(client, data, now):
+                try:
+                    self.receive(client, data, now)
+                except DefinitionsPendingError as error:
+                    messages[number] = error.data or data
+                    return number
         return len(messages)
 
     def _perform(self, client: Client, data: bytes, now: float, *, is_whole: bool) -> None:

@@ -76,11 +76,11 @@ class Outbox:
         "_largest",
         "_max_bytes",
         "_numbers",
-        "_undroppable",
         "_wire_bytes",
         "deadline",
         "overflowed",
         "size",
+        "undroppable",
         "wire",
     )
 
@@ -88,7 +88,6 @@ class Outbox:
         """Bound the queue to `max_bytes`; a single payload has at most `largest`."""
         self._max_bytes = max_bytes
         self._largest = largest
-        self._undroppable = 0
         self._entries: deque[_Entry] = deque()
         self._droppable: deque[_Entry] = deque()
         self._gaps = 0
@@ -101,6 +100,8 @@ class Outbox:
         """Payloads for the socket's next write; None while it accepts nothing, so that everything is queued."""
         self.size = 0
         """Bytes in the queue."""
+        self.undroppable = 0
+        """Bytes of answers and requests in the queue."""
         self.overflowed = False
         """Whether something that cannot be dropped exceeded the bound: the client does not read its answers."""
         self.deadline = inf
@@ -117,7 +118,7 @@ class Outbox:
     @property
     def congested(self) -> bool:
         """Return whether one more answer could overflow it, so that its client must read before it asks again."""
-        return self._undroppable > 0 and self._undroppable + self._largest > self._max_bytes
+        return self.undroppable > 0 and self.undroppable + self._largest > self._max_bytes
 
     def take_wire(self) -> list[bytes]:
         """Return and remove the payloads for the socket's next write."""
@@ -131,7 +132,7 @@ class Outbox:
         if self._make_room(len(payload)):
             self._entries.append(_Entry(payload, None, fragment_size))
             self.size += len(payload)
-            self._undroppable += len(payload)
+            self.undroppable += len(payload)
         else:
             self.overflowed = True
 
@@ -149,7 +150,18 @@ class Outbox:
                     self._hold(lane, payload)
                 return
             lane.next_time = now + lane.throttle
-        self._deliver(lane, payload)
+        wire = self.wire  # as `_bypass`, without its call: most messages go this way
+        if (
+            wire is None
+            or lane.fragment_size
+            or self._entries
+            or self._wire_bytes >= _WIRE_BYTES
+            or self._fragments is not None
+        ):
+            self._queue(lane, payload)
+        else:
+            wire.append(payload)
+            self._wire_bytes += len(payload)
 
     def pop(self) -> bytes | None:
         """Take the next message or fragment for the socket, or None."""
@@ -166,7 +178,7 @@ class Outbox:
                 self._gaps -= 1
                 continue
             if entry.lane is None:
-                self._undroppable -= len(payload)
+                self.undroppable -= len(payload)
             else:
                 entry.lane.queued.popleft()  # this very entry: a lane has the outbox's order
                 entry.payload = None

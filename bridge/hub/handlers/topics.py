@@ -46,6 +46,8 @@ _QUOTES: Final = 200
 """Maximum of quotes in a message that is cut out: checking more takes as long as rewriting it."""
 _SHORT: Final = 4096
 """Bytes up to which the key is searched at once; longer messages are mostly numbers, where quotes are found faster."""
+_MESSAGE_WORK: Final = 20
+"""Units of work of one message, besides those for each subscriber."""
 _PLAIN: Final = Compression.NONE
 
 
@@ -186,7 +188,7 @@ class Topics:
         if topic.latching:
             room = self._limits.latched_bytes - self._graph.latched_bytes + len(topic.latched or b"")
             self._graph.latch(topic, data if len(data) <= room else None)
-        self._dispatcher.work += 2 * len(topic.subscriptions)
+        self._dispatcher.work += _MESSAGE_WORK + 2 * len(topic.subscriptions)
         # Subscribers that use the same name for the topic share one payload.
         message: Message | None = None
         for subscription in topic.subscriptions.values():
