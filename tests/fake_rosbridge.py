@@ -1,7 +1,7 @@
 """A fake rosbridge server for tests: scripted, and able to be silent, late and wrong, to refuse and to vanish.
 
-It is a fake and says so: its HTTP answers bear ``Server: FakeRosbridge, a test double``. It shares no code with
-``bridge``: `websockets` and the standard library's json are all it uses. It knows no message types, so it checks none.
+Its HTTP answers identify it as a fake: `Server: FakeRosbridge, a test double`. It shares no code with `bridge`, and uses only
+`websockets` and the standard library's json. It has no message types, so it does not check them.
 
     async with FakeRosbridge() as fake:
         ...                                  # clients at fake.uri, in this process or in others
@@ -10,18 +10,18 @@ It is a fake and says so: its HTTP answers bear ``Server: FakeRosbridge, a test 
         await fake.vanish()                  # every connection is cut, nothing listens
         await fake.come_back()               # on the same port
 
-What real servers do that it does too (A: rosbridge_suite on ROS 1, B: on ROS 2, R: rosbridge-server-rs):
+It behaves as real servers do (A: rosbridge_suite on ROS 1, B: on ROS 2, R: rosbridge-server-rs):
 
 * a subscription without a type, to a topic that nobody has advertised, is forgotten (A, B, R);
-* a ``throttle_rate`` that is no int kills a subscription (A, B without a word, R with one);
-* nothing is said about any error (A, B), unless ``statuses`` (R: ``{"op": "status", "level": "error", ...}``);
-* a client that subscribes to a topic by two ids gets its first message twice (B), with ``doubles_first`` every
+* a `throttle_rate` that is not an int ends a subscription (A and B silently, R with a status);
+* errors are not reported (A, B), unless `statuses` (R: `{"op": "status", "level": "error", ...}`);
+* a client that subscribes to a topic by two ids gets its first message twice (B), with `doubles_first` every
   client does;
-* NaN and infinities leave as null (A, B, R), with ``leaks_nan`` as bare ``NaN``;
-* null where a published message may hold a number is refused (A, B, R), with ``refuses_null``;
-* after a message that is JSON but no object the connection is open and dead (A, B), with ``zombies``;
-* every ``/`` leaves as ``\\/`` (A, B), with ``escapes``;
-* type names of the ROS 2 form are refused (A), with ``ros=1``; rosapi, if there, answers as that ROS does.
+* NaN and infinities leave as null (A, B, R), with `leaks_nan` as bare `NaN`;
+* null where a published message may hold a number is refused (A, B, R), with `refuses_null`;
+* after a message that is JSON but not an object the connection is open and dead (A, B), with `zombies`;
+* every `/` leaves as `\\/` (A, B), with `escapes`;
+* type names of the ROS 2 form are refused (A), with `ros=1`; rosapi, if there, answers as that ROS does.
 """
 
 import asyncio
@@ -45,7 +45,7 @@ SERVER = "FakeRosbridge, a test double"
 
 @dataclass(frozen=True)
 class Received:
-    """One operation that a client sent; ``op`` is None if it was no JSON object."""
+    """One operation that a client sent; `op` is None if it was not a JSON object."""
 
     client: int
     op: dict[str, Any] | None
@@ -72,8 +72,8 @@ class FakeRosbridge:
     """A fake server on a port of this machine.
 
     Attributes (all may be changed while it runs):
-        silent: takes everything, answers pings, says nothing else.
-        delay: seconds by which everything that it says is late.
+        silent: reads everything and answers pings, but sends nothing else.
+        delay: seconds by which everything that it sends is late.
         refuses: an HTTP status with which new connections are refused, None to take them.
         received: all that clients sent, in order.
         connections: how many connections were ever made.
@@ -136,7 +136,7 @@ class FakeRosbridge:
             self._place.close()
 
     async def come_back(self) -> None:
-        """Listen (again), knowing nothing of what was before."""
+        """Listen, again if it vanished, without any earlier state."""
         assert self._server is None, "it is here already"
         if self._place is None:
             # bound and never listening: while nobody serves there, nobody else is given the port
@@ -159,7 +159,7 @@ class FakeRosbridge:
         )
 
     async def vanish(self) -> None:
-        """Cut every connection without a goodbye, and listen no more."""
+        """Cut every connection without a closing handshake, and stop listening."""
         for task in self._late:
             task.cancel()
         server, self._server = self._server, None
@@ -170,18 +170,18 @@ class FakeRosbridge:
             await asyncio.wait_for(server.wait_closed(), 120)
 
     async def cut(self) -> None:
-        """Cut every connection without a goodbye, but go on listening."""
+        """Cut every connection without a closing handshake, but continue listening."""
         for client in list(self._clients):
             client.connection.transport.abort()
         await self._until(lambda: not self._clients, 30, "all connections to be gone")
 
     async def hang_up(self, code: int = 1001) -> None:
-        """Close every connection as the protocol wants it."""
+        """Close every connection with a closing handshake."""
         for client in list(self._clients):
             await client.connection.close(code)
 
     def freeze(self) -> None:
-        """Read nothing more from the present connections, not even pings: what a lost Wi-Fi looks like."""
+        """Stop reading from the present connections, even pings, as if the Wi-Fi were lost."""
         for client in self._clients:
             client.connection.transport.pause_reading()
 
@@ -197,7 +197,7 @@ class FakeRosbridge:
     # What a test asks and says
 
     def ops(self, op: str, **fields: Any) -> list[dict[str, Any]]:
-        """The received operations of one kind, with the given fields."""
+        """Return the received operations of one kind, with the given fields."""
         return [
             received.op
             for received in self.received
@@ -209,12 +209,12 @@ class FakeRosbridge:
     async def wait_for_op(
         self, op: str, *, count: int = 1, timeout: float = 30, **fields: Any
     ) -> dict[str, Any]:
-        """Wait until so many operations of one kind, with the given fields, have been received; the last of them."""
+        """Wait for a number of operations of one kind, with the given fields, and return the last."""
         await self._until(lambda: len(self.ops(op, **fields)) >= count, timeout, f"{count} {op} {fields}")
         return self.ops(op, **fields)[count - 1]
 
     async def wait_for_connections(self, count: int, timeout: float = 30) -> None:
-        """Wait until so many connections were ever made."""
+        """Wait until a number of connections has been made."""
         await self._until(lambda: self.connections >= count, timeout, f"{count} connections")
 
     async def _until(self, condition: Callable[[], bool], timeout: float, what: str) -> None:
@@ -229,15 +229,15 @@ class FakeRosbridge:
             ) from None
 
     def know(self, topic: str, type_name: str) -> None:
-        """Know a topic as if a ROS node had advertised it."""
+        """Register a topic as if a ROS node had advertised it."""
         self.types[_slashed(topic)] = type_name
 
     async def publish(self, topic: str, msg: dict[str, Any]) -> int:
-        """Publish as a ROS node would; says how many clients it went to."""
+        """Publish as a ROS node would, and return the number of clients that got it."""
         return await self._publish(_slashed(topic), msg)
 
     def latch(self, topic: str, msg: dict[str, Any]) -> None:
-        """Keep a message for those who subscribe later."""
+        """Latch a message for later subscribers."""
         self.latched[_slashed(topic)] = msg
 
     def serve(self, service: str, handler: Callable[[dict[str, Any]], Any]) -> None:
@@ -245,7 +245,7 @@ class FakeRosbridge:
         self.services[_slashed(service)] = handler
 
     async def say(self, data: str | bytes | dict[str, Any]) -> None:
-        """Say anything at all to every client."""
+        """Send any text to every client."""
         for client in list(self._clients):
             await self._say(client, data)
 
@@ -356,7 +356,7 @@ class FakeRosbridge:
         return reached
 
     def _times(self, client: _Client, topic: str) -> int:
-        """How often a client gets a message: mostly once or never."""
+        """Return how often a client gets a message: mostly once or never."""
         subscriptions = client.subscribed.get(topic, {})
         if not subscriptions:
             return 0
@@ -425,7 +425,7 @@ class FakeRosbridge:
         await self._say(client, answer)
 
     async def _op_status(self, client: _Client, op: dict[str, Any]) -> None:
-        """Clients may send these too; nobody cares."""
+        """Ignore operations that clients may send too."""
 
     # rosapi
 

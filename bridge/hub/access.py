@@ -32,7 +32,7 @@ _MAX_TOKENS: Final = 1000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Door:
+class AccessPolicy:
     """The credentials that the hub expects, and those that it presents.
 
     Attributes:

@@ -3,7 +3,7 @@
 A connection has no task: messages are read, brokered and written to all their subscribers within one callback of the event
 loop, with one write for each subscriber. Nothing is compressed: on loopback that costs more than it saves.
 
-Messages that a socket does not take wait in its client's outbox, which drops the oldest; no other client waits for it.
+Messages that a socket does not accept wait in its client's outbox, which drops the oldest; no other client waits for it.
 """
 
 import asyncio
@@ -20,7 +20,7 @@ from websockets.frames import CloseCode
 from websockets.http11 import Request, Response
 from websockets.server import ServerProtocol
 
-from bridge.hub.access import Door, choose_subprotocol
+from bridge.hub.access import AccessPolicy, choose_subprotocol
 from bridge.hub.broker import Broker
 from bridge.hub.delivery.definitions import RosVersion
 from bridge.hub.delivery.outbox import Outbox
@@ -58,7 +58,7 @@ async def serve_hub(
     port: int,
     *,
     limits: HubLimits | None = None,
-    door: Door | None = None,
+    access: AccessPolicy | None = None,
     ros_version: RosVersion = 1,
     on_ready: Callable[[int], None] | None = None,
     on_graph: Callable[[Graph], None] | None = None,
@@ -71,7 +71,7 @@ async def serve_hub(
             reaches the address may publish to your robot.
         port: 0 for any free one.
         limits: bounds on clients and messages.
-        door: access control and TLS; by default every program may connect, and web pages of this machine.
+        access: access control and TLS; by default every program may connect, and web pages of this machine.
         ros_version: the ROS version that the hub speaks for.
         on_ready: called with the port once clients can connect.
         on_graph: called before that with the graph of clients and topics, which it may read but not change.
@@ -84,8 +84,8 @@ async def serve_hub(
         raise HubError(
             f"the hub cannot listen on {host} port {port}: a port is a number from 0 to {_LAST_PORT}"
         )
-    door = door or Door()
-    hub = _Hub(limits or HubLimits(), door, ros_version)
+    access = access or AccessPolicy()
+    hub = _Hub(limits or HubLimits(), access, ros_version)
     _retain_memory()
     loop = asyncio.get_running_loop()
     try:
@@ -93,8 +93,8 @@ async def serve_hub(
             lambda: _Connection(hub),
             host,
             port,
-            ssl=door.tls,
-            ssl_handshake_timeout=hub.limits.handshake_timeout if door.tls else None,
+            ssl=access.tls,
+            ssl_handshake_timeout=hub.limits.handshake_timeout if access.tls else None,
         )
     except socket.gaierror as error:
         raise HubError(
@@ -130,10 +130,10 @@ def _retain_memory() -> None:
 class _Hub:
     """The broker, its connections and its timers."""
 
-    def __init__(self, limits: HubLimits, door: Door, ros_version: RosVersion) -> None:
+    def __init__(self, limits: HubLimits, access: AccessPolicy, ros_version: RosVersion) -> None:
         self.limits = limits
         self.broker = Broker(limits, ros_version=ros_version)
-        self.door = door
+        self.access = access
         self.connections: set[_Connection] = set()
         self.handshakes: dict[_Connection, None] = {}  # in the order in which they began
         self._by_client: dict[Client, _Connection] = {}
@@ -192,9 +192,9 @@ class _Hub:
         loaded.result()
 
     def sweep(self) -> None:
-        """Look after those who say nothing and take nothing, now and then."""
+        """Check for silent and stuck clients, periodically."""
         now = time.monotonic()
-        # When the hub itself was held up, its clients' answers may be waiting to be read: next time, then.
+        # After a delay of the hub itself, the clients' answers may be waiting to be read.
         if now < self._swept + 3 * _SWEEP:
             for connection in list(self.connections):
                 connection.sweep(now)
@@ -202,7 +202,7 @@ class _Hub:
         self._sweeper = asyncio.get_running_loop().call_later(_SWEEP, self.sweep)
 
     async def close(self) -> None:
-        """End all connections: politely, then not."""
+        """End all connections, with a closing handshake where the client takes part in it."""
         if self._sweeper is not None:
             self._sweeper.cancel()
         for connection in list(self.connections):
@@ -218,7 +218,7 @@ class _Hub:
             self._timer.cancel()
 
     def serve(self) -> None:
-        """Send what the broker has for whom, and see that it is woken in time."""
+        """Write the clients' output, and schedule the broker's next deadline."""
         for client in self.broker.take_ready():
             connection = self._by_client.get(client)
             if connection is not None:
@@ -249,7 +249,7 @@ class _Connection(WebSocketTransport):
 
     def __init__(self, hub: _Hub) -> None:
         protocol = ServerProtocol(
-            origins=hub.door.allowed_origins,
+            origins=hub.access.allowed_origins,
             max_size=hub.limits.message_bytes,
             select_subprotocol=lambda _, offered: choose_subprotocol(offered),
         )
@@ -277,7 +277,7 @@ class _Connection(WebSocketTransport):
     # --- calls of the event loop
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Begin to wait for the handshake."""
+        """Start waiting for the handshake."""
         super().connection_made(transport)
         peer = transport.get_extra_info("peername")
         self._address = str(peer[0]) if peer else "?"
@@ -285,14 +285,14 @@ class _Connection(WebSocketTransport):
         transport.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
 
     def pause_writing(self) -> None:
-        """Let the client's outbox fill while the socket takes nothing."""
+        """Let the client's outbox fill while the socket accepts nothing."""
         super().pause_writing()
         self._stuck_since = time.monotonic()
         if self._client is not None:
             self._client.outbox.wire = None
 
     def resume_writing(self) -> None:
-        """Write what waited."""
+        """Write the queued messages."""
         self._stuck_since = None
         super().resume_writing()
         self.flush()
@@ -304,9 +304,9 @@ class _Connection(WebSocketTransport):
         protocol, request = self._server_protocol, cast("Request", event)
         response = protocol.accept(request)
         if response.status_code == HTTPStatus.SWITCHING_PROTOCOLS:
-            refusal = self._hub.door.refusal(request)
+            refusal = self._hub.access.refusal(request)
             if refusal is not None:
-                response = protocol.reject(refusal, "The hub wants a token.\n")
+                response = protocol.reject(refusal, "The hub expects a token.\n")
                 response.headers["WWW-Authenticate"] = "Bearer"
             elif self._hub.broker.full:
                 response = protocol.reject(
@@ -322,7 +322,7 @@ class _Connection(WebSocketTransport):
             self._hub.warn("a connection from %s was refused: HTTP %d", self._address, response.status_code)
 
     def messages_received(self, messages: list[bytes]) -> None:
-        """Have the broker handle the messages, and send what follows from them."""
+        """Have the broker perform the messages, and write the output."""
         if self._client is not None:
             performed = self._hub.broker.receive_turn(self._client, messages, self.last_heard)
             if performed < len(messages):
@@ -345,7 +345,7 @@ class _Connection(WebSocketTransport):
     # --- calls of the hub
 
     def flush(self) -> None:
-        """Write what waits for the client, as far as the socket takes it, in one piece where it is small."""
+        """Write the client's queue, as far as the socket accepts it, in one piece where it is small."""
         client = self._client
         if client is None or not self.is_open or self.is_closing:
             return
@@ -389,7 +389,7 @@ class _Connection(WebSocketTransport):
             if self._close_by == inf and now > self._started + limits.handshake_timeout:
                 self.abort()
         elif self._stuck_since is not None and now > self._stuck_since + limits.stuck_timeout:
-            self._give_up(f"its socket took nothing for {limits.stuck_timeout:g} s")
+            self._give_up(f"its socket accepted nothing for {limits.stuck_timeout:g} s")
         elif self.is_blocked:
             self.last_heard = now  # nothing is read from it
         elif self._pinged_at is None:
@@ -399,7 +399,7 @@ class _Connection(WebSocketTransport):
         elif self.last_heard >= self._pinged_at:
             self._pinged_at = None
         elif now > self._pinged_at + limits.ping_timeout:
-            self._give_up(f"nothing was heard from it for {now - self.last_heard:.0f} s")
+            self._give_up(f"it was silent for {now - self.last_heard:.0f} s")
 
     def close(self, code: CloseCode, reason: str) -> None:
         """Begin the closing handshake, or end a connection that is not open."""

@@ -1,7 +1,7 @@
-"""Fuzzing the bridge with atheris: see scripts/fuzz.
+"""Fuzzing of the bridge with atheris: see scripts/fuzz.
 
-atheris is no dependency of the project: it comes from atheris.lock into an environment of its own, which sees the
-project's packages besides.
+atheris is not a dependency of the project: it is installed from atheris.lock into a separate environment, which also
+sees the project's packages.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ OUT = ROOT / "out" / "fuzz"
 SECONDS = 600.0
 LONGEST_INPUT = 4096
 SLOWEST_INPUT = 10
-"""Seconds after which one input counts as one that never ends."""
+"""Seconds after which one input counts as endless."""
 MEMORY = 2048
-"""MiB that a target may take."""
+"""MiB that a target may occupy."""
 INSTALL_LIMIT = 600.0
 PLAY = """
 import sys
@@ -43,14 +43,14 @@ atheris.Fuzz()
 
 
 class FuzzError(Exception):
-    """Fuzzing cannot go on here; one sentence says why, and what to do."""
+    """Raised when fuzzing cannot continue."""
 
 
 def python() -> Path:
-    """The interpreter of the environment that has atheris; made where it is missing.
+    """Return the interpreter of the environment with atheris, creating it if it is missing.
 
     Raises:
-        FuzzError: it cannot be installed.
+        FuzzError: It cannot be installed.
     """
     digest = hashlib.sha256(LOCK.read_bytes() + sys.version.encode()).hexdigest()[:12]
     cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
@@ -71,15 +71,14 @@ def python() -> Path:
         )
     except (subprocess.SubprocessError, OSError) as error:
         shutil.rmtree(home, ignore_errors=True)
-        said = (getattr(error, "stderr", None) or str(error)).strip().splitlines()[-1]
-        msg = f"{LOCK.name} cannot be installed: {said}"
-        raise FuzzError(msg) from error
+        reason = (getattr(error, "stderr", None) or str(error)).strip().splitlines()[-1]
+        raise FuzzError(f"{LOCK.name} cannot be installed: {reason}") from error
     return home / "bin" / "python"
 
 
 @dataclass
 class Run:
-    """One target under way."""
+    """One running target."""
 
     target: str
     process: subprocess.Popen[bytes]
@@ -88,7 +87,7 @@ class Run:
 
 
 def start(target: str, seconds: float, interpreter: Path, scratch: Path) -> Run:
-    """Let one target run for so long."""
+    """Start one target for a number of seconds."""
     corpus, failures, log = OUT / "corpus" / target, scratch / f"{target}-", scratch / f"{target}.log"
     corpus.mkdir(parents=True, exist_ok=True)
     seeds = scratch / f"seeds-{target}"
@@ -126,10 +125,10 @@ def start(target: str, seconds: float, interpreter: Path, scratch: Path) -> Run:
 
 
 def finish(run: Run, limit: float) -> list[Path]:
-    """Wait for a target's end; the inputs that it failed on, kept where the tests find them.
+    """Wait for a target's end, and store the inputs that it failed on where the tests find them.
 
     Raises:
-        FuzzError: it ended for another reason.
+        FuzzError: It ended for another reason.
     """
     code = run.process.wait(limit)
     lines = run.log.read_text(errors="replace").splitlines()
@@ -153,15 +152,14 @@ def finish(run: Run, limit: float) -> list[Path]:
         shutil.copy(run.log, OUT / f"{run.target}.log")
         print(f"    log: {(OUT / f'{run.target}.log').relative_to(ROOT)}")
     elif code != 0:
-        msg = f"target {run.target} ended with {code}: {' '.join(lines[-1:])[:300]}"
-        raise FuzzError(msg)
+        raise FuzzError(f"target {run.target} ended with {code}: {' '.join(lines[-1:])[:300]}")
     else:
         print(f"ok  {run.target}: {done} inputs")
     return kept
 
 
 def fuzz(targets: list[str], seconds: float) -> int:
-    """Run all targets, as many at a time as there are processors; exit code 1 if one failed."""
+    """Run all targets, as many at a time as there are processors; return exit code 1 if one failed."""
     interpreter = python()
     OUT.mkdir(parents=True, exist_ok=True)
     at_once = min(len(targets), os.cpu_count() or 1)
@@ -189,16 +187,18 @@ def fuzz(targets: list[str], seconds: float) -> int:
 
 
 def main() -> int:
-    """Read the flags."""
+    """Run the command."""
     parser = argparse.ArgumentParser(
         prog="scripts/fuzz", description="Fuzzes the bridge (see the head of the script)."
     )
-    parser.add_argument("targets", nargs="*", metavar="TARGET", help=f"of {', '.join(TARGETS)} (all)")
+    parser.add_argument(
+        "targets", nargs="*", metavar="TARGET", help=f"of {', '.join(TARGETS)} (default: all)"
+    )
     parser.add_argument("--seconds", type=float, default=SECONDS, help=f"for all of it ({SECONDS:g})")
     options = parser.parse_args()
     unknown = [target for target in options.targets if target not in TARGETS]
     if unknown:
-        parser.error(f"there is no target {unknown[0]!r}; there are {', '.join(TARGETS)}")
+        parser.error(f"{unknown[0]!r} is not a target; expected one of {', '.join(TARGETS)}")
     try:
         return fuzz(options.targets or list(TARGETS), options.seconds)
     except FuzzError as error:

@@ -1,7 +1,7 @@
-"""What is fuzzed: each target takes any bytes and fails if the bridge does what it must never do.
+"""Fuzzing targets: each takes any bytes and fails if the bridge violates an invariant.
 
-A target reads its input as a little program (`Source`), so that one input says what is asked of the client, what a
-server says, in which form, and when the connection breaks. `scripts/fuzz` plays them under atheris; tests/bridge
+A target reads its input as a small program (`Source`): one input determines the requests to the client, the operations of
+a server, their encodings, and when the connection breaks. `scripts/fuzz` plays them under atheris; tests/bridge
 plays them with generated input, and every input that ever failed (tests/bridge/findings).
 """
 
@@ -40,7 +40,7 @@ from bridge.hub.limits import HubLimits
 from bridge.qos import Qos
 
 LONGEST_SENTENCE = 700
-"""Characters of an error's sentence: what arrived is quoted, not repeated."""
+"""Maximum of characters in an error's sentence, which quotes received data and does not repeat all of it."""
 MAX_SIZE, MAX_DEPTH = 4096, 8
 TOPICS = ("/a", "b", "/a/b")
 DELIVERIES = (
@@ -144,28 +144,28 @@ class Source:
         return self._at < len(self._data)
 
     def byte(self) -> int:
-        """The next byte."""
+        """Return the next byte."""
         self._at += 1
         return self._data[self._at - 1] if self._at <= len(self._data) else 0
 
     def pick(self, choices: Any) -> Any:
-        """One of some."""
+        """Return one of some choices."""
         return choices[self.byte() % len(choices)]
 
     def piece(self) -> bytes:
-        """Up to 255 of the next bytes."""
+        """Return up to 255 of the next bytes."""
         size = self.byte()
         self._at += size
         return self._data[self._at - size : self._at]
 
     def rest(self) -> bytes:
-        """All that is left."""
+        """Return the rest."""
         rest, self._at = self._data[self._at :], len(self._data)
         return rest
 
 
 def check_sentence(error: BridgeError) -> None:
-    """An error is one line for a person, whatever caused it."""
+    """Check that an error is one short line, whatever caused it."""
     said = str(error)
     assert said
     assert "\n" not in said
@@ -173,7 +173,7 @@ def check_sentence(error: BridgeError) -> None:
 
 
 def check_plain(value: Any, *, finite: bool, depth: int) -> None:
-    """A message holds nothing but what a ROS message has."""
+    """Check that a message has no types but those of ROS messages."""
     assert depth >= 0
     if isinstance(value, dict):
         for key, part in value.items():
@@ -189,7 +189,7 @@ def check_plain(value: Any, *, finite: bool, depth: int) -> None:
 
 
 def fuzz_json(data: bytes) -> None:
-    """JSON in: an object of plain values or one sentence; what was read can be written and read again."""
+    """Decode JSON: to an object of plain values that survives a round trip, or to one sentence."""
     try:
         message = json_codec.decode(data, max_size=MAX_SIZE, max_depth=MAX_DEPTH)
     except DecodeError as error:
@@ -206,7 +206,7 @@ def fuzz_json(data: bytes) -> None:
 
 
 def fuzz_cbor(data: bytes) -> None:
-    """CBOR in: a map of plain values or one sentence, as lists and as arrays alike; and out again."""
+    """Decode CBOR: to a map of plain values, as lists and as arrays alike, or to one sentence; and encode it."""
     forms: dict[str, Any] = {}
     for arrays in ("list", "numpy"):
         try:
@@ -228,7 +228,7 @@ def fuzz_cbor(data: bytes) -> None:
 
 
 def fuzz_png(data: bytes) -> None:
-    """A picture in: some bytes within the limit or one sentence; and every message comes out of its own."""
+    """Decode a picture: to bytes within the limit, or to one sentence; and every message from its own picture."""
     try:
         found = png.decode(data.decode("latin-1"), max_size=MAX_SIZE)
         assert len(found) <= 16 * MAX_SIZE
@@ -238,7 +238,7 @@ def fuzz_png(data: bytes) -> None:
 
 
 def fuzz_fragments(data: bytes) -> None:
-    """Fragments in any order and number: bounded in every way; a message comes out only as it was cut."""
+    """Reassemble fragments in any order and number, within all bounds."""
     source = Source(data)
     box = Reassembler(max_size=64, max_sets=3, max_age=10)
     now = 0.0
@@ -261,7 +261,7 @@ def fuzz_fragments(data: bytes) -> None:
 
 
 def fuzz_fields(data: bytes) -> None:
-    """Any path in any message: a value or nothing, and a sentence that says why."""
+    """Look up any path in any message: to a value, or to a sentence with the reason."""
     source = Source(data)
     name = source.piece().decode("utf-8", "replace")
     try:
@@ -283,7 +283,7 @@ _TYPES = MessageTypes()
 
 
 def fuzz_serialised(data: bytes) -> None:
-    """Serialised bytes in: a message of the type or one sentence."""
+    """Decode serialised bytes: to a message of the type, or to one sentence."""
     source = Source(data)
     name = source.pick(TYPES)
     try:
@@ -295,7 +295,7 @@ def fuzz_serialised(data: bytes) -> None:
 
 
 class Play:
-    """A client's core between a user and a server that may do anything."""
+    """A client's core between a user and a server, both of which may do anything."""
 
     def __init__(self, source: Source) -> None:
         self.source = source
@@ -310,7 +310,7 @@ class Play:
         self.tickets: list[int] = []
 
     def run(self) -> None:
-        """Play until the input ends."""
+        """Run until the input ends."""
         steps: tuple[Callable[[], None], ...] = (
             self.hear_raw,
             self.hear,
@@ -338,7 +338,7 @@ class Play:
             self.check()
 
     def check(self) -> None:
-        """What must hold at any time."""
+        """Check the invariants."""
         core = self.core
         for data in core.data_to_send():
             assert core.wire.connected
@@ -354,14 +354,14 @@ class Play:
         assert core._fragments.waiting_bytes <= 4 * (MAX_SIZE + 128)  # noqa: SLF001  # no one else can see it
 
     def hear_raw(self) -> None:
-        """The server says anything."""
+        """Receive any data from the server."""
         data = self.source.piece()
         self.take(data)
         with contextlib.suppress(UnicodeDecodeError):
             self.take(data.decode())
 
     def hear(self) -> None:
-        """The server says an operation, right or wrong in any of its fields, in any form."""
+        """Receive an operation with any of its fields right or wrong, in any encoding."""
         source = self.source
         operation: dict[str, Any] = {"op": source.pick(OPS)}
         right = {
@@ -416,12 +416,12 @@ class Play:
             assert "\n" not in event.reason
 
     def connect(self) -> None:
-        """A connection is there (again)."""
+        """Establish a connection, or another one."""
         self.core.lost()
         self.core.restore()
 
     def subscribe(self) -> None:
-        """The user subscribes, perhaps as someone did otherwise before."""
+        """Subscribe, perhaps with options that conflict with another subscription."""
         number = self.core.subscriptions.subscribe(
             self.source.pick(TOPICS),
             self.source.pick(("p/T", "p/msg/T", None, "p/U")),
@@ -431,14 +431,14 @@ class Play:
         self.subscriptions.add(number)
 
     def unsubscribe(self) -> None:
-        """The user has enough of a topic."""
+        """Unsubscribe."""
         if self.subscriptions:
             number = sorted(self.subscriptions)[self.source.byte() % len(self.subscriptions)]
             self.subscriptions.remove(number)
             self.core.subscriptions.unsubscribe(number)
 
     def advertise(self) -> None:
-        """The user advertises a topic."""
+        """Advertise a topic."""
         self.advertisements.append(
             self.core.publications.advertise(
                 self.source.pick(TOPICS),
@@ -448,7 +448,7 @@ class Play:
         )
 
     def publish(self) -> None:
-        """The user publishes something, which may be nothing that can be."""
+        """Publish a message, which may be impossible to encode."""
         if self.advertisements:
             number = self.advertisements[self.source.byte() % len(self.advertisements)]
             value = self.source.pick((*ODD, math.nan, np.arange(3.0), np.array([math.inf]), b"x", {1: 2}))
@@ -456,20 +456,20 @@ class Play:
             assert type(json.loads(data, parse_constant=_no_constant)["msg"]) is dict
 
     def unadvertise(self) -> None:
-        """The user stops publishing."""
+        """Stop publishing."""
         if self.advertisements:
             self.core.publications.unadvertise(
                 self.advertisements.pop(self.source.byte() % len(self.advertisements))
             )
 
     def call(self) -> None:
-        """The user calls a service, and perhaps waits no longer."""
+        """Call a service, and perhaps abandon the call."""
         self.calls.append(self.core.calls.send(self.source.pick(("/s", "t")), {"x": self.source.pick(ODD)}))
         if self.source.byte() % 4 == 0:
             self.core.calls.forget(self.calls[-1])
 
     def send_goal(self) -> None:
-        """The user sends a goal, and perhaps cancels or forgets it."""
+        """Send a goal, and perhaps cancel or abandon it."""
         goal = self.core.goals.send("/fly", "p/Fly", {"x": self.source.pick(ODD)}, feedback=True)
         self.goals.append(goal)
         what = self.source.byte() % 4
@@ -479,7 +479,7 @@ class Play:
             self.core.goals.forget(goal)
 
     def serve(self) -> None:
-        """The user serves a service, or serves it no longer."""
+        """Offer a service, or withdraw it."""
         service = self.source.pick(("/s", "/t"))
         if service in self.core.services:
             self.core.services.unadvertise(service)
@@ -487,7 +487,7 @@ class Play:
             self.core.services.advertise(service, "p/T")
 
     def answer(self) -> None:
-        """The user answers a request, perhaps one that nobody waits for any more."""
+        """Answer a request, perhaps an abandoned one."""
         if self.tickets:
             ticket = self.tickets.pop(self.source.byte() % len(self.tickets))
             self.core.services.answer(ticket, {"x": self.source.pick(ODD)}, ok=self.source.byte() % 2 == 0)
@@ -504,13 +504,13 @@ def fuzz_core(data: bytes) -> None:
 
 
 def _published(source: Source) -> bytes:
-    """What may be a publish: an envelope or half of one, and what stands in place of its message."""
+    """Return a possible publish operation: an envelope or half of one, and anything in place of its message."""
     message = b"".join(source.pick(PARTS) or source.piece() for _ in range(source.byte() % 6))
     return bytes(source.pick(ENVELOPES)) + message + bytes(source.pick((b"}", b"}", b"}", b"", b"} ", b"}}")))
 
 
 def fuzz_again(data: bytes) -> None:
-    """A client that knows an envelope understands whatever comes as one does that looks at all of it."""
+    """Compare a client that knows an envelope with one that parses everything."""
     source = Source(data)
     cores = [ClientCore(max_size=200, max_depth=3), ClientCore(max_size=200, max_depth=3)]
     delivery = source.pick((Delivery(), Delivery(arrays="numpy")))
@@ -519,29 +519,29 @@ def fuzz_again(data: bytes) -> None:
         core.subscriptions.subscribe("/a", delivery=delivery)
         core.subscriptions.subscribe("b")
     while source:
-        heard = _published(source)
-        cores[1].subscriptions.forget_envelopes()  # so that it looks closely
-        events = [repr(core.receive(heard, 0.0)) for core in cores]
+        received = _published(source)
+        cores[1].subscriptions.forget_envelopes()  # so that it parses everything
+        events = [repr(core.receive(received, 0.0)) for core in cores]
         assert events[0] == events[1], events
         assert len(cores[0].subscriptions.envelopes) <= 16
 
 
 def fuzz_hub(data: bytes) -> None:
-    """A hub that knows a publisher's envelopes passes on whatever comes as one does that looks at all of it."""
+    """Compare a hub that knows a publisher's envelopes with one that parses everything."""
     source = Source(data)
     brokers = [Broker(HubLimits(depth=4)), Broker(HubLimits(depth=4))]
-    publishers, heard = [], []
+    publishers, received = [], []
     for broker in brokers:
         publishers.append(broker.connect("publisher"))
-        ears = [broker.connect("ears") for _ in range(3)]
-        for client, topic, form in zip(ears, ("/a", "a", "/a"), ("none", "none", "cbor"), strict=True):
+        listeners = [broker.connect("listener") for _ in range(3)]
+        for client, topic, form in zip(listeners, ("/a", "a", "/a"), ("none", "none", "cbor"), strict=True):
             client.outbox.wire = []
             asked = {"op": "subscribe", "topic": topic, "compression": form, "queue_length": 1000}
             broker.receive(client, json.dumps(asked).encode(), 0.0)
         for topic, latch in (("/a", True), ("b", False)):
             asked = {"op": "advertise", "topic": topic, "type": "p/T", "latch": latch}
             broker.receive(publishers[-1], json.dumps(asked).encode(), 0.0)
-        heard.append(ears)
+        received.append(listeners)
     while source:
         said = [_published(source) for _ in range(source.byte() % 4)]
         if source.byte() % 8 == 0:
@@ -552,7 +552,7 @@ def fuzz_hub(data: bytes) -> None:
             rest = rest[brokers[0].receive_turn(publishers[0], rest, 0.0) :]
         for one in said:
             brokers[1].receive(publishers[1], one, 0.0)
-    for known, looked in zip(*heard, strict=True):
+    for known, looked in zip(*received, strict=True):
         assert known.outbox.wire is not None
         assert looked.outbox.wire is not None
         assert [_read(payload) for payload in known.outbox.wire] == [
@@ -567,7 +567,7 @@ def fuzz_hub(data: bytes) -> None:
 
 
 def _read(payload: bytes) -> str:
-    """What a client of the hub reads: strict JSON, or CBOR."""
+    """Return the content of a payload: strict JSON, or CBOR."""
     return repr(orjson.loads(payload)) if payload[:1] == b"{" else payload.hex()
 
 

@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 import typer
 
 from bridge.codecs.json_codec import MAX_SIZE
-from bridge.hub.access import Door, is_loopback, read_tokens, tls_context
+from bridge.hub.access import AccessPolicy, is_loopback, read_tokens, tls_context
 from bridge.hub.graph import Graph
 from bridge.hub.limits import HubLimits
 from bridge.hub.server import serve_hub
@@ -72,11 +72,11 @@ def hub(
 ) -> int:
     """Serve rosbridge without ROS."""
     end_with_parent()
-    door = _door(tls_cert, tls_key, token_file, origin or [])
-    if not is_loopback(host) and not insecure and (door.tls is None or not door.tokens):
+    access = _access_policy(tls_cert, tls_key, token_file, origin or [])
+    if not is_loopback(host) and not insecure and (access.tls is None or not access.tokens):
         missing = " and ".join(
             flags
-            for flags, there in (("--tls-cert and --tls-key", door.tls), ("--token-file", door.tokens))
+            for flags, there in (("--tls-cert and --tls-key", access.tls), ("--token-file", access.tokens))
             if not there
         )
         msg = f"--host {shown(host)} lets everybody on that network publish to your robot; give {missing}, or --insecure if that is meant"
@@ -90,7 +90,7 @@ def hub(
 
     def ready(at: int) -> None:
         address = f"[{host}]" if ":" in host else host
-        listening.append(f"listening on {'wss' if door.tls else 'ws'}://{address}:{at}")
+        listening.append(f"listening on {'wss' if access.tls else 'ws'}://{address}:{at}")
         say(f"hub: {listening[0]}")
 
     def tell() -> ProcessStatus:
@@ -116,7 +116,7 @@ def hub(
             serve_hub(
                 host,
                 port,
-                door=door,
+                access=access,
                 limits=HubLimits(message_bytes=message_bytes, client_bytes=4 * max(message_bytes, MAX_SIZE)),
                 ros_version=ros,
                 on_ready=on_ready,
@@ -125,7 +125,7 @@ def hub(
             )
         ]
         if announce is not None:
-            work.append(_announce(announce, host, listens, ros, door))
+            work.append(_announce(announce, host, listens, ros, access))
         async with status_served(run_directory, "hub", tell):
             await _all_of(work)
         return 0
@@ -134,14 +134,14 @@ def hub(
 
 
 async def _announce(
-    name: str, host: str, listens: asyncio.Future[int], ros_version: Literal[1, 2], door: Door
+    name: str, host: str, listens: asyncio.Future[int], ros_version: Literal[1, 2], access: AccessPolicy
 ) -> None:
     """Announce the hub once it listens, until this is cancelled."""
     from bridge.discovery import announced
 
     port = await listens
     async with announced(
-        name, host, port, ros_version=ros_version, tls=door.tls is not None, token=bool(door.tokens)
+        name, host, port, ros_version=ros_version, tls=access.tls is not None, token=bool(access.tokens)
     ):
         say(f"hub: announced as robot:{name}")
         await asyncio.Event().wait()
@@ -160,7 +160,9 @@ async def _all_of(work: Sequence[Coroutine[None, None, None]]) -> None:
         await asyncio.gather(*tasks, return_exceptions=True)
 
 
-def _door(certificate: Path | None, key: Path | None, tokens: Path | None, origins: list[str]) -> Door:
+def _access_policy(
+    certificate: Path | None, key: Path | None, tokens: Path | None, origins: list[str]
+) -> AccessPolicy:
     """Who may come in, of the flags that say so."""
     if (certificate is None) != (key is None):
         msg = "TLS needs both the certificate and its key: give --tls-cert FILE and --tls-key FILE"
@@ -169,7 +171,7 @@ def _door(certificate: Path | None, key: Path | None, tokens: Path | None, origi
         if not page.startswith(("http://", "https://")) or page.count("/") != 2:
             msg = f"--origin {shown(page)} is no web page's origin: expected for example https://robot.example:8000"
             raise SettingsError(msg)
-    return Door(
+    return AccessPolicy(
         tls=tls_context(certificate, key) if certificate is not None and key is not None else None,
         tokens=read_tokens(tokens) if tokens is not None else (),
         origins=tuple(origins),

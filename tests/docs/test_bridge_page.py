@@ -20,7 +20,7 @@ from bridge.client.protocol.calls import MAX_CALLS
 from bridge.client.protocol.goals import MAX_GOALS
 from bridge.client.protocol.services import MAX_REQUESTS
 from bridge.codecs import fragments, json_codec
-from bridge.hub.access import Door
+from bridge.hub.access import AccessPolicy
 from tests.bridge.hub.sockets import running_hub
 
 GUIDE = Path(__file__).parents[2] / "docs/how-to/bridge.md"
@@ -157,7 +157,7 @@ async def test_the_door_of_the_guide(tmp_path):
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.load_cert_chain(certificate, key)
     example = EXAMPLES["TLS, tokens, proxies"].replace('"ca.pem"', repr(str(certificate)))
-    async with running_hub(door=Door(tokens=(TOKEN,), tls=context)) as port:
+    async with running_hub(access=AccessPolicy(tokens=(TOKEN,), tls=context)) as port:
         out = await run(example.replace("localhost:9443", f"localhost:{port}"), "-", ROBOT_TOKEN=TOKEN)
     assert f"wss://localhost:{port} " in out
     assert TOKEN not in out

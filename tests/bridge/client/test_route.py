@@ -60,7 +60,7 @@ def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @dataclass
-class Door:
+class AccessPolicy:
     """A WebSocket server, what it wants, and what it was shown."""
 
     port: int = 0
@@ -69,10 +69,10 @@ class Door:
 
 
 @contextlib.asynccontextmanager
-async def door(
+async def access(
     tls: ssl.SSLContext | None = None, wants: str | None = None, host: str = "127.0.0.1"
-) -> AsyncIterator[Door]:
-    made = Door(wants=wants)
+) -> AsyncIterator[AccessPolicy]:
+    made = AccessPolicy(wants=wants)
 
     def look(connection: ServerConnection, request: Request) -> Response | None:
         made.shown.append(request)
@@ -104,7 +104,7 @@ def server_context(certificates: Path, *, asks: bool = False) -> ssl.SSLContext:
 
 
 async def test_a_ca_of_ones_own_vouches_for_the_server(certificates):
-    async with door(server_context(certificates)) as server:
+    async with access(server_context(certificates)) as server:
         uri = f"wss://localhost:{server.port}"
         async with connect(uri, ca_file=certificates / "ca.pem") as ros:
             assert ros.state is State.CONNECTED
@@ -116,7 +116,7 @@ async def test_a_ca_of_ones_own_vouches_for_the_server(certificates):
 
 
 async def test_the_certificate_must_be_of_that_host(certificates):
-    async with door(server_context(certificates), host="127.0.0.2") as server:
+    async with access(server_context(certificates), host="127.0.0.2") as server:
         context = ssl.create_default_context(cafile=certificates / "ca.pem")
         with pytest.raises(UnreachableError, match=r"not to be trusted: its certificate: .*mismatch"):
             await connect(f"wss://127.0.0.2:{server.port}", tls=context).__aenter__()
@@ -127,7 +127,7 @@ async def test_a_server_that_asks_for_a_certificate(certificates, files):
     certificate: Any = certificates / "both.pem"
     if files == 2:
         certificate = (certificates / "client.pem", certificates / "client.key")
-    async with door(server_context(certificates, asks=True)) as server:
+    async with access(server_context(certificates, asks=True)) as server:
         uri = f"wss://localhost:{server.port}"
         async with connect(uri, ca_file=certificates / "ca.pem", client_certificate=certificate):
             pass
@@ -171,7 +171,7 @@ def test_certificates_without_tls(name):
 
 async def test_a_token_and_headers_are_shown_at_the_door_and_nowhere_else(caplog, capfd):
     caplog.set_level(logging.DEBUG)
-    async with door(wants=f"Bearer {TOKEN}") as server:
+    async with access(wants=f"Bearer {TOKEN}") as server:
         uri = f"ws://127.0.0.1:{server.port}"
         ros = connect(uri, token=TOKEN, headers={"X-Robot": "boat-s3cret"})
         async with ros:
@@ -195,7 +195,7 @@ async def test_a_token_and_headers_are_shown_at_the_door_and_nowhere_else(caplog
 async def test_credentials_in_the_uri_are_shown_at_the_door_and_nowhere_else(caplog):
     caplog.set_level(logging.DEBUG)
     wanted = "Basic " + base64.b64encode(b"user:s3cret").decode()
-    async with door(wants=wanted) as server:
+    async with access(wants=wanted) as server:
         uri = f"ws://user:s3cret@127.0.0.1:{server.port}/path?key=s3cret"
         async with connect(uri) as ros:
             assert ros.uri == f"ws://127.0.0.1:{server.port}/path?***"
@@ -212,7 +212,7 @@ async def test_credentials_in_the_uri_are_shown_at_the_door_and_nowhere_else(cap
 
 
 async def test_the_token_is_shown_again_after_a_loss():
-    async with door(wants=f"Bearer {TOKEN}") as server:
+    async with access(wants=f"Bearer {TOKEN}") as server:
         async with connect(f"ws://127.0.0.1:{server.port}", token=TOKEN) as ros:
             ros._session._websocket.abort()
             await ros.wait_for_state(State.RECONNECTING, PATIENCE)
@@ -319,7 +319,7 @@ async def connect_proxy(**options: Any) -> AsyncIterator[ConnectProxy]:
 async def test_through_a_proxy(certificates, secure):
     context = server_context(certificates) if secure else None
     options = {"ca_file": certificates / "ca.pem"} if secure else {}
-    async with door(context, wants=f"Bearer {TOKEN}") as server, connect_proxy() as proxy:
+    async with access(context, wants=f"Bearer {TOKEN}") as server, connect_proxy() as proxy:
         uri = f"{'wss' if secure else 'ws'}://localhost:{server.port}"
         through = f"http://user:s3cret@127.0.0.1:{proxy.port}"
         async with connect(uri, proxy=through, token=TOKEN, **options) as ros:
@@ -333,7 +333,7 @@ async def test_through_a_proxy(certificates, secure):
 
 
 async def test_the_proxy_of_the_environment(monkeypatch):
-    async with door() as server, connect_proxy() as proxy:
+    async with access() as server, connect_proxy() as proxy:
         for name in ("no_proxy", "NO_PROXY", "all_proxy", "ALL_PROXY", "ws_proxy", "socks_proxy"):
             monkeypatch.delenv(name, raising=False)
         monkeypatch.setenv("https_proxy", f"http://127.0.0.1:{proxy.port}")
@@ -357,7 +357,7 @@ async def test_the_proxy_of_the_environment(monkeypatch):
     ],
 )
 async def test_a_proxy_that_does_not_let_through(answer, said):
-    async with door() as server, connect_proxy(answer=answer) as proxy:
+    async with access() as server, connect_proxy(answer=answer) as proxy:
         uri = f"ws://127.0.0.1:{server.port}"
         through = f"http://user:s3cret@127.0.0.1:{proxy.port}"
         with pytest.raises(UnreachableError, match=said) as caught:
@@ -423,7 +423,7 @@ async def test_through_socks(certificates, secure):
     options = {"ca_file": certificates / "ca.pem"} if secure else {}
     proxy = SocksProxy()
     async with (
-        door(context, wants=f"Bearer {TOKEN}") as server,
+        access(context, wants=f"Bearer {TOKEN}") as server,
         await asyncio.start_server(proxy.serve, "127.0.0.1", 0) as listening,
     ):
         port = listening.sockets[0].getsockname()[1]

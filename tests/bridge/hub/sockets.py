@@ -13,7 +13,7 @@ from typing import Any, Literal
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.frames import Frame, Opcode
 
-from bridge.hub.access import Door
+from bridge.hub.access import AccessPolicy
 from bridge.hub.limits import HubLimits
 from bridge.hub.server import serve_hub
 
@@ -59,7 +59,7 @@ async def running_hub(
     *,
     port: int = 0,
     limits: HubLimits | None = None,
-    door: Door | None = None,
+    access: AccessPolicy | None = None,
     ros_version: Literal[1, 2] = 1,
 ) -> AsyncIterator[int]:
     """A hub on a port of this machine (0: any free one); its port."""
@@ -70,7 +70,7 @@ async def running_hub(
             "127.0.0.1",
             port,
             limits=limits,
-            door=door,
+            access=access,
             ros_version=ros_version,
             on_ready=ready.set_result,
             stop=stop,

@@ -8,7 +8,7 @@ import pytest
 from websockets.asyncio.client import connect
 from websockets.exceptions import InvalidStatus
 
-from bridge.hub.access import Door, is_loopback, read_tokens, tls_context
+from bridge.hub.access import AccessPolicy, is_loopback, read_tokens, tls_context
 from bridge.hub.errors import HubError
 from tests.bridge.hub.sockets import PATIENCE, Client, RawClient, running_hub
 
@@ -67,7 +67,7 @@ def certificate(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     ],
 )
 async def test_a_token_opens_the_door(headers: list[str], status: int) -> None:
-    async with running_hub(door=Door(tokens=(TOKEN, OTHER))) as port:
+    async with running_hub(access=AccessPolicy(tokens=(TOKEN, OTHER))) as port:
         raw = await RawClient.connect(port, handshake=False)
         answer = await raw.request(*headers)
         assert f" {status} " in answer
@@ -76,7 +76,7 @@ async def test_a_token_opens_the_door(headers: list[str], status: int) -> None:
 
 async def test_a_browsers_token_is_not_sent_back() -> None:
     async with (
-        running_hub(door=Door(tokens=(TOKEN,))) as port,
+        running_hub(access=AccessPolicy(tokens=(TOKEN,))) as port,
         connect(f"ws://127.0.0.1:{port}", subprotocols=["rosbridge", f"bearer.{TOKEN}"]) as socket,  # type: ignore[list-item]  # NewType of str
     ):
         assert socket.subprotocol == "rosbridge"
@@ -95,9 +95,9 @@ async def test_without_tokens_a_subprotocol_is_nobodys_business() -> None:
 
 
 async def test_tokens_are_in_no_log_and_no_answer(caplog: pytest.LogCaptureFixture) -> None:
-    door = Door(tokens=(TOKEN,))
-    assert TOKEN not in repr(door)
-    async with running_hub(door=door) as port:
+    access = AccessPolicy(tokens=(TOKEN,))
+    assert TOKEN not in repr(access)
+    async with running_hub(access=access) as port:
         guess = "guess-of-a-stranger"
         with pytest.raises(InvalidStatus) as caught:
             await connect(f"ws://127.0.0.1:{port}", additional_headers={"Authorization": f"Bearer {guess}"})
@@ -115,7 +115,7 @@ async def test_tokens_are_in_no_log_and_no_answer(caplog: pytest.LogCaptureFixtu
 )
 def test_a_token_that_is_guessed_or_cannot_be_sent_is_refused(token: str) -> None:
     with pytest.raises(HubError, match="token 2 ") as caught:
-        Door(tokens=(TOKEN, token))
+        AccessPolicy(tokens=(TOKEN, token))
     assert caught.value.exit_code == 2
     if token:
         assert token not in str(caught.value)
@@ -139,9 +139,9 @@ def test_tokens_are_read_from_a_file_that_nobody_else_reads(tmp_path: Path) -> N
 
 
 async def test_tls_and_a_token(certificate: tuple[Path, Path]) -> None:
-    door = Door(tokens=(TOKEN,), tls=tls_context(*certificate))
+    access = AccessPolicy(tokens=(TOKEN,), tls=tls_context(*certificate))
     trusting = ssl.create_default_context(cafile=str(certificate[0]))
-    async with running_hub(door=door) as port:
+    async with running_hub(access=access) as port:
         headers = {"Authorization": f"Bearer {TOKEN}"}
         async with connect(f"wss://localhost:{port}", ssl=trusting, additional_headers=headers) as socket:
             ears = Client(socket)
@@ -158,7 +158,7 @@ async def test_tls_and_a_token(certificate: tuple[Path, Path]) -> None:
 
 async def test_the_hub_ends_its_tls_connections(certificate: tuple[Path, Path]) -> None:
     trusting = ssl.create_default_context(cafile=str(certificate[0]))
-    async with running_hub(door=Door(tls=tls_context(*certificate))) as port:
+    async with running_hub(access=AccessPolicy(tls=tls_context(*certificate))) as port:
         socket = await connect(f"wss://localhost:{port}", ssl=trusting)
         await Client(socket).sync()
     assert await Client(socket).closed() == 1001

@@ -10,7 +10,7 @@ from websockets.exceptions import InvalidStatus
 from websockets.frames import Frame, Opcode
 
 from bridge.hub import server
-from bridge.hub.access import Door
+from bridge.hub.access import AccessPolicy
 from bridge.hub.errors import HubError
 from bridge.hub.limits import HubLimits
 from bridge.hub.server import serve_hub
@@ -189,7 +189,7 @@ async def test_an_address_that_is_not_ours_is_one_sentence(host: str, port: int,
     ],
 )
 async def test_web_pages_from_elsewhere_are_refused(origin: str | None, status: int) -> None:
-    async with running_hub(door=Door(origins=("https://robot.example",))) as port:
+    async with running_hub(access=AccessPolicy(origins=("https://robot.example",))) as port:
         raw = await RawClient.connect(port, handshake=False)
         headers = [] if origin is None else [f"Origin: {origin}"]
         assert f" {status} " in await raw.request(*headers)
@@ -254,7 +254,7 @@ async def test_a_hub_that_was_held_up_blames_nobody() -> None:
         def sweep(self, now: float) -> None:
             swept.append(now)
 
-    hub = server._Hub(HubLimits(), Door(), 1)
+    hub = server._Hub(HubLimits(), AccessPolicy(), 1)
     hub.connections.add(Connection())  # type: ignore[arg-type]  # a double with the one method that is called
     hub._swept -= 10
     hub.sweep()
