@@ -63,7 +63,7 @@ class Process:
                 log.flush()
                 self._lines.append(text)
                 self._news.set()
-                # an error is said by whoever waits for this process, with the place of its log
+                # `failure` reports errors, with the path of the log
                 if self._shown and not text.startswith("error: "):
                     print(text, flush=True)
         self._news.set()
@@ -149,8 +149,7 @@ def run_script(work: Callable[[], Awaitable[int]], limit: float) -> int:
         try:
             return await asyncio.wait_for(work(), limit)
         except TimeoutError:
-            msg = f"this did not end within {limit:.0f} s"
-            raise StackError(msg) from None
+            raise StackError(f"this did not end within {limit:.0f} s") from None
 
     try:
         return run_async(limited())

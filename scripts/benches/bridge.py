@@ -112,12 +112,11 @@ async def soon(awaited: Awaitable[Result], what: str) -> Result:
         async with asyncio.timeout(PATIENCE):
             return await awaited
     except TimeoutError:
-        msg = f"{what} did not come within {PATIENCE:.0f} s"
-        raise StackError(msg) from None
+        raise StackError(f"{what} did not come within {PATIENCE:.0f} s") from None
 
 
 def frame(operation: dict[str, Any]) -> bytes:
-    """A masked frame (with a mask of zeros)."""
+    """Return a masked frame (with a mask of zeros)."""
     payload = json.dumps(operation, separators=(",", ":")).encode()
     size = len(payload)
     if size < 126:
@@ -131,7 +130,7 @@ def frame(operation: dict[str, Any]) -> bytes:
 
 @asynccontextmanager
 async def bare(uri: str) -> Any:
-    """A bare client of a server."""
+    """Connect a bare client to a server."""
     host, _, port = uri.removeprefix("ws://").rpartition(":")
     _, client = await asyncio.get_running_loop().create_connection(Bare, host, int(port))
     try:
@@ -214,13 +213,12 @@ class Child:
         self._process = process
 
     async def answer(self) -> Any:
-        """The next line that is an answer."""
+        """Return the next line that is an answer."""
         assert self._process.stdout is not None
         while True:
             line = await soon(self._process.stdout.readline(), f"an answer of {self.kind.name}")
             if not line:
-                msg = f"{self.kind.name} ended in the middle of a measurement"
-                raise StackError(msg)
+                raise StackError(f"{self.kind.name} ended in the middle of a measurement")
             try:
                 return json.loads(line)
             except ValueError:
@@ -254,7 +252,7 @@ async def child_of(kind: Kind, uri: str) -> Any:
 
 
 async def published(child: Child, uri: str, topic: str, values: int, count: int) -> Rate:
-    """What the client gets out."""
+    """Measure the messages that the client publishes."""
     async with bare(uri) as counter:
         counter.send(frame({"op": "subscribe", "topic": topic, "type": TYPE, "queue_length": 1000}))
         await settled(counter)
@@ -273,7 +271,7 @@ async def published(child: Child, uri: str, topic: str, values: int, count: int)
 
 
 async def received(child: Child, uri: str, topic: str, values: int, count: int, form: str) -> Rate:
-    """What the client takes in."""
+    """Measure the messages that the client receives."""
     async with bare(uri) as publisher:
         publisher.send(frame({"op": "advertise", "topic": topic, "type": TYPE}))
         publisher.send(frame({"op": "subscribe", "topic": f"{topic}/heard", "type": TYPE}))
@@ -320,7 +318,7 @@ def kinds() -> list[Kind]:
 
 
 def topics() -> Iterator[str]:
-    """A new topic for each measurement."""
+    """Return a new topic for each measurement."""
     number = 0
     while True:
         number += 1
@@ -432,7 +430,7 @@ class Figures:
         }
 
     def ratios(self) -> dict[str, float]:
-        """This project's client against the better of roslibpy's transports."""
+        """Return this project's client's rate relative to the better of roslibpy's transports."""
         median, theirs = (
             statistics.median,
             [name for name, _ in self.published if name.startswith("roslibpy")],
@@ -461,7 +459,7 @@ class Figures:
 
 
 def middle(rates: list[Rate]) -> Rate:
-    """The medians of both figures."""
+    """Return the medians of both figures."""
     return Rate(*map(statistics.median, zip(*rates, strict=True)))
 
 
@@ -490,7 +488,7 @@ async def measure_clients(clients: list[Kind], uri: str, found: Figures) -> None
 
 
 def show(summary: dict[str, Any]) -> None:
-    """The tables on standard output."""
+    """Print the tables."""
     out = Console() if sys.stdout.isatty() else Console(width=110)
     servers = Table(title=f"messages of 64 bytes a second, {IN_FLIGHT} in flight")
     servers.add_column("server")
@@ -522,7 +520,7 @@ def show(summary: dict[str, Any]) -> None:
         times = f"{row['round_trip_us']:,.0f}", f"{row['round_trip_p99_us']:,.0f}"
         table.add_row(row["client"], form, str(row["values"]), *out_figures, *figures, *times)
     out.print(table)
-    ratios = Table(title="ratios (ours to the better of roslibpy's transports, where nothing else is said)")
+    ratios = Table(title="ratios (ours to the better of roslibpy's transports, unless stated otherwise)")
     ratios.add_column("of what")
     ratios.add_column("ratio", justify="right")
     for name, ratio in summary["ratios"].items():

@@ -42,7 +42,7 @@ STAGES = (
 _TICKS = os.sysconf("SC_CLK_TCK")
 LINES = 32 * 32
 BOUND = 2.5
-"""What a cycle may take, in times of the floor and the boards' computing together."""
+"""Bound of a cycle's time, as a multiple of floor plus computing on the boards."""
 WINDOW = 4
 """Readings under way at once when frames per second are measured."""
 TOPICS = {"processes": BOAT_TOPIC, "fused": BOAT_TOPIC + "_fused"}
@@ -59,7 +59,7 @@ class Measured:
 
 
 def readings(seed: int, count: int) -> list[dict[str, int]]:
-    """Readings of boats at random places, without noise but rounded: what the normaliser would publish."""
+    """Return readings of boats at random places, without noise but rounded, as the normaliser publishes them."""
     import math
 
     chance = random.Random(seed)
@@ -75,7 +75,7 @@ def readings(seed: int, count: int) -> list[dict[str, int]]:
 
 
 def message(reading: dict[str, int]) -> dict[str, object]:
-    """A reading as the normaliser publishes it."""
+    """Return a reading as the normaliser publishes it."""
     return {"header": header(time.time_ns(), "map"), **reading}
 
 
@@ -117,7 +117,7 @@ def cpu_of(pids: dict[str, list[int]]) -> dict[str, float]:
 
 
 def processes_of(master: int) -> dict[str, list[int]]:
-    """The process numbers of the master and all that came from it, by command."""
+    """Return the process numbers of the master and its descendants, by command."""
     parents: dict[int, int] = {}
     names: dict[int, str] = {}
     for entry in Path("/proc").iterdir():
@@ -142,7 +142,7 @@ def processes_of(master: int) -> dict[str, list[int]]:
 async def collect_stages(
     ros: Ros, publication: Publication, results: Subscription, some: list[dict[str, int]], measured: Measured
 ) -> None:
-    """The stages of some frames.
+    """Return the stages of some frames.
 
     The wire's stages are seen from this client, whose clock the host shares: from the reading's stamp to its
     receipt by the subscriber, and from the publisher's beginning to publish to the result's arrival here.
@@ -166,7 +166,7 @@ async def collect_stages(
 
 
 def quantile(values: list[float], share: float) -> float:
-    """The value below which a share of them lies."""
+    """Return the value below which a share of them lies."""
     return sorted(values)[min(len(values) - 1, int(share * len(values)))]
 
 

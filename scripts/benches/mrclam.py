@@ -171,9 +171,9 @@ async def run_stack(
 
 
 async def bench(arguments: argparse.Namespace) -> int:
-    """Play recordings through running stacks; 1 when a robot is beyond the bound, or a fit is no better."""
+    """Play recordings through running stacks; 1 when a robot is beyond the bound, or a fit is not better."""
     for name in RECORDINGS:
-        read_recording(arguments.data / name)  # what is wrong with it is said before anything starts
+        read_recording(arguments.data / name)  # refuse a bad recording before anything starts
     fitted = None if arguments.fit is None else await fit(arguments)
     names = RECORDINGS if fitted is None else RECORDINGS[1:]
     found = []

@@ -43,7 +43,7 @@ TRANSPORTS = ("twisted", "asyncio")
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of one test: `passed`, `failed` or `skipped`, and why if not passed."""
+    """The outcome of one test: `passed`, `failed` or `skipped`, with the reason if not passed."""
 
     client: str
     ros_version: str
@@ -53,7 +53,7 @@ class Outcome:
 
 
 def free_port() -> int:
-    """A port of loopback that nobody has at the moment."""
+    """Return a free port on loopback."""
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         return int(taken.getsockname()[1])
@@ -91,7 +91,7 @@ async def output_of(command: list[str], environment: dict[str, str], cwd: Path) 
 
 
 def last_line(text: str) -> str:
-    """The last line that says something."""
+    """Return the last line that is not blank."""
     return next((line.strip() for line in reversed(text.splitlines()) if line.strip()), "it said nothing")
 
 
@@ -182,7 +182,7 @@ async def check(arguments: argparse.Namespace) -> int:
 
 
 def show(outcomes: list[Outcome]) -> None:
-    """The table and the last line on standard output."""
+    """Print the table and the last line."""
     table = Table(title="the hub under other projects' tests")
     for column in ("client", "ROS", "test", "outcome", "why"):
         table.add_column(column, overflow="fold")

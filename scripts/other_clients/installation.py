@@ -32,7 +32,7 @@ def home() -> Path:
 
 
 def installed(name: str, *locks: Path) -> tuple[Path, bool]:
-    """The folder of what these lock files name, and whether it is complete."""
+    """Return the folder for the packages of these lock files, and whether it is complete."""
     digest = hashlib.sha256(LAYOUT.encode() + b"".join(lock.read_bytes() for lock in locks)).hexdigest()[:12]
     folder = home() / f"{name}-{digest}"
     return folder, (folder / ".complete").exists()
@@ -48,24 +48,22 @@ def run(*command: str | Path, cwd: Path | None = None) -> None:
     try:
         subprocess.run(command, cwd=cwd, check=True, capture_output=True, text=True, timeout=DOWNLOAD_LIMIT)
     except subprocess.TimeoutExpired as error:
-        msg = f"`{shown} ...` did not end within {DOWNLOAD_LIMIT} s; try again"
-        raise SettingsError(msg) from error
+        raise SettingsError(f"`{shown} ...` did not end within {DOWNLOAD_LIMIT} s; try again") from error
     except subprocess.CalledProcessError as error:
         lines = [line for line in error.stderr.splitlines() if re.match(r"(ERROR|npm error)", line)]
         said = (lines or error.stderr.splitlines() or [f"exit code {error.returncode}"])[0]
-        msg = f"`{shown} ...` failed: {said}"
-        raise SettingsError(msg) from error
+        raise SettingsError(f"`{shown} ...` failed: {said}") from error
 
 
 def begin(folder: Path, what: str) -> None:
-    """An empty folder for an installation, and a line for who waits."""
+    """Make an empty folder for an installation, and print a line about it."""
     print(f"installing {what} into {folder} (once) ...", file=sys.stderr)
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
 
 
 def install_roslibpy() -> Path:
-    """The folder with roslibpy's environment (venv) and its source package (source); made where missing."""
+    """Return the folder with roslibpy's environment (venv) and source package (source), installed if missing."""
     folder, complete = installed("roslibpy", LOCK)
     if complete:
         return folder
@@ -91,19 +89,21 @@ def install_roslibpy() -> Path:
 
 
 def install_roslib() -> Path:
-    """The module of roslib; installed where missing.
+    """Return the module of roslib, installed if missing.
 
     Raises:
         SettingsError: Node is not there, or too old.
     """
     node, npm = shutil.which("node"), shutil.which("npm")
     if node is None or npm is None:
-        msg = f"roslib needs Node {OLDEST_NODE} or later with npm, which are not on PATH: install them (Debian: apt-get install nodejs npm), or use --only roslibpy"
-        raise SettingsError(msg)
+        raise SettingsError(
+            f"roslib needs Node {OLDEST_NODE} or later with npm, which are not on PATH: install them (Debian: apt-get install nodejs npm), or use --only roslibpy"
+        )
     version = subprocess.run([node, "--version"], capture_output=True, text=True, check=True, timeout=30)
     if int(re.sub(r"^v(\d+).*\n", r"\1", version.stdout)) < OLDEST_NODE:
-        msg = f"roslib needs Node {OLDEST_NODE} or later, this is {version.stdout.strip()}: install a newer one, or use --only roslibpy"
-        raise SettingsError(msg)
+        raise SettingsError(
+            f"roslib needs Node {OLDEST_NODE} or later, this is {version.stdout.strip()}: install a newer one, or use --only roslibpy"
+        )
     locks = (PACKAGES / "package.json", PACKAGES / "package-lock.json")
     folder, complete = installed("roslib", *locks)
     if not complete:

@@ -117,7 +117,7 @@ def read_map(source: Path = SOURCE) -> RegisterMap:
     """Return the map that a SystemRDL file defines.
 
     Raises:
-        systemrdl.RDLCompileError: The file is no valid SystemRDL; the compiler has printed where.
+        systemrdl.RDLCompileError: The file is not valid SystemRDL; the compiler has printed where.
     """
     from systemrdl.compiler import RDLCompiler
     from systemrdl.node import MemNode, RegNode

@@ -8,7 +8,7 @@ The register block is written here and not by peakrdl-regblock-vhdl, which was t
   in which the low word has no effect until the high one is written.
 - A board refuses accesses by their address, its state and the value written. That takes a decoder of its own in front of
   the exporter's block.
-- The exported text needs a VHDL package out of the exporter's wheel, which whoever builds the hardware would need too.
+- The exported text needs a VHDL package out of the exporter's wheel, which everyone who builds the hardware would need too.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ class Register:
 
     @property
     def written(self) -> bool:
-        """Whether software writes it."""
+        """Whether software writes the field."""
         return bool(self.stored | self.pulsed)
 
 

@@ -205,7 +205,7 @@ def check_results(results: list[Result]) -> str:
         CheckError: they are not.
     """
     wrong = [each.wrong for each in results if each.wrong]
-    # who has just connected, or connected again, may have missed the reading of a result
+    # a client that has just connected may have missed the reading of a result
     others = [each for each in wrong if each != "no reading has its stamp"]
     expect(not others, f"a result is wrong: {others[:1]}")
     expect(len(wrong) <= len(results) / 2, "most results have no reading")
@@ -278,7 +278,7 @@ class Stack:
         return self.docker("compose", *arguments, limit=limit)
 
     def client_command(self, network: str, *options: str) -> list[str]:
-        """How a client's container is started; its URI and flags follow."""
+        """Return the command that starts a client's container; its URI and flags follow."""
         volumes = ["--volume", f"{self.project / CLIENT.relative_to(ROOT)}:/client.py:ro"]
         safe = ["--read-only", "--tmpfs", "/tmp", "--cap-drop", "ALL", "--init"]  # noqa: S108 - the container's own
         return [
@@ -452,7 +452,7 @@ class Stack:
             time.sleep(0.1)
 
     def restarts(self, service: str) -> int:
-        """How often the engine has restarted a service."""
+        """Return the number of times that the engine has restarted a service."""
         return int(self.inspect(service)[0]["RestartCount"])
 
     def save_logs(self, check: str) -> None:

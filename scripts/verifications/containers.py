@@ -256,7 +256,7 @@ def rosbridge_cut_off(stack: Stack, client: Client) -> None:
 
 
 def check_stop(stack: Stack) -> None:
-    """All services end by themselves within their time after SIGTERM; who was too slow has some more tries."""
+    """Check that all services end by themselves within their time after SIGTERM; slow ones get more tries."""
     for left in reversed(range(STOPS)):
         began = time.time()
         stack.compose("stop", limit=120)

@@ -243,7 +243,7 @@ def draw(model: Model, chance: random.Random) -> tuple[int, ...]:
 
 
 def machine_difference(asked: Asked) -> float:
-    """How far a BM1 of 16-bit codes and ideal random numbers is from exact inference, in total variation, at its worst."""
+    """Return the largest total variation between a BM1 with 16-bit codes and ideal random numbers and exact inference."""
     model = asked.model
     codes = quantise(model, prob_bits=16)
     parameters = BM1Parameters(

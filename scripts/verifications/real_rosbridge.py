@@ -25,7 +25,7 @@ LAYOUT = "1"
 """Of the folder that is installed: rises when its content changes for the same lock."""
 HOME_VARIABLE = "ROSBAYES_ROS2_HOME"
 READY = "server listening"
-"""What the server's log says once it takes connections."""
+"""Line in the server's log once it accepts connections."""
 DEFAULT_PORT = 9090
 DOWNLOAD_LIMIT = 600.0
 GLIBC = (2, 35)
@@ -148,7 +148,7 @@ def _interface_flags(control: socket.socket, name: str) -> int:
 
 
 def network_is_alone() -> bool:
-    """Whether this process's network has no interface up but loopback."""
+    """Return whether loopback is the only interface of this process's network that is up."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as control:
         others = [name for _, name in socket.if_nameindex() if name != "lo"]
         return not any(_interface_flags(control, name) & _IFF_UP for name in others)
@@ -164,16 +164,16 @@ def network_command() -> list[str]:
         raise RealServerError(
             "`unshare` is not installed, and the real server is to run in a network of its own (Debian: apt-get install util-linux)"
         )
-    # a user namespace gives the right to make a network to those who are not root, where the system allows it
+    # a user namespace lets users other than root make a network, if the system allows it
     as_user = [] if os.geteuid() == 0 else ["--user", "--map-root-user"]
     command = [unshare, *as_user, "--net", "--"]
     try:
         subprocess.run([*command, "true"], check=True, capture_output=True, text=True, timeout=10)
     except subprocess.CalledProcessError as error:
-        who = "not even root may make one here" if os.geteuid() == 0 else "this user may not make one"
+        reason = "not even root may make one here" if os.geteuid() == 0 else "this user may not make one"
         advice = "give the container the capability SYS_ADMIN" if os.geteuid() == 0 else "run this as root"
         raise RealServerError(
-            f"the real server is to run in a network of its own, and {who} ({error.stderr.strip()}): {advice}"
+            f"the real server is to run in a network of its own, and {reason} ({error.stderr.strip()}): {advice}"
         ) from error
     except subprocess.TimeoutExpired as error:
         raise RealServerError(

@@ -148,7 +148,7 @@ class PlainClient:
             ) from None
 
     def count(self, topic: str) -> int:
-        """How many messages came on a topic."""
+        """Return the number of messages received on a topic."""
         return sum(1 for received in self.received if received.topic == topic)
 
 
@@ -255,7 +255,7 @@ class Stand:
 
     @property
     def serves(self) -> bool:
-        """Whether the server was started, and not stopped."""
+        """Whether the server is running."""
         return self._server is not None
 
     @property
@@ -264,7 +264,7 @@ class Stand:
         return f"ws://127.0.0.1:{self.port}"
 
     async def start_server(self) -> None:
-        """Start the server, or start it anew.
+        """Start or restart the server.
 
         Raises:
             CheckError: it does not serve in time.

@@ -1,6 +1,6 @@
 """A double of the reference server's design, for scripts/bench bridge: Tornado, threads, json, a message class per type.
 
-It is no rosbridge_suite: that needs ROS. What a message passes through there is done here too, for one type of message:
+It is not rosbridge_suite, which needs ROS, but does the same work on a message, for one type:
 Tornado reads it; a queue takes it to a thread of its connection, which parses it and fills a message object, every
 field checked against its type; the message is serialised and goes through a socket, as between ROS nodes; the
 subscription's thread reads it, makes a message object, takes the values out of it again and writes them as JSON;
@@ -70,7 +70,7 @@ def filled(message: Message, values: dict[str, Any]) -> Message:
 
 
 def fitting(kind: str, value: Any) -> Any:
-    """A value of a field's type."""
+    """Return a value of a field's type."""
     if kind.endswith("[]"):
         return [fitting(kind[:-2], item) for item in value]
     if kind in TYPES:
@@ -81,7 +81,7 @@ def fitting(kind: str, value: Any) -> Any:
 
 
 def taken_out(value: Any) -> Any:
-    """What a message holds, for JSON."""
+    """Return a message's content for JSON."""
     if isinstance(value, Message):
         return {name: taken_out(getattr(value, name)) for name in value.fields}
     if isinstance(value, list):
@@ -90,14 +90,14 @@ def taken_out(value: Any) -> Any:
 
 
 def serialised(message: Any) -> bytes:
-    """A Float64MultiArray (without dimensions) as ROS 1 sends it."""
+    """Return a Float64MultiArray (without dimensions) as ROS 1 sends it."""
     data = message.data
     body = struct.pack(f"<III{len(data)}d", 0, message.layout.data_offset, len(data), *data)
     return struct.pack("<I", len(body)) + body
 
 
 def deserialised(body: bytes) -> Message:
-    """The message of these bytes."""
+    """Return the message in these bytes."""
     message: Any = Float64MultiArray()
     _, message.layout.data_offset, count = struct.unpack_from("<III", body)
     message.data = list(struct.unpack_from(f"<{count}d", body, 12))
