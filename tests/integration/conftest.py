@@ -14,6 +14,7 @@ import subprocess
 import sys
 import time
 import uuid
+from collections.abc import Callable
 from pathlib import Path
 
 import psutil
@@ -86,6 +87,8 @@ class Stage:
         self.run = uuid.uuid4().hex
         self.running: list[Running] = []
         self._places: list[socket.socket] = []
+        self.runs = where / "runs"
+        self.runs.mkdir()
 
     def start(self, *command: str, environment: dict[str, str] | None = None) -> Running:
         running = Running(self.where, self.run, *command, environment=environment)
@@ -134,6 +137,45 @@ class Stage:
         first = found.pop(parent)
         # process numbers begin again from below now and then
         return sorted(found.values(), key=lambda each: (each.pid - first.pid) % PID_MAX)
+
+    async def loop(self, boat: Path, *options: str, robot: type["Robot"] | None = None, rate: float = 20):
+        """Start a hub, a robot that publishes and a master in --loop, and wait for the first results."""
+        hub, uri = await self.hub()
+        publishing = (robot or Robot)(uri)
+        await publishing.connect()
+        await publishing.keep_publishing(rate=rate, **READING)
+        command = ("master", "--loop", "--connect-timeout", "30", "-d", str(boat), "--uri", uri, *options)
+        master = self.start(*command, environment={"BM_RUN_DIRECTORY": str(self.runs)})
+        await publishing.have(3)
+        return hub, publishing, master
+
+    async def status(self, name: str, wanted: Callable[[dict], bool] = bool) -> dict:
+        """Wait for a status of a process in the run directory that is as wanted."""
+        deadline = time.monotonic() + PATIENCE
+        while True:
+            found: dict = {}
+            with contextlib.suppress(OSError, ValueError):
+                found = await status_of(self.runs, name)
+            if found and wanted(found):
+                return found
+            assert time.monotonic() < deadline, f"{name}: {found}"
+            await asyncio.sleep(0.05)
+
+    async def restarted(self, role: str, times: int = 1) -> None:
+        """Wait until the master has restarted a service so many times."""
+        await self.status(
+            "master",
+            lambda status: any(
+                peer["name"] == role and peer["restarts"] >= times for peer in status["peers"]
+            ),
+        )
+
+    async def board_is_back(self, times: int = 1) -> None:
+        """Wait until boards have failed so many times, and pcie-app has all of them again."""
+        await self.status(
+            "pcie-app",
+            lambda status: status["ready"] and sum(board["restarts"] for board in status["boards"]) >= times,
+        )
 
     async def nothing_left(self, *except_for: str, timeout: float = PATIENCE) -> None:
         """All processes but the named have ended, and no socket or private directory is left."""

@@ -140,8 +140,7 @@ async def test_a_value_out_of_range_names_the_range(stage, server, tmp_path):
 
 async def test_in_a_loop_unusable_messages_are_counted_and_told_once(stage, boat, server):
     uri, robot = server
-    runs = stage.where / "runs"
-    runs.mkdir()
+    runs = stage.runs
     master = stage.start(
         *("master", "--loop", "-d", str(boat), "--uri", uri, "--count", "3"),
         environment={"BM_RUN_DIRECTORY": str(runs)},

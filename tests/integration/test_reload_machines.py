@@ -166,7 +166,6 @@ async def test_a_master_that_is_killed_in_a_reload_leaves_nothing(stage, boat, o
     await until(half_way)
     master.send(signal.SIGKILL)
     assert await reloading.end() == 6
-    assert "ended before it was done" in reloading.err
     boards[3].resume()
     await stage.nothing_left("hub")
     assert not list(runs.iterdir())
