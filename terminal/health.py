@@ -1,4 +1,4 @@
-"""Health of a process: whether it is ready, and why, told to whoever connects to its status socket.
+"""Health of a process: whether it is ready, and why, shown on its status socket.
 
 A process listens on `NAME.status.sock` in the run directory, a socket of its user alone (0600). Each connection gets one
 JSON object, which has at least `ready` and `why`, and is closed; nothing is read from it. This module imports the standard

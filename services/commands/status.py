@@ -1,4 +1,4 @@
-"""The command `status`: asks every process of a run at its status socket, all at once, and shows what they say."""
+"""The command `status`, which asks every process of a run at its status socket, all at once."""
 
 from __future__ import annotations
 
@@ -70,19 +70,19 @@ def _place(name: str) -> tuple[int, int, str]:
 
 
 async def ask_stack(directory: Path) -> StackStatus:
-    """What the processes in a run directory say of themselves, asked in parallel, within about a second."""
+    """Return the status of all processes in a run directory, asked in parallel, within about a second."""
     paths = _status_sockets(directory)
     loop = asyncio.get_running_loop()
     with ThreadPoolExecutor(max(1, len(paths))) as pool:
         answers = await asyncio.gather(*(loop.run_in_executor(pool, _ask, path) for path in paths))
     processes = [each for each in answers if isinstance(each, ProcessStatus)]
     silent = [each for each in answers if isinstance(each, SilentProcess)]
-    heard = {each.name for each in answers}
+    answered = {each.name for each in answers}
     silent.extend(
         SilentProcess(peer.name, f"the master waits for it at {peer.endpoint}")
         for process in processes
         for peer in process.peers
-        if peer.name not in heard and not peer.ready
+        if peer.name not in answered and not peer.ready
     )
     processes.sort(key=lambda each: _place(each.name))
     silent.sort(key=lambda each: _place(each.name))
@@ -185,9 +185,7 @@ def status(
 
     named = settings.run_directory
     if named is not None and not named.is_dir():
-        msg = (
-            f"{named} is no folder; name the one with the status sockets (BM_RUN_DIRECTORY of the processes)"
-        )
+        msg = f"{named} is not a folder; name the one with the status sockets (BM_RUN_DIRECTORY of the processes)"
         raise SettingsError(msg)
 
     async def run() -> int:

@@ -205,7 +205,7 @@ class FrameFlow:
 
     @property
     def busy_with(self) -> str:
-        """What frames wait for: the boards, the publisher, or nothing."""
+        """The place where frames are in flight, in words; empty for none."""
         if self._computing is not None:
             return "a frame on the boards"
         return "results at the publisher" if self._at_publisher else ""

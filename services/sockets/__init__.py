@@ -1,1 +1,1 @@
-"""What the processes tell each other, and the local sockets over which they do."""
+"""Local sockets of the processes, and the records that cross them."""

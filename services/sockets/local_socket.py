@@ -17,8 +17,7 @@ import msgspec
 
 from pcie_shim.endpoint import Endpoint, no_delay
 from services.errors import LocalSocketError, OtherPeerError
-from services.sockets.records import AnyRecord, Hello, Record
-from services.version import VERSION
+from services.sockets.records import VERSION, AnyRecord, Hello, Record
 
 MAX_RECORD = 4 * 1024 * 1024
 """Bytes of the largest record: 64 boards of 4096 counts fit with room to spare."""

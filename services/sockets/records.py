@@ -7,8 +7,12 @@ time; those called `*_tick` are the machine's monotonic clock, comparable betwee
 from __future__ import annotations
 
 from enum import StrEnum
+from importlib.metadata import version
 
 import msgspec
+
+VERSION = version("rosbayes")
+"""Version that every greeting carries: both sides of a local socket have the same."""
 
 
 class LossReason(StrEnum):
@@ -170,7 +174,7 @@ class Publish(Record, tag="publish", frozen=True):
 class Published(Record, tag="published", frozen=True):
     """Publisher to master: the fate of a result.
 
-    `seen` is whether it was seen on the wire (None where nobody looked). `best_line` has `best_probability`;
+    `seen` is whether it was seen on the wire (None if that was not checked). `best_line` has `best_probability`;
     `total_ns` is the time from the reading's receipt to the result's sending. `missed` counts the outputs, of several,
     whose servers were away.
     """

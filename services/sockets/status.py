@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, TypeVar
 import msgspec
 
 from services.errors import SettingsError
+from services.sockets.records import VERSION
 from services.supervision.parent import leave_private_directory
-from services.version import VERSION
 from terminal.health import health_served, health_thread, not_ours, read_status
 
 if TYPE_CHECKING:
@@ -85,7 +85,7 @@ class HubStatus(msgspec.Struct, frozen=True):
 
 
 class ProcessStatus(msgspec.Struct, frozen=True, kw_only=True):
-    """A process. `why` says what it waits for while it is not ready, and what it has when it is.
+    """A process. `why` says the cause while it is not ready, and its state when it is.
 
     `deployment` is the hash of the one in force, `generation` how often that has changed since the run began, and
     `folder` where the master has read it.

@@ -22,8 +22,7 @@ from services.sockets.local_socket import (
     encode_record,
     own_hello,
 )
-from services.sockets.records import Frame, FrameResult, Hello, Notice
-from services.version import VERSION
+from services.sockets.records import VERSION, Frame, FrameResult, Hello, Notice
 
 
 def raw(value) -> msgspec.Raw:

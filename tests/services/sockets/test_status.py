@@ -9,6 +9,7 @@ import pytest
 
 from services.errors import SettingsError
 from services.sockets import status
+from services.sockets.records import VERSION
 from services.sockets.status import (
     FrameCounts,
     ProcessStatus,
@@ -19,7 +20,6 @@ from services.sockets.status import (
     status_thread,
 )
 from services.supervision.private_directory import remove_stale_sockets
-from services.version import VERSION
 from terminal.health import NoHealthError, Silence, health_thread, status_socket
 
 PATIENCE = 60.0
