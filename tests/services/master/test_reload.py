@@ -6,6 +6,7 @@ import msgspec
 import pytest
 
 from services.errors import NotReloadedError, SettingsError
+from services.master import reload
 from services.master.reload import fates
 from services.pipeline.frames import QUEUE_ALL_DEPTH
 from services.sockets.control_socket import ReloadOrder
@@ -70,6 +71,20 @@ async def test_frames_in_flight_finish_by_the_deployment_that_they_were_read_for
         begun.take(begun.publisher, Published(number, Outcome.PUBLISHED, None, 0, 1.0, 1, 1))
     assert (await reloading).count("2 frames were in flight and finished before,") == 1
     assert begun.lost == {}
+
+
+async def test_readings_that_still_wait_after_the_drain_are_lost(begun, order, monkeypatch):
+    monkeypatch.setattr(reload, "_DRAIN_TIME", 0.1)
+    begun.flow.hold()
+    begun.read(3)
+    assert f"; {fates(3, 3)}, " in await begun.reloads.order(order)
+    assert begun.lost == {LossReason.IN_RELOAD: 3}
+
+
+async def test_boards_get_no_frame_while_they_are_programmed(begun, order):
+    begun.app.before_switch = begun.read
+    assert f"; {fates(0, 1)}, " in await begun.reloads.order(order)
+    assert begun.app.frames == []
 
 
 async def test_a_second_order_is_refused_meanwhile(begun, order):
