@@ -78,13 +78,14 @@ def _script(boards: range) -> str:
     return f"""#
 # Compiles a programming file for every board, in the project's folder:
 #     quartus_sh -t {PROJECT}.tcl FOLDER
-# FOLDER holds the machine's VHDL: the entity {PROJECT} with the generic BOARD, and what it is made of.
+# FOLDER holds the machine's VHDL, as the project's hdl/: the entity {PROJECT} with the generic BOARD, what it is made of,
+# and in synthesis/ the memories that are filled from the MIFs.
 
 package require ::quartus::project
 package require ::quartus::flow
 
 set folder [lindex $quartus(args) 0]
-set sources [lsort [glob -nocomplain -directory $folder *.vhd]]
+set sources [lsort [glob -nocomplain -directory $folder *.vhd synthesis/*.vhd]]
 if {{[llength $sources] == 0}} {{
     puts stderr "error: no .vhd file in '$folder'; name the folder that holds the machine's VHDL"
     exit 2
