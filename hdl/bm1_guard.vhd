@@ -158,14 +158,9 @@ begin
         resume_is_bad <= '1';
       end if;
 
-      for replica in REPLICAS to 255 loop
-
-        if (halt_i(replica) = '1') then
-          resume_is_bad <= '1';
-        end if;
-
-      end loop;
-
+      if (REPLICAS < 256 and (or halt_i(255 downto REPLICAS)) = '1') then
+        resume_is_bad <= '1';
+      end if;
     end if;
 
   end process check_resume;

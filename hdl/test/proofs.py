@@ -75,7 +75,7 @@ def failed_proof(name: str, folder: Path, hdl: Path = HDL) -> str | None:
     try:
         run_yosys(
             f"read_verilog -formal design.v; read_verilog -sv -formal {define} properties.sv; {parameter}"
-            f"prep -flatten -top {top}; async2sync; {command}",
+            f"prep -flatten -top {top}; select -assert-none t:$dlatch; async2sync; {command}",
             folder,
         )
     except HardwareToolError as error:
