@@ -10,7 +10,9 @@ from hypothesis import strategies as st
 
 from machines.parameters import RngKind, RngReset
 from pcie_shim.programming_file import read_image
+from toolchain.building.board_layout import board_layout
 from toolchain.building.build import build_date, build_deployment
+from toolchain.building.machine import machine_parameters
 from toolchain.building.options import BuildOptions
 from toolchain.building.quantise import quantise
 from toolchain.deployment import Queue, Scale, Stop, load_deployment
@@ -224,3 +226,13 @@ def test_the_build_date_is_source_date_epoch_or_the_files(tmp_path_factory, seco
         patch.setenv("SOURCE_DATE_EPOCH", "yesterday")
         with pytest.raises(ToolchainError, match="SOURCE_DATE_EPOCH is 'yesterday'"):
             build_date(path)
+
+
+def test_an_interface_of_exactly_the_machine_s_size_is_enough():
+    parameters = machine_parameters(model(), OPTIONS)
+    needed = (len(model().known), model().lines)
+    assert board_layout(parameters, 1, needed).interface == needed
+    assert board_layout(parameters, 1, (64, 4096)).interface == (64, 4096)
+    for small in ((needed[0] - 1, needed[1]), (needed[0], needed[1] - 1)):
+        with pytest.raises(BuildError):
+            board_layout(parameters, 1, small)

@@ -6,6 +6,7 @@ import pytest
 
 from pcie_shim.programming_file import read_image
 from tests.command_runner import invoke
+from toolchain.building.edits import DeploymentEdits, edited
 from toolchain.commands.main import app
 from toolchain.deployment import load_deployment
 from toolchain.errors import DamagedDeploymentError
@@ -179,7 +180,21 @@ def test_an_edit_by_hand_that_the_images_contradict(built, old, new):
     path = built / "deployment.toml"
     path.write_text(path.read_text().replace(old, new, 1))
     before = contents(built)
+    regenerate("deployment", built, code=2)
     assert contents(built) == before
+
+
+def test_a_column_takes_the_source_of_the_variable_that_it_reads(built):
+    deployment = load_deployment(built)
+    one, two = deployment.variables
+    sources = (deployment.sources[0], deployment.sources[0].replace(topic="/other"))
+    deployment = deployment.replace(sources=sources, variables=(one, two.replace(source=1, path="data[1]")))
+    changed = edited(deployment, DeploymentEdits(order=(two.name, one.name))).variables
+    assert [(each.name, each.source, each.path) for each in changed] == [
+        (two.name, 1, "data[1]"),
+        (one.name, 0, one.path),
+    ]
+    assert [each.bits for each in changed] == [one.bits, two.bits]
 
 
 def test_the_project(built):

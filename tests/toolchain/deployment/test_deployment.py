@@ -292,6 +292,9 @@ def test_the_advice_is_the_nearest_right_name(folder, old, new, advice):
 )
 def test_parts_that_disagree(folder, old, new):
     edit(folder, old, new)
+    with pytest.raises(DeploymentError) as caught:
+        load_deployment(folder, images=False, edited=True)
+    assert caught.value.place == ()
 
 
 def test_no_deployment(tmp_path):
@@ -310,6 +313,7 @@ def test_no_deployment(tmp_path):
 )
 def test_what_is_no_deployment_at_all(folder, content):
     (folder / "deployment.toml").write_bytes(content)
+    refused(folder)
 
 
 @given(st.binary(max_size=200))

@@ -188,6 +188,7 @@ MISTAKES = [
     (*changed("dog.bif", "{ <5, >=5, n/a }", '{ "<5", ">=5", "n\u202ea" }'), 7),
     (*changed("dog.bif", "table 0.15, 0.85", "table 0.15"), 8),
     (*changed("dog.bif", "table 0.15, 0.85", "table 0.15, 0.35"), 8),
+    (*changed("dog.bif", "table 0.15, 0.85", "table 0.15, 0.82"), 8),
     (*changed("dog.bif", "table 0.15, 0.85", "table -0.15, 1.15"), 8),
     (*changed("dog.bif", "table 0.15, 0.85", "table nan, 0.85"), 8),
     (*changed("dog.bif", "table 0.15, 0.85", "table inf, 0.85"), 8),
