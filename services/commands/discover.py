@@ -1,4 +1,4 @@
-"""The rosbridge servers that announce themselves on the local network, as a command."""
+"""The command `discover`."""
 
 from __future__ import annotations
 
@@ -52,8 +52,9 @@ def discover(
         elif robots:
             Console().print(_table(robots))
         if not robots:
-            msg = f"no rosbridge server announced itself on this network within {timeout:g} s; the hub does with --announce NAME"
-            raise UnknownRobotError(msg)
+            raise UnknownRobotError(
+                f"no rosbridge server announced itself on this network within {timeout:g} s; the hub does with --announce NAME"
+            )
         return 0
 
     return run_async(look())

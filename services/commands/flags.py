@@ -1,4 +1,4 @@
-"""The flags that several commands share, each with one meaning."""
+"""Flags that several commands share, each with one meaning."""
 
 from __future__ import annotations
 

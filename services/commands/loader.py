@@ -1,4 +1,4 @@
-"""The loader: programs a board over its own port, without a restart of the host (thesis 3.4, SofLoader)."""
+"""The command `loader`: programs a board over its own port, without a restart of the host (thesis 3.4, SofLoader)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The command `master`, which runs the stack, and `master reload`, which speaks to one that runs."""
+"""The commands `master`, which runs the stack, and `master reload`, which sends an order to a running one."""
 
 from __future__ import annotations
 
@@ -75,8 +75,9 @@ def master(
     connected = {}
     if connect is not None:
         if not connect.is_dir():
-            msg = f"--connect {connect} is no folder; name the one with the sockets of the services that run already"
-            raise SettingsError(msg)
+            raise SettingsError(
+                f"--connect {connect} is not a folder; name the one with the sockets of the services that run already"
+            )
         for name in ("subscriber", "publisher", "pcie-app"):
             connected[name.replace("-", "_")] = str(endpoint_in(connect, name))
     settings = load_settings(
@@ -99,11 +100,9 @@ def master(
         print(orjson.dumps(settings.model_dump(mode="json"), option=orjson.OPT_INDENT_2).decode())
         return ExitCode.DONE
     if once == loop:
-        msg = "choose one of --once and --loop"
-        raise SettingsError(msg)
+        raise SettingsError("choose one of --once and --loop")
     if once and count is not None:
-        msg = "--count belongs to --loop; --once computes one frame"
-        raise SettingsError(msg)
+        raise SettingsError("--count belongs to --loop; --once computes one frame")
     loaded = deployment_for(settings)
     return run_async(run_master(settings, loaded, once=once, count=count, json=json))
 
@@ -131,7 +130,7 @@ def reload_(
     folder = "" if settings.deployment is None else str(settings.deployment.absolute())
 
     async def order() -> int:
-        from services.commands.status import find_run
+        from services.sockets.stack import find_run
 
         run = directory or settings.control_directory or settings.run_directory or await find_run()
         print(one_line(await give_order(control_socket(run), ReloadOrder(folder), timeout=RELOAD_TIME)))

@@ -1,1 +1,1 @@
-"""What the commands print and save: readings, results and posteriors, as lines, as a picture, as files; a stack's status."""
+"""Output for users: results, posteriors and status, printed, drawn and saved."""

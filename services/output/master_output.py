@@ -1,4 +1,4 @@
-"""What `master` prints of a result on standard output: a JSON object a line, or one sentence."""
+"""Results that `master` prints on standard output: a JSON object a line, or one sentence."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ def print_json(record: Published, in_force: InForce) -> None:
     """Print a result as a line of JSON.
 
     Raises:
-        BrokenPipeError: whoever read it has what it wanted.
-        StackError: standard output can't be written.
+        BrokenPipeError: The reader has closed the pipe.
+        StackError: Standard output can't be written.
     """
     line = orjson.dumps(
         {
@@ -36,8 +36,7 @@ def print_json(record: Published, in_force: InForce) -> None:
     except BrokenPipeError:
         raise
     except OSError as error:
-        msg = f"standard output can't be written: {error.strerror or error}"
-        raise StackError(msg) from error
+        raise StackError(f"standard output can't be written: {error.strerror or error}") from error
 
 
 def print_sentence(record: Published, in_force: InForce) -> None:
@@ -53,11 +52,11 @@ def print_sentence(record: Published, in_force: InForce) -> None:
 
 
 def cell(deployment: Deployment, line: int) -> dict[str, float]:
-    """The values that a line of the result stands for, by label.
+    """Return the values of a line of the result, by label.
 
     Args:
-        deployment: whose result it is.
-        line: its number; the last dimension is the fastest.
+        deployment: The deployment of the result.
+        line: Index of the line; the last dimension is the fastest.
     """
     values: dict[str, float] = {}
     for dimension in reversed(deployment.result_dimensions):

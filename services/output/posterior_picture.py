@@ -30,7 +30,7 @@ _LABEL: Final = 24
 
 @dataclass(frozen=True, slots=True)
 class Axis:
-    """A dimension of a posterior, and what its indices stand for where a deployment says it."""
+    """A dimension of a posterior, with the values of its indices if a deployment is known."""
 
     label: str
     size: int
@@ -42,7 +42,7 @@ class Axis:
         return self.dimension is not None and bool(self.dimension.states)
 
     def value(self, index: float) -> float | str:
-        """What stands at an index: a value in its unit, a state's name, or the index itself."""
+        """Return the value of an index: a number in its unit, a state's name, or the index itself."""
         if self.dimension is None:
             return index
         if self.dimension.states:
@@ -50,35 +50,36 @@ class Axis:
         return self.dimension.value(index)
 
     def shown(self, index: float) -> str:
-        """The same as text for a terminal."""
+        """Return the value of an index as text for a terminal."""
         value = self.value(index)
         return printable(value) if isinstance(value, str) else f"{value:.6g}"
 
 
 def axes_of(posterior: Posterior, deployment: Deployment | None) -> list[Axis]:
-    """The dimensions of a posterior that came over the wire.
+    """Return the dimensions of a posterior that came over the wire.
 
     Raises:
-        ValueError: it is none of the deployment's.
+        ValueError: They differ from the deployment's.
     """
     if deployment is None:
         return [Axis(label, size) for label, size in zip(posterior.labels, posterior.sizes, strict=True)]
     ours = [(dimension.label, dimension.size) for dimension in deployment.result_dimensions]
     theirs = list(zip(posterior.labels, posterior.sizes, strict=True))
     if ours != theirs:
-        msg = f"the posterior that came has {_grid(theirs)}, but the deployment of {deployment.directory} has {_grid(ours)}"
-        raise ValueError(msg)
+        raise ValueError(
+            f"the posterior that came has {_grid(theirs)}, but the deployment of {deployment.directory} has {_grid(ours)}"
+        )
     return [Axis(dimension.label, dimension.size, dimension) for dimension in deployment.result_dimensions]
 
 
 def printable(text: str) -> str:
-    """What came over the wire, safe for a terminal and not too long."""
+    """Return text that came over the wire without control characters, and cut."""
     text = text if len(text) <= _LABEL else text[: _LABEL - 3] + "..."
     return text if text.isprintable() else repr(text)
 
 
 def in_colour(console: Console) -> bool:
-    """Whether a console shows colours, and nobody asked for none (NO_COLOR)."""
+    """Return whether a console shows colours, and the user has not turned them off (NO_COLOR)."""
     return console.color_system is not None and not console.no_color
 
 
@@ -86,11 +87,11 @@ def picture(posterior: Posterior, axes: list[Axis], *, width: int, colour: bool,
     """Draw a posterior.
 
     Args:
-        posterior: of three dimensions or more the two largest are drawn, the others summed out.
-        axes: of it, in its order.
-        width: characters across.
-        colour: whether cells are coloured; else they are characters from " " to "@".
-        rows: lines at most, four for words not counted.
+        posterior: The posterior; of three dimensions or more the two largest are drawn, the others summed out.
+        axes: Its axes, in its order.
+        width: Characters across.
+        colour: Whether cells are coloured; else they are characters from " " to "@".
+        rows: Lines at most, without four for words.
     """
     width, rows = min(width, WIDTH), max(min(rows, ROWS), 2)
     if len(axes) == 1:
@@ -152,7 +153,7 @@ def _heat(
 
 
 def _blocks(values: npt.NDArray[np.float64], step: int, axis: int) -> npt.NDArray[np.float64]:
-    """Sums over blocks of so many cells along an axis; the last block may have fewer."""
+    """Return the sums over blocks of cells along an axis; the last block may have fewer."""
     import numpy as np
 
     return np.add.reduceat(values, np.arange(0, values.shape[axis], step), axis=axis)

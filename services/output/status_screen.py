@@ -1,12 +1,18 @@
-"""A whole stack in one screen: the verdict, its processes, their connections, its boards."""
+"""A stack's status in one screen: the verdict, its processes, their connections, its boards."""
 
 from __future__ import annotations
 
+import asyncio
+import sys
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import msgspec
 
-from services.sockets.status import BoardStatus, FrameCounts, ProcessStatus
+from services.errors import SettingsError
+from services.sockets.stack import StackStatus, ask_stack
+from services.sockets.status import BoardStatus, FrameCounts
+from terminal.errors import ExitCode
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -14,35 +20,20 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
     from rich.table import Table
 
+_WATCH_INTERVAL = 1.0
+_PLAIN_WIDTH = 140
 _SHOWN = 200
-"""Characters of a sentence or name that are shown: what answers may be anything."""
-
-
-class SilentProcess(msgspec.Struct, frozen=True):
-    """A process that has a status socket, or that the master works with, but did not answer."""
-
-    name: str
-    why: str
-
-
-class StackStatus(msgspec.Struct, frozen=True, kw_only=True):
-    """All processes of one run; `why` has a sentence for each that is not ready."""
-
-    directory: str
-    ready: bool
-    why: list[str]
-    processes: list[ProcessStatus]
-    silent: list[SilentProcess]
+"""Characters of a sentence or name that are shown: another process may answer anything."""
 
 
 def plain(text: str) -> str:
-    """A text that can't write over the terminal."""
+    """Return a text without control characters, cut to a length that fits."""
     kept = "".join(each if each.isprintable() else "?" for each in text[:_SHOWN])
     return kept if len(text) <= _SHOWN else f"{kept}..."
 
 
 def screen(stack: StackStatus) -> RenderableType:
-    """One screen of all that is known of a stack."""
+    """Return one screen with all that is known of a stack."""
     from rich.console import Group
     from rich.text import Text
 
@@ -140,7 +131,7 @@ def _boards(boards: list[BoardStatus]) -> Table:
 
 
 def _boards_by_number(stack: StackStatus) -> list[BoardStatus]:
-    """The boards as pcie-app sees them, with the restarts that they know themselves."""
+    """Return the boards as pcie-app sees them, with the restarts that they count themselves."""
     boards: dict[int, BoardStatus] = {}
     for process in stack.processes:
         for board in process.boards:
@@ -163,10 +154,56 @@ def _duration(seconds: float) -> str:
 
 
 def _counts(frames: FrameCounts | None) -> tuple[str, str, str, str, str]:
-    """Received, completed, per second, last frame, lost."""
+    """Return the columns received, completed, per second, last frame and lost."""
     if frames is None:
         return "", "", "", "", ""
     number = "" if frames.last_number is None else f"{frames.last_number}, "
     last = "none yet" if frames.last_age_s is None else f"{number}{_duration(frames.last_age_s)} ago"
     lost = ", ".join(f"{count} {plain(reason)}" for reason, count in frames.lost.items())
     return str(frames.received), str(frames.completed), f"{frames.rate:.1f}", last, lost or "none"
+
+
+async def show(directory: Path, *, watch: bool, json: bool) -> int:
+    """Print a run's status, once or every second.
+
+    Returns:
+        0 if all of it is ready, else 6.
+
+    Raises:
+        SettingsError: No process answers, and `watch` does not wait for one.
+    """
+    from rich.console import Console
+    from rich.live import Live
+
+    terminal = sys.stdout.isatty()
+    console = Console(width=None if terminal else _PLAIN_WIDTH, highlight=False)
+    live = Live(console=console, auto_refresh=False, screen=True) if watch and terminal and not json else None
+
+    def put(stack: StackStatus) -> None:
+        if json:
+            sys.stdout.buffer.write(msgspec.json.encode(stack) + b"\n")
+            sys.stdout.buffer.flush()
+        elif live is not None:
+            live.update(screen(stack), refresh=True)
+        else:
+            console.print(screen(stack))
+
+    if live is not None:
+        live.start()
+    try:
+        while True:
+            stack = await ask_stack(directory)
+            if not stack.processes and not watch:
+                break
+            put(stack)
+            if not watch:
+                return ExitCode.DONE if stack.ready else ExitCode.CHILD
+            await asyncio.sleep(_WATCH_INTERVAL)
+    finally:
+        if live is not None:
+            live.stop()
+    names = ", ".join(plain(each.name) for each in stack.silent)
+    killed = f" (sockets of killed processes: {names})" if names else ""
+    raise SettingsError(
+        f"no process of rosbayes answers in {directory}{killed}; is the stack started, with this BM_RUN_DIRECTORY?"
+    )

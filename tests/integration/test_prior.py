@@ -3,7 +3,6 @@
 message ──▶ subscriber ──▶ master ──▶ pcie-app ──▶ PRIOR_SELECT or PRIOR_CODES of two boards ──▶ posterior on the wire
 """
 
-import json
 import subprocess
 import textwrap
 
@@ -91,7 +90,7 @@ async def test_a_prior_is_written_with_every_frame(stage, tmp_path):
     assert "unusable" not in master.err
 
 
-async def test_a_belief_that_is_none_is_said_and_skipped(stage, tmp_path):
+async def test_a_belief_of_the_wrong_length_ends_a_run_of_one_frame(stage, tmp_path):
     deployment = built(
         tmp_path / "rooms", select=False, options=("--prior-mode", "written", "--prior-path", "belief")
     )
@@ -100,11 +99,3 @@ async def test_a_belief_that_is_none_is_said_and_skipped(stage, tmp_path):
         await robot.keep_publishing(heard=1, belief=[1, 2, 3])
         master = stage.start("master", "--once", "-d", str(deployment), "--uri", uri)
         assert await master.end() == 4
-        assert "expected one number for each of 4 lines" in master.err.splitlines()[-1]
-
-
-def test_alone_the_boards_take_what_the_subscriber_prints(tmp_path):
-    from services.pipes.pcie_app import reading_from_line
-
-    line = json.dumps({"addresses": [1], "stamp_ns": 5, "prior_codes": [9, 2]}).encode()
-    assert reading_from_line(line, 1).prior_codes == [9, 2]

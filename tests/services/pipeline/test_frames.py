@@ -10,6 +10,7 @@ from services.pipeline.frames import (
     UNPAIRED_DEPTH,
     UNPAIRED_WARNING,
     FrameAssembler,
+    StampGap,
     WaitingFrames,
 )
 from toolchain.deployment import Board, Deployment, Dimension, MachineSection, Source, Variable
@@ -31,6 +32,11 @@ def deployment(*variables: Variable, sources: int = 1, tolerance_s: float = 0.05
 
 def variable(name: str, **settings) -> Variable:
     return Variable(name=name, bits=7, values=101, **settings)
+
+
+def two_topics(*, tolerance_s=0.05, **second):
+    variables = variable("D1"), variable("D2", source=1, **second)
+    return FrameAssembler(deployment(*variables, sources=2, tolerance_s=tolerance_s))
 
 
 def stamped(ms: float, **values):
@@ -58,13 +64,13 @@ def test_missing_is_an_error_or_a_missing_address(message):
 
 
 @pytest.mark.parametrize("value", ["12", 500, {"a": 1}, [1]])
-def test_unusable_values_name_topic_and_variable(value):
-    with pytest.raises(VariableError, match=r"/t0: .*D1"):
-        FrameAssembler(deployment(variable("D1"))).take(0, {"D1": value}, 0, 0)
+def test_unusable_values_are_refused(value):
+    with pytest.raises(VariableError):
+        FrameAssembler(deployment(variable("D1", on_missing="missing"))).take(0, {"D1": value}, 0, 0)
 
 
 def test_two_topics_are_paired_by_stamp():
-    frames = FrameAssembler(deployment(variable("D1"), variable("D2", source=1), sources=2))
+    frames = two_topics()
     assert frames.take(0, stamped(0, D1=1), 1, 1) is None
     assert frames.take(0, stamped(100, D1=2), 2, 2) is None
     reading = frames.take(1, stamped(110, D2=9), 3, 3)
@@ -74,55 +80,49 @@ def test_two_topics_are_paired_by_stamp():
     assert frames.take(1, stamped(111, D2=9), 4, 4) is None  # the second one is used
 
 
-def test_two_topics_too_far_apart_wait():
-    frames = FrameAssembler(deployment(variable("D1"), variable("D2", source=1), sources=2))
+def test_stamps_pair_up_to_the_tolerance():
+    frames = two_topics()
     assert frames.take(0, stamped(0, D1=1), 1, 1) is None
-    assert frames.take(1, stamped(51, D2=9), 1, 1) is None
-    assert frames.take(0, stamped(40, D1=3), 1, 1).addresses == [3, 9]
+    assert frames.take(1, stamped(50.000001, D2=9), 1, 1) is None
+    assert frames.take(0, stamped(100.000001, D1=3), 1, 1).addresses == [3, 9]  # exactly the tolerance
+    assert frames.unpaired == 1
 
 
 def test_an_optional_topic_is_not_waited_for():
-    frames = FrameAssembler(
-        deployment(variable("D1"), variable("D2", source=1, on_missing="missing"), sources=2)
-    )
+    frames = two_topics(on_missing="missing")
+    assert (frames.needs(0), frames.needs(1)) == (True, False)
     assert frames.take(0, stamped(0, D1=1), 1, 1).addresses == [1, None]
 
 
 def test_an_endless_topic_without_partner_stays_bounded():
-    frames = FrameAssembler(deployment(variable("D1"), variable("D2", source=1), sources=2))
+    frames = two_topics()
     for at in range(UNPAIRED_DEPTH + 10):
         assert frames.take(0, stamped(at, D1=1), 1, 1) is None
     assert frames.unpaired == 10
 
 
 def far_apart(ms, count=UNPAIRED_WARNING, **second):
-    frames = FrameAssembler(deployment(variable("D1"), variable("D2", source=1), sources=2))
+    frames = two_topics()
     for at in range(count):
         frames.take(0, stamped(10 * at, D1=1), 1, 1)
         frames.take(1, stamped(10 * at - ms, D2=1) | second, 10**12, 1)
     return frames
 
 
-def test_stamps_that_never_meet_are_said():
-    assert not far_apart(2000, UNPAIRED_WARNING - 1).stamp_gap()
+def test_stamps_that_never_meet_are_reported():
+    assert far_apart(2000, UNPAIRED_WARNING - 1).stamp_gap() is None
     frames = far_apart(2000)
-    assert str(frames.stamp_gap()) == (
-        "messages come on all topics but make no frame: the newest of /t1 is 2 s older than that of /t0, "
-        "and the tolerance is 0.05 s; set the clocks, or build with a larger --tolerance"
-    )
+    assert frames.stamp_gap() == StampGap("/t1", "/t0", 2.0, 0.05, ())
+    assert far_apart(0, header={}).stamp_gap().without_header == ("/t1",)
     assert frames.take(1, stamped(10 * UNPAIRED_WARNING, D2=1), 1, 1) is not None
-    assert not frames.stamp_gap()
+    assert frames.stamp_gap() is None
 
 
-def test_who_has_no_header_is_said_too():
-    assert "(/t1 without a header, so by receipt)" in str(far_apart(0, header={}).stamp_gap())
-
-
-def test_a_topic_that_is_silent_is_not_said_to_be_apart():
-    frames = FrameAssembler(deployment(variable("D1"), variable("D2", source=1), sources=2))
+def test_a_silent_topic_is_not_reported_as_apart():
+    frames = two_topics()
     for at in range(100):
         frames.take(0, stamped(10 * at, D1=1), 1, 1)
-    assert not frames.stamp_gap()
+    assert frames.stamp_gap() is None
 
 
 def test_topics_that_all_may_be_missing_wait_for_nothing():
@@ -132,15 +132,9 @@ def test_topics_that_all_may_be_missing_wait_for_nothing():
     assert frames.take(1, stamped(0, D1=3), 1, 1).addresses == [None, 3]
 
 
-def test_which_topics_are_needed():
-    optional = variable("D2", source=1, on_missing="missing")
-    frames = FrameAssembler(deployment(variable("D1"), optional, sources=2))
-    assert (frames.needs(0), frames.needs(1)) == (True, False)
-
-
 @given(st.lists(st.tuples(st.integers(0, 1), st.integers(0, 400)), max_size=80))
 def test_paired_readings_are_within_tolerance_and_used_once(arrivals):
-    frames = FrameAssembler(deployment(variable("D1"), variable("D2", source=1), sources=2, tolerance_s=0.01))
+    frames = two_topics(tolerance_s=0.01)
     counts = [0, 0]
     made = 0
     for source, ms in arrivals:
@@ -163,7 +157,7 @@ def test_all_keeps_order_and_names_the_slow_part_when_full():
     waiting = WaitingFrames("all")
     for frame in range(QUEUE_ALL_DEPTH):
         waiting.put(frame)
-    with pytest.raises(OverflowedQueueError, match="pcie-app") as caught:
+    with pytest.raises(OverflowedQueueError) as caught:
         waiting.put(256)
     assert caught.value.exit_code == 6
     assert [waiting.get() for _ in range(QUEUE_ALL_DEPTH)] == list(range(QUEUE_ALL_DEPTH))

@@ -1,4 +1,4 @@
-"""Hearing a stack's posteriors: in order, over losses, in time, with or without asyncio.
+"""Listening to a stack's posteriors: in order, over losses, in time, with or without asyncio.
 
 fake server  ->  /bm/frame, /BMresults  ->  posteriors(), listen()
 """
@@ -14,9 +14,8 @@ import pytest
 
 from bridge.client import State, connect
 from bridge.errors import ConcurrentReadError, DisconnectedError, OptionError, UnreachableError
-from posteriors.errors import BadResultError, NoResultError
+from posteriors import BadResultError, NoResultError, listen, posteriors
 from posteriors.frame_report import FrameReport
-from posteriors.listening import listen, posteriors
 from tests.fake_rosbridge import FakeRosbridge
 
 PATIENCE = 60.0
@@ -89,42 +88,34 @@ async def test_a_posterior_without_a_report_comes_too():
     async with hearing() as (fake, heard):
         await fake.publish("/BMresults", result(0, 1, 0, 0))
         posterior = await heard.next(PATIENCE)
-        assert posterior.number is None
-        assert posterior.best() == {"y": 0, "x": 1}
+        assert (posterior.number, posterior.best()) == (None, {"y": 0, "x": 1})
 
 
-async def test_other_topics():
-    async with hearing(topic="/here", frame_topic="/frames") as (fake, heard):
+async def test_other_topics_and_other_stacks():
+    async with hearing(topic="/here", frame_topic="/frames", deployment="boat") as (fake, heard):
+        await fake.publish("/frames", report(70, deployment="car"))
         await fake.publish("/frames", report(5))
         await fake.publish("/here", result(1, 0, 0, 0))
         assert (await heard.next(PATIENCE)).number == 5
 
 
-async def test_frames_of_another_stack_are_passed_over():
-    async with hearing(deployment="boat") as (fake, heard):
-        await fake.publish("/bm/frame", report(70, deployment="car"))
-        await fake.publish("/bm/frame", report(71, deployment="car"))
-        await say(fake, 1, 1, 0, 0, 0)
-        assert (await heard.next(PATIENCE)).number == 1
-
-
 async def test_silence_is_named():
     async with hearing() as (fake, heard):
-        with pytest.raises(NoResultError, match=f"/bm/frame and /BMresults from {fake.uri} within 0.1 s: is"):
+        with pytest.raises(NoResultError):
             await heard.next(0.1)
         await fake.vanish()
         await heard._ros.wait_for_state(State.RECONNECTING, PATIENCE)
-        with pytest.raises(NoResultError, match=r"within 0.2 s: the connection is reconnecting"):
+        with pytest.raises(NoResultError, match=State.RECONNECTING):
             await heard.next(0.2)
 
 
 @pytest.mark.parametrize("topic", ["/bm/frame", "/BMresults"])
-async def test_nonsense_is_said_once_and_in_its_place(topic):
+async def test_nonsense_is_raised_once_and_in_its_place(topic):
     async with hearing() as (fake, heard):
         await say(fake, 1, 1, 0, 0, 0)
         assert (await heard.next(PATIENCE)).number == 1
         await fake.publish(topic, {"data": "nonsense"})
-        with pytest.raises(BadResultError, match=f"a message on {topic} is not"):
+        with pytest.raises(BadResultError, match=topic):
             await heard.next(PATIENCE)
         await say(fake, 2, 1, 0, 0, 0)
         assert (await heard.next(PATIENCE)).number == 2
@@ -162,7 +153,7 @@ async def test_closing_ends_the_iteration_after_what_waits():
                 await asyncio.sleep(0.01)
         await heard.close()
         assert [posterior.number async for posterior in heard] == [None]
-        with pytest.raises(DisconnectedError, match="subscription of /BMresults is closed"):
+        with pytest.raises(DisconnectedError):
             await heard.next(1)
         await fake.wait_for_op("unsubscribe", topic="/bm/frame")
 
@@ -189,7 +180,7 @@ async def test_two_readers_are_one_too_many():
 
 async def test_a_queue_needs_room():
     async with FakeRosbridge() as fake, connect(fake.uri) as ros:
-        with pytest.raises(OptionError, match="queue_size of /BMresults must be at least 1"):
+        with pytest.raises(OptionError):
             posteriors(ros, queue_size=0)
 
 
@@ -238,27 +229,24 @@ async def test_a_function_gets_each_in_the_callers_thread(calling):
     assert "posteriors" not in threads
 
 
-async def test_returning_false_ends_it(calling):
+async def test_returning_false_ends_it_and_nothing_or_zero_does_not(calling):
     assert await calling(lambda posterior: posterior.number < 2) == 2
-
-
-async def test_returning_nothing_or_zero_does_not(calling):
     assert await calling(lambda posterior: 0 if posterior.number == 1 else None, count=2) == 2
 
 
-async def test_what_the_function_raises_is_raised(calling):
+async def test_the_functions_exceptions_are_raised(calling):
     with pytest.raises(ZeroDivisionError):
         await calling(lambda posterior: 1 / 0)
 
 
 async def test_silence_ends_it(calling):
-    with pytest.raises(NoResultError, match="within 0.2 s"):
+    with pytest.raises(NoResultError):
         await calling(lambda posterior: None, frames=0, first_timeout=0.2)
-    with pytest.raises(NoResultError, match="within 0.3 s"):
+    with pytest.raises(NoResultError):
         await calling(lambda posterior: None, frames=1, timeout=0.3)
 
 
-async def test_more_can_be_said_of_the_connection(calling):
+async def test_a_client_may_be_given_instead_of_a_uri(calling):
     calling.server = connect(calling.fake.uri, connect_timeout=30)
     assert await calling(lambda posterior: None, count=1) == 1
 
@@ -301,15 +289,15 @@ async def test_ctrl_c_is_an_end_like_any_other(when):
 
 
 def test_numpy_is_not_imported_before_it_is_wanted():
-    code = "import sys, posteriors.listening; sys.exit('numpy' in sys.modules)"
+    code = "import sys, posteriors; sys.exit('numpy' in sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True, timeout=PATIENCE)
 
 
-def test_where_there_is_no_loop_nobody_waits_for_one(monkeypatch):
+def test_a_thread_without_a_loop_raises_in_the_caller(monkeypatch):
     def run(work):
         work.close()
         raise OSError(errno.EMFILE, "Too many open files")
 
     monkeypatch.setattr(asyncio, "run", run)
-    with pytest.raises(OSError, match="Too many open files"):
+    with pytest.raises(OSError, match="Too many"):
         listen("ws://127.0.0.1:1", print)

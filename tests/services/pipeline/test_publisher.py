@@ -1,28 +1,22 @@
-"""Results that go to several servers, one of which may be away."""
+"""Results: in order, and to several servers, one of which may be away."""
 
 import asyncio
 from contextlib import asynccontextmanager
 
 import numpy as np
-import pytest
 
 from bridge.client import State
 from pcie_shim.host.frame import BoardResult
 from services.pipeline.driver_frames import encode_boards
+from services.pipeline.publisher import Publisher
 from services.pipeline.result_topics import ResultTopics
 from services.settings import Settings
-from services.sockets.records import FrameResult, Publish
+from services.sockets.records import FrameResult, Outcome, Publish, Published
 from tests.fake_rosbridge import FakeRosbridge
-from tests.integration.conftest import build_boat
-from toolchain.deployment import Output, load_deployment
+from toolchain.deployment import Output
 
 REASON = 1
 """Of a board that stopped: a counter had reached its target."""
-
-
-@pytest.fixture(scope="module")
-def boat(tmp_path_factory):
-    return load_deployment(build_boat(tmp_path_factory.mktemp("boat") / "deployment"))
 
 
 @asynccontextmanager
@@ -55,29 +49,76 @@ async def gone(topics, fake):
         await ros.wait_for_state(State.RECONNECTING, 30)
 
 
+class FakeTopics:
+    """Topics of a server that takes a result when it is allowed to, one after the other."""
+
+    must_wait = True
+    rosbridges = {}  # noqa: RUF012  # nobody changes it
+
+    def __init__(self):
+        self.published = []
+        self.allowed = asyncio.Semaphore(0)
+
+    @asynccontextmanager
+    async def opened(self, _on_state):
+        yield "here"
+
+    def publish_now(self, publish):
+        self.published.append(publish.result.number)
+        return Published(publish.result.number, Outcome.PUBLISHED, None, 0, 1.0, 9, 9)
+
+    async def publish(self, publish, *, look):
+        await self.allowed.acquire()
+        return self.publish_now(publish)
+
+
+async def test_results_stay_in_order_while_the_queue_drains(boat, link):
+    publisher = Publisher(Settings(), boat, link.make)
+    topics = publisher._topics = FakeTopics()
+    running = asyncio.create_task(publisher.run())
+    await asyncio.sleep(0.01)
+    for number in (1, 2, 3):
+        link.take(result(boat, number))
+    topics.must_wait = False
+    topics.allowed.release()  # the first is published, and the second waits
+    while topics.published != [1]:
+        await asyncio.sleep(0.001)
+    await asyncio.sleep(0.01)
+    link.take(result(boat, 4))
+    for _ in range(3):
+        topics.allowed.release()
+    while len(topics.published) < 4:
+        await asyncio.sleep(0.001)
+    await asyncio.sleep(0.01)
+    link.take(result(boat, 5))  # at once: nothing waits any more
+    assert topics.published == [1, 2, 3, 4, 5]
+    assert publisher.status().frames.completed == 5
+    running.cancel()
+
+
 async def test_results_go_on_where_a_server_is(boat):
     async with FakeRosbridge() as first, FakeRosbridge() as second, topics_of(boat, first, second) as topics:
         both = await topics.publish(result(boat, 1), look=False)
-        assert (both.outcome, both.missed) == ("published", 0)
+        assert (both.outcome, both.missed) == (Outcome.PUBLISHED, 0)
         await second.wait_for_op("publish", topic="/second")
         await gone(topics, second)
         assert not topics.must_wait  # for nobody who is there
         for number in (2, 3):
             one = await topics.publish(result(boat, number), look=False)
-            assert (one.outcome, one.missed) == ("published", 1)
+            assert (one.outcome, one.missed) == (Outcome.PUBLISHED, 1)
         await first.wait_for_op("publish", topic="/BMresults", count=3)
         assert len(first.ops("publish", topic="/bm/frame")) == 3
         await second.come_back()
         await topics.rosbridges[second.uri].wait_for_state(State.CONNECTED, 30)
         await gone(topics, first)
         other = await topics.publish(result(boat, 4), look=False)
-        assert (other.outcome, other.missed) == ("published", 1)
+        assert (other.outcome, other.missed) == (Outcome.PUBLISHED, 1)
         await second.wait_for_op("publish", topic="/second", count=2)
         # whose data would be on the first
-        assert (await topics.publish(result(boat, 5, count=0), look=False)).outcome == "rosbridge away"
+        assert (await topics.publish(result(boat, 5, count=0), look=False)).outcome == Outcome.ROSBRIDGE_AWAY
         await gone(topics, second)
         assert topics.must_wait
-        assert (await topics.publish(result(boat, 6), look=False)).outcome == "rosbridge away"
+        assert (await topics.publish(result(boat, 6), look=False)).outcome == Outcome.ROSBRIDGE_AWAY
 
 
 async def test_a_server_that_takes_nothing_keeps_nobody_else_from_results(boat, monkeypatch):
@@ -92,7 +133,7 @@ async def test_a_server_that_takes_nothing_keeps_nobody_else_from_results(boat, 
             await asyncio.sleep(0)
         assert topics.must_wait
         one = await topics.publish(result(boat, 1), look=False)
-        assert (one.outcome, one.missed) == ("published", 1)
+        assert (one.outcome, one.missed) == (Outcome.PUBLISHED, 1)
         await first.wait_for_op("publish", topic="/BMresults")
         second.thaw()
 

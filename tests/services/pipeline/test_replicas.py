@@ -1,4 +1,4 @@
-"""Replicas and readings for each line, in the services: rows of addresses in, posteriors one after the other out."""
+"""Replicas and readings for each line: rows of addresses in, posteriors one after the other out."""
 
 import json
 
@@ -56,13 +56,10 @@ def test_a_written_prior_is_for_all_replicas_or_each():
         assert np.frombuffer(reading.prior_codes, "<u2").tolist() == codes
 
 
-def test_a_wrong_length_names_the_variable_and_the_topic():
-    with pytest.raises(
-        VariableError, match=r"/t: variable K has 5 values, expected 6 \(3 replicas of 2 lines\)"
-    ):
-        FrameAssembler(CELLS).take(0, {"K": [0] * 5, "P": [0, 0, 0]}, 5, 6)
-    with pytest.raises(VariableError, match="variable P has 2 values, expected 3"):
-        FrameAssembler(CELLS).take(0, {"K": [0] * 6, "P": [0, 0]}, 5, 6)
+@pytest.mark.parametrize("message", [{"K": [0] * 5, "P": [0, 0, 0]}, {"K": [0] * 6, "P": [0, 0]}])
+def test_an_array_of_another_length_is_refused(message):
+    with pytest.raises(VariableError):
+        FrameAssembler(CELLS).take(0, message, 5, 6)
 
 
 @pytest.mark.parametrize(
@@ -75,23 +72,23 @@ def test_a_wrong_length_names_the_variable_and_the_topic():
         ({"sensor_mode": SensorMode.CELL}, [[1, 2], 1], [[1, 2]], 1),
     ],
 )
-def test_what_the_driver_is_given(changes, addresses, inputs, rows):
+def test_addresses_become_the_drivers_inputs(changes, addresses, inputs, rows):
     found, row = machine_inputs(deployment(**changes), addresses)
     assert (found.tolist(), row) == (inputs, rows)
 
 
 @pytest.mark.parametrize(
-    ("addresses", "sentence"),
+    "addresses",
     [
-        ([[0] * 6], "has 1 readings; this deployment has 2 variables"),
-        ([[0] * 5, [0] * 3], "reading of K has 5 addresses; this deployment takes 6 of it"),
-        ([7, [0] * 3], "reading of K has one address; this deployment takes 6 of it"),
-        ([[0] * 6, [0] * 4], "reading of P has 4 addresses; this deployment takes 3 of it"),
-        ([[0] * 5 + [2**70], [0] * 3], "reading of K has an address beyond"),
+        [[0] * 6],
+        [[0] * 5, [0] * 3],
+        [7, [0] * 3],
+        [[0] * 6, [0] * 4],
+        [[0] * 5 + [2**70], [0] * 3],
     ],
 )
-def test_rows_that_do_not_fit_are_refused(addresses, sentence):
-    with pytest.raises(FrameInputError, match=sentence):
+def test_rows_that_do_not_fit_are_refused(addresses):
+    with pytest.raises(FrameInputError):
         machine_inputs(CELLS, addresses)
 
 
@@ -120,7 +117,7 @@ def test_posteriors_are_normalised_over_boards_and_by_replica():
     assert (nothing.posterior, nothing.best, nothing.totals) == (None, -1, [0])
 
 
-def test_what_is_published_is_read_back():
+def test_a_published_frame_is_read_back():
     counted = result(board([[1, 3], [0, 0], [2, 2]], [100, 0, 40], [OVERFLOW, IMPOSSIBLE, SLICE]))
     inferred = Inference(counted)
     message = {"layout": posterior_layout(CELLS), "data": inferred.posterior.tolist()}
@@ -138,15 +135,10 @@ def test_what_is_published_is_read_back():
     assert of_board.replica_stopped == ("overflow", "impossible", "slice")
 
 
-@pytest.mark.parametrize(
-    ("value", "said"),
-    [(None, "is absent or null"), ([], "is an empty array"), ([[], []], "is an empty array")],
-)
-def test_what_stands_there_instead_of_readings_is_said(value, said):
-    needed = CELLS.model_copy(
-        update={
-            "variables": tuple(each.model_copy(update={"on_missing": "error"}) for each in CELLS.variables)
-        }
-    )
-    with pytest.raises(VariableError, match=f"variable K {said}, and this deployment needs it"):
-        FrameAssembler(needed).take(0, {"K": value, "P": [0, 1, 0]}, 5, 6)
+@pytest.mark.parametrize("value", [None, [], [[], []]])
+def test_a_needed_array_may_not_be_missing(value):
+    needed = tuple(each.model_copy(update={"on_missing": "error"}) for each in CELLS.variables)
+    with pytest.raises(VariableError):
+        FrameAssembler(CELLS.model_copy(update={"variables": needed})).take(
+            0, {"K": value, "P": [0, 1, 0]}, 5, 6
+        )

