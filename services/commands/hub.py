@@ -86,7 +86,9 @@ def hub(
     )
 
 
-def _access_policy(certificate: Path | None, key: Path | None, tokens: Path | None, origins: list[str]) -> AccessPolicy:
+def _access_policy(
+    certificate: Path | None, key: Path | None, tokens: Path | None, origins: list[str]
+) -> AccessPolicy:
     """Return the access rules of the flags."""
     if (certificate is None) != (key is None):
         raise SettingsError(
