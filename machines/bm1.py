@@ -19,8 +19,8 @@ class BM1Machine:
     """A machine that can run: parameters and the codes of every cell. Arrays are kept as read-only copies.
 
     Attributes:
-        parameters: What the machine is built with.
-        prior: uint16[2**prior_bits, lines], the prior's codes; its row 0 is also what a written prior is
+        parameters: Sizes, widths and generators.
+        prior: uint16[2**prior_bits, lines], the prior's codes; its row 0 is also a written prior's
             until the host writes one.
         tables: One uint16[2**sensor_bits, lines] per sensor column; the top row is all-ones codes (a
             missing reading). None of them where `sensor_mode` is `threshold`.

@@ -182,7 +182,7 @@ class DrivenBoard:
             )
 
     def close(self, reason: str) -> None:
-        """End the link; the board stops what it was doing."""
+        """End the link; the board stops computing."""
         if self.link is not None:
             self.link.close(reason)
             self.link = None
@@ -274,7 +274,7 @@ class DrivenBoard:
 
     def result(self) -> BoardResult:
         """Return the frame's result; the counts are copied out of the link's buffer."""
-        assert self.done is not None  # noqa: S101 - every board has said done
+        assert self.done is not None  # noqa: S101 - every board is done
         if self.replicas > 1:
             reasons = tuple(StopReason(reason) for reason in self.outcomes["reason"].tolist())
             joint = joint_reason(reasons, range(self.replicas))

@@ -67,15 +67,15 @@ class BoardResult(msgspec.Struct, frozen=True, array_like=True, tag="board"):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrameOutput:
-    """A frame's results, and where its time went (thesis figure 4.5), in nanoseconds.
+    """A frame's results and the time of its parts (thesis figure 4.5), in nanoseconds.
 
     Attributes:
         boards: One result per board, in the order of the partition.
         register_writes_ns: Posting settings, sensors, starts and resumes.
-        compute_ns: Waiting for the boards, their computing and the link's way included.
-        reads_ns: Taking the results out of what came.
-        boards_compute_ns: The boards' own computing: the slowest board of each slice, summed. What
-            `compute_ns` has above it is transport, and boards that had to share a core.
+        compute_ns: Waiting for the boards, which includes their computing and the link's transport.
+        reads_ns: Copying the results.
+        boards_compute_ns: The boards' own computing: the slowest board of each slice, summed. The rest of
+            `compute_ns` is transport, and waiting of boards that share a core.
         slices: Number of rounds of starting or resuming and waiting.
     """
 

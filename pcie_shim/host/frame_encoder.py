@@ -1,4 +1,4 @@
-"""Register words of a frame: what the host writes to each board to start it."""
+"""Register words of a frame, which the host writes to each board to start it."""
 
 from __future__ import annotations
 

@@ -50,7 +50,7 @@ class Done(NamedTuple):
 
 
 class Link(Protocol):
-    """One open link to a board, whatever carries it; it closes itself once what it carries cannot be trusted.
+    """One open link to a board over any medium; it closes itself once its data cannot be trusted.
 
     A host with one board reads, writes and waits. A host with many boards posts to each of them, polls
     their descriptors and takes what has come. Every method raises `LinkError`: `AccessError` where the

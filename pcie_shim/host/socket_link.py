@@ -367,7 +367,7 @@ class SocketLink(Link):
 
     def _broken_send(self, error: OSError) -> NoReturn:
         if isinstance(error, BlockingIOError):
-            self._give_up(self.late(self.timeout, "take what was written"))
+            self._give_up(self.late(self.timeout, "accept the data"))
         # A board sends the reason before it closes: its ERROR may be in the buffer.
         frame = None
         with suppress(LinkError):

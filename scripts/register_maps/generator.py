@@ -97,7 +97,7 @@ class RegisterMap:
 
     @property
     def bar_size(self) -> int:
-        """The smallest power of two, in bytes, that holds the map: what a BAR can be."""
+        """The smallest power of two, in bytes, that holds the map, as a BAR requires."""
         return 1 << (max(block.address + 4 * block.words for block in self.blocks) - 1).bit_length()
 
     @property
@@ -300,7 +300,7 @@ def generated_files(register_map: RegisterMap) -> dict[Path, str]:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Write all files, or with `--check` say whether they are what the SystemRDL file makes of them."""
+    """Write all files, or with `--check` compare them with the SystemRDL file's output."""
     parser = argparse.ArgumentParser(
         prog="scripts/registers",
         description="Makes the constants module, the documentation, the VHDL and the C header from hdl/bm_registers.rdl.",

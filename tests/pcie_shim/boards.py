@@ -9,6 +9,7 @@ import signal
 import socket
 import struct
 from collections.abc import Sequence
+from typing import TypeAlias
 
 import numpy as np
 
@@ -119,8 +120,12 @@ class BoardProcess:
         self.process.join(60)
 
 
-def expected(parts: Sequence[Image], frame: FrameInput) -> list[tuple[list[int], int, StopReason]]:
-    """What the machines give for a frame, computed here with kernels and no board: counts, cycles, reason."""
+Outcomes: TypeAlias = list[tuple[list[int], int, StopReason]]
+"""Counts, cycles and reason of each board."""
+
+
+def expected(parts: Sequence[Image], frame: FrameInput) -> Outcomes:
+    """Compute a frame here, with kernels and without boards."""
     kernels = [make_kernel(part.machine) for part in parts]
     sliced = frame.stop == "slices"
     end = 256 if sliced else 0
@@ -128,16 +133,12 @@ def expected(parts: Sequence[Image], frame: FrameInput) -> list[tuple[list[int],
         end *= 2
     for kernel, part in zip(kernels, parts, strict=True):
         parameters = part.machine.parameters
-        offset = part.partition.line_offset
-        prior = frame.prior_codes
+        lines = slice(part.partition.line_offset, part.partition.line_offset + parameters.lines)
         kernel.start(
             Start(
-                addresses=tuple(
-                    parameters.missing_address(column) if address is None else address
-                    for column, address in enumerate(frame.addresses, start=1)
-                ),
+                addresses=_inputs(parameters, frame.addresses, lines),
                 prior_address=frame.prior_address,
-                prior_codes=None if prior is None else prior[offset : offset + parameters.lines],
+                prior_codes=None if frame.prior_codes is None else frame.prior_codes[lines],
                 target_count=frame.target_count,
                 max_cycles=frame.max_cycles,
                 bank=frame.bank,
@@ -154,63 +155,41 @@ def expected(parts: Sequence[Image], frame: FrameInput) -> list[tuple[list[int],
     return [(kernel.counts.tolist(), kernel.cycles, kernel.reason) for kernel in kernels]
 
 
-def expected_of_replicas(
-    parts: Sequence[Image], frame: FrameInput
-) -> list[list[tuple[list[int], int, StopReason]]]:
-    """The same, for each replica: what machines of one replica each give, which know nothing of the others."""
-    total = sum(part.machine.parameters.lines for part in parts)
-    replicas = parts[0].machine.parameters.replicas
-    inputs = np.asarray(frame.addresses)
-    by_replica = []
-    for at in range(replicas):
-        own = inputs[at] if replicas > 1 else inputs
-        priors, codes = frame.prior_address, frame.prior_codes
-        alone = []
-        for part in parts:
-            parameters = part.machine.parameters
-            lines = slice(part.partition.line_offset, part.partition.line_offset + parameters.lines)
-            # what each cell is given becomes a table of one row: a machine of one input per column
-            rows = [
-                _codes_of(
-                    parameters, part.machine.tables[column] if parameters.has_tables else None, row, lines
-                )
-                for column, row in enumerate(own)
-            ]
-            plain = dataclasses.replace(
-                parameters,
-                replicas=1,
-                sensor_mode=SensorMode.COLUMN,
-                sensor_bits=(1,) * parameters.sensors,
-            )
-            top = np.full(parameters.lines, parameters.ones_code, np.uint16)
-            tables = tuple(np.stack([row, top]) for row in rows)
-            machine = BM1Machine(plain, part.machine.prior, tables, part.machine.rng_table)
-            alone.append(dataclasses.replace(part, machine=machine, interface_sensors=20))
-        by_replica.append(
-            expected(
-                alone,
-                dataclasses.replace(
-                    frame,
-                    addresses=(0,) * len(own),
-                    prior_address=priors[at] if isinstance(priors, tuple) else priors,
-                    prior_codes=codes[at]
-                    if codes is not None and codes.shape == (replicas, total)
-                    else codes,
-                ),
-            )
+def expected_of_replicas(parts: Sequence[Image], frame: FrameInput) -> list[Outcomes]:
+    """Compute a frame for each replica with machines of one replica, which are independent of the others."""
+    parameters = parts[0].machine.parameters
+    alone = []
+    for part in parts:
+        one = dataclasses.replace(part.machine.parameters, replicas=1)
+        of_one = dataclasses.replace(part.machine, parameters=one)
+        alone.append(dataclasses.replace(part, machine=of_one, interface_sensors=interface_words(one)[0]))
+    inputs = np.asarray(frame.addresses).reshape(parameters.replicas, parameters.sensors, -1)
+    priors, codes = frame.prior_address, frame.prior_codes
+    return [
+        expected(
+            alone,
+            dataclasses.replace(
+                frame,
+                addresses=own,
+                prior_address=priors[replica] if isinstance(priors, tuple) else priors,
+                prior_codes=codes if codes is None or codes.ndim == 1 else codes[replica],
+            ),
         )
-    return by_replica
+        for replica, own in enumerate(inputs)
+    ]
 
 
-def _codes_of(
-    parameters: BM1Parameters, table: np.ndarray | None, given: np.ndarray, lines: slice
-) -> np.ndarray:
-    """One code per line of a board, from a column's inputs (-1: missing)."""
-    own = given[lines] if np.ndim(given) else np.full(parameters.lines, given)
-    if own[0] == -1:
-        return np.full(parameters.lines, parameters.ones_code, np.uint16)
-    codes = own if table is None else table[own, np.arange(parameters.lines)]
-    return np.asarray(codes, np.uint16)
+def _inputs(parameters: BM1Parameters, given: object, lines: slice) -> tuple[int, ...] | np.ndarray:
+    """Return a board's inputs; None or -1 is a missing reading."""
+    if not parameters.sensors:
+        return ()
+    missing = (1 << np.array(parameters.sensor_bits, np.int64)) - 1
+    if isinstance(given, tuple):
+        given = np.array([-1 if address is None else address for address in given], np.int64)
+    own = given.reshape(parameters.sensors, -1)
+    if parameters.sensor_mode is not SensorMode.COLUMN:
+        return np.where(own[:, lines] == -1, missing[:, np.newaxis], own[:, lines])
+    return tuple(np.where(own[:, 0] == -1, missing, own[:, 0]).tolist())
 
 
 def tcp_endpoint() -> str:

@@ -173,6 +173,7 @@ def _section(shape: list[int], **others: object) -> Callable[[dict], None]:
         _section([1, 8], dtype="O"),
         _section([1, 8], name="column 1"),
         lambda identity: identity["sections"].pop(),
+        lambda identity: identity["sections"].clear(),
         lambda identity: identity["sections"].append(identity["sections"][0]),
         lambda identity: identity["parameters"].update(lines=2**32 - 1),
         lambda identity: identity["parameters"].update(lines=10**30),
@@ -190,7 +191,10 @@ def test_a_crafted_manifest_is_refused_before_anything_is_allocated(change: Call
     manifest["image_hash"] = hashlib.sha256(programming_file._canonical(manifest["identity"])).hexdigest()
     text = programming_file._canonical(manifest)
     header = content[:8] + len(text).to_bytes(4, "little") + bytes(4) + hashlib.sha256(text).digest()
-    crafted = header + text + content[48 + int.from_bytes(content[8:12], "little") :]
+    data = (
+        content[48 + int.from_bytes(content[8:12], "little") :] if manifest["identity"]["sections"] else b""
+    )
+    crafted = header + text + data
     tracemalloc.start()
     try:
         with pytest.raises(ImageError) as caught:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from machines.bm1 import Start, StopReason
+from machines.bm1 import BM1Machine, Start, StopReason
 from machines.kernel import make_kernel
 from pcie_shim import framing
 from pcie_shim import register_map as rm
@@ -42,6 +42,12 @@ PATIENCE = 60.0
 
 def open_link(board: BoardProcess) -> SocketLink:
     return SocketLink.open(parse_endpoint(board.endpoint), timeout=PATIENCE)
+
+
+def programmed(start_board: StartBoard, of: BM1Machine) -> BoardProcess:
+    board = start_board()
+    program(board.endpoint, image(of))
+    return board
 
 
 def refused(code: ErrorCode):
@@ -89,9 +95,7 @@ def test_a_frame_over_a_link(start_board: StartBoard, kind: str) -> None:
 
 
 def test_results_of_an_interrupt_outlive_later_reads(start_board: StartBoard) -> None:
-    board = start_board()
-    program(board.endpoint, image(MACHINE))
-    with open_link(board) as link:
+    with open_link(programmed(start_board, MACHINE)) as link:
         link.write32(rm.CONTROL, ENABLE)
         link.write_block(rm.SENSORS, words(2, 5))
         link.write_block(rm.TARGET_COUNT, struct.pack("<IQIIQI", 50, 4000, 1, 0, 0, 1))
@@ -104,9 +108,7 @@ def test_results_of_an_interrupt_outlive_later_reads(start_board: StartBoard) ->
 
 
 def test_without_interrupts_the_host_reads_done(start_board: StartBoard) -> None:
-    board = start_board()
-    program(board.endpoint, image(MACHINE))
-    with open_link(board) as link:
+    with open_link(programmed(start_board, MACHINE)) as link:
         link.write_block(rm.SENSORS, words(1, 1))
         link.write_block(rm.TARGET_COUNT, struct.pack("<IQIIQI", 5, 4000, 0, 0, 0, 1))
         assert link.read32(rm.DONE) == 1
@@ -136,8 +138,7 @@ def test_a_refused_posted_write_is_heard_of(start_board: StartBoard) -> None:
 
 
 def test_a_running_board_answers_and_can_be_reset(start_board: StartBoard) -> None:
-    board = start_board()
-    program(board.endpoint, image(never_stopping()))
+    board = programmed(start_board, never_stopping())
     with open_link(board) as link:
         run_for_minutes(link)
         with refused(ErrorCode.BUSY):
@@ -158,8 +159,7 @@ def test_a_running_board_answers_and_can_be_reset(start_board: StartBoard) -> No
 
 
 def test_a_second_host_is_refused_and_the_first_goes_on(start_board: StartBoard) -> None:
-    board = start_board()
-    program(board.endpoint, image(never_stopping()))
+    board = programmed(start_board, never_stopping())
     with open_link(board) as silent, open_link(board) as link:
         # the first connection made no request, and so does not hold the board
         assert link.read32(rm.ID) == rm.ID_VALUE
@@ -187,8 +187,7 @@ def test_silent_connections_are_bounded_and_keep_nobody_out(start_board: StartBo
 
 
 def test_a_host_that_vanishes_leaves_the_board_well(start_board: StartBoard) -> None:
-    board = start_board()
-    program(board.endpoint, image(never_stopping()))
+    board = programmed(start_board, never_stopping())
     for _ in range(20):
         link = open_link(board)
         run_for_minutes(link)
@@ -266,9 +265,7 @@ def test_the_host_hears_why_its_link_was_closed(start_board: StartBoard) -> None
 
 
 def test_a_wrong_done_number_closes_the_link(start_board: StartBoard) -> None:
-    board = start_board()
-    program(board.endpoint, image(MACHINE))
-    with open_link(board) as link:
+    with open_link(programmed(start_board, MACHINE)) as link:
         link.write32(rm.CONTROL, ENABLE)
         link.write_block(rm.TARGET_COUNT, struct.pack("<IQIIQI", 5, 4000, 0, 0, 0, 1))
         with pytest.raises(SequenceError):
@@ -290,8 +287,7 @@ def test_sockets_are_private_and_go_away(start_board: StartBoard, folder: Path) 
 
 
 def test_a_running_machine_does_not_keep_a_board_from_stopping(start_board: StartBoard, folder: Path) -> None:
-    board = start_board()
-    program(board.endpoint, image(never_stopping()))
+    board = programmed(start_board, never_stopping())
     with open_link(board) as link:
         run_for_minutes(link)
         assert board.stop() == 0
@@ -356,8 +352,7 @@ def test_large_images_come_in_parts(start_board: StartBoard) -> None:
 
 
 def test_the_loader_is_refused_while_a_host_holds_the_board(start_board: StartBoard) -> None:
-    board = start_board()
-    program(board.endpoint, image(MACHINE))
+    board = programmed(start_board, MACHINE)
     with open_link(board) as link:
         assert link.read32(rm.PROGRAMMED) == 1
         with pytest.raises(HeldError):
@@ -367,8 +362,7 @@ def test_the_loader_is_refused_while_a_host_holds_the_board(start_board: StartBo
 
 
 def test_a_handle_open_across_a_reprogramming_is_stale(start_board: StartBoard) -> None:
-    board = start_board()
-    program(board.endpoint, image(MACHINE))
+    board = programmed(start_board, MACHINE)
     link = open_link(board)
     program(board.endpoint, image(machine(2)), token=link.greeting.token)
     with pytest.raises(StaleHandleError):
@@ -380,8 +374,7 @@ def test_a_handle_open_across_a_reprogramming_is_stale(start_board: StartBoard) 
 
 
 def test_a_running_board_is_not_programmed_even_by_its_host(start_board: StartBoard) -> None:
-    board = start_board()
-    program(board.endpoint, image(never_stopping()))
+    board = programmed(start_board, never_stopping())
     with open_link(board) as link:
         run_for_minutes(link)
         with refused(ErrorCode.BUSY):
