@@ -32,49 +32,6 @@ def test_order_is_kept_between_topics_and_answers() -> None:
     assert (outbox.size, len(outbox)) == (0, 0)
 
 
-def test_a_full_lane_drops_its_own_oldest_and_counts_it() -> None:
-    outbox, quick, quiet = Outbox(1000), _lane(queue_length=2), _lane()
-    outbox.offer(quiet, b"quiet", 0)
-    for index in range(5):
-        outbox.offer(quick, b"%d" % index, 0)
-    assert _drain(outbox) == [b"quiet", b"3", b"4"]
-    assert (quick.dropped, quiet.dropped) == (3, 0)
-
-
-def test_bytes_are_bounded_over_all_lanes_and_answers_are_never_dropped() -> None:
-    outbox, one, other = Outbox(10), _lane(), _lane()
-    outbox.offer(one, b"1111", 0)
-    outbox.put(b"22")
-    outbox.offer(other, b"3333", 0)
-    outbox.offer(other, b"4444", 0)
-    assert _drain(outbox) == [b"22", b"3333", b"4444"]
-    assert one.dropped == 1
-    assert not outbox.overflowed
-
-
-def test_answers_beyond_the_bound_overflow() -> None:
-    outbox, lane = Outbox(10), _lane()
-    outbox.offer(lane, b"333", 0)
-    outbox.put(b"55555")
-    outbox.put(b"55555")
-    assert not outbox.overflowed
-    outbox.put(b"1")
-    assert outbox.overflowed
-    outbox.offer(lane, b"1", 0)
-    assert lane.dropped == 2
-    assert _drain(outbox) == [b"55555", b"55555"]
-
-
-def test_a_throttle_without_a_queue_drops_what_comes_too_early() -> None:
-    outbox, lane = Outbox(1000), _lane(throttle=1.0, queue_length=0)
-    sent = []
-    for index in range(25):
-        outbox.offer(lane, b"%d" % index, index / 10)
-        sent += _drain(outbox)
-    assert sent == [b"0", b"10", b"20"]
-    assert outbox.deadline == inf
-
-
 def test_a_throttle_with_a_queue_spreads_what_comes_too_early() -> None:
     outbox, lane = Outbox(1000), _lane(throttle=1.0, queue_length=2)
     for index in range(5):
@@ -104,15 +61,6 @@ def test_what_is_held_counts_towards_the_bytes_and_makes_room() -> None:
     assert held.dropped == 5
 
 
-def test_a_late_release_does_not_turn_the_order() -> None:
-    outbox, lane = Outbox(1000), _lane(throttle=1.0, queue_length=9)
-    for index in range(3):
-        outbox.offer(lane, b"%d" % index, index * 0.9)  # the second waits until 1, and nobody releases it
-    assert _drain(outbox) == [b"0"]
-    outbox.release(1.8)
-    assert _drain(outbox) == [b"1"]
-
-
 def test_lifting_a_throttle_queues_what_it_held() -> None:
     outbox, lane = Outbox(1000), _lane(throttle=1.0, queue_length=5)
     for index in range(4):
@@ -133,14 +81,6 @@ def test_shortening_a_queue_drops_the_oldest_held() -> None:
     assert outbox.deadline == 0.5
     outbox.release(0.5)
     assert _drain(outbox) == [b"3"]
-
-
-def test_a_throttled_message_replaces_the_one_that_the_socket_has_not_taken() -> None:
-    outbox, lane = Outbox(1000), _lane(throttle=1.0, queue_length=0)
-    outbox.offer(lane, b"old", 0)
-    outbox.offer(lane, b"new", 1)
-    assert _drain(outbox) == [b"new"]
-    assert lane.dropped == 1
 
 
 def test_forgetting_a_lane_leaves_nothing_of_it() -> None:
