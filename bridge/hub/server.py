@@ -354,7 +354,8 @@ class _Connection(WebSocketTransport):
             return
         outbox = client.outbox
         if outbox.wire:
-            self.send(outbox.take_wire())
+            payloads, outbox.wire = outbox.wire, []
+            self.send(payloads)
         if outbox.wire is None or not outbox.empty:
             self._flush_backlog(outbox)
         self.proceed()

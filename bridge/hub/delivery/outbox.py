@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 
 _GAPS: Final = 64
 """Gaps in a queue before it is packed, beyond as many as there are messages."""
-_WIRE_BYTES: Final = 64 * 1024
-"""Bytes on the wire list after which payloads are queued, and so counted, until the socket has accepted these."""
 _BRACE: Final = ord("{")
 
 
@@ -76,7 +74,6 @@ class Outbox:
         "_largest",
         "_max_bytes",
         "_numbers",
-        "_wire_bytes",
         "deadline",
         "overflowed",
         "size",
@@ -95,9 +92,8 @@ class Outbox:
         self._fragments: Iterator[bytes] | None = None
         self._cutting = 0
         self._numbers = itertools.count(1)
-        self._wire_bytes = 0
         self.wire: list[bytes] | None = None
-        """Payloads for the socket's next write; None while it accepts nothing, so that everything is queued."""
+        """Payloads of this turn for the socket; None while it accepts nothing, so that everything is queued."""
         self.size = 0
         """Bytes in the queue."""
         self.undroppable = 0
@@ -119,11 +115,6 @@ class Outbox:
     def congested(self) -> bool:
         """Return whether one more answer could overflow it, so that its client must read before it asks again."""
         return self.undroppable > 0 and self.undroppable + self._largest > self._max_bytes
-
-    def take_wire(self) -> list[bytes]:
-        """Return and remove the payloads for the socket's next write."""
-        payloads, self.wire, self._wire_bytes = self.wire or [], [], 0
-        return payloads
 
     def put(self, payload: bytes, fragment_size: int = 0) -> None:
         """Queue an answer or a request of a service or an action, which must not be dropped."""
@@ -151,17 +142,10 @@ class Outbox:
                 return
             lane.next_time = now + lane.throttle
         wire = self.wire  # as `_bypass`, without its call: most messages go this way
-        if (
-            wire is None
-            or lane.fragment_size
-            or self._entries
-            or self._wire_bytes >= _WIRE_BYTES
-            or self._fragments is not None
-        ):
+        if wire is None or lane.fragment_size or self._entries or self._fragments is not None:
             self._queue(lane, payload)
         else:
             wire.append(payload)
-            self._wire_bytes += len(payload)
 
     def pop(self) -> bytes | None:
         """Take the next message or fragment for the socket, or None."""
@@ -225,16 +209,9 @@ class Outbox:
 
     def _bypass(self, payload: bytes, fragment_size: int) -> bool:
         """Put a payload on the wire list, if nothing waits before it and the socket accepts data."""
-        if (
-            self.wire is None
-            or fragment_size
-            or self._entries
-            or self._wire_bytes >= _WIRE_BYTES
-            or self._fragments is not None
-        ):
+        if self.wire is None or fragment_size or self._entries or self._fragments is not None:
             return False
         self.wire.append(payload)
-        self._wire_bytes += len(payload)
         return True
 
     def _deliver(self, lane: Lane, payload: bytes) -> None:

@@ -17,12 +17,12 @@ from bridge.hub.access import AccessPolicy
 from bridge.hub.limits import HubLimits
 from bridge.hub.server import serve_hub
 
-#: No wait in these tests may take longer; none should take a tenth of it.
 PATIENCE = 60.0
+"""Maximum of seconds for any wait in these tests; none should take a tenth of it."""
 
 
 class Client:
-    """A WebSocket client that speaks in operations."""
+    """A WebSocket client that sends and receives operations."""
 
     def __init__(self, websocket: ClientConnection) -> None:
         self.websocket = websocket
@@ -41,12 +41,18 @@ class Client:
         assert (answer["op"], answer["id"]) == ("service_response", "ask"), answer
         return answer["values"]
 
+    async def wait_for(self, service: str, accepts: Callable[[Any], bool], **args: Any) -> None:
+        """Repeat a call until its one value is accepted."""
+        async with asyncio.timeout(PATIENCE):
+            while not accepts(next(iter((await self.ask(service, **args)).values()))):
+                await asyncio.sleep(0.01)
+
     async def sync(self) -> None:
-        """Come back when the hub has done all that was sent before."""
+        """Wait until the hub has performed everything that was sent before."""
         await self.ask("/rosapi/get_time")
 
     async def closed(self) -> int:
-        """Wait for the hub to end the connection; the close code."""
+        """Wait for the hub to end the connection, and return the close code."""
         async with asyncio.timeout(PATIENCE):
             await self.websocket.wait_closed()
         code = self.websocket.close_code
@@ -62,7 +68,7 @@ async def running_hub(
     access: AccessPolicy | None = None,
     ros_version: Literal[1, 2] = 1,
 ) -> AsyncIterator[int]:
-    """A hub on a port of this machine (0: any free one); its port."""
+    """Run a hub on a port of this machine, 0 for any free one, and yield its port."""
     stop = asyncio.Event()
     ready: asyncio.Future[int] = asyncio.get_running_loop().create_future()
     served = asyncio.create_task(
@@ -91,7 +97,7 @@ async def client(port: int, **options: Any) -> AsyncIterator[Client]:
 
 
 class RawClient:
-    """A WebSocket client that does nothing by itself: it answers no ping, reads only when told."""
+    """A WebSocket client that does nothing by itself: it answers no pings and reads on demand."""
 
     def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self.reader = reader
@@ -111,7 +117,7 @@ class RawClient:
         return raw
 
     async def request(self, *headers: str, path: str = "/") -> str:
-        """Ask for a WebSocket; the status line of the answer."""
+        """Request a WebSocket, and return the status line of the answer."""
         key = base64.b64encode(os.urandom(16)).decode()
         lines = [
             f"GET {path} HTTP/1.1",
@@ -133,7 +139,7 @@ class RawClient:
         self.send(json.dumps(operation).encode())
 
     async def frame(self) -> tuple[int, bytes]:
-        """The next frame's opcode and payload."""
+        """Return the next frame's opcode and payload."""
         first, length = await self.reader.readexactly(2)
         if length == 126:
             (length,) = struct.unpack("!H", await self.reader.readexactly(2))
@@ -142,7 +148,7 @@ class RawClient:
         return first & 15, await self.reader.readexactly(length)
 
     async def message(self) -> bytes:
-        """The next message's payload; pings may come between any two messages."""
+        """Return the next message's payload, skipping pings."""
         async with asyncio.timeout(PATIENCE):
             while True:
                 opcode, payload = await self.frame()
@@ -150,7 +156,7 @@ class RawClient:
                     return payload
 
     async def ended(self) -> bytes:
-        """Wait until the hub ends the connection; what came before that."""
+        """Wait until the hub ends the connection, and return everything before that."""
         async with asyncio.timeout(PATIENCE):
             data = b""
             try:
