@@ -1,4 +1,4 @@
-"""Whatever clients send: nobody is told, nothing breaks, and they are served on."""
+"""Malformed messages are refused silently, and their senders continue to be served."""
 
 import json
 import logging

@@ -146,28 +146,23 @@ async def test_the_port_can_be_used_again_at_once() -> None:
     await serve_hub("127.0.0.1", port, stop=stop)
 
 
-async def test_an_address_in_use_is_one_sentence() -> None:
+async def test_an_address_in_use_is_an_error_with_an_exit_code() -> None:
     async with running_hub() as port:
-        with pytest.raises(HubError, match=f"127.0.0.1 port {port}.*ddress.*in use") as caught:
+        with pytest.raises(HubError, match=f"port {port}") as caught:
             await serve_hub("127.0.0.1", port, stop=asyncio.Event())
         assert caught.value.exit_code == 2
         assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
-    ("host", "port", "said"),
-    [
-        ("192.0.2.1", 0, "192.0.2.1 port 0"),
-        ("no-such-host.invalid", 0, "no-such-host.invalid: that is not an address or name of this machine"),
-        ("127.0.0.1", 70000, "127.0.0.1 port 70000"),
-    ],
+    ("host", "port"), [("192.0.2.1", 0), ("no-such-host.invalid", 0), ("127.0.0.1", 70000)]
 )
-async def test_an_address_that_is_not_ours_is_one_sentence(host: str, port: int, said: str) -> None:
-    with pytest.raises(HubError, match=said):
+async def test_an_address_that_is_not_ours_is_an_error(host: str, port: int) -> None:
+    with pytest.raises(HubError, match=host):
         await serve_hub(host, port, stop=asyncio.Event())
 
 
-# --- who may come in
+# --- access
 
 
 @pytest.mark.parametrize(

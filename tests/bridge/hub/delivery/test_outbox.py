@@ -56,8 +56,10 @@ def test_what_is_held_counts_towards_the_bytes_and_makes_room() -> None:
     for _ in range(5):
         outbox.offer(held, b"333", 0)
     assert (outbox.size, held.dropped) == (9, 2)  # one queued and two held
+    outbox.put(b"1")
+    assert (outbox.size, held.dropped) == (10, 2)
     outbox.offer(queued, b"8888 8888", 0)
-    assert outbox.size == 9
+    assert outbox.size == 10
     assert held.dropped == 5
 
 
