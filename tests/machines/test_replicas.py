@@ -95,6 +95,10 @@ def test_a_halted_replica_stays_where_it_is_and_the_generators_go_on(make):
     alone = ReferenceBM1(machine_of(1, rng_reset=RngReset.FREE, counter_bits=32))
     alone.start(Start(addresses=(0, 0), target_count=2**32 - 1, max_cycles=running.cycles))
     assert alone.rng_state.tolist() == states.tolist()
+    # the next frame halts nobody
+    running.start(start)
+    running.resume(128)
+    assert running.replica_cycles == (128, 128, 128)
 
 
 @pytest.mark.parametrize(
