@@ -63,7 +63,7 @@ async def test_it_says_that_it_is_a_fake():
         assert client.response.headers["Server"] == SERVER
 
 
-async def test_errors_are_silent_or_told():
+async def test_errors_are_silent_or_reported():
     bad = json.dumps({"op": "nonsense"})
     async with FakeRosbridge() as fake, raw_connect(fake.uri) as client:
         await client.send(bad)
@@ -105,7 +105,7 @@ async def test_two_ids_bring_the_first_message_twice_and_throttling_drops():
         assert await fake.publish("/a", {"n": 3}) == 0
 
 
-async def test_what_nobody_advertised_is_not_relayed_and_null_can_be_refused():
+async def test_unadvertised_topics_are_not_relayed_and_null_can_be_refused():
     async with FakeRosbridge(refuses_null=True) as fake, raw_connect(fake.uri) as client:
         for operation in (
             {"op": "subscribe", "topic": "/a", "type": "p/T"},

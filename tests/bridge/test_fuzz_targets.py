@@ -48,6 +48,6 @@ def test_any_sequence_keeps_the_cores_invariants(steps):
 
 
 @pytest.mark.parametrize("path", FINDINGS, ids=lambda path: path.name)
-def test_what_once_failed_does_not_fail_again(path):
+def test_earlier_findings_pass(path):
     """The name's first part is the target's."""
     TARGETS[path.name.split("-")[0]](path.read_bytes())

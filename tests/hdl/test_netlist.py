@@ -36,7 +36,9 @@ def image(parameters):
     shutil.which("ghdl") is None, reason="ghdl is not installed (Debian: apt-get install ghdl)"
 )
 @pytest.mark.parametrize(
-    ("parameters", "aluts", "registers"), [(PLAIN, 2175, 1298), (REPLICAS, 2224, 1580)], ids=["plain", "replicas"]
+    ("parameters", "aluts", "registers"),
+    [(PLAIN, 2175, 1298), (REPLICAS, 2224, 1580)],
+    ids=["plain", "replicas"],
 )
 def test_a_small_board_takes_as_much_logic_as_it_did(tmp_path, parameters, aluts, registers):
     found = synthesised(image(parameters), tmp_path)

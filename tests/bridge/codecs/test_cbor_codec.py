@@ -107,7 +107,7 @@ def test_no_other_tag_is_taken(value):
     ],
 )
 @pytest.mark.parametrize("arrays", ["list", "numpy"])
-def test_what_is_no_message(data, arrays):
+def test_malformed_messages_are_refused(data, arrays):
     with pytest.raises(DecodeError) as caught:
         decode(data, arrays=arrays)
     assert len(str(caught.value)) < 300
@@ -140,7 +140,7 @@ plain = st.recursive(
 
 
 @given(st.dictionaries(st.text(), plain, max_size=5))
-def test_what_is_written_is_read_again(message):
+def test_a_round_trip(message):
     assert decode(encode(message)) == message
     assert decode(encode(message), arrays="numpy") == message
 
@@ -200,7 +200,7 @@ def test_other_numpy_values():
         {"a": {b"b": 1}},
     ],
 )
-def test_what_no_message_holds_is_refused(value):
+def test_types_outside_of_messages_are_refused(value):
     with pytest.raises(EncodeError) as caught:
         encode({"a": value})
     assert "\n" not in str(caught.value)

@@ -12,7 +12,7 @@ from bridge.codecs.envelope import LONGEST, envelope_of, topic_of
 CANONICAL = b'{"op":"publish","topic":"/t","msg":'
 
 
-def test_what_stands_before_a_message_is_its_envelope():
+def test_the_bytes_before_a_message_are_its_envelope():
     assert envelope_of(CANONICAL + b'{"msg":1}}') == CANONICAL
     assert envelope_of(b'{"op":"status"}') == b""
     assert envelope_of(b'{"op":"publish","topic":"' + b"t" * LONGEST + b'","msg":{}}') == b""
@@ -49,7 +49,7 @@ def test_an_envelope_tells_its_topic(envelope):
         CANONICAL + b"{}}",
     ],
 )
-def test_what_is_no_envelope_of_a_topic_alone_tells_none(envelope):
+def test_other_beginnings_are_not_envelopes(envelope):
     assert topic_of(envelope) is None
 
 
@@ -84,7 +84,7 @@ def core_that_knows() -> ClientCore:
     return core
 
 
-def test_what_is_wrong_is_told_behind_a_known_envelope_too():
+def test_errors_are_found_behind_a_known_envelope():
     core = core_that_knows()
     for message in (
         b"{",
@@ -104,7 +104,7 @@ def test_what_is_wrong_is_told_behind_a_known_envelope_too():
     assert core.receive(CANONICAL + b'{"a":1},"msg":{"b":2}}', 0.0) == MessageReceived("/t", {"b": 2}, (1,))
 
 
-def test_a_known_envelope_is_of_nobody_who_unsubscribed():
+def test_a_known_envelope_is_ignored_after_unsubscribing():
     core = core_that_knows()
     core.subscriptions.unsubscribe(1)
     assert core.receive(CANONICAL + b'{"a":1}}', 0.0) is None
@@ -114,7 +114,7 @@ def test_a_known_envelope_is_of_nobody_who_unsubscribed():
         assert core.receive(CANONICAL + b'{"a":1}}', 0.0) == MessageReceived("/t", {"a": 1}, (number, again))
 
 
-def test_who_is_slower_stays_slower_with_a_known_envelope():
+def test_throttles_apply_with_a_known_envelope():
     core = core_that_knows()
     slow = core.subscriptions.subscribe("/t", throttle_rate=1000)
     heard = [core.receive(CANONICAL + b"{}}", now) for now in (10.0, 10.1, 10.2, 11.1)]

@@ -37,7 +37,7 @@ def test_a_message_is_cut_between_characters():
 
 
 @given(st.text(min_size=1), st.integers(1, 40), st.randoms(use_true_random=False))
-def test_whatever_the_order_the_message_comes_back(text, size, order):
+def test_fragments_may_arrive_in_any_order(text, size, order):
     message = json.dumps({"op": "publish", "msg": text}, ensure_ascii=False)
     try:
         message.encode()
@@ -73,7 +73,7 @@ def test_one_fragment_is_a_message():
     assert take_all(Reassembler(), [fragment(0, "abc", 1), fragment(1, "abc", 1.0)]) == ["abc"] * 2
 
 
-def test_what_comes_twice_counts_once():
+def test_a_repeated_fragment_counts_once():
     box = Reassembler()
     assert take_all(box, [fragment(0, "a", 2), fragment(0, "a", 2), fragment(1, "b", 2)]) == ["ab"]
     assert box.given_up == 0
@@ -130,7 +130,7 @@ def test_numbers_with_a_hole_make_no_message():
         fragment([0], "a", 2),
     ],
 )
-def test_what_is_no_fragment(broken):
+def test_malformed_fragments_are_refused(broken):
     box = Reassembler()
     with pytest.raises(DecodeError) as caught:
         box.take(broken, 0.0)

@@ -45,7 +45,7 @@ def numbers_of(value):
 
 
 @given(objects)
-def test_what_the_standard_library_writes_is_read(message):
+def test_output_of_the_standard_library_is_read(message):
     read = decode(json.dumps(message))
     assert all(map(math.isfinite, numbers_of(read)))
     # Written again without what is not finite, it is the same for both.
@@ -82,7 +82,7 @@ def test_any_input_is_an_object_or_an_error(data):
         ('{"topic": "\\/a\\/b"}', {"topic": "/a/b"}),
     ],
 )
-def test_what_servers_leak(text, message):
+def test_leaked_nonfinite_numbers_are_none(text, message):
     read = decode(text)
     assert read == message
     assert {key: type(value) for key, value in read.items()} == {k: type(v) for k, v in message.items()}
@@ -107,7 +107,7 @@ def test_what_servers_leak(text, message):
         '{"a": NaN, "b": ' + "[" * 5000 + "]" * 5000 + "}",
     ],
 )
-def test_what_is_no_message(text):
+def test_malformed_messages_are_refused(text):
     with pytest.raises(DecodeError):
         decode(text)
     with pytest.raises(DecodeError):
@@ -202,7 +202,7 @@ def test_arrays_of_any_layout(array):
 
 
 @pytest.mark.parametrize("array", [np.zeros(2, complex), np.array([object()], object)])
-def test_arrays_of_what_json_has_not_got(array):
+def test_arrays_without_a_json_form_are_refused(array):
     with pytest.raises(EncodeError):
         encode({"a": array})
     with pytest.raises(EncodeError):
@@ -256,7 +256,7 @@ def test_a_refused_number_is_named_with_its_place(message, place):
     assert b"null" in encode(message)
 
 
-def test_null_is_no_nan():
+def test_null_is_not_a_nan():
     assert encode({"a": None, "b": "null"}, nonfinite="refuse") == b'{"a":null,"b":"null"}'
 
 
@@ -285,12 +285,12 @@ def test_arrays_go_out_without_lists():
         {"a": 1j},
     ],
 )
-def test_what_cannot_be_json(message):
+def test_values_without_a_json_form_are_refused(message):
     with pytest.raises(EncodeError):
         encode(message)
 
 
-def test_the_limits_of_what_leaves():
+def test_the_limits_of_outgoing_messages():
     assert len(encode({"a": "x" * (MAX_SIZE - 8)})) == MAX_SIZE
     with pytest.raises(EncodeError, match=f"{MAX_SIZE + 1} bytes"):
         encode({"a": "x" * (MAX_SIZE - 7)})

@@ -31,7 +31,7 @@ def by_hand(lines: bytes, header: tuple[int, ...], *, before: bytes = b"") -> st
 
 
 @given(st.binary(min_size=1, max_size=500))
-def test_what_is_put_in_comes_out(message):
+def test_a_round_trip(message):
     found = decode(encode(message))
     assert found.startswith(message)
     assert not found[len(message) :].strip(b"\n")
@@ -87,7 +87,7 @@ def _with_sums(data: bytes) -> bytes:
         by_hand(bytes(9), (2**32 - 1, 2**32 - 1, 8, 2, 0, 0, 0)),
     ],
 )
-def test_what_is_no_message(data):
+def test_malformed_messages_are_refused(data):
     with pytest.raises(DecodeError) as caught:
         decode(data)
     assert "\n" not in str(caught.value)

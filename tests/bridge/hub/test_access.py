@@ -68,7 +68,7 @@ async def test_a_browsers_token_is_not_sent_back() -> None:
         await Client(socket).sync()
 
 
-async def test_without_tokens_a_subprotocol_is_nobodys_business() -> None:
+async def test_without_tokens_a_subprotocol_is_accepted() -> None:
     async with (
         running_hub() as port,
         connect(f"ws://127.0.0.1:{port}", subprotocols=["rosbridge"]) as socket,  # type: ignore[list-item]  # NewType of str
@@ -147,7 +147,7 @@ async def test_the_hub_ends_its_tls_connections(certificate: tuple[Path, Path]) 
     assert await Client(socket).closed() == 1001
 
 
-def test_what_is_no_certificate_is_one_sentence(certificate: tuple[Path, Path], tmp_path: Path) -> None:
+def test_unusable_certificates_are_an_error(certificate: tuple[Path, Path], tmp_path: Path) -> None:
     nothing = tmp_path / "nothing.pem"
     nothing.write_text("nothing")
     for files in (
@@ -175,5 +175,5 @@ def test_what_is_no_certificate_is_one_sentence(certificate: tuple[Path, Path], 
         ("", False),
     ],
 )
-def test_what_only_this_machine_reaches(host: str, loopback: bool) -> None:
+def test_loopback_addresses_are_recognised(host: str, loopback: bool) -> None:
     assert is_loopback(host) is loopback

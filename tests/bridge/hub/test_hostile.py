@@ -350,7 +350,7 @@ async def test_a_server_of_actions_that_hangs_up_fails_its_goals() -> None:
         assert (answer["op"], answer["id"], answer["result"]) == ("action_result", "x", False)
 
 
-async def test_a_flood_of_refusals_is_told_without_harm() -> None:
+async def test_a_flood_of_refusals_is_reported_without_harm() -> None:
     async with _hub_and_witness() as (port, witness), client(port, max_queue=None) as listener:
         await listener.send(op="subscribe", topic="/rosout", queue_length=10)
         await listener.sync()
@@ -409,7 +409,7 @@ async def test_a_server_that_hangs_up_during_a_call_fails_it() -> None:
 
 
 @pytest.mark.parametrize("how", ["reset", "eof", "mid-message"])
-async def test_whoever_vanishes_leaves_nothing(how: str) -> None:
+async def test_a_vanished_client_leaves_nothing(how: str) -> None:
     async with _hub_and_witness() as (port, witness):
         raw = await RawClient.connect(port)
         raw.send_operation(op="subscribe", topic="/t", type="a/B")

@@ -77,14 +77,14 @@ def test_depth_up_to_the_limit_passes() -> None:
         assert bool(peer.read()) is passes
 
 
-def test_what_is_larger_than_the_limit_is_refused() -> None:
+def test_a_message_beyond_the_limit_is_refused() -> None:
     hub = Harness(message_bytes=100)
     peer = hub.connect()
     peer.send_raw(b'{"op":"subscribe","topic":"/t"%b}' % (b" " * 100))
     assert peer.client.refused == 1
 
 
-def test_a_flood_of_nonsense_is_no_flood_of_log_lines(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_flood_of_nonsense_does_not_flood_the_log(caplog: pytest.LogCaptureFixture) -> None:
     peer = Harness().connect("192.0.2.1")
     with caplog.at_level(logging.WARNING, "bridge.hub.broker"):
         for _ in range(1234):

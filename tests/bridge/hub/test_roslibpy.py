@@ -16,7 +16,7 @@ _SESSION = Path(__file__).with_name("roslibpy_session.py")
 
 @pytest.mark.parametrize("transport", ["twisted", "asyncio"])
 @pytest.mark.asyncio(loop_factories=["uvloop"])
-async def test_what_users_of_roslibpy_do(transport: str) -> None:
+async def test_a_session_of_roslibpy(transport: str) -> None:
     async with running_hub() as port:
         session = await asyncio.create_subprocess_exec(
             sys.executable,

@@ -2,6 +2,8 @@
 
 import asyncio
 import socket
+import subprocess
+import sys
 from contextlib import AsyncExitStack
 
 import pytest
@@ -66,7 +68,7 @@ async def test_a_service_between_clients() -> None:
         assert (await caller.receive())["values"] == {"sum": 2}
 
 
-async def test_what_a_throttle_held_comes_later_by_itself() -> None:
+async def test_a_throttled_message_is_sent_later() -> None:
     async with running_hub() as port, client(port) as ears:
         await ears.send(op="subscribe", topic="/t", type="a/B", throttle_rate=30, queue_length=10)
         for index in range(4):
@@ -117,7 +119,7 @@ async def test_a_client_can_leave_politely() -> None:
         assert (await stays.ask("/rosapi/topics"))["topics"] == ["/rosout"]
 
 
-async def test_the_end_of_the_hub_is_told_to_its_clients() -> None:
+async def test_the_end_of_the_hub_closes_its_clients_with_1001() -> None:
     async with AsyncExitStack() as clients, AsyncExitStack() as hub:
         port = await hub.enter_async_context(running_hub())
         ears = await clients.enter_async_context(client(port))
@@ -191,7 +193,7 @@ async def test_web_pages_from_elsewhere_are_refused(origin: str | None, status: 
         raw.cut()
 
 
-async def test_too_many_clients_are_told_so() -> None:
+async def test_too_many_clients_are_answered_503() -> None:
     async with running_hub(limits=HubLimits(clients=2)) as port:
         async with client(port) as one, client(port):
             with pytest.raises(InvalidStatus) as caught:
@@ -202,7 +204,7 @@ async def test_too_many_clients_are_told_so() -> None:
             await late.sync()
 
 
-async def test_a_web_browser_is_told_what_this_is() -> None:
+async def test_a_web_browser_gets_an_explanation() -> None:
     async with running_hub() as port:
         raw = await RawClient.connect(port, handshake=False)
         raw.writer.write(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
@@ -214,7 +216,7 @@ async def test_a_web_browser_is_told_what_this_is() -> None:
 @pytest.mark.parametrize(
     "garbage", [b"\r\n\r\n", b"SSH-2.0-x\r\n\r\n", b"\x16\x03\x01" + b"\0" * 300, b"x" * 100_000]
 )
-async def test_what_is_no_http_is_ended(garbage: bytes) -> None:
+async def test_garbage_instead_of_http_ends_the_connection(garbage: bytes) -> None:
     async with running_hub() as port, client(port) as ears:
         raw = await RawClient.connect(port, handshake=False)
         raw.writer.write(garbage)
@@ -242,7 +244,23 @@ def test_the_loop_is_left_as_it_was() -> None:
         sock.connect(("127.0.0.1", port))
 
 
-async def test_a_hub_that_was_held_up_blames_nobody() -> None:
+def test_memory_of_large_messages_is_retained() -> None:
+    code = """
+import resource
+from bridge.hub.server import _retain_memory
+_retain_memory()
+def faults(): return resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+bytearray(1 << 20)
+before = faults()
+for _ in range(100):
+    bytearray(1 << 20)
+print(faults() - before)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True, timeout=PATIENCE)
+    assert int(done.stdout) < 2000, "a page fault for each of the 25600 pages"
+
+
+async def test_a_delayed_hub_closes_no_client() -> None:
     swept = []
 
     class Connection:

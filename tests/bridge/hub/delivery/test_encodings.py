@@ -215,7 +215,7 @@ def test_a_message_in_fragments(asked: int, size: int, compression: str) -> None
     assert [operation["msg"] for operation in heard] == messages
 
 
-def test_what_fits_into_one_piece_and_what_is_cbor_comes_whole() -> None:
+def test_small_messages_and_cbor_are_not_cut() -> None:
     _, publisher, subscriber = _publisher_and_subscriber("a/B", fragment_size=60)
     publisher.publish("/t", {"a": 1})
     assert subscriber.messages() == [{"a": 1}]
@@ -245,7 +245,7 @@ def test_the_answer_to_a_call_in_fragments_and_as_png() -> None:
     assert json.loads(png.decode(operation["data"]))["id"] == "x"
 
 
-def test_what_comes_in_fragments_is_one_operation() -> None:
+def test_fragments_are_one_operation() -> None:
     hub = Harness()
     peer, other = hub.connect(), hub.connect()
     other.subscribe("/t", type="a/B")
@@ -275,7 +275,7 @@ def test_of_several_wishes_the_last_form_and_the_least_size_count() -> None:
 
 
 @pytest.mark.parametrize("compression", ["bson", "", None, 7, ["png"], {}])
-def test_what_nobody_knows_is_plain_json(compression: object) -> None:
+def test_an_unknown_compression_is_plain_json(compression: object) -> None:
     _, publisher, subscriber = _publisher_and_subscriber("a/B", compression=compression)
     publisher.publish("/t", {"a": 1})
     assert subscriber.messages() == [{"a": 1}]
@@ -301,7 +301,7 @@ def test_each_form_is_written_once(compression: str, monkeypatch: pytest.MonkeyP
     assert len([form for form in written if form[0] == compression]) == 1
 
 
-def test_what_a_throttle_drops_is_not_even_written(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_dropped_message_is_not_encoded(monkeypatch: pytest.MonkeyPatch) -> None:
     _, publisher, subscriber = _publisher_and_subscriber(ARRAY, compression="cbor", throttle_rate=1000)
     publisher.publish("/t", {"data": [1.5]})
     monkeypatch.setattr(topics.Message, "payload", None)
@@ -346,7 +346,7 @@ def test_large_messages_are_cut_out_only_where_that_is_sure(raw: bytes, cut: boo
     assert (topics._cut_out(json.loads(raw), raw if strict else None) is not None) is cut
 
 
-def test_a_message_of_many_quotes_is_written_anew() -> None:
+def test_a_message_of_many_quotes_is_rewritten() -> None:
     peer = Harness().connect()
     peer.advertise("/t")
     peer.subscribe("/t")
@@ -357,7 +357,7 @@ def test_a_message_of_many_quotes_is_written_anew() -> None:
 # --- what goes wrong is told to who wants it
 
 
-def test_who_asks_for_them_gets_status_messages() -> None:
+def test_status_messages_are_sent_on_request() -> None:
     hub = Harness()
     peer = hub.connect()
     peer.send_raw(b"42")
@@ -385,7 +385,7 @@ def test_status_messages_do_not_pile_up() -> None:
 
 
 @pytest.mark.parametrize("ros_version", [1, 2])
-def test_refusals_are_told_on_rosout(ros_version: Any) -> None:
+def test_refusals_are_logged_on_rosout(ros_version: Any) -> None:
     hub = Harness(ros_version=ros_version)
     peer, listener = hub.connect(), hub.connect()
     listener.subscribe("/rosout", type="rosgraph_msgs/Log" if ros_version == 1 else "rcl_interfaces/msg/Log")
@@ -405,7 +405,7 @@ def test_refusals_are_told_on_rosout(ros_version: Any) -> None:
     assert len(listener.messages("/rosout")) == 1
 
 
-def test_what_cannot_be_told_on_rosout_ends_there(
+def test_a_failure_on_rosout_is_not_reported_there(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setitem(sys.modules, "rosbags.typesys", None)

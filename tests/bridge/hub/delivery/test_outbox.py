@@ -32,7 +32,7 @@ def test_order_is_kept_between_topics_and_answers() -> None:
     assert (outbox.size, len(outbox)) == (0, 0)
 
 
-def test_a_throttle_with_a_queue_spreads_what_comes_too_early() -> None:
+def test_a_throttle_with_a_queue_delays_early_messages() -> None:
     outbox, lane = Outbox(1000), _lane(throttle=1.0, queue_length=2)
     for index in range(5):
         outbox.offer(lane, b"%d" % index, 100)
@@ -51,7 +51,7 @@ def test_a_throttle_with_a_queue_spreads_what_comes_too_early() -> None:
     assert outbox.deadline == 111
 
 
-def test_what_is_held_counts_towards_the_bytes_and_makes_room() -> None:
+def test_held_messages_count_towards_the_bytes_and_make_room() -> None:
     outbox, held, queued = Outbox(10), _lane(throttle=1.0, queue_length=9), _lane(queue_length=9)
     for _ in range(5):
         outbox.offer(held, b"333", 0)
@@ -63,7 +63,7 @@ def test_what_is_held_counts_towards_the_bytes_and_makes_room() -> None:
     assert held.dropped == 5
 
 
-def test_lifting_a_throttle_queues_what_it_held() -> None:
+def test_lifting_a_throttle_queues_held_messages() -> None:
     outbox, lane = Outbox(1000), _lane(throttle=1.0, queue_length=5)
     for index in range(4):
         outbox.offer(lane, b"%d" % index, 0)
@@ -122,7 +122,7 @@ def test_while_the_socket_takes_it_nothing_waits() -> None:
     assert (outbox.size, lane.dropped, outbox.overflowed) == (0, 0, False)
 
 
-def test_what_waits_already_keeps_its_place() -> None:
+def test_queued_payloads_keep_their_place() -> None:
     outbox, lane, cut = Outbox(1000), _lane(), _lane()
     cut.fragment_size = 16
     outbox.put(b"1")

@@ -78,7 +78,7 @@ def test_a_message_goes_on_as_it_came() -> None:
     ],
     ids=lambda rest: repr(rest[:40]),
 )
-def test_whatever_stands_after_it_means_what_it_meant(rest: bytes) -> None:
+def test_the_rest_of_an_operation_keeps_its_meaning(rest: bytes) -> None:
     knowing, reading = (Hub(knowing=known, depth=5, message_bytes=500) for known in (True, False))
     for hub in (knowing, reading):
         hub.say(PUBLISH + rest)
@@ -96,7 +96,7 @@ def test_a_topic_that_is_not_advertised_any_more_is_not_published() -> None:
 
 
 @pytest.mark.parametrize("begun", [b'{"op":"publish","msg":', b'{"msg":', b'{"topic":"/t","msg":'])
-def test_what_says_the_rest_after_its_message_has_no_envelope(begun: bytes) -> None:
+def test_an_operation_with_keys_after_its_message_has_no_envelope(begun: bytes) -> None:
     hub = Hub(knowing=True)
     rest = {"op": "publish", "topic": "/t"}
     for key in [key for key in rest if f'"{key}"'.encode() in begun]:
@@ -123,7 +123,7 @@ def test_each_topic_has_its_envelope_and_one_alone() -> None:
     assert len(hub.publisher.envelopes) == 2
 
 
-def test_what_latches_keeps_what_came() -> None:
+def test_a_latched_message_with_a_known_envelope() -> None:
     hub = Hub(knowing=True)
     hub.ask(hub.publisher, op="advertise", topic="/t", type="p/T", latch=True, id="latching")
     hub.say(PUBLISH + b'{"n":1}}')

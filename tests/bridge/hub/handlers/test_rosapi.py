@@ -81,7 +81,7 @@ def test_every_service_that_is_listed_can_be_called(peer: Peer) -> None:
         assert answer["result"] is not needs_more, answer
 
 
-def test_what_the_hub_cannot_know_is_said(peer: Peer) -> None:
+def test_unknown_definitions_are_refused(peer: Peer) -> None:
     answer = peer.ask("/rosapi/message_details", {"type": "boat_msgs/Sensors"})
     assert answer["result"] is False
     assert "boat_msgs/Sensors" in answer["values"]
@@ -150,7 +150,7 @@ def test_parameters_outlive_their_client(hub: Harness, peer: Peer) -> None:
 
 
 @pytest.mark.parametrize("value", ["", "text", "{", "NaN", "1e999", "[" * 100 + "]" * 100])
-def test_what_is_no_json_is_no_parameter(peer: Peer, value: str) -> None:
+def test_a_parameter_must_be_json(peer: Peer, value: str) -> None:
     answer = peer.ask("/rosapi/set_param", {"name": "/p", "value": value})
     assert answer["result"] is False
     assert peer.rosapi("get_param_names") == {"names": []}
