@@ -138,9 +138,7 @@ def test_the_boiler_is_a_question_and_the_printed_refusal_is_said(tmp_path):
 
 
 def test_every_check_is_described():
-    described = documented(
-        (DOCS / "reference" / "toolchain.md").read_text(), "Checks before anything runs"
-    )
+    described = documented((DOCS / "reference" / "toolchain.md").read_text(), "Checks before anything runs")
     assert set(described) == set(Check) - {Check.RNG}
 
 
