@@ -47,7 +47,7 @@ SOURCES: Final = (
 
 SIMULATED_TABLE: Final = "simulation/bm1_table_textio.vhd"
 
-_LIMIT_S: Final = 300.0
+_LIMIT_S: Final = 1200.0
 
 
 class HardwareToolError(Exception):
