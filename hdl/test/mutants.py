@@ -69,8 +69,8 @@ MUTANTS: Final = (
     Mutant(
         "the seeds are off by one",
         "bm1_generators.vhd",
-        "GENERATORS + GENERATORS - 1, ADDRESS_BITS)",
-        "GENERATORS + GENERATORS - 1 - to_natural(BANKS > 1), ADDRESS_BITS)",
+        "remaining <= to_unsigned(GENERATORS, INDEX_BITS);",
+        "remaining <= to_unsigned(GENERATORS - 1, INDEX_BITS);",
     ),
     Mutant(
         "a reset keeps the bank",

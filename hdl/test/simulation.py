@@ -124,7 +124,13 @@ def run_bench(
     }
     library = cocotb_tools.config.lib_entry("vpi", "ghdl")
     command = ["ghdl", "-r", "--std=08", top, f"--vpi={library}", "--ieee-asserts=disable-at-0", *options]
-    said = run_tool(command, folder, environment)
+    try:
+        said = run_tool(command, folder, environment)
+    except HardwareToolError as error:
+        # it ran, and went wrong: an index out of its bounds, an assertion
+        if "simulation failed" not in str(error):
+            raise
+        return Outcome((next(line for line in str(error).splitlines() if ":error:" in line),))
     if not results.is_file():
         message = f"the simulation of {top} ended without a verdict: {said.strip()[-600:]}"
         raise HardwareToolError(message)

@@ -64,7 +64,7 @@ def parameters_vhd(deployment: Deployment, images: Sequence[Image]) -> str:
             _flag("PRIOR_WRITTEN", parameters.prior_mode is PriorMode.WRITTEN, "the host writes it"),
             _generators(image),
             _seeds(image),
-            _section("When a machine stops, until the host writes other values"),
+            _section("When a machine stops: the registers hold 0 until the host writes these"),
             _constant("TARGET_COUNT", _vector(32), _hexadecimal(deployment.machine.target_count, 32)),
             _constant("MAX_CYCLES", _vector(64), _hexadecimal(deployment.machine.max_cycles, 64)),
             _section("The PCIe interface"),
