@@ -22,7 +22,7 @@ def texts(node):
         yield re.sub(r"%[sd]", "…", node.value)
 
 
-ALARMS = PAGE.split("## What each alarm means", 1)[1]
+ALARMS = PAGE.split("## Alarms", 1)[1]
 
 
 def alarms():
