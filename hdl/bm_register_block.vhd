@@ -41,7 +41,7 @@ entity bm_register_block is
     cap_sensor_bits_i : in    std_logic_vector(511 downto 0); -- Widths of the sensors' addresses, as read
     control_o         : out   std_logic_vector(31 downto 0);  -- Control, as written
     target_count_o    : out   std_logic_vector(31 downto 0);  -- Target count, as written
-    max_cycles_o      : out   std_logic_vector(63 downto 0);  -- Most cycles of a frame, as written
+    max_cycles_o      : out   std_logic_vector(63 downto 0);  -- Maximum cycles of a frame, as written
     bank_o            : out   std_logic_vector(31 downto 0);  -- RNG bank, as written
     prior_select_o    : out   std_logic_vector(31 downto 0);  -- Prior select, as written
     run_until_o       : out   std_logic_vector(63 downto 0);  -- End of the slice, as written
@@ -50,7 +50,7 @@ entity bm_register_block is
     done_i            : in    std_logic_vector(31 downto 0);  -- Done, as read
     status_i          : in    std_logic_vector(31 downto 0);  -- Status, as read
     cycles_i          : in    std_logic_vector(63 downto 0);  -- Cycles, as read
-    compute_ns_i      : in    std_logic_vector(63 downto 0);  -- Time computed, as read
+    compute_ns_i      : in    std_logic_vector(63 downto 0);  -- Computing time, as read
     halt_o            : out   std_logic_vector(255 downto 0)  -- Replicas to halt, as written
   );
 end entity bm_register_block;

@@ -32,8 +32,8 @@ class RngKind(IntEnum):
         LFSR16: 16-bit Fibonacci LFSR.
         LFSR24: 24-bit Fibonacci LFSR.
         LFSR32: 32-bit Fibonacci LFSR.
-        TABLE: a table that all columns play in a ring.
-        IDEAL: a hash of seed, column and cycle; emulated boards only.
+        TABLE: a table of random numbers that all columns read cyclically.
+        IDEAL: a hash of seed, column and cycle; only on emulated boards.
     """
 
     NONE = 0
@@ -63,10 +63,10 @@ class BoardState(IntEnum):
     """Values of STATUS.STATE.
 
     Attributes:
-        BLANK: no image: only identity and control can be used.
-        IDLE: reset, nothing has run.
-        RUNNING: the machine runs; writes are refused, except CONTROL.RESET.
-        DONE: the machine has stopped; STOP_REASON says why.
+        BLANK: no image: only identity and control registers are usable.
+        IDLE: reset; nothing has run.
+        RUNNING: the machine is running; writes are refused, except CONTROL.RESET.
+        DONE: the machine has stopped for the reason in STOP_REASON.
     """
 
     BLANK = 0
@@ -82,8 +82,8 @@ class StopReason(IntEnum):
         NONE: nothing has run since the reset.
         OVERFLOW: a counter reached TARGET_COUNT.
         MAX_CYCLES: MAX_CYCLES cycles have run.
-        SLICE: RUN_UNTIL was reached; RESUME goes on.
-        IMPOSSIBLE: no line can count for these readings; nothing was run.
+        SLICE: RUN_UNTIL was reached; RESUME continues.
+        IMPOSSIBLE: no line can count for these readings; nothing has run.
     """
 
     NONE = 0
@@ -99,17 +99,17 @@ class ErrorCode(IntEnum):
     Attributes:
         NONE: nothing was refused since the reset.
         OUTSIDE: the address is not in the map, or not implemented by this image.
-        MISALIGNED: the address is no multiple of 4.
+        MISALIGNED: the address is not a multiple of 4.
         TOO_LONG: the access runs past the end of its block.
         READ_ONLY: the register cannot be written.
-        BUSY: the machine runs; only CONTROL.RESET may be written.
+        BUSY: the machine is running; only CONTROL.RESET may be written.
         BLANK: no image has been loaded.
         DOORBELL: the number is not DONE + 1, or there is nothing to resume.
-        BAD_VALUE: a value is impossible for the machine: address, target, bank, cycles.
+        BAD_VALUE: a value is not valid for the machine: address, target, bank, cycles.
         STALE: the board was programmed after this handle was opened.
-        HELD: another host holds the board, or another loader programs it.
-        BAD_FRAME: the frame is broken: operation, length, CRC or sequence number; the link is closed.
-        BAD_IMAGE: the image is damaged, or made for another map or board.
+        HELD: another host holds the board, or another loader is programming it.
+        BAD_FRAME: the frame is invalid: operation, length, CRC or sequence number; the link is closed.
+        BAD_IMAGE: the image is damaged, or was built for another map or board.
     """
 
     NONE = 0

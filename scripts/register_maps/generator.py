@@ -247,13 +247,13 @@ def document_text(register_map: RegisterMap) -> str:
         "",
         *register_map.text.splitlines(),
         "",
-        f"The map takes {register_map.bar_size // 1024} KiB (the BAR's size). Hash of its definition:",
+        f"The map occupies {register_map.bar_size // 1024} KiB (the size of the BAR). Hash of its definition:",
         f"`{register_map.hash}`.",
         "",
-        "Access to any other address, or to words that the image does not implement, is answered with an",
-        "error: see [boards.md](boards.md).",
+        "An access to any other address, or to words that the image does not implement, is refused with an",
+        "error: see [Boards](boards.md).",
         "",
-        "| offset | register | words | access | |",
+        "| offset | register | words | access | name |",
         "|---|---|---|---|---|",
     ]
     for block in register_map.blocks:
@@ -267,14 +267,14 @@ def document_text(register_map: RegisterMap) -> str:
             f"`{block.address:#06x}`, {_size(block)}. {block.title}: {block.text}",
         ]
         if block.fields:
-            lines += ["", "| bits | field | access | reset | |", "|---|---|---|---|---|"]
+            lines += ["", "| bits | field | access | reset | meaning |", "|---|---|---|---|---|"]
         for field in block.fields:
             bits = f"{field.high}:{field.low}" if field.high > field.low else str(field.low)
             reset = "" if field.reset is None else f"`{field.reset:#x}`"
             lines.append(f"| {bits} | {field.name} | {field.access} | {reset} | {field.text} |")
         for field in block.fields:
             if field.encoding is not None:
-                lines += ["", f"{field.name}:", "", "| value | name | |", "|---|---|---|"]
+                lines += ["", f"{field.name}:", "", "| value | name | meaning |", "|---|---|---|"]
                 lines += [
                     f"| {member.value} | {member.name} | {member.text} |" for member in field.encoding.members
                 ]
