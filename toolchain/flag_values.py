@@ -11,11 +11,7 @@ if TYPE_CHECKING:
 
 
 def key_values(settings: Iterable[str], flag: str = "--set", example: str = "width=64") -> dict[str, str]:
-    """Return the values of a flag by key.
-
-    Raises:
-        BuildError: A setting has no `=` or no key, or a key is given twice.
-    """
+    """Return the values of a flag by key; a BuildError for no `=`, no key or the same key twice."""
     found: dict[str, str] = {}
     for setting in settings:
         key, equals, value = setting.partition("=")
@@ -29,11 +25,7 @@ def key_values(settings: Iterable[str], flag: str = "--set", example: str = "wid
 
 
 def names_in(flag: str, text: str) -> list[str]:
-    """Return the names in `A,B,C`.
-
-    Raises:
-        BuildError: A name is empty.
-    """
+    """Return the names in `A,B,C`; a BuildError if one is empty."""
     names = [name.strip() for name in text.split(",")] if text else []
     if not all(names):
         raise BuildError(f"{flag} {text}: expected names with a comma between them, such as {flag} A,B")

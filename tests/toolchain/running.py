@@ -1,9 +1,17 @@
-"""The `toolchain` command within a test's process."""
+"""The `toolchain` command within a test's process, and what several rooms' tests share."""
+
+import tracemalloc
+from contextlib import contextmanager
+
+import pytest
 
 from tests.command_runner import invoke
+from toolchain.building.options import BuildOptions
 from toolchain.commands.main import app
 
 TARGET = ("--uri", "ws://robot:9090", "--topic", "/readings", "--type", "std_msgs/msg/Float64")
+
+OPTIONS = BuildOptions(uri="ws://robot:9090", topic="/readings", type="std_msgs/Float64MultiArray")
 
 
 def toolchain(*arguments):
@@ -19,3 +27,20 @@ def assert_refused(result, *named):
     assert "Traceback" not in result.stderr
     for each in named:
         assert str(each) in sentence
+
+
+def contents(folder):
+    """Return the bytes of every file below a folder, by its relative path."""
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@contextmanager
+def refused_within(limit, error):
+    """Expect an error in the block, and that at most so many bytes are allocated on the way to it."""
+    tracemalloc.start()
+    try:
+        with pytest.raises(error) as caught:
+            yield caught
+        assert tracemalloc.get_traced_memory()[1] < limit
+    finally:
+        tracemalloc.stop()

@@ -33,11 +33,7 @@ def read_images(deployment: Deployment) -> list[Image]:
 
 
 def check_agreement(deployment: Deployment, images: Sequence[Image]) -> None:
-    """Refuse a `deployment.toml` that describes another machine than its images.
-
-    Raises:
-        DeploymentError: They differ; names the key and both values.
-    """
+    """Refuse, with a DeploymentError, a `deployment.toml` that describes another machine than its images."""
     machine = deployment.machine
     for index, (board, image) in enumerate(zip(deployment.boards, images, strict=True)):
         parameters = image.machine.parameters

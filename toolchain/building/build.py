@@ -84,11 +84,7 @@ def build_deployment(model: Model, directory: Path, options: BuildOptions, *, re
 
 
 def assemble(model: Model, options: BuildOptions) -> Built:
-    """Return a model's deployment without writing anything.
-
-    Raises:
-        BuildError: The options don't fit each other, the model or the register map.
-    """
+    """Return a model's deployment without writing anything, or raise a BuildError."""
     check_options(options)
     parameters = machine_parameters(model, options)
     layout = board_layout(parameters, options.partitions, options.interface)

@@ -28,11 +28,7 @@ def describe(
     images: Sequence[Image],
     options: BuildOptions,
 ) -> Deployment:
-    """Return the deployment of these images, with its hash.
-
-    Raises:
-        BuildError: An option that does not fit the machine, such as a target that its counters can't hold.
-    """
+    """Return the deployment of these images, with its hash; a BuildError if an option does not fit the machine."""
     target = parameters.target_count_max if options.target_count is None else options.target_count
     try:
         deployment = Deployment(

@@ -44,11 +44,7 @@ class DeploymentEdits:
 
 
 def edited(deployment: Deployment, edits: DeploymentEdits) -> Deployment:
-    """Return the deployment with the edits, and its new hash.
-
-    Raises:
-        BuildError: An edit has a wrong value, or does not fit the deployment.
-    """
+    """Return the deployment with the edits, and its new hash; a BuildError if an edit is wrong."""
     target = _given(uri=edits.uri, topic=edits.topic, type=edits.type)
     if target and len(deployment.sources) > 1:
         raise BuildError(

@@ -20,11 +20,7 @@ _MOST_CODES: Final = 1 << 30
 
 
 def machine_parameters(model: Model, options: BuildOptions) -> BM1Parameters:
-    """Return the parameters of the whole model's machine.
-
-    Raises:
-        BuildError: The options don't fit the model, or no such machine can be built.
-    """
+    """Return the parameters of the whole model's machine; a BuildError if it can't be built."""
     if options.prior_mode is PriorMode.TABLE and options.written_prior is not None:
         flag = "--prior-path" if options.sources is None else options.sources.toml.path
         raise BuildError(f"{flag} names the place of a written prior: add --prior-mode written")
@@ -60,11 +56,7 @@ def machine_parameters(model: Model, options: BuildOptions) -> BM1Parameters:
 
 
 def whole_machine(parameters: BM1Parameters, quantised: Quantised, options: BuildOptions) -> BM1Machine:
-    """Return the machine that holds all lines of a model.
-
-    Raises:
-        BuildError: The machine can't be built, such as with random numbers that its generators can't play.
-    """
+    """Return the machine that holds all lines of a model; a BuildError if it can't be built."""
     table = options.rng_table
     if table is None and parameters.rng is RngKind.TABLE:
         table = random_table(parameters.prob_bits)

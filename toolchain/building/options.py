@@ -114,11 +114,7 @@ class BuildOptions:
 
 
 def check_options(options: BuildOptions) -> None:
-    """Refuse wrong options, and options that exclude each other, before anything is computed.
-
-    Raises:
-        BuildError: An option is wrong; names its flag and what was expected.
-    """
+    """Refuse, with a BuildError, wrong or contradicting options before anything is computed."""
     try:
         Output(topic=options.output), options.all_sources, options.written_prior
     except ValidationError as reason:

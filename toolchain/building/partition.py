@@ -24,11 +24,7 @@ class Block:
 
 
 def partition_lines(lines: int, count: int) -> tuple[Block, ...]:
-    """Return the blocks of `lines` lines on `count` boards, in order; the first `lines` mod `count` are one longer.
-
-    Raises:
-        BuildError: Fewer than 1 board, or more boards than lines.
-    """
+    """Return the blocks of `lines` lines on `count` boards, in order; the first `lines` mod `count` are one longer."""
     if not 1 <= count <= lines:
         raise BuildError(
             f"{lines} lines can't be split over {count} boards: expected 1 to {lines} partitions"
@@ -40,11 +36,7 @@ def partition_lines(lines: int, count: int) -> tuple[Block, ...]:
 
 
 def split(machine: BM1Machine, count: int) -> tuple[BM1Machine, ...]:
-    """Return the machines of the boards that a whole machine is split over.
-
-    Raises:
-        BuildError: Fewer than 1 board, or more boards than lines.
-    """
+    """Return the machines of the boards that a whole machine is split over; a BuildError as for the lines."""
     return tuple(
         BM1Machine(
             replace(machine.parameters, lines=block.lines),

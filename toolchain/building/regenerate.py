@@ -68,11 +68,7 @@ def regenerate_memories(directory: Path, model: Model | None = None, *, build_da
 
 
 def regenerate_project(directory: Path) -> Changes:
-    """Write the Quartus project again.
-
-    Raises:
-        DeploymentError: No deployment, or a damaged one.
-    """
+    """Write the Quartus project again."""
     deployment = load_deployment(directory)
     return write_files(directory, quartus_files(deployment, read_images(deployment)))
 
@@ -90,7 +86,6 @@ def regenerate_deployment(directory: Path, edits: DeploymentEdits) -> Changes:
 
 
 def _options(deployment: Deployment, image: Image) -> BuildOptions:
-    """Return the options that a deployment was built with."""
     machine, source = deployment.machine, deployment.sources[0]
     partitions = len(deployment.boards)
     whole = replace(image.machine.parameters, lines=machine.lines)

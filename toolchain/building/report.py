@@ -106,7 +106,6 @@ def _topics_sentence(deployment: Deployment) -> str:
 
 
 def _state_paragraph(model: Model) -> list[str]:
-    """List the number of each state, where values have names."""
     named = [
         f"  {name}: " + ", ".join(f"{offset + at * step:g} {state}" for at, state in enumerate(states))
         for name, offset, step, states in (

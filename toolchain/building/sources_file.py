@@ -83,11 +83,7 @@ class SourcesFile:
         )
 
     def place(self, variables: tuple[Variable, ...]) -> tuple[Variable, ...]:
-        """Return a model's variables, each with its source and its place there.
-
-        Raises:
-            BuildError: A variable that the model does not have, that two sources have, or that none has.
-        """
+        """Return a model's variables, each with its source and its place there; a BuildError if they don't match."""
         places: dict[str, tuple[int, str]] = {}
         names = [variable.name for variable in variables]
         for at, table in enumerate(self.tables):
@@ -117,12 +113,7 @@ class SourcesFile:
         )
 
     def check(self) -> None:
-        """Refuse mistakes that can be seen without a model.
-
-        Raises:
-            BuildError: A source without a server or without anything to read, two that take what is left, one topic
-                twice, two priors.
-        """
+        """Refuse, with a BuildError, mistakes that can be seen without a model."""
         seen: dict[tuple[str | None, str], int] = {}
         priors = [at for at, table in enumerate(self.tables) if table.prior is not None]
         rests = [at for at, table in enumerate(self.tables) if table.variables is None]
@@ -146,15 +137,7 @@ class SourcesFile:
 
 
 def read_sources(path: Path, uri: str | None) -> SourcesFile:
-    """Read a sources file.
-
-    Args:
-        path: The file.
-        uri: The rosbridge server of the sources that name none.
-
-    Raises:
-        BuildError: The file is absent, not TOML, or has a mistake (file, line, nearest right name).
-    """
+    """Read a sources file; `uri` is the server of sources that name none. A BuildError names the line."""
     toml = TomlFile.read(path, BuildError)
     tables = toml.validated(SourcesTables).sources
     file = SourcesFile(toml, tuple(table.model_copy(update={"uri": table.uri or uri}) for table in tables))

@@ -44,15 +44,7 @@ class Check(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One finding of a check.
-
-    Attributes:
-        severity: How bad it is.
-        check: The check that found it.
-        about: A variable's name, or another part of the machine.
-        what: The mistake, in the model's own names.
-        advice: The change that removes it; empty where none is needed.
-    """
+    """One finding of a check; `advice` is the change that removes it, empty where none is needed."""
 
     severity: Severity
     check: Check

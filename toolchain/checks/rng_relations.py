@@ -35,12 +35,7 @@ class Relation:
 
 @dataclass(frozen=True, slots=True)
 class Relations:
-    """Relations among some groups of generators.
-
-    Attributes:
-        found: At most one relation for each group, of the fewest bits.
-        groups: Number of groups that were searched.
-    """
+    """At most one relation of the fewest bits for each group, and the number of groups that were searched."""
 
     found: tuple[Relation, ...]
     groups: int

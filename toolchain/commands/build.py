@@ -74,11 +74,7 @@ def build(
 
 
 def _with_sources(options: "BuildOptions", path: Path | None) -> "BuildOptions":
-    """Return the options with the file that assigns variables to topics, where there is one.
-
-    Raises:
-        BuildError: A mistake in the file, flags that repeat it, or neither the file nor all flags.
-    """
+    """Return the options with the file that assigns variables to topics, where there is one."""
     from toolchain.building.sources_file import read_sources
     from toolchain.errors import BuildError
 

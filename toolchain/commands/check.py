@@ -60,7 +60,6 @@ def check(
 
 
 def _model_flags(context: typer.Context) -> list[str]:
-    """Return the flags on the command line that belong to a model."""
     given = []
     for each in context.command.params:
         source = context.get_parameter_source(each.name or "")

@@ -210,7 +210,6 @@ def _name_of(point: "Point") -> str:
 
 
 def _run_claims(directory: Path, *, frames: int, seed: int) -> None:
-    """Run the thesis's claims as experiments, print their figures and draw them."""
     from toolchain.analysis.accuracy.readings import check_frames
     from toolchain.analysis.exploration.claims import experiments, run_claims
     from toolchain.analysis.exploration.pictures import check_pictures_possible, draw_claims

@@ -7,14 +7,7 @@ from contextlib import contextmanager
 
 @contextmanager
 def progress(total: int) -> Iterator[Callable[[str], None]]:
-    """Show a bar on a terminal, nothing elsewhere.
-
-    Args:
-        total: Steps until the end.
-
-    Yields:
-        A function to call after each step, with the words to show beside the bar.
-    """
+    """Show a bar on a terminal, nothing elsewhere; yield a function to call with words after each step."""
     if not sys.stderr.isatty():
         yield lambda _: None
         return

@@ -137,7 +137,6 @@ def _lines(directory: Path) -> list[str]:
 
 
 def _print_changes(changes: "Changes", before: Sequence[str] = (), after: Sequence[str] = ()) -> None:
-    """Print each file's change, and the changed lines of `deployment.toml`."""
     for name, change in changes:
         typer.echo(f"{change:9}  {name}")
         if name == FILE_NAME:

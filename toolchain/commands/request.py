@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import TYPE_CHECKING
 
 from machines.errors import MachineError
@@ -34,60 +34,21 @@ def model_file(path: Path) -> Path:
 
 
 def read_model(path: Path, flags: ModelFlags, bits: Iterable[str] | None = None) -> Model:
-    """Return the model at a path.
-
-    Args:
-        path: A folder with `model.py`, or a network's file.
-        flags: Its parameters, or the question to the network.
-        bits: `NAME=BITS`, the address bits of some columns.
-
-    Raises:
-        ModelError: The model has a mistake, or a column can't be so wide.
-        BuildError: Flags that don't fit the model.
-    """
+    """Return the model of a folder or of a network's file; `bits` are `NAME=BITS`, the address bits of some columns."""
     settings = key_values(flags.settings or ())
     model = (_network_model if is_network(path) else _case_model)(path, flags, settings)
     return _with_bits(model, key_values(bits or (), "--bits", "range=8"))
 
 
 def build_options(flags: BuildFlags, *, uri: str, topic: str, message_type: str) -> BuildOptions:
-    """Return the options of a build, but for the files that flags name.
-
-    Args:
-        flags: The machine's flags.
-        uri: The rosbridge server with the readings.
-        topic: Their topic.
-        message_type: That topic's type.
-    """
-    return BuildOptions(
-        uri=uri,
-        topic=topic,
-        type=message_type,
-        partitions=flags.partitions,
-        scale=flags.scale,
-        prob_bits=flags.prob_bits,
-        prior_mode=flags.prior_mode,
-        counter_bits=flags.counter_bits,
-        target_count=flags.target_count,
-        max_cycles=flags.max_cycles,
-        stop=flags.stop,
-        rng=flags.rng,
-        rng_banks=flags.rng_banks,
-        rng_reset=flags.rng_reset,
-        shared=flags.shared,
-        steps_per_clock=flags.steps_per_clock,
-        sensor_mode=flags.sensor_mode,
-        replicas=flags.replicas,
-    )
+    """Return the options of a build, but for the files that flags name."""
+    common = {field.name for field in fields(BuildOptions)} & {field.name for field in fields(flags)}
+    values = {name: getattr(flags, name) for name in common - {"interface", "rng_table"}}
+    return BuildOptions(uri=uri, topic=topic, type=message_type, **values)
 
 
 def read_named(options: BuildOptions, flags: BuildFlags) -> BuildOptions:
-    """Return the options with the interface and the table of random numbers that flags name.
-
-    Raises:
-        BuildError: Not an interface, or random numbers for generators that play none.
-        MifError: The file of random numbers can't be read.
-    """
+    """Return the options with the interface and the table of random numbers that flags name."""
     if flags.interface is not None:
         try:
             options = replace(options, interface=parse_interface(flags.interface))
@@ -101,13 +62,7 @@ def read_named(options: BuildOptions, flags: BuildFlags) -> BuildOptions:
 
 
 def fit_to_device(options: BuildOptions, model: Model, name: str | None) -> tuple[BuildOptions, str]:
-    """Return the options with as many boards as the lines need on a device, and the reason as a sentence.
-
-    More boards than needed are kept where more were asked for.
-
-    Raises:
-        BuildError: Not a device, not a machine, or a machine of which not even one line fits.
-    """
+    """Return the options with at least as many boards as the lines need on a device, and the reason as a sentence."""
     if name is None:
         return options, ""
     device = device_named(name)
@@ -146,12 +101,7 @@ def _with_bits(model: Model, bits: dict[str, str]) -> Model:
 
 
 def _network_model(path: Path, flags: ModelFlags, settings: dict[str, str]) -> Model:
-    """Return the model that answers the question to a network's file.
-
-    Raises:
-        ModelError: Not a network, or a question that no BM1 computes.
-        BuildError: No question, or one that can't be read.
-    """
+    """Return the model that answers the question to a network's file."""
     if settings:
         raise BuildError(
             f"--set {next(iter(settings))}: a network's file has no parameters; --given NAME=STATE fixes a variable"

@@ -115,14 +115,7 @@ class Deployment(DeploymentFile):
         return next((variable for variable in self.variables if variable.kind == "prior_select"), None)
 
     def machine_addresses(self, addresses: Iterable[int | None]) -> tuple[tuple[int | None, ...], int]:
-        """Return the sensors' addresses in the columns' order, and the row of the prior's table.
-
-        Args:
-            addresses: One per variable, in the order of `variables`; None for a missing reading.
-
-        Raises:
-            ValueError: Another number of addresses than variables.
-        """
+        """Return the sensors' addresses in the columns' order, and the prior's row; None is a missing reading."""
         sensors: list[int | None] = []
         row = 0
         for variable, address in zip(self.variables, addresses, strict=True):

@@ -13,16 +13,13 @@ NAME_MAX: Final = 200
 """Characters of a name."""
 
 _TYPE = re.compile(r"[A-Za-z]\w*/(?:msg/)?[A-Za-z]\w*")
+_SHA256 = re.compile(r"[0-9a-f]{64}")
 _TOPIC = re.compile(r"/?[A-Za-z]\w*(?:/\w+)*")
 MESSAGE_PATH = re.compile(r"[A-Za-z_][A-Za-z0-9_]*(?:\.[A-Za-z_][A-Za-z0-9_]*|\[[0-9]{1,9}\])*")
 
 
 def websocket_uri(uri: str) -> str:
-    """Return a WebSocket's URI.
-
-    Raises:
-        ValueError: It is not one.
-    """
+    """Return a WebSocket's URI, or raise a ValueError."""
     try:
         is_whole = bool(urlsplit(uri).hostname) and urlsplit(uri).port != 0
     except ValueError:  # a port beyond 65535, half an IPv6 address
@@ -42,32 +39,19 @@ def _topic(topic: str) -> str:
     return topic
 
 
-def _message_type(name: str) -> str:
-    if not _TYPE.fullmatch(name):
-        raise ValueError(
-            f"{name!r} is not a message type; expected one like 'std_msgs/Float64' or 'std_msgs/msg/Float64'"
-        )
-    return name
+def _matching(pattern: re.Pattern[str], what: str) -> AfterValidator:
+    def check(text: str) -> str:
+        if not pattern.fullmatch(text):
+            raise ValueError(f"{text!r} is not {what}")
+        return text
+
+    return AfterValidator(check)
 
 
 def _not_zero(step: float) -> float:
     if step == 0:
         raise ValueError("a step of 0 would give every value the same address")
     return step
-
-
-def _sha256(text: str) -> str:
-    if not re.fullmatch(r"[0-9a-f]{64}", text):
-        raise ValueError(f"{text!r} is not a SHA-256 hash; expected 64 hexadecimal digits")
-    return text
-
-
-def _message_path(path: str) -> str:
-    if not MESSAGE_PATH.fullmatch(path):
-        raise ValueError(
-            f"{path!r} is not a path in a message; expected one like 'pose.position.x', 'ranges[3]' or a field's name"
-        )
-    return path
 
 
 def _printable(name: str) -> str:
@@ -78,13 +62,16 @@ def _printable(name: str) -> str:
 
 WebSocketUri = Annotated[str, AfterValidator(websocket_uri)]
 Topic = Annotated[str, AfterValidator(_topic)]
-MessageType = Annotated[str, AfterValidator(_message_type)]
-MessagePath = Annotated[str, AfterValidator(_message_path)]
-PathOrName = Annotated[str, AfterValidator(lambda path: path and _message_path(path))]
+MessageType = Annotated[
+    str, _matching(_TYPE, "a message type; expected one like 'std_msgs/Float64' or 'std_msgs/msg/Float64'")
+]
+_A_PATH = "a path in a message; expected one like 'pose.position.x', 'ranges[3]' or a field's name"
+MessagePath = Annotated[str, _matching(MESSAGE_PATH, _A_PATH)]
+PathOrName = Annotated[str, _matching(re.compile(f"(?:{MESSAGE_PATH.pattern})?"), _A_PATH)]
 """A path, or empty to search the message for the variable's name."""
 Name = Annotated[str, Field(min_length=1, max_length=NAME_MAX), AfterValidator(_printable)]
 """One printable line: names come from networks' files, too."""
-Sha256 = Annotated[str, AfterValidator(_sha256)]
+Sha256 = Annotated[str, _matching(_SHA256, "a SHA-256 hash; expected 64 hexadecimal digits")]
 Step = Annotated[float, AfterValidator(_not_zero)]
 
 Item = TypeVar("Item")
@@ -96,21 +83,13 @@ States = Annotated[tuple[Name, ...], Field(strict=False, exclude_if=lambda state
 
 
 def states_fit(name: str, states: tuple[str, ...], size: int) -> None:
-    """Refuse a number of state names that is not the number of values.
-
-    Raises:
-        ValueError: The numbers differ; names both.
-    """
+    """Refuse, with a ValueError, a number of state names that is not the number of values."""
     if states and len(states) != size:
         raise ValueError(f"{name} has {size} values, but {len(states)} states are named")
 
 
 def names_differ(kind: str, names: list[str]) -> None:
-    """Refuse a name that several entries of one kind share.
-
-    Raises:
-        ValueError: Two entries share a name.
-    """
+    """Refuse, with a ValueError, a name that several entries of one kind share."""
     twice = [name for name, count in Counter(names).items() if count > 1]
     if twice:
         raise ValueError(f"[[{kind}]] has {twice[0]!r} twice; names must differ")

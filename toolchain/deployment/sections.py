@@ -73,11 +73,7 @@ class Section(BaseModel):
     )
 
     def replace(self, **changes: Any) -> Self:
-        """Return a copy with some fields replaced, checked like a new one.
-
-        Raises:
-            ValidationError: A new value is wrong, or does not fit the other fields.
-        """
+        """Return a copy with some fields replaced, checked like a new one: a ValidationError if it is wrong."""
         return type(self)(**dict(self) | changes)
 
 
@@ -248,11 +244,7 @@ class Output(Section):
 
 
 def parse_interface(text: str) -> tuple[int, int]:
-    """Return inputs and results of an interface such as `20x1200` (thesis 3.2).
-
-    Raises:
-        ValueError: Not two numbers from 1 with an `x` between.
-    """
+    """Return inputs and results of an interface such as `20x1200` (thesis 3.2), or raise a ValueError."""
     match = _INTERFACE.fullmatch(text)
     if not match:
         raise ValueError(f"{text!r} is not an interface; expected inputs x results, such as '20x1200'")

@@ -21,11 +21,7 @@ _HEADER: Final = """\
 
 
 def write_deployment(directory: Path, deployment: Deployment) -> Deployment:
-    """Write `deployment.toml` with its hash, whole or not at all, and return what was written.
-
-    Raises:
-        DeploymentError: The folder can't be written.
-    """
+    """Write `deployment.toml` with its hash, whole or not at all, and return what was written."""
     written = with_hash(deployment.replace(directory=Path(directory)))
     with whole_file(written.path, DeploymentError) as partial:
         partial.write_text(deployment_text(written), encoding="utf-8")

@@ -39,16 +39,7 @@ def open_regular(path: Path, error: type[ToolchainError], most: int | None = Non
 
 
 def read_bounded(path: Path, most: int, error: type[ToolchainError]) -> bytes:
-    """Return a file's content.
-
-    Args:
-        path: The file.
-        most: The most bytes that it may have.
-        error: The type of the error that is raised.
-
-    Raises:
-        error: The file is absent, can't be read, is not a regular file, or is larger.
-    """
+    """Return the content of a regular file of at most `most` bytes, or raise the error."""
     try:
         with open_regular(path, error, most) as file:
             pieces, size = [], 0

@@ -52,11 +52,7 @@ class TomlFile:
 
     @classmethod
     def read(cls, path: Path, error: type[ToolchainError]) -> Self:
-        """Read a file.
-
-        Raises:
-            error: The file is absent, not readable, too large, not UTF-8 or not TOML; names the line.
-        """
+        """Read a file of bounded size and depth; the error names the line."""
         data = read_bounded(path, _MOST_BYTES, error)
         try:
             text = data.decode()
@@ -76,11 +72,7 @@ class TomlFile:
             raise error(_PLACE.sub("", str(reason)), path=path, line=line) from None
 
     def validated(self, model: type[Model]) -> Model:
-        """Return the tables as a pydantic model, by its fields' aliases.
-
-        Raises:
-            error: A key or a value is wrong; names the line and the nearest right name.
-        """
+        """Return the tables as a pydantic model, by its fields' aliases; errors name line and nearest right name."""
         try:
             return model.model_validate(self.tables, by_alias=True, by_name=False)
         except ValidationError as reason:

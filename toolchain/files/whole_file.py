@@ -17,9 +17,6 @@ def whole_file(path: Path, error: type[ToolchainError]) -> Iterator[Path]:
     """Yield the path of a partial file, which takes the place of the file at the end of the block.
 
     A partial file that was removed in the block leaves the file as it is.
-
-    Raises:
-        error: The file can't be written.
     """
     partial = path.with_name(path.name + ".part")
     try:

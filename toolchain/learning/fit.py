@@ -73,13 +73,7 @@ class Support:
 
 
 def locate(model: Model, columns: Mapping[str, Sequence[object]], rows: int) -> Truth:
-    """Return the true place in each row.
-
-    Args:
-        model: The model, whose searched dimensions define the cells.
-        columns: True values of each searched dimension, by its label.
-        rows: The number of rows of the recording.
-    """
+    """Return the true place in each of `rows` rows; `columns` are the searched dimensions' true values by label."""
     places = np.array(
         [[_position(dimension, value) for value in columns[dimension.label]] for dimension in model.searched]
     ).reshape(len(model.searched), rows)
@@ -104,21 +98,7 @@ def fit_model(
     recordings: Sequence[FittedRecording],
     options: FitOptions,
 ) -> tuple[Fit, tuple[Support, ...]]:
-    """Learn from rows with a truth.
-
-    Args:
-        model: The model.
-        truth: The true place in each row.
-        readings: Of each known variable that is to be learnt, one a row of the recording.
-        recordings: The recordings as they are listed in the file.
-        options: Method, pools, priors.
-
-    Returns:
-        The fit, and the amount of data that each table rests on.
-
-    Raises:
-        ModelError: No row has a true place, or a variable can't be learnt with this method.
-    """
+    """Learn from rows with a truth; return the fit, and the amount of data that each table rests on."""
     if not len(truth.rows):
         raise ModelError(
             "no row has a true value inside the searched dimensions: is --truth right, and in the model's unit?"

@@ -40,19 +40,7 @@ def run_fit(
     options: FitOptions,
     checks: Sequence[Path] = (),
 ) -> str:
-    """Learn a model's tables, write them, and return a report.
-
-    Args:
-        case: The folder with model.py.
-        recordings: The recordings to learn from.
-        output: The file to write.
-        settings: `KEY=VALUE`s for the model.
-        options: The method and its parameters.
-        checks: Recordings to compare the model before and after the fit on; nothing is learnt from them.
-
-    Raises:
-        ToolchainError: Anything that is wrong with the model, the recordings or the options.
-    """
+    """Learn a model's tables, write them, and return a report; nothing is learnt from `checks`."""
     _check(options, output)
     for path in checks:
         if any(path.resolve() == other.resolve() for other in recordings):

@@ -94,11 +94,7 @@ def with_fit(model: Model, path: Path | None) -> Model:
 
 
 def apply_fit(model: Model, fit: Fit, where: str = "the fit") -> Model:
-    """Return a model with what was learnt; variables that the fit doesn't have stay as they are.
-
-    Raises:
-        ModelError: A fitted variable that the model doesn't have, or one whose table has another shape.
-    """
+    """Return a model with what was learnt; variables that the fit doesn't have stay as they are."""
     known = {each.name: each for each in model.known}
     for variable in fit.file.variables:
         if variable.name not in known:
@@ -130,11 +126,7 @@ def cell_spread(model: Model, known: Known) -> NDArray[np.float64]:
 
 
 def mean_slopes(model: Model, known: Known) -> NDArray[np.float64]:
-    """Return how a variable's mean changes from cell to cell: float64[dimensions, lines], per cell.
-
-    Raises:
-        ModelError: The variable has no mean: its table is not one of normals.
-    """
+    """Return how a variable's mean changes from cell to cell: float64[dimensions, lines], per cell."""
     if known.normal is None:
         raise ModelError(
             f"{known.name} has no mean in the model to be normal around; fit it with --method counts"
@@ -180,11 +172,7 @@ def _with_normal(model: Model, known: Known, fitted: FittedVariable, floor: floa
 
 
 def write_fit(path: Path, fit: Fit) -> None:
-    """Write a fit: TOML of normals, NPZ of counts. The same fit gives the same bytes.
-
-    Raises:
-        ModelError: The file's suffix is not the method's, or it can't be written.
-    """
+    """Write a fit: TOML of normals, NPZ of counts. The same fit gives the same bytes."""
     suffix = ".toml" if fit.file.method == "normals" else ".npz"
     if path.suffix != suffix:
         raise ModelError(f"{path}: the method {fit.file.method} writes a file that ends in {suffix}")
@@ -198,11 +186,7 @@ def write_fit(path: Path, fit: Fit) -> None:
 
 
 def read_fit(path: Path) -> Fit:
-    """Return what `toolchain fit` wrote.
-
-    Raises:
-        ModelError: Not there, damaged, or of another kind; one sentence with the file.
-    """
+    """Return what `toolchain fit` wrote, or raise a ModelError."""
     if path.suffix == ".npz":
         return _read_tables(path)
     file = TomlFile.read(path, ModelError).validated(FitFile)

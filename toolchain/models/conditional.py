@@ -111,11 +111,7 @@ def wrapped_normal(
 
 
 def normal_table(name: str, shape: Normal, *, values: int, offset: float, step: float) -> NDArray[np.float64]:
-    """Return P(K | S) of a normal over bins, float64[values, lines]; the end bins hold the tails.
-
-    Raises:
-        ModelError: A sigma, step, floor, share or number of values that is not positive.
-    """
+    """Return P(K | S) of a normal over bins, float64[values, lines]; the end bins hold the tails."""
     mean, sigma = _checked(name, shape, values, step)
     inner = offset + (np.arange(1, values) - 0.5) * step
     edges = np.concatenate(([-np.inf], inner, [np.inf]))[:, np.newaxis]
@@ -128,11 +124,7 @@ def normal_table(name: str, shape: Normal, *, values: int, offset: float, step: 
 def wrapped_normal_table(
     name: str, shape: Normal, *, values: int, offset: float, step: float
 ) -> NDArray[np.float64]:
-    """Return P(K | S) of a wrapped normal over a turn of `values` bins, float64[values, lines].
-
-    Raises:
-        ModelError: A sigma, step, floor, share or number of values that is not positive.
-    """
+    """Return P(K | S) of a wrapped normal over a turn of `values` bins, float64[values, lines]."""
     mean, sigma = _checked(name, shape, values, step)
     turn = values * step
     sigma = np.minimum(sigma, _UNIFORM * turn)

@@ -86,14 +86,7 @@ def table(symbol: Symbol, values: ArrayLike, *, given: Sequence[Symbol] = ()) ->
     """
     given = tuple(given)
     scope = _scope(symbol, given)
-    numbers = np.array(values, dtype=np.float64)
-    shape = tuple(each.size for each in scope)
-    if numbers.shape != shape:
-        raise ModelError(f"{_title(symbol, given)} has shape {numbers.shape}, expected {shape}")
-    if not np.all(np.isfinite(numbers)) or np.any(numbers < 0):
-        raise ModelError(
-            f"{_title(symbol, given)} holds a number that is not a probability: negative, infinite or NaN"
-        )
+    numbers = _numbers(_title(symbol, given), values, scope)
     sums = numbers.sum(axis=0)
     wrong = np.argwhere(np.abs(sums - 1) > _SUM_TOLERANCE)
     if len(wrong):
@@ -104,7 +97,6 @@ def table(symbol: Symbol, values: ArrayLike, *, given: Sequence[Symbol] = ()) ->
             + (f" for {where}" if where else "")
             + "; a distribution sums to 1"
         )
-    numbers.flags.writeable = False
     return Distribution(symbol=symbol, given=given, table=numbers)
 
 
@@ -199,16 +191,19 @@ def potential(symbols: Sequence[Symbol], values: ArrayLike) -> Potential:
         ModelError: Another shape, or a number that is negative, infinite or NaN.
     """
     scope = _scope(symbols[0], tuple(symbols[1:])) if symbols else ()
+    title = f"the potential of {', '.join(each.name for each in scope)}"
+    return Potential(scope=scope, table=_numbers(title, values, scope))
+
+
+def _numbers(title: str, values: ArrayLike, scope: tuple[Symbol, ...]) -> NDArray[np.float64]:
     numbers = np.array(values, dtype=np.float64)
-    names = ", ".join(each.name for each in scope)
-    if numbers.shape != tuple(each.size for each in scope):
-        raise ModelError(
-            f"the potential of {names} has shape {numbers.shape}, expected {tuple(each.size for each in scope)}"
-        )
+    shape = tuple(each.size for each in scope)
+    if numbers.shape != shape:
+        raise ModelError(f"{title} has shape {numbers.shape}, expected {shape}")
     if not np.all(np.isfinite(numbers)) or np.any(numbers < 0):
-        raise ModelError(f"the potential of {names} holds a number that is negative, infinite or NaN")
+        raise ModelError(f"{title} holds a number that is negative, infinite or NaN")
     numbers.flags.writeable = False
-    return Potential(scope=scope, table=numbers)
+    return numbers
 
 
 def _scope(symbol: Symbol, given: tuple[Symbol, ...]) -> tuple[Symbol, ...]:

@@ -41,11 +41,7 @@ def reduced(term: Term, values: Mapping[str, int]) -> Term:
 
 
 def product(terms: Sequence[Term], scope: Sequence[str], sizes: Mapping[str, int]) -> NDArray[np.float64]:
-    """Return the terms' product over a scope that holds all their names, float64[size of each name].
-
-    Raises:
-        ModelError: It would be larger than the limit.
-    """
+    """Return the terms' product over all their names, float64[size of each]; a ModelError above the limit."""
     _check_size(scope, sizes, "the answer")
     found = np.ones(tuple(sizes[name] for name in scope))
     for term in terms:

@@ -59,10 +59,7 @@ def exact_posterior(
 def fuse(prior: NDArray[np.float64], likelihoods: Iterable[NDArray[np.float64]]) -> NDArray[np.float64]:
     """Return the normalised product of a prior and likelihoods, float64[lines] each, up to factors.
 
-    The product is a sum of logarithms, so that thirty small likelihoods don't underflow.
-
-    Raises:
-        ModelError: The product is 0 on every line.
+    The product is a sum of logarithms, so that thirty small likelihoods don't underflow; a ModelError if it is 0.
     """
     with np.errstate(divide="ignore"):  # log 0 = -inf is an impossible line
         logarithm = np.log(prior)

@@ -45,11 +45,6 @@ class JointDistribution:
     symbols: tuple[Symbol, ...] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        """Check that the factors belong together.
-
-        Raises:
-            ModelError: Two symbols of one name, two distributions of one symbol, one without any, or a cycle.
-        """
         object.__setattr__(self, "factors", tuple(self.factors))
         symbols: dict[str, Symbol] = {}
         for factor in self.factors:
@@ -75,11 +70,7 @@ class JointDistribution:
         object.__setattr__(self, "symbols", tuple(symbols.values()))
 
     def symbol(self, name: Named) -> Symbol:
-        """Return a symbol by its name.
-
-        Raises:
-            ModelError: There is no such symbol; lists those there are.
-        """
+        """Return a symbol by its name, or raise a ModelError."""
         wanted = name if isinstance(name, str) else name.name
         for symbol in self.symbols:
             if symbol.name == wanted:

@@ -19,10 +19,6 @@ MAX_MODEL_ENTRIES: Final = 2**28
 
 
 def check_size(what: str, entries: int, most: int, advice: str = "") -> None:
-    """Refuse a size above its limit.
-
-    Raises:
-        ModelError: Names the part, its size and the limit.
-    """
+    """Refuse, with a ModelError, a size above its limit."""
     if entries > most:
         raise ModelError(f"{what} would have {entries} entries; the most is {most}{advice}")

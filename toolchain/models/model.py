@@ -82,11 +82,7 @@ class TabulatedVariable:
         return len(self.table)
 
     def as_variable(self) -> Variable:
-        """Return the rule from readings to addresses, as `deployment.toml` has it.
-
-        Raises:
-            ModelError: The name is empty, the addresses don't fit the bits, or the step is 0.
-        """
+        """Return the rule from readings to addresses, as `deployment.toml` has it; a ModelError if it is wrong."""
         own = {each.name for each in fields(self)}
         rule = {key: getattr(self, key) for key in Variable.model_fields if key in own}
         try:
@@ -108,11 +104,6 @@ class Known(TabulatedVariable):
     """The normals that the table was made of, or None."""
 
     def __post_init__(self) -> None:
-        """Check the table by itself.
-
-        Raises:
-            ModelError: The table is not a conditional distribution, or the addresses don't fit.
-        """
         what = f"P({self.name} | S)"
         self._keep_table(what)
         _check_distribution(what, self.table)
@@ -126,11 +117,6 @@ class PriorSelect(TabulatedVariable):
     """
 
     def __post_init__(self) -> None:
-        """Check the table by itself.
-
-        Raises:
-            ModelError: A row is not a distribution, or the addresses don't fit.
-        """
         what = f"P(S | {self.name})"
         self._keep_table(what)
         for address, row in enumerate(self.table):
@@ -154,11 +140,6 @@ class Model:
     """The variable that selects the prior; then `prior` is the one without a selection."""
 
     def __post_init__(self) -> None:
-        """Check that the parts belong together.
-
-        Raises:
-            ModelError: A wrong shape, or a name that is wrong or used twice.
-        """
         name = self.name if isinstance(self.name, str) else ""  # a user's file is not type-checked
         if not (0 < len(name) <= NAME_MAX and name.isprintable()):
             raise ModelError(
@@ -254,11 +235,7 @@ def dimension(
 
 
 def interval(label: str, low: float, high: float, *, cells: int) -> Dimension:
-    """Return a searched dimension that cuts [low, high] into equal cells.
-
-    Raises:
-        ModelError: No cells, or no interval.
-    """
+    """Return a searched dimension that cuts [low, high] into equal cells; a ModelError if it has none."""
     if cells < 1 or not low < high:
         raise ModelError(f"searched dimension {label!r}: [{low:g}, {high:g}] can't be cut into {cells} cells")
     step = (high - low) / cells
@@ -273,11 +250,7 @@ def cell_centres(*searched: Dimension) -> tuple[NDArray[np.float64], ...]:
 
 
 def check_table(what: str, values: int, lines: int) -> None:
-    """Refuse a known variable's table that is too large, before it is made.
-
-    Raises:
-        ModelError: More values than a column serves, or more entries than a table may have.
-    """
+    """Refuse, with a ModelError, a known variable's table that is too large, before it is made."""
     if values > MAX_VALUES:
         raise ModelError(
             f"{what} has {values} values; a column serves at most {MAX_VALUES}: use a larger step"

@@ -35,11 +35,6 @@ class IntegerType:
     wraps: bool = False
 
     def __post_init__(self) -> None:
-        """Refuse an empty range.
-
-        Raises:
-            ModelError: `high` is below `low`, or one is not a whole number.
-        """
         if not (_is_whole(self.low) and _is_whole(self.high)):
             raise ModelError(f"an integer type from {self.low!r} to {self.high!r}: expected whole numbers")
         if self.high < self.low:
@@ -79,11 +74,6 @@ class IntervalType:
     wraps: bool = False
 
     def __post_init__(self) -> None:
-        """Refuse an interval that can't be cut.
-
-        Raises:
-            ModelError: No intervals or no whole number of them, or `high` is not above `low`.
-        """
         if not _is_whole(self.intervals):
             raise ModelError(
                 f"[{self.low:g}, {self.high:g}] can't be cut into {self.intervals!r} intervals: expected a whole number"
@@ -123,11 +113,6 @@ class LabelType:
     labels: tuple[str, ...]
 
     def __init__(self, *labels: str) -> None:
-        """Take the names in their order.
-
-        Raises:
-            ModelError: None, an empty one, or one twice.
-        """
         if not labels or not all(labels) or len(set(labels)) < len(labels):
             raise ModelError(
                 f"a label type needs names that differ, not {', '.join(map(repr, labels)) or 'none'}"
@@ -187,11 +172,6 @@ class Symbol:
     """`missing` where a reading may be missing."""
 
     def __post_init__(self) -> None:
-        """Refuse a symbol without a name.
-
-        Raises:
-            ModelError: The name is empty.
-        """
         if not self.name:
             raise ModelError("a symbol needs a name")
         check_size(f"the symbol {self.name!r}", self.type.size, MAX_ENTRIES)
@@ -212,11 +192,7 @@ class Symbol:
         return values
 
     def index(self, label: str) -> int:
-        """Return the index of the value that a word names: a label, or a number.
-
-        Raises:
-            ModelError: The word is not one of the symbol's values; lists them.
-        """
+        """Return the index of the value that a label or a number names, or raise a ModelError."""
         if label in self.type.labels:
             return self.type.labels.index(label)
         if not self.type.labels and _NUMBER.fullmatch(label):

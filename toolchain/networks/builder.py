@@ -41,7 +41,7 @@ class Place(Protocol):
 
 
 class NetworkBuilder:
-    """A builder of a joint distribution from a file's variables and tables."""
+    """A builder of a joint distribution; each method refuses wrong or too large parts with a NetworkFileError."""
 
     def __init__(self, path: Path, *, on_missing: Literal["error", "missing"] = "error") -> None:
         self.path = path
@@ -63,21 +63,13 @@ class NetworkBuilder:
         return tuple(self._symbols)
 
     def size(self, name: str, place: Place) -> int:
-        """Return how many states a variable has.
-
-        Raises:
-            NetworkFileError: The variable is not defined yet.
-        """
+        """Return how many states a variable has."""
         if name not in self._symbols:
             raise place.error(f"there is no variable {name[:MAX_NAME]!r} before this line")
         return self._symbols[name].size
 
     def state(self, name: str, label: str, place: Place) -> int:
-        """Return which state of a variable a label is.
-
-        Raises:
-            NetworkFileError: No such variable or state.
-        """
+        """Return which state of a variable a label is."""
         self.size(name, place)
         try:
             return self._symbols[name].index(label)
@@ -85,11 +77,7 @@ class NetworkBuilder:
             raise place.error(str(reason)) from None
 
     def variable(self, name: str, states: Sequence[str] | int, place: Place) -> None:
-        """Take a variable with the names of its states, or with the number of its states.
-
-        Raises:
-            NetworkFileError: The name is taken or empty, there are no states, or a limit is exceeded.
-        """
+        """Take a variable with the names of its states, or with the number of its states."""
         if not 0 < len(name) <= MAX_NAME:
             raise place.error(f"a variable's name has {len(name)} characters, expected 1 to {MAX_NAME}")
         if not name.isprintable():
@@ -112,11 +100,7 @@ class NetworkBuilder:
             raise place.error(f"variable {name}: {reason}") from None
 
     def shape(self, scope: Sequence[str], place: Place) -> tuple[int, ...]:
-        """Return the shape of a table over some variables, within the limits.
-
-        Raises:
-            NetworkFileError: A variable is not defined or named twice, or the table is above a limit.
-        """
+        """Return the shape of a table over some variables, within the limits."""
         if len(scope) > MAX_PARENTS + 1:
             raise place.error(f"a table of {len(scope)} variables; the most is {MAX_PARENTS + 1}")
         if len(set(scope)) < len(scope):
@@ -134,13 +118,7 @@ class NetworkBuilder:
     def distribution(
         self, child: str, parents: Sequence[str], values: NDArray[np.float64], place: Place
     ) -> None:
-        """Take P(child | parents), float64[child's states, states of each parent].
-
-        Rounded numbers, whose sum is nearly 1, are divided by their sum.
-
-        Raises:
-            NetworkFileError: The child has a table, or the numbers are not probabilities or don't sum to 1.
-        """
+        """Take P(child | parents), float64[child's states, each parent's]; sums that are nearly 1 are divided out."""
         if child in self._children:
             raise place.error(f"{child} has two tables")
         self._children.add(child)
@@ -165,22 +143,14 @@ class NetworkBuilder:
             raise place.error(str(reason)) from None
 
     def potential(self, scope: Sequence[str], values: NDArray[np.float64], place: Place) -> None:
-        """Take a potential, float64[states of each variable].
-
-        Raises:
-            NetworkFileError: Numbers that are negative, infinite or NaN.
-        """
+        """Take a potential, float64[states of each variable]."""
         try:
             self._factors.append(potential([self._symbols[name] for name in scope], values))
         except ModelError as reason:
             raise place.error(str(reason)) from None
 
     def joint(self) -> JointDistribution:
-        """Return the joint distribution; its symbols are in the file's order.
-
-        Raises:
-            ModelError: No variables, one without a table, or a circle of parents.
-        """
+        """Return the joint distribution; its symbols are in the file's order."""
         if not self._symbols:
             raise ModelError("the file has no variables")
         used = {symbol.name for symbol in chain.from_iterable(factor.scope for factor in self._factors)}

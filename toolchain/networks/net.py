@@ -10,6 +10,8 @@ from toolchain.networks.builder import MAX_PARENTS, MAX_STATES
 from toolchain.networks.scanner import Scanner
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from toolchain.networks.builder import NetworkBuilder
 
 _COMMENTS: Final = r"%[^\n]*"
@@ -17,11 +19,7 @@ _OTHER_NODES: Final = {"continuous", "utility", "decision", "function"}
 
 
 def read_net(data: bytes, builder: NetworkBuilder) -> None:
-    """Read a NET file of discrete nodes; `data` has the parents in their order, the child fastest.
-
-    Raises:
-        NetworkFileError: The file is not NET, or has other nodes than discrete chance nodes; names the line.
-    """
+    """Read a NET file of discrete chance nodes; `data` has the parents in their order, the child fastest."""
     text = Scanner(data, builder.path, signs="{}()|;,=", comments=_COMMENTS)
     in_class = False
     while (block := text.next()) or text.quoted:
@@ -53,14 +51,19 @@ def read_net(data: bytes, builder: NetworkBuilder) -> None:
         raise text.error("expected '}' of the class, found the end of the file")
 
 
-def _node(text: Scanner, builder: NetworkBuilder) -> None:
-    name = text.word("a node's name")
-    states: list[str] | None = None
+def _keys(text: Scanner) -> Iterator[str]:
     text.sign("{")
     while (key := text.next()) != "}":
         if not key:
             raise text.error("expected '}', found the end of the file")
         text.sign("=")
+        yield key
+
+
+def _node(text: Scanner, builder: NetworkBuilder) -> None:
+    name = text.word("a node's name")
+    states: list[str] | None = None
+    for key in _keys(text):
         if key == "states":
             text.sign("(")
             states = text.words(")", "states", MAX_STATES)
@@ -76,11 +79,7 @@ def _potential(text: Scanner, builder: NetworkBuilder) -> None:
     child, parents = text.scope("a node's name", MAX_PARENTS)
     shape = builder.shape((*parents, child), text)
     values = None
-    text.sign("{")
-    while (key := text.next()) != "}":
-        if not key:
-            raise text.error("expected '}', found the end of the file")
-        text.sign("=")
+    for key in _keys(text):
         if key == "data":
             numbers = text.numbers(";", int(np.prod(shape)), f"the data of {child}", between="(),")
             values = np.moveaxis(numbers.reshape(shape), -1, 0)

@@ -19,7 +19,7 @@ _SHOWN: Final = 40
 
 
 class Scanner:
-    """A scanner that moves forward; `sign` and `word` take the next token and refuse any other kind."""
+    """A scanner that moves forward; each method refuses what it does not expect with a NetworkFileError."""
 
     def __init__(self, data: bytes, path: Path, *, signs: str = "{}()[]|;,", comments: str = "") -> None:
         """Scan a file's bytes.
@@ -29,9 +29,6 @@ class Scanner:
             path: The file's name in errors.
             signs: Characters that stand for themselves; a word ends before one.
             comments: A regular expression for the format's comments; for /* ... */ only the beginning.
-
-        Raises:
-            NetworkFileError: It is not UTF-8 text, or has a comment that is not closed.
         """
         self._path = path
         try:
@@ -56,11 +53,7 @@ class Scanner:
         return NetworkFileError(sentence, path=self._path, line=line)
 
     def next(self) -> str:
-        """Take the next token: a word, a quoted word without its quotes, or a sign; empty at the end.
-
-        Raises:
-            NetworkFileError: A quote that is not closed on its line.
-        """
+        """Take the next token: a word, a quoted word without its quotes, or a sign; empty at the end."""
         match = self._token.match(self._text, self._end)
         if match is None:  # the last alternative takes any character
             raise AssertionError
@@ -78,32 +71,20 @@ class Scanner:
         return piece
 
     def sign(self, wanted: str) -> None:
-        """Take a sign or a keyword.
-
-        Raises:
-            NetworkFileError: The next token is another one.
-        """
+        """Take a sign or a keyword."""
         found = self.next()
         if found != wanted or self.quoted:
             raise self.error(f"expected {wanted!r}, found {_shown(found)}")
 
     def word(self, what: str) -> str:
-        """Take a word, plain or quoted; `what` names it in errors.
-
-        Raises:
-            NetworkFileError: The next token is a sign or the end.
-        """
+        """Take a word, plain or quoted; `what` names it in errors."""
         found = self.next()
         if not self.quoted and (not found or self._is_sign(found)):
             raise self.error(f"expected {what}, found {_shown(found)}")
         return found
 
     def words(self, end: str, what: str, most: int) -> list[str]:
-        """Take words up to a sign and the sign, with or without commas between them.
-
-        Raises:
-            NetworkFileError: Another sign, the end, or more words than `most`.
-        """
+        """Take at most `most` words up to a sign and the sign, with or without commas between them."""
         found: list[str] = []
         while True:
             piece = self.next()
@@ -118,11 +99,7 @@ class Scanner:
             found.append(piece)
 
     def scope(self, what: str, most: int) -> tuple[str, list[str]]:
-        """Take `( CHILD | PARENTS )` or `( CHILD )`; `what` names the child in errors.
-
-        Raises:
-            NetworkFileError: The next tokens are others, or there are more parents than `most`.
-        """
+        """Take `( CHILD | PARENTS )` or `( CHILD )`; `what` names the child in errors."""
         self.sign("(")
         child = self.word(what)
         separator = self.next()
@@ -131,25 +108,14 @@ class Scanner:
         return child, self.words(")", "parents", most) if separator == "|" else []
 
     def count(self, what: str, most: int) -> int:
-        """Take a whole number from 0.
-
-        Raises:
-            NetworkFileError: The word is not a whole number, or above `most`.
-        """
+        """Take a whole number from 0 to `most`."""
         word = self.word(what)
         if not (word.isascii() and word.isdigit() and len(word) <= 9) or int(word) > most:
             raise self.error(f"expected {what}, 0 to {most}, found {_shown(word)}")
         return int(word)
 
     def numbers(self, end: str, wanted: int, what: str, *, between: str = ",") -> NDArray[np.float64]:
-        """Take numbers up to a sign and the sign, with the signs `between` anywhere among them.
-
-        Returns:
-            float64[wanted].
-
-        Raises:
-            NetworkFileError: A word is not a number, there are more or fewer, or brackets don't match.
-        """
+        """Take numbers up to a sign and the sign, with the signs `between` anywhere among them: float64[wanted]."""
         stop = self._text.find(end, self._end)
         if stop < 0:
             self._start = self._end = len(self._text)
@@ -163,14 +129,7 @@ class Scanner:
         return self._floats(piece.split(maxsplit=wanted), wanted, what, begin)
 
     def next_numbers(self, wanted: int, what: str) -> NDArray[np.float64]:
-        """Take this many numbers with only white space between them.
-
-        Returns:
-            float64[wanted].
-
-        Raises:
-            NetworkFileError: A word is not a number, or the file ends.
-        """
+        """Take this many numbers with only white space between them: float64[wanted]."""
         begin, words = self._end, []
         for _ in range(wanted):
             word = self.next()
@@ -180,11 +139,7 @@ class Scanner:
         return self._floats(words, wanted, what, begin)
 
     def skip(self, end: str) -> None:
-        """Take everything up to a sign and the sign, but for signs in brackets and quotes.
-
-        Raises:
-            NetworkFileError: The file ends first, or brackets don't match.
-        """
+        """Take everything up to a sign and the sign, but for signs in brackets and quotes."""
         depth = 0
         while True:
             piece = self.next()

@@ -22,11 +22,7 @@ _DECIMAL: Final = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 
 
 def read_xmlbif(data: bytes, builder: NetworkBuilder) -> None:
-    """Read an XMLBIF file; a TABLE has the GIVENs in their order, the FOR fastest.
-
-    Raises:
-        NetworkFileError: The file is not XMLBIF, or declares an entity; names the line.
-    """
+    """Read an XMLBIF file without entities; a TABLE has the GIVENs in their order, the FOR fastest."""
     _Reader(builder).read(data)
 
 

@@ -46,11 +46,6 @@ class Mif:
     """Every word, from address 0; addresses that a file leaves out are 0, as in Quartus."""
 
     def __post_init__(self) -> None:
-        """Refuse words that no memory of this width holds.
-
-        Raises:
-            MifError: The memory has no words or no width, or a word has more bits.
-        """
         if not self.words or self.width < 1:
             raise MifError(f"a memory of {len(self.words)} words of {self.width} bits holds nothing")
         for address, word in enumerate(self.words):
@@ -87,11 +82,7 @@ def printable(text: str) -> str:
 
 
 def read_mif(path: Path) -> Mif:
-    """Read a memory's contents from a file in any form of MIF.
-
-    Raises:
-        MifError: The file can't be read, or is not a MIF; names the line and what was expected.
-    """
+    """Read a memory's contents from a file in any form of MIF; a MifError names the line."""
     data = read_bounded(path, MOST_BYTES, MifError)
     return parse_mif(data.decode("latin-1"), str(path))
 

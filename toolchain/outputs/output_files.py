@@ -92,14 +92,7 @@ def text_file(name: str, text: str) -> OutputFiles:
 
 
 def write_files(directory: Path, files: OutputFiles) -> list[tuple[str, Change]]:
-    """Write a part of a deployment into its folder, each file whole or not at all.
-
-    Returns:
-        Every path from the folder, sorted, and its change.
-
-    Raises:
-        BuildError: The folder can't be written.
-    """
+    """Write a part of a deployment, each file whole or not at all; return every path, sorted, and its change."""
     changes: dict[str, Change] = {}
     for name, pieces in files.contents.items():
         changes[name] = _write(directory / name, pieces)

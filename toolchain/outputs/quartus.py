@@ -26,12 +26,7 @@ _UNVERIFIED: Final = """\
 
 
 def project_files(deployment: Deployment, mifs: Sequence[str]) -> dict[str, str]:
-    """Return the project's files by name: `bm1.qpf`, a `.qsf` for every board, `bm1.tcl`.
-
-    Args:
-        deployment: The deployment.
-        mifs: Paths of the memory files from the deployment's folder.
-    """
+    """Return the project's files by name: `bm1.qpf`, a `.qsf` for every board, `bm1.tcl`; `mifs` are its memories."""
     boards = range(len(deployment.boards))
     head = (
         f"# The Bayesian machine of the model {printable(deployment.name)}, written by 'toolchain build'.\n"

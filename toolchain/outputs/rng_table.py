@@ -38,12 +38,7 @@ def random_table(prob_bits: int) -> NDArray[np.uint32]:
 
 
 def read_table(path: Path) -> NDArray[np.uint32]:
-    """Return the random numbers in a user's MIF, uint32[length].
-
-    Raises:
-        MifError: The file can't be read, or is not a MIF.
-        BuildError: Its words have more than 32 bits.
-    """
+    """Return the random numbers in a user's MIF, uint32[length]; a MifError or BuildError if it has none."""
     mif = read_mif(path)
     if mif.width > 32:
         raise BuildError(

@@ -65,15 +65,6 @@ def test_a_machine_beside_its_model():
     assert fine.cycles.median.value % 256 == 0 or fine.cycles.median.value < 512
 
 
-def test_more_counts_are_more_accurate():
-    model = corridor(24, sigma=1.5)
-    readings = sample_readings(model, 25, seed=2)
-    machine = machine_of(model, counter_bits=12)
-    few, many = (measure(boards_of(machine, target=target), readings, model) for target in (63, 4095))
-    assert many.sampling.total_variation.value < few.sampling.total_variation.value / 4
-    assert many.cycles.median.value > 16 * few.cycles.median.value
-
-
 def test_z_scores_are_near_1_with_fresh_bits_and_larger_without():
     model = corridor(40, sigma=2.0)
     readings = sample_readings(model, 100, seed=1)

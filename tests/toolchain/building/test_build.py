@@ -10,17 +10,13 @@ from hypothesis import strategies as st
 
 from machines.parameters import RngKind, RngReset
 from pcie_shim.programming_file import read_image
-from toolchain.building.board_layout import board_layout
-from toolchain.building.build import build_date, build_deployment
-from toolchain.building.machine import machine_parameters
-from toolchain.building.options import BuildOptions
+from tests.toolchain.running import OPTIONS
+from toolchain.building.build import assemble, build_date, build_deployment
 from toolchain.building.quantise import quantise
 from toolchain.deployment import Queue, Scale, Stop, load_deployment
 from toolchain.errors import BuildError, DeploymentError, ToolchainError
 from toolchain.models.conditional import normal, wrapped_normal
 from toolchain.models.model import Known, Model, cell_centres, interval
-
-OPTIONS = BuildOptions(uri="ws://robot:9090", topic="/readings", type="std_msgs/Float64MultiArray")
 
 
 def model(size=5, sensors=2):
@@ -32,10 +28,6 @@ def model(size=5, sensors=2):
         for i in range(1, sensors)
     ]
     return Model(name="small", searched=(y, x), known=tuple(known))
-
-
-def contents(folder):
-    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
 @pytest.mark.parametrize("partitions", [1, 3, 4, 25])
@@ -57,62 +49,30 @@ def test_the_boards_together_are_the_machine(tmp_path, partitions):
     assert len({image.image_hash for image in images}) == partitions
 
 
-def test_the_same_input_gives_the_same_bytes_anywhere(tmp_path):
-    options = replace(OPTIONS, partitions=3, build_date="2020-02-02T02:02:02Z")
-    build_deployment(model(), tmp_path / "one", options)
-    build_deployment(model(), tmp_path / "another" / "one", options)
-    assert contents(tmp_path / "one") == contents(tmp_path / "another" / "one")
-    assert set(contents(tmp_path / "one")) == {
-        "deployment.toml",
-        "report.txt",
-        "bm1.qpf",
-        "bm1.tcl",
-        "bm_arch/bm1_parameters.vhd",
-        "bm_arch/Memory_MIFs/rng_seeds.mif",
-        *(f"boards/board{i}.bm" for i in range(3)),
-        *(f"bm1_board{i}.qsf" for i in range(3)),
-        *(
-            f"bm_arch/Memory_MIFs/board{i}_{what}.mif"
-            for i in range(3)
-            for what in ("prior", "column1", "column2")
-        ),
-    }
-
-
 def test_options_arrive_in_the_deployment_and_in_the_images(tmp_path):
-    options = replace(
-        OPTIONS,
-        output="/where",
-        scale=Scale.COLUMN,
-        prob_bits=5,
-        counter_bits=6,
-        target_count=17,
-        max_cycles=999,
-        stop=Stop.OWN,
-        rng=RngKind.LFSR16,
-        rng_banks=3,
-        rng_reset=RngReset.FREE,
-        queue=Queue.ALL,
-        tolerance_s=0.2,
-        interface=(4, 30),
-        build_date="2020-02-02T02:02:02Z",
-    )
+    limits = {"target_count": 17, "max_cycles": 999, "stop": Stop.OWN}
+    machine = {
+        "prob_bits": 5,
+        "counter_bits": 6,
+        "rng": RngKind.LFSR16,
+        "rng_banks": 3,
+        "rng_reset": RngReset.FREE,
+    }
+    frames = {"queue": Queue.ALL, "tolerance_s": 0.2}
+    others = {"output": "/where", "interface": (4, 30), "build_date": "2020-02-02T02:02:02Z"}
+    options = replace(OPTIONS, scale=Scale.COLUMN, **limits, **machine, **frames, **others)
     deployment = build_deployment(model(), tmp_path, options).deployment
-    machine = deployment.machine
-    assert (machine.target_count, machine.max_cycles, machine.stop) == (17, 999, "own")
-    assert (machine.rng, machine.rng_banks, machine.rng_reset) == ("lfsr16", 3, "free")
-    assert (machine.prob_bits, machine.counter_bits, machine.steps_per_clock) == (5, 6, 8)
-    assert machine.interface == "4x30"
-    assert (deployment.queue, deployment.tolerance_s, deployment.outputs[0].topic) == ("all", 0.2, "/where")
     image = read_image(deployment.image_path(0))
-    parameters = image.machine.parameters
-    assert (parameters.prob_bits, parameters.counter_bits, parameters.rng_banks) == (5, 6, 3)
-    assert (parameters.rng, parameters.rng_reset) == ("lfsr16", "free")
-    assert (image.interface_sensors, image.interface_results) == (4, 30)
-    assert image.build_date == "2020-02-02T02:02:02Z"
-    assert np.array_equal(
-        image.machine.tables[0], quantise(model(), prob_bits=5, scale=Scale.COLUMN).tables[0]
-    )
+    for section, fields in (
+        (deployment.machine, limits | machine | {"interface": "4x30", "steps_per_clock": 8}),
+        (image.machine.parameters, machine),
+        (deployment, frames),
+        (image, {"interface_sensors": 4, "interface_results": 30, "build_date": others["build_date"]}),
+    ):
+        assert {name: getattr(section, name) for name in fields} == fields
+    assert deployment.outputs[0].topic == "/where"
+    scaled = quantise(model(), prob_bits=5, scale=Scale.COLUMN)
+    assert np.array_equal(image.machine.tables[0], scaled.tables[0])
 
 
 def test_seeds_that_no_memory_holds(tmp_path):
@@ -122,17 +82,17 @@ def test_seeds_that_no_memory_holds(tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_the_target_is_the_counters_largest_count(tmp_path):
-    assert build_deployment(model(), tmp_path, OPTIONS).deployment.machine.target_count == 255
-
-
 def test_the_interface_grows_with_the_model_and_says_so(tmp_path):
     built = build_deployment(model(sensors=21), tmp_path, OPTIONS)
     assert built.deployment.machine.interface == "21x1200"
-    assert "Interface: 21x1200, larger than the default 20x1200: a board needs 21 inputs and 25 results " in (
-        built.report
-    )
-    assert "Interface: 20x1200.\n" in build_deployment(model(), tmp_path, OPTIONS).report
+    assert "Interface: 21x1200, larger than the default 20x1200: " in built.report
+    default = build_deployment(model(), tmp_path, OPTIONS)
+    assert "Interface: 20x1200.\n" in default.report
+    assert default.deployment.machine.target_count == 255
+    for interface in ((2, 25), (64, 4096)):  # exactly the machine's size, and the register map's
+        assert assemble(
+            model(), replace(OPTIONS, interface=interface)
+        ).deployment.machine.interface == "{}x{}".format(*interface)
 
 
 @pytest.mark.parametrize(
@@ -141,8 +101,9 @@ def test_the_interface_grows_with_the_model_and_says_so(tmp_path):
         {"partitions": 0},
         {"partitions": 26},
         {"interface": (1, 1200)},
-        {"interface": (20, 24)},
+        {"interface": (2, 24)},
         {"interface": (65, 100)},
+        {"interface": (2, 4097)},
         {"prob_bits": 17},
         {"prob_bits": 8, "rng": RngKind.LFSR8},
         {"rng_table": np.arange(4, dtype=np.uint32)},
@@ -226,13 +187,3 @@ def test_the_build_date_is_source_date_epoch_or_the_files(tmp_path_factory, seco
         patch.setenv("SOURCE_DATE_EPOCH", "yesterday")
         with pytest.raises(ToolchainError, match="SOURCE_DATE_EPOCH is 'yesterday'"):
             build_date(path)
-
-
-def test_an_interface_of_exactly_the_machine_s_size_is_enough():
-    parameters = machine_parameters(model(), OPTIONS)
-    needed = (len(model().known), model().lines)
-    assert board_layout(parameters, 1, needed).interface == needed
-    assert board_layout(parameters, 1, (64, 4096)).interface == (64, 4096)
-    for small in ((needed[0] - 1, needed[1]), (needed[0], needed[1] - 1)):
-        with pytest.raises(BuildError):
-            board_layout(parameters, 1, small)

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from toolchain.building.partition import Block, partition_lines
+from toolchain.building.partition import partition_lines
 from toolchain.errors import BuildError
 
 
@@ -18,11 +18,6 @@ def test_blocks_cover_all_lines_in_order(data):
     assert sizes == sorted(sizes, reverse=True)
     assert sizes.count(lines // count + 1) == lines % count
     assert len(blocks) == count
-
-
-def test_the_thesis_and_an_uneven_split():
-    assert partition_lines(1024, 4) == tuple(Block(256 * board, 256) for board in range(4))
-    assert partition_lines(11, 3) == (Block(0, 4), Block(4, 4), Block(8, 3))
 
 
 @pytest.mark.parametrize("count", [0, -1, 5])

@@ -3,6 +3,8 @@
 model ──▶ deployment.toml, images ──▶ addresses of a frame ──▶ row of the prior's table, codes to write ──▶ posterior
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from pydantic import ValidationError
@@ -11,20 +13,20 @@ from machines.encode import decode_code
 from machines.parameters import PriorMode
 from machines.posterior import posterior
 from pcie_shim.programming_file import read_image
+from tests.toolchain.running import OPTIONS
+from toolchain.analysis.accuracy.emulation import joined
 from toolchain.building.build import build_deployment
-from toolchain.building.options import BuildOptions
 from toolchain.building.quantise import quantise
 from toolchain.deployment import Scale, Variable, WrittenPrior, load_deployment
 from toolchain.deployment.address import to_address
 from toolchain.deployment.written_codes import written_prior
 from toolchain.errors import BuildError, DeploymentError, ModelError, ReadingError
-from toolchain.models.distribution import table, uniform
+from toolchain.models.distribution import table
 from toolchain.models.fusion import exact_posterior, fuse
 from toolchain.models.joint import JointDistribution
 from toolchain.models.model import Known, Model, PriorSelect, dimension
 from toolchain.models.symbol import IntegerType, LabelType, Symbol
 
-OPTIONS = BuildOptions(uri="ws://robot:9090", topic="/readings", type="std_msgs/Float64MultiArray")
 FINE = {"prob_bits": 14, "counter_bits": 16, "target_count": 20000}
 PRIORS = np.array([[0.7, 0.1, 0.1, 0.1], [0.1, 0.1, 0.1, 0.7], [0.0, 0.5, 0.5, 0.0]])
 HEARD = np.array([[0.9, 0.4, 0.4, 0.1], [0.1, 0.6, 0.6, 0.9]])
@@ -40,42 +42,29 @@ def selected(**fields):
 
 
 def build(tmp_path, built_model, **options):
-    built = build_deployment(built_model, tmp_path, BuildOptions(**(vars_of(OPTIONS) | options)))
-    return load_deployment(tmp_path), built
+    build_deployment(built_model, tmp_path, replace(OPTIONS, **options))
+    return load_deployment(tmp_path)
 
 
-def vars_of(options):
-    return {name: getattr(options, name) for name in options.__dataclass_fields__}
-
-
-def on_boards(deployment, addresses, **written):
+def on_boards(deployment, addresses, codes=None):
     """What the boards of a deployment compute together, normalised as the host does it."""
     sensors, row = deployment.machine_addresses(addresses)
-    parts = []
-    for at, board in enumerate(deployment.boards):
-        machine = read_image(deployment.image_path(at)).machine
-        lines = slice(board.line_offset, board.line_offset + board.lines)
-        codes = {"prior_codes": written["codes"][lines]} if "codes" in written else {}
-        prior = codes.get(
-            "prior_codes", machine.prior[row] if deployment.machine.prior_bits else machine.prior[0]
-        )
-        rows = [table_[address] for table_, address in zip(machine.tables, sensors, strict=True)]
-        parts.append(
-            np.prod([decode_code(each, machine.parameters.prob_bits) for each in (prior, *rows)], axis=0)
-        )
-        if at == 0 and len(deployment.boards) == 1:
-            counted = posterior(
-                machine, sensors, prior_address=row, target_count=deployment.machine.target_count, **codes
-            )
-            exact = parts[0] / parts[0].sum()
-            assert counted == pytest.approx(exact, abs=0.02)
-    whole = np.concatenate(parts)
-    return whole / whole.sum()
+    boards = [read_image(deployment.image_path(at)).machine for at in range(len(deployment.boards))]
+    machine = joined(boards)
+    prior = machine.prior[row if deployment.machine.prior_bits else 0] if codes is None else codes
+    rows = [table_[address] for table_, address in zip(machine.tables, sensors, strict=True)]
+    product = np.prod([decode_code(each, machine.parameters.prob_bits) for each in (prior, *rows)], axis=0)
+    exact = product / product.sum()
+    if len(boards) == 1:
+        target = deployment.machine.target_count
+        counted = posterior(machine, sensors, prior_address=row, target_count=target, prior_codes=codes)
+        assert counted == pytest.approx(exact, abs=0.02)
+    return exact
 
 
 @pytest.mark.parametrize("partitions", [1, 2])
 def test_the_selected_row_is_the_prior_of_the_frame(tmp_path, partitions):
-    deployment, _ = build(tmp_path, model(prior_select=selected()), partitions=partitions, **FINE)
+    deployment = build(tmp_path, model(prior_select=selected()), partitions=partitions, **FINE)
     assert deployment.machine.prior_bits == 2
     assert [variable.name for variable in deployment.sensors] == ["heard"]
     assert deployment.prior_select.name == "time"
@@ -88,13 +77,12 @@ def test_the_selected_row_is_the_prior_of_the_frame(tmp_path, partitions):
 
 
 def test_a_missing_selection_is_the_top_row_the_prior_without_it(tmp_path):
-    deployment, built = build(tmp_path, model(prior_select=selected()), **FINE)
+    deployment = build(tmp_path, model(prior_select=selected()), **FINE)
     assert deployment.machine_addresses([1, None]) == ((1,), 3)
     found = on_boards(deployment, [1, None])
     assert found == pytest.approx(fuse(PRIORS.mean(axis=0), [HEARD[1]]), abs=2e-3)
     given = model(prior_select=selected(), prior=np.array([0.4, 0.3, 0.2, 0.1]))
     assert quantise(given).prior[3].tolist() == [255, 192, 128, 64]
-    assert "Prior: selected by time, one of 3 rows" in built.report
 
 
 def test_rows_that_are_not_served_are_impossible():
@@ -137,7 +125,7 @@ def test_an_impossible_value_selects_the_plain_prior():
 
 @pytest.mark.parametrize("partitions", [1, 2])
 def test_a_written_prior_stands_in_the_place_of_the_models(tmp_path, partitions):
-    deployment, built = build(
+    deployment = build(
         tmp_path,
         model(),
         prior_mode=PriorMode.WRITTEN,
@@ -147,7 +135,6 @@ def test_a_written_prior_stands_in_the_place_of_the_models(tmp_path, partitions)
     )
     assert deployment.machine.prior_mode is PriorMode.WRITTEN
     assert deployment.prior == WrittenPrior(path="prior.data")
-    assert "Prior: written every frame, from prior.data" in built.report
     wish = [0.1, 0.2, 0.3, 0.4]
     codes = written_prior(wish, lines=4, prob_bits=14)
     found = on_boards(deployment, [1], codes=codes)
@@ -209,7 +196,7 @@ def test_refused_selections(make):
 
 
 def test_a_deployment_whose_prior_does_not_agree_is_refused(tmp_path):
-    deployment, _ = build(tmp_path, model(prior_select=selected()))
+    deployment = build(tmp_path, model(prior_select=selected()))
     fields = dict(deployment)
     two = (*deployment.variables, Variable(name="other", kind="prior_select", bits=2, values=3))
     for changes, sentence in (
@@ -232,10 +219,3 @@ def test_a_word_that_is_no_state_is_no_number(tmp_path):
         to_address(variable, "of")
     with pytest.raises(ValidationError, match="v has 2 values, but 1 states are named"):
         Variable(name="v", bits=2, values=2, states=("on",))
-
-
-def test_uniform_selection_is_no_selection():
-    time, room = Symbol("time", IntegerType(0, 1)), Symbol("room", IntegerType(0, 3))
-    joint = JointDistribution("r", (uniform(time), uniform(room)))
-    asked = joint.ask(["room"], prior_select="time").model()
-    assert asked.prior_select.table == pytest.approx(np.full((2, 4), 0.25))

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from machines.encode import decode_code, encode_probability
 from machines.errors import ParameterError
-from toolchain.building.quantise import quantise, scaled
+from toolchain.building.quantise import quantise
 from toolchain.deployment import Scale
 from toolchain.models.conditional import normal, wrapped_normal
 from toolchain.models.model import Known, Model, PriorSelect, dimension
@@ -110,13 +110,6 @@ def test_the_prior_is_a_column_too_and_its_rows_are_selected_equally_often(
         check_loss(loss, exact, decode_code(quantised.prior, prob_bits)[: len(exact)])
 
 
-def test_more_bits_lose_less():
-    model = model_of(normal("D", mean=np.linspace(0, 20, 30), sigma=3.0, values=21).table)
-    losses = [quantise(model, prob_bits=bits).losses[1] for bits in (4, 8, 12, 16)]
-    assert [loss.mass for loss in losses] == sorted((loss.mass for loss in losses), reverse=True)
-    assert [loss.kl_bits for loss in losses] == sorted((loss.kl_bits for loss in losses), reverse=True)
-
-
 def with_floor(floor, prob_bits=8):
     known = normal("D", mean=np.arange(40.0), sigma=1.0, values=40, floor=floor)
     model = Model(name="m", searched=(dimension("s", size=40),), known=(known,))
@@ -158,13 +151,6 @@ def test_codes_of_one_bit_hold_no_floor():
     assert "below 2^-1 of the largest" in found.what
     bits = int(found.advice.removeprefix("use --prob-bits "))
     assert not with_floor(0.02, bits).warnings
-
-
-def test_scaling_never_exceeds_one_and_keeps_rows_of_zeros():
-    table = np.array([[0.2, 0.7], [0.0, 0.0], [0.8, 0.3]])
-    assert scaled(table, Scale.ADDRESS) == pytest.approx(np.array([[0.2 / 0.7, 1], [0, 0], [1, 0.375]]))
-    assert scaled(table, Scale.COLUMN) == pytest.approx(table / 0.8)
-    assert scaled(table, Scale.NONE) is table
 
 
 @pytest.mark.parametrize("prob_bits", [0, 17])

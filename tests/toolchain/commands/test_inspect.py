@@ -5,23 +5,8 @@ import json
 import pytest
 
 from tests.toolchain.running import TARGET, assert_refused, toolchain
-from toolchain.analysis.inspection.inspection import machines_of
 from toolchain.analysis.inspection.report import _unit
 from toolchain.deployment import load_deployment
-
-MODEL = """
-import numpy as np
-from toolchain.models.conditional import normal
-from toolchain.models.model import Known, Model, cell_centres, interval
-
-def model(cells: int = 12):
-    place = interval("x", 0.0, 10.0, cells=cells)
-    (x,) = cell_centres(place)
-    loud = 0.05 + 0.9 * np.exp(-x / 3)
-    return Model(name="corridor", searched=(place,), known=(
-        normal("range", mean=x, sigma=1.0, values=21, step=0.5, on_missing="missing"),
-        Known(name="loud", table=np.array([1 - loud, loud]))))
-"""
 
 
 @pytest.fixture
@@ -88,7 +73,10 @@ def test_recorded_readings(case, deployment):
     assert "Readings: 3 of 3 rows of run.csv, each with 4 sets of seeds." in result.stdout
 
 
-def test_a_deployment_with_columns_of_another_width(case):
+def test_deployments_of_other_machines(case):
+    build(case, "--per-cell", "--target-count", "20")
+    slow = toolchain("inspect", case.parent / "out")  # to emulate, so for fewer frames
+    assert "Readings: 20 frames drawn from what the codes say of the model (seed 1).\n" in slow.stdout
     build(case, "--bits", "range=6", "--scale", "column", "--rng", "lfsr16", "--stop", "own")
     out = case.parent / "out"
     result = look(out, "--model", str(case), "--bits", "range=6")
@@ -120,11 +108,6 @@ def test_no_deployment(tmp_path):
     assert_refused(look(tmp_path), tmp_path)
 
 
-def test_the_machines_are_those_that_were_built(case, deployment):
-    machines = machines_of(load_deployment(deployment))
-    assert [machine.parameters.lines for machine in machines] == [6, 6]
-
-
 def test_a_build_on_a_device_takes_its_own_number_of_boards(case):
     result = build(case, "--device", "proce-v-d8")
     assert "\nAll 12 lines fit one Gidel Proce V D8 (Stratix V GS D8):" in result.stdout
@@ -133,14 +116,6 @@ def test_a_build_on_a_device_takes_its_own_number_of_boards(case):
     assert (
         len(load_deployment(case.parent / "out").boards) == 2
     )  # as many as were asked for, since they are more
-
-
-def test_a_machine_that_is_slow_to_emulate_is_looked_at_for_fewer_frames(case):
-    build(case, "--per-cell", "--target-count", "20")
-    result = toolchain("inspect", case.parent / "out")
-    assert result.exit_code == 0, result.stderr
-    assert "Readings: 20 frames drawn from what the codes say of the model (seed 1).\n" in result.stdout
-    assert "lfsr32 one a cell" in result.stdout
 
 
 def test_units():

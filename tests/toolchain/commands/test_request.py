@@ -1,11 +1,9 @@
 """Flags and the build options that they become."""
 
-import inspect
 from dataclasses import fields
 
 from machines.parameters import PriorMode, RngKind, RngReset, SensorMode
-from toolchain.commands.flags import BuildFlags, ModelFlags, ReadingFlags
-from toolchain.commands.registration import expand_flags
+from toolchain.commands.flags import BuildFlags, ModelFlags
 from toolchain.commands.request import build_options
 from toolchain.deployment import Scale, Stop
 
@@ -43,24 +41,3 @@ def test_every_flag_reaches_the_options():
     assert {field.name for field in fields(BuildFlags)} == set(OTHERS) | read_elsewhere
     default = build_options(BuildFlags(), uri="", topic="", message_type="")
     assert not [name for name, value in OTHERS.items() if getattr(default, name) == value]
-
-
-def test_a_command_has_a_parameter_for_each_field():
-    taken = {}
-
-    def command(name: str, flags: ModelFlags, readings: ReadingFlags, count: int = 3) -> None:
-        taken.update(name=name, flags=flags, readings=readings, count=count)
-
-    expanded = expand_flags(command)
-    parameters = inspect.signature(expanded).parameters
-    groups = (*fields(ModelFlags), *fields(ReadingFlags))
-    assert list(parameters) == ["name", *(field.name for field in groups), "count"]
-    assert all(parameters[field.name].default == field.default for field in groups)
-    values = {field.name: field.default for field in groups}
-    expanded(name="a", count=4, **values | {"searched": "s", "seed": 7})
-    assert taken == {
-        "name": "a",
-        "flags": ModelFlags(searched="s"),
-        "readings": ReadingFlags(seed=7),
-        "count": 4,
-    }

@@ -60,13 +60,6 @@ def test_a_period_comes_before_the_range_check(variable, turns):
             assert to_address(variable, value) == address
 
 
-@given(variables(), st.data())
-def test_every_served_address_is_reached_from_its_middle(variable, data):
-    variable = variable.model_copy(update={"offset": float(round(variable.offset)), "step": 0.5})
-    address = data.draw(st.integers(0, variable.values - 1))
-    assert to_address(variable, variable.offset + address * variable.step) == address
-
-
 @given(
     variables() | variables(period=True),
     st.text() | st.lists(NUMBERS, min_size=1) | st.dictionaries(st.text(), NUMBERS),
@@ -76,33 +69,18 @@ def test_what_is_no_number_is_never_one(variable, value):
         to_address(variable, value)
 
 
-@pytest.mark.parametrize(
-    ("value", "address"),
-    [
-        (0, 0),
-        (100, 100),
-        (49.4, 49),
-        (49.5, 50),
-        (-0.5, 0),
-        (100.4999, 100),
-        (True, 1),
-        (False, 0),
-        (-0.0, 0),
-    ],
-)
+@pytest.mark.parametrize(("value", "address"), [(49.5, 50), (-0.5, 0), (True, 1), (False, 0)])
 def test_rounding_and_booleans(value, address):
     assert to_address(variable(), value) == address
 
 
-@pytest.mark.parametrize("value", [-0.51, 100.5, 1e300, 10**400, -(10**400), math.inf, -math.inf])
+@pytest.mark.parametrize(
+    "value",
+    [-0.51, 100.5, 1e300, 10**400, -(10**400), pytest.param(10**5000, id="10**5000"), math.inf, -math.inf],
+)
 def test_out_of_range_names_variable_value_and_range(value):
     with pytest.raises(ValueOutOfRangeError, match=r"D1: .* out of range, expected 0 to 100 in steps of 1"):
         to_address(variable(), value)
-
-
-def test_an_integer_too_long_to_print_is_named_too():
-    with pytest.raises(ValueOutOfRangeError, match="thousands of digits"):
-        to_address(variable(), 10**5000)
 
 
 @pytest.mark.parametrize(
@@ -130,12 +108,6 @@ def test_missing_readings(value, word):
     assert to_address(variable(on_missing="missing"), value) is None
     with pytest.raises(ReadingMissingError, match=f"D1 is .*{word}"):
         to_address(variable(), value)
-
-
-def test_out_of_range_as_missing():
-    assert to_address(variable(on_range="missing", on_missing="missing"), 101) is None
-    with pytest.raises(ReadingMissingError, match="101, out of range"):
-        to_address(variable(on_range="missing"), 101)
 
 
 @pytest.mark.parametrize("value", ["12", "x" * 10_000, [1, 2], {"data": 1}, b"12"])

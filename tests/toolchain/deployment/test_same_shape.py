@@ -68,55 +68,29 @@ def test_what_may_change(fields):
 
 
 @pytest.mark.parametrize(
-    ("fields", "said"),
+    ("fields", "field"),
     [
-        ({"queue": Queue.ALL}, "queue is latest in the run and all in the new one"),
-        ({"sources": (changed(SOURCE, uri="ws://b:9090"),)}, "[[source]] 0 uri is ws://a:9090 in"),
-        ({"sources": (changed(SOURCE, topic="/b"),)}, "[[source]] 0 topic is /boat/sensors in"),
-        ({"sources": (changed(SOURCE, type="b/B"),)}, "[[source]] 0 type is boat_msgs/Sensors in"),
-        ({"sources": (changed(SOURCE, compression="cbor"),)}, "[[source]] 0 compression is none in"),
-        ({"sources": (SOURCE, changed(SOURCE, topic="/b"))}, "[[source]] number is 1 in the run and 2 in"),
-        ({"variables": (D1, ROOM)}, "[[variable]] names is B1, D1, room in the run and D1, room in"),
-        (
-            {"variables": (changed(D1, bits=8), B1, ROOM)},
-            "[[variable]] bits of column 1 is 7 in the run and 8",
-        ),
-        ({"searched": (X, Y)}, "[[searched]] 0 label is y in the run and x in"),
-        ({"outputs": (Output(topic="/other"),)}, "[[output]] 0 topic is /BMresults in"),
-        ({"outputs": (Output(uri="ws://b:1"),)}, "[[output]] 0 uri is empty in the run and ws://b:1 in"),
-        ({"boards": (changed(BOARDS[0], endpoint="unix:/b"), BOARDS[1])}, "[[board]] 0 endpoint is empty in"),
-        ({"boards": (changed(BOARDS[0], lines=12),)}, "[[board]] number is 2 in the run and 1 in"),
-        *(
-            ({"machine": changed(MACHINE, **{name: value})}, f"[machine] {name} is")
-            for name, value in {
-                "interface": "20x2048",
-                "prob_bits": 10,
-                "counter_bits": 10,
-                "rng": "lfsr16",
-                "rng_banks": 8,
-                "rng_reset": "free",
-                "shared": False,
-                "steps_per_clock": 4,
-                "sensor_mode": "cell",
-                "replicas": 2,
-            }.items()
-        ),
+        ({"queue": Queue.ALL}, "queue"),
+        ({"sources": (changed(SOURCE, compression="cbor"),)}, "[[source]] 0 compression"),
+        ({"sources": (SOURCE, changed(SOURCE, topic="/b"))}, "[[source]] number"),
+        ({"variables": (D1, ROOM)}, "[[variable]] names"),
+        ({"variables": (changed(D1, bits=8), B1, ROOM)}, "[[variable]] bits of column 1"),
+        ({"variables": (changed(B1, bits=9), D1, ROOM)}, "[[variable]] bits of column 1"),
+        ({"searched": (changed(Y, label="z"), X)}, "[[searched]] 0 label"),
+        ({"searched": (Y, changed(X, size=4))}, "[[searched]] 1 size"),
+        ({"boards": (changed(BOARDS[0], endpoint="unix:/b"), BOARDS[1])}, "[[board]] 0 endpoint"),
+        ({"boards": (changed(BOARDS[0], lines=12),)}, "[[board]] number"),
+        ({"machine": changed(MACHINE, prob_bits=10)}, "[machine] prob_bits"),
     ],
 )
-def test_what_may_not_change_is_named(fields, said):
+def test_what_may_not_change_is_named(fields, field):
     found = differences(deployment(), Deployment.model_construct(**(dict(deployment()) | fields)))
-    assert str(found[0]).startswith(said), found
-    assert len(found) == 1 or "searched" in said
+    assert [each.field for each in found] == [field]
 
 
-def test_columns_of_other_widths_are_no_other_order():
-    wide = changed(B1, bits=9)
-    before = deployment(variables=(D1, wide, ROOM))
-    found = differences(before, deployment(variables=(wide, D1, ROOM)))
-    assert [each.field for each in found] == [
-        "[[variable]] bits of column 1",
-        "[[variable]] bits of column 2",
-    ]
+def test_a_difference_is_one_sentence_with_both_values():
+    (found,) = differences(deployment(), deployment(outputs=(Output(uri="ws://b:1"),)))
+    assert str(found).startswith("[[output]] 0 uri is empty in the run and ws://b:1 in")
 
 
 def test_every_field_is_decided():

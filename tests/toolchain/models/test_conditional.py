@@ -47,15 +47,6 @@ def test_a_wrapped_normal_is_the_sum_over_all_turns(mean, sigma, values, offset,
     assert known.period == values
 
 
-def test_a_full_turn_changes_nothing_and_the_bin_across_the_seam_is_like_any_other():
-    mean = np.array([0.0, 90.25, 179.9, 359.9])
-    once = wrapped_normal("B", mean=mean, sigma=10.0, values=360).table
-    again = wrapped_normal("B", mean=mean - 720, sigma=10.0, values=360).table
-    assert again == pytest.approx(once, abs=1e-12)
-    assert once[0, 0] == once.max(axis=0)[0]
-    assert once[359, 0] == pytest.approx(once[1, 0])
-
-
 def test_a_wide_bearing_is_uniform_and_takes_no_time():
     table = wrapped_normal("B", mean=np.zeros(2), sigma=1e12, values=36).table
     assert table == pytest.approx(np.full((36, 2), 1 / 36))

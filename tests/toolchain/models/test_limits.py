@@ -1,17 +1,15 @@
 """Sizes above the limits are refused before anything of that size is allocated."""
 
-import tracemalloc
-
 import numpy as np
 import pytest
 
+from tests.toolchain.running import OPTIONS, refused_within
 from toolchain.building.machine import machine_parameters
-from toolchain.building.options import BuildOptions
 from toolchain.building.partition import partition_lines
 from toolchain.errors import BuildError, ModelError
 from toolchain.models import IntegerType, IntervalType, Known, Model, PriorSelect, Symbol
 from toolchain.models.conditional import normal, wrapped_normal
-from toolchain.models.distribution import conditional_normal, table
+from toolchain.models.distribution import conditional_normal, potential, table
 from toolchain.models.joint import JointDistribution
 from toolchain.models.model import cell_centres, dimension, interval
 
@@ -56,31 +54,34 @@ def question(lines, *sizes):
     ],
 )
 def test_a_model_part_above_its_limit_is_refused_unmade(too_large):
-    tracemalloc.start()
-    try:
-        with pytest.raises(ModelError):
-            too_large()
-        assert tracemalloc.get_traced_memory()[1] < 4 << 20
-    finally:
-        tracemalloc.stop()
+    with refused_within(4 << 20, ModelError):
+        too_large()
 
 
-@pytest.mark.parametrize("too_large", [question(1501, *[10_000] * 20), question(5000, 2, 10_000)])
+def searched_together(count):
+    """A question for symbols of 16 values each that are joined by one that is summed over."""
+    hidden = Symbol("h", IntegerType(0, 1))
+    symbols = [Symbol(f"s{at}", IntegerType(0, 15)) for at in range(count)]
+    joint = JointDistribution("many", tuple(potential([each, hidden], np.ones((16, 2))) for each in symbols))
+    return joint.ask(symbols[:4] if count == 5 else symbols, symbols[4:] if count == 5 else ())
+
+
+@pytest.mark.parametrize(
+    "too_large", [question(1501, *[10_000] * 20), question(5000, 2, 10_000), searched_together(7)]
+)
 def test_a_question_with_tables_that_are_too_large_is_refused_unmade(too_large):
-    tracemalloc.start()
-    try:
-        with pytest.raises(ModelError):
-            too_large.model()
-        assert tracemalloc.get_traced_memory()[1] < 64 << 20
-    finally:
-        tracemalloc.stop()
+    with refused_within(64 << 20, ModelError):
+        too_large.model()
+
+
+def test_a_question_with_large_tables_is_answered():
+    assert searched_together(5).model().lines == 16**4
 
 
 def test_codes_that_no_memory_holds_are_refused_before_they_are_made():
-    options = BuildOptions(uri="ws://robot:9090", topic="/readings", type="a/B")
-    assert machine_parameters(model_of_views(2**14, 16), options).lines == 2**14
+    assert machine_parameters(model_of_views(2**14, 16), OPTIONS).lines == 2**14
     with pytest.raises(BuildError):
-        machine_parameters(model_of_views(2**14 + 1, 16), options)
+        machine_parameters(model_of_views(2**14 + 1, 16), OPTIONS)
 
 
 @pytest.mark.timeout(20)

@@ -9,22 +9,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from machines.parameters import PriorMode, RngKind, RngReset
 from machines.rng import random_numbers
 from pcie_shim.programming_file import read_image
+from tests.toolchain.running import OPTIONS, contents
 from toolchain.building.build import build_deployment
-from toolchain.building.options import BuildOptions
 from toolchain.deployment import load_deployment
 from toolchain.models.conditional import normal
 from toolchain.models.model import Known, Model, PriorSelect, cell_centres, interval
-from toolchain.outputs.memories import packed_words
-from toolchain.outputs.mif import parse_mif, read_mif
+from toolchain.outputs.mif import read_mif
 from toolchain.outputs.rng_table import random_table
 
-OPTIONS = BuildOptions(uri="ws://robot:9090", topic="/readings", type="std_msgs/Float64MultiArray")
 KINDS = [
     {},
     {"prob_bits": 5, "partitions": 2, "rng": RngKind.LFSR8, "rng_banks": 3},
@@ -57,46 +53,6 @@ def build(folder, *, select=False, lines=7, **changes):
     return [read_image(deployment.image_path(board)) for board in range(len(deployment.boards))]
 
 
-def unpacked(path, machine):
-    """Codes by address and line, taken out of the words one by one."""
-    bits, lines = machine.parameters.prob_bits, machine.parameters.lines
-    mif = read_mif(path)
-    assert mif.width == bits * lines
-    return [[word >> (bits * line) & (2**bits - 1) for line in range(lines)] for word in mif.words]
-
-
-@pytest.mark.parametrize("changes", KINDS)
-def test_the_memories_hold_the_machine(tmp_path, changes):
-    images = build(tmp_path, select=True, **changes)
-    folder = tmp_path / "bm_arch" / "Memory_MIFs"
-    for board, image in enumerate(images):
-        machine = image.machine
-        prior = folder / f"board{board}_prior.mif"
-        if machine.parameters.prior_mode is PriorMode.WRITTEN:  # a word a line: what PRIOR_CODES holds first
-            assert [list(read_mif(prior).words)] == machine.prior.tolist()
-        else:
-            assert unpacked(prior, machine) == machine.prior.tolist()
-        for column, table in enumerate(machine.tables, start=1):
-            assert unpacked(folder / f"board{board}_column{column}.mif", machine) == table.tolist()
-        parameters = machine.parameters
-        seeds = read_mif(folder / ("rng_seeds.mif" if parameters.shared else f"board{board}_rng_seeds.mif"))
-        expected = [random_numbers(machine).restart(bank) for bank in range(parameters.rng_banks)]
-        assert list(seeds.words) == np.ravel(expected).tolist()
-        if parameters.rng is RngKind.TABLE:
-            assert seeds.width == 16
-            assert list(read_mif(folder / "rng_table.mif").words) == machine.rng_table.tolist()
-        else:
-            assert seeds.width == parameters.rng.lfsr_bits
-    assert (folder / "rng_table.mif").is_file() == (changes.get("rng") is RngKind.TABLE)
-
-
-@given(st.integers(1, 16), st.integers(1, 40), st.integers(1, 130), st.integers(0, 2**32))
-def test_a_word_is_the_codes_of_all_lines(prob_bits, lines, rows, seed):
-    codes = np.random.default_rng(seed).integers(0, 2**prob_bits, (rows, lines), dtype=np.uint16)
-    expected = [sum(int(code) << (prob_bits * line) for line, code in enumerate(row)) for row in codes]
-    assert list(packed_words(codes, prob_bits)) == expected
-
-
 def test_the_made_table_has_every_number_equally_often():
     for bits in (1, 8, 16):
         assert np.bincount(random_table(bits)).tolist() == [2 ** (16 - bits)] * 2**bits
@@ -115,39 +71,28 @@ def read_by_srec_cat(path, folder):
     text = path.read_text("ascii")
     width = int(re.search(r"^WIDTH=(\d+);$", text, re.MULTILINE)[1])
     digits = -(-width // 4)
-    words = []
-    for at, low in enumerate(range(0, digits, SLICE_DIGITS)):
+    words = None
+    for low in range(0, digits, SLICE_DIGITS):
         bits = min(4 * SLICE_DIGITS, width - 4 * low)
-        count = -(-bits // 4)
-
-        def own_digits(entry, low=low, count=count):
-            address, word = entry.groups()
-            assert len(word) == digits
-            return f"{address} : {word[digits - low - count : digits - low]};"
-
-        narrow = re.sub(r"^([0-9A-F]+) : ([0-9A-F]+);$", own_digits, text, flags=re.MULTILINE)
-        narrow = narrow.replace(f"WIDTH={width};", f"WIDTH={bits};")
+        high, count = digits - low, -(-bits // 4)
+        narrow = re.sub(
+            rf"^([0-9A-F]+) : [0-9A-F]{{{high - count}}}([0-9A-F]{{{count}}})[0-9A-F]{{{low}}};$",
+            r"\1 : \2;",
+            text.replace(f"WIDTH={width};", f"WIDTH={bits};"),
+            flags=re.MULTILINE,
+        )
         (folder / "slice.mif").write_text(narrow, "ascii")
-        binary = folder / "words.bin"
-        subprocess.run(
-            [
-                "srec_cat",
-                path if digits <= SLICE_DIGITS else folder / "slice.mif",
-                "-mif",
-                "-o",
-                binary,
-                "-binary",
-            ],
-            check=True,
-            timeout=240,
-            capture_output=True,
-        )
-        data, size = binary.read_bytes(), -(-bits // 8)
+        command = ["srec_cat", folder / "slice.mif", "-mif", "-o", folder / "words.bin", "-binary"]
+        subprocess.run(command, check=True, timeout=240, capture_output=True)
+        data, size = (folder / "words.bin").read_bytes(), -(-bits // 8)
         found = [int.from_bytes(data[place : place + size], "little") for place in range(0, len(data), size)]
-        words = (
-            found if at == 0 else [word | part << 4 * low for word, part in zip(words, found, strict=True)]
-        )
+        words = [word | part << 4 * low for word, part in zip(words or [0] * len(found), found, strict=True)]
     return width, words
+
+
+def read_by_toolchain(path, _):
+    mif = read_mif(path)
+    return mif.width, list(mif.words)
 
 
 def words_of(machine, codes):
@@ -156,35 +101,35 @@ def words_of(machine, codes):
     return [sum(code << bits * line for line, code in enumerate(row)) for row in codes.tolist()]
 
 
+@pytest.mark.parametrize("reader", [read_by_srec_cat, read_by_toolchain])
 @pytest.mark.parametrize(
     "changes", [*KINDS, {"lines": 400}, {"lines": 131, "prob_bits": 11, "partitions": 2}]
 )
-def test_srec_cat_reads_what_the_images_hold(tmp_path, changes):
+def test_the_memories_hold_what_the_images_hold(tmp_path, changes, reader):
     """Every word of every memory, also of those that are thousands of bits wide."""
-    if shutil.which("srec_cat") is None:
+    if reader is read_by_srec_cat and shutil.which("srec_cat") is None:
         pytest.skip("srec_cat is not there; Debian has it in the package srecord")
     images = build(tmp_path, select=True, **changes)
     folder = tmp_path / "bm_arch" / "Memory_MIFs"
     left = {path.name for path in folder.iterdir()}
     for board, image in enumerate(images):
-        machine = image.machine
-        shared = machine.parameters.shared
-        written = machine.parameters.prior_mode is PriorMode.WRITTEN
-        prior = machine.prior[0].tolist() if written else words_of(machine, machine.prior)
-        tables = {f"board{board}_prior.mif": prior} | {
-            f"board{board}_column{column}.mif": words_of(machine, table)
-            for column, table in enumerate(machine.tables, start=1)
+        machine, parameters = image.machine, image.machine.parameters
+        wide = parameters.prob_bits * parameters.lines
+        expected = {
+            f"board{board}_{name}.mif": (wide, words_of(machine, table))
+            for name, table in zip(
+                ("prior", "column1", "column2"), (machine.prior, *machine.tables), strict=True
+            )
         }
-        banks = [random_numbers(machine).restart(bank) for bank in range(machine.parameters.rng_banks)]
-        tables["rng_seeds.mif" if shared else f"board{board}_rng_seeds.mif"] = np.ravel(banks).tolist()
+        if parameters.prior_mode is PriorMode.WRITTEN:  # a word a line: what PRIOR_CODES holds first
+            expected[f"board{board}_prior.mif"] = (parameters.prob_bits, machine.prior[0].tolist())
+        banks = [random_numbers(machine).restart(bank) for bank in range(parameters.rng_banks)]
+        seeds = "rng_seeds.mif" if parameters.shared else f"board{board}_rng_seeds.mif"
+        expected[seeds] = (parameters.rng.lfsr_bits or 16, np.ravel(banks).tolist())
         if machine.rng_table is not None:
-            tables["rng_table.mif"] = machine.rng_table.tolist()
-        for name, words in tables.items():
-            width, found = read_by_srec_cat(folder / name, tmp_path)
-            assert found == words, name
-            if "rng" not in name and not (written and "prior" in name):
-                assert width == machine.parameters.lines * machine.parameters.prob_bits
-        left -= tables.keys()
+            expected["rng_table.mif"] = (parameters.prob_bits, machine.rng_table.tolist())
+        assert {name: reader(folder / name, tmp_path) for name in expected} == expected
+        left -= expected.keys()
     assert not left
 
 
@@ -330,25 +275,18 @@ def test_the_script_names_the_sources_and_compiles_every_board(tmp_path):
     (tmp_path / "hdl").mkdir()
     for name in ("b.vhd", "a.vhd", "c.txt"):
         (tmp_path / "hdl" / name).touch()
-
-    def run(folder):
-        return subprocess.run(
-            ["tclsh"],
-            check=False,
-            input=f"set folder {folder}\n{TCL}",
-            cwd=tmp_path,
-            capture_output=True,
-            text=True,
-            timeout=240,
-        )
-
     expected = []
     for board in range(2):
         expected += [f"open bm1 -revision bm1_board{board}"]
         expected += [f"set -name VHDL_FILE hdl/{name}.vhd" for name in "ab"]
         expected += ["export", "flow -compile", "close"]
-    assert run("hdl").stdout.splitlines() == expected
-    assert "error: no .vhd file in 'boards'" in run("boards").stderr
+    for folder, lines in (("hdl", expected), ("boards", [])):
+        script = f"set folder {folder}\n{TCL}"
+        done = subprocess.run(
+            ["tclsh"], check=False, input=script, cwd=tmp_path, capture_output=True, text=True, timeout=240
+        )
+        assert done.stdout.splitlines() == lines
+    assert "error: no .vhd file in 'boards'" in done.stderr
 
 
 def test_generators_that_exist_emulated_only_have_no_seeds_and_no_project(tmp_path):
@@ -366,7 +304,8 @@ ELSEWHERE = """
 import sys
 from dataclasses import replace
 from pathlib import Path
-from tests.toolchain.outputs.test_memories import OPTIONS, model
+from tests.toolchain.outputs.test_memories import model
+from tests.toolchain.running import OPTIONS
 from toolchain.building.build import build_deployment
 build_deployment(model(), Path(sys.argv[1]), replace(OPTIONS, partitions=2, build_date="2020-02-02T02:02:02Z"))
 """
@@ -376,26 +315,19 @@ def test_the_same_bytes_in_another_folder_locale_and_hash_seed(tmp_path):
     found = []
     for number, language in enumerate(["C", "C.UTF-8"]):
         folder = tmp_path / f"number {number}"
+        place = {"PYTHONHASHSEED": str(number), "LC_ALL": language, "TZ": ["UTC", "Asia/Tokyo"][number]}
         subprocess.run(
-            [sys.executable, "-c", ELSEWHERE, folder],
-            check=True,
-            timeout=100,
-            env=os.environ
-            | {"PYTHONHASHSEED": str(number), "LC_ALL": language, "TZ": ["UTC", "Asia/Tokyo"][number]},
+            [sys.executable, "-c", ELSEWHERE, folder], check=True, timeout=100, env=os.environ | place
         )
-        found.append(
-            {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-        )
+        found.append(contents(folder))
     assert found[0] == found[1]
     for name, content in found[0].items():
         assert str(tmp_path).encode() not in content, name
-        assert b"2020" not in content or name.suffix == ".bm", name
-
-
-def test_every_mif_of_a_build_is_canonical(tmp_path):
-    build(tmp_path)
-    for path in (tmp_path / "bm_arch" / "Memory_MIFs").iterdir():
-        entries = [
-            line for line in path.read_text().splitlines() if " : " in line and not line.startswith("--")
-        ]
-        assert len(entries) == len(parse_mif(path.read_text()).words)
+        assert b"2020" not in content or name.endswith(".bm"), name
+    memories = [f"board{i}_{what}" for i in range(2) for what in ("prior", "column1", "column2")]
+    assert set(found[0]) == {
+        *("deployment.toml", "report.txt", "bm1.qpf", "bm1.tcl", "bm_arch/bm1_parameters.vhd"),
+        *(f"boards/board{i}.bm" for i in range(2)),
+        *(f"bm1_board{i}.qsf" for i in range(2)),
+        *(f"bm_arch/Memory_MIFs/{each}.mif" for each in ("rng_seeds", *memories)),
+    }

@@ -43,7 +43,7 @@ def frames_of(case: Case) -> list[Frame]:
     never = 1 if parameters.has_tables else 0
     rows = random.integers(0, parameters.ones_code + 1, (6, *parameters.count_shape)).astype(np.uint16)
 
-    def inputs() -> np.ndarray[tuple[int, ...], np.dtype[np.int64]]:
+    def inputs():
         drawn = np.empty(parameters.input_shape, dtype=np.int64)
         by_column = drawn.reshape(replicas, parameters.sensors, -1)
         for column, bits in enumerate(parameters.sensor_bits):
@@ -51,13 +51,7 @@ def frames_of(case: Case) -> list[Frame]:
             by_column[:, column] = random.choice(choice, by_column[:, column].shape)
         return drawn
 
-    def start(
-        at: int,
-        where: np.ndarray[tuple[int, ...], np.dtype[np.int64]],
-        target: int,
-        limit: int,
-        until: int = 0,
-    ) -> Start:
+    def start(at, where, target, limit, until=0):
         prior = at % parameters.prior_addresses
         others = tuple((at + replica) % parameters.prior_addresses for replica in range(replicas))
         return Start(
@@ -70,32 +64,25 @@ def frames_of(case: Case) -> list[Frame]:
             run_until=until,
         )
 
-    def hopeless(which: slice) -> np.ndarray[tuple[int, ...], np.dtype[np.int64]]:
+    def hopeless(which):
         where = inputs()
         where.reshape(replicas, parameters.sensors, -1)[which, 0] = never
         return where
 
     missing = np.array(missing_inputs(parameters), dtype=np.int64)
-    return [
+    frames = [
         Frame(start(0, inputs(), 200, 64)),
         Frame(start(1, inputs(), 5, 400)),
         Frame(start(2, inputs(), 255, 100, until=31), ((57, ()),)),
         Frame(start(3, hopeless(slice(None)), 9, 50)),
         Frame(start(4, missing, 30, 300)),
         Frame(start(5, inputs(), 3, 200, until=64), ((0, ()),)),
-        *(
-            [
-                # one can't count, one is left behind at the first slice, and another one at the second
-                Frame(
-                    start(1, hopeless(slice(0, 1)), 250, 140, until=8),
-                    ((32, (1,)), (64, (replicas - 1,)), (0, ())),
-                ),
-                Frame(start(2, inputs(), 12, 150, until=16), ((48, ()), (0, (0,)))),
-            ]
-            if several
-            else []
-        ),
     ]
+    if several:  # one can't count, one is left behind at the first slice, and another one at the second
+        resumes = ((32, (1,)), (64, (replicas - 1,)), (0, ()))
+        frames.append(Frame(start(1, hopeless(slice(0, 1)), 250, 140, until=8), resumes))
+        frames.append(Frame(start(2, inputs(), 12, 150, until=16), ((48, ()), (0, (0,)))))
+    return frames
 
 
 def reference(machine: BM1Machine, frames: Sequence[Frame]) -> tuple[list[Outcome], list[Frame]]:
@@ -115,16 +102,9 @@ def reference(machine: BM1Machine, frames: Sequence[Frame]) -> tuple[list[Outcom
             kernel.resume(until, halted)
             resumes.append((until, halted))
         played.append(Frame(frame.start, tuple(resumes)))
-        outcomes.append(
-            Outcome(
-                kernel.reason,
-                kernel.cycles,
-                kernel.replica_reasons,
-                kernel.replica_cycles,
-                tuple(kernel.counts.ravel().tolist()),
-                tuple(kernel.rng_state.ravel().tolist()),
-            )
-        )
+        counts, states = (tuple(each.ravel().tolist()) for each in (kernel.counts, kernel.rng_state))
+        ends = (kernel.reason, kernel.cycles, kernel.replica_reasons, kernel.replica_cycles)
+        outcomes.append(Outcome(*ends, counts, states))
     return outcomes, played
 
 
@@ -223,14 +203,6 @@ def simulated(case: Case, frames: Sequence[Frame], folder: Path) -> list[Outcome
             lengths = [word[2] + (word[3] << 32) for word in words]
             rest = rest[verilog.OUTCOME_WORDS * parameters.replicas :]
         results = parameters.replicas * parameters.lines
-        outcomes.append(
-            Outcome(
-                StopReason(reason),
-                cycles,
-                tuple(reasons),
-                tuple(lengths),
-                tuple(rest[:results]),
-                tuple(rest[results:]),
-            )
-        )
+        counts, states = tuple(rest[:results]), tuple(rest[results:])
+        outcomes.append(Outcome(StopReason(reason), cycles, tuple(reasons), tuple(lengths), counts, states))
     return outcomes

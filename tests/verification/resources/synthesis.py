@@ -19,15 +19,7 @@ FIT_ROUNDS = 20_000
 
 @dataclass(frozen=True, kw_only=True)
 class Alms:
-    """Logic: look-up tables by their inputs, bits of carry chains, registers.
-
-    Attributes:
-        luts: Look-up tables of up to 4 inputs.
-        luts5: Those of 5.
-        luts6: Those of 6.
-        sums: Bits of carry chains.
-        registers: Flip-flops.
-    """
+    """Logic: look-up tables of up to 4, 5 and 6 inputs, bits of carry chains, registers."""
 
     luts: float = 0.0
     luts5: float = 0.0
@@ -88,10 +80,7 @@ def calibrate(cases, folder):
     print(f"largest relative error of {len(cases)} machines: ALUTs {luts_error:.1%}, ALMs {alms_error:.1%}")
 
 
-def fitted(
-    counted: np.ndarray[tuple[int, int], np.dtype[np.float64]],
-    found: np.ndarray[tuple[int, int], np.dtype[np.float64]],
-) -> tuple[list[float], float]:
+def fitted(counted, found):
     """Return costs of 0 or more with the least squares of relative errors, and the largest of these.
 
     Args:

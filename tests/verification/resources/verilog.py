@@ -71,17 +71,14 @@ class Places:
 
     @property
     def inputs_a_column(self) -> int:
-        """Inputs of one sensor column of one replica."""
         return 1 if self.parameters.sensor_mode is SensorMode.COLUMN else self.parameters.lines
 
     @property
     def inputs(self) -> int:
-        """The first sensor input."""
         return PRIOR_ADDRESSES + self.parameters.replicas
 
     @property
     def prior_codes(self) -> int:
-        """The first code of a written prior."""
         return self.inputs + self.parameters.replicas * self.parameters.sensors * self.inputs_a_column
 
     @property
@@ -104,16 +101,7 @@ class Places:
 
 
 def verilog(machine: BM1Machine, *, tables: bool) -> str:
-    """Return a machine's text: module `bm1` and its parts.
-
-    Args:
-        machine: Which one; shared generators or one a cell, LFSRs only.
-        tables: Whether the tables are there, for a simulation; else they are black boxes, and what is counted is
-            everything but them.
-
-    Raises:
-        BuildError: Generators that are not LFSRs, or more than `MAX_CELLS` cells.
-    """
+    """Return a machine's text, module `bm1` and its parts; tables are black boxes unless they are asked for."""
     parameters = machine.parameters
     if parameters.rng.lfsr_bits is None:
         raise BuildError(f"rng = {parameters.rng} has no logic here: use an LFSR")

@@ -26,13 +26,7 @@ Inputs: TypeAlias = "tuple[int, ...] | NDArray[np.int64]"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameRun:
-    """Counts, cycles and stop reasons of one frame.
-
-    Attributes:
-        counts: uint32[lines] of each board.
-        cycles: Of each board.
-        reasons: Stop reason of each board.
-    """
+    """uint32[lines] counts, cycles and stop reason of each board in one frame."""
 
     counts: tuple[NDArray[np.uint32], ...]
     cycles: tuple[int, ...]
@@ -50,17 +44,7 @@ class FrameRun:
 
 
 class EmulatedBoards:
-    """Boards of one machine, its lines split over them.
-
-    Args:
-        machines: Each board's machine, in the order of the model's lines.
-        target_count: The count that stops a board.
-        max_cycles: The cycle at which it stops anyway.
-        stop: Whether boards stop together after slices, or each at its own overflow.
-
-    Raises:
-        BuildError: The target does not fit the counters, or there is no cycle to run.
-    """
+    """Boards of one machine, its lines split over them; a BuildError if the target does not fit the counters."""
 
     def __init__(
         self, machines: Sequence[BM1Machine], *, target_count: int, max_cycles: int, stop: Stop
@@ -125,7 +109,6 @@ class EmulatedBoards:
         return self._shown()
 
     def _start(self, start: Start, addresses: Inputs) -> list[StopReason]:
-        """Start every board with its part of the inputs."""
         return [
             kernel.start(replace(start, addresses=own))
             for kernel, own in zip(self._kernels, inputs_of_boards(addresses, self.machines), strict=True)

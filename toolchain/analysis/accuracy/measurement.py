@@ -120,13 +120,11 @@ class _Differences:
         self._frames: dict[int, list[tuple[float, float, float]]] = {}
 
     def add(self, frame: int, ours: list[NDArray[np.float64]], theirs: NDArray[np.float64]) -> None:
-        """Add the posteriors of a frame's runs, or of one replica's."""
         if ours:
             mean = np.mean([_difference(each, theirs) for each in ours], axis=0)
             self._frames.setdefault(frame, []).append(tuple(mean.tolist()))
 
     def summary(self) -> Difference | None:
-        """Return the averages, or None where there was no frame."""
         if not self._frames:
             return None
         columns = np.array([np.mean(replicas, axis=0) for replicas in self._frames.values()])
@@ -188,20 +186,7 @@ def measure(
 
 @dataclass(slots=True)
 class _Results:
-    """Results of the readings that were run so far.
-
-    Attributes:
-        boards: The machine.
-        readings: The frames.
-        banks: Sets of seeds that each is run with.
-        lengths: By frame, and in it by replica: the cycles of each run.
-        places: Where the readings stand for which some line can count.
-        weights: Of these, each line's probability to count in a cycle: float64[lines].
-        posteriors: Readings that were run.
-        impossible: Those for which no line can count.
-        without: Runs without a posterior.
-        overflow: Runs that a full counter ended.
-    """
+    """Results of the readings that were run so far; `lengths` are by frame, and in it by replica."""
 
     boards: EmulatedBoards
     readings: Readings
@@ -248,7 +233,6 @@ class _Results:
             self.of_machine.add(frame, posteriors, exact)
 
     def summary(self) -> Accuracy:
-        """Return all of it as shares, averages and intervals."""
         lengths = np.array([np.max(each, axis=0) for each in self.lengths.values()])
         # a count's z-score is taken from the cycles of single replicas
         by_themselves = np.array([length for each in self.lengths.values() for length in each])

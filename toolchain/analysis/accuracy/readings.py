@@ -84,39 +84,19 @@ class Readings:
 
 
 def check_frames(frames: int) -> None:
-    """Refuse a number of frames out of range.
-
-    Raises:
-        BuildError: Fewer than 1, or more than `MOST_FRAMES`.
-    """
+    """Refuse, with a BuildError, a number of frames that is not 1 to `MOST_FRAMES`."""
     if not 1 <= frames <= MOST_FRAMES:
         raise BuildError(f"--frames is {frames}, expected 1 to {MOST_FRAMES}")
 
 
 def check_columns(recording: Path | None, columns: Sequence[str] | None) -> None:
-    """Refuse columns of a recording where there is none.
-
-    Raises:
-        BuildError: Columns without a recording.
-    """
+    """Refuse, with a BuildError, columns of a recording where there is none."""
     if recording is None and columns:
         raise BuildError(f"--reading {columns[0]} is a column of a recording; add --readings FILE")
 
 
 def sample_readings(model: Model, frames: int, *, seed: int, source: str = "") -> Readings:
-    """Draw readings from a model: a line from the prior, then each reading given that line; none is missing.
-
-    Where the prior is selected, every selection is as probable as every other.
-
-    Args:
-        model: The model.
-        frames: Number of frames.
-        seed: The same seed draws the same readings.
-        source: Their origin, as reports name it.
-
-    Raises:
-        BuildError: No frames, or too many.
-    """
+    """Draw a line from the prior, or from one of equally probable selections, then every reading given that line."""
     check_frames(frames)
     random = np.random.default_rng(seed)
     rows = np.full(frames, MISSING, dtype=np.int64)
@@ -181,12 +161,6 @@ def model_of_codes(
 
     Each row of a table was divided by its maximum before it was quantised; the factors are found again as those
     with which every line's column sums to 1, as nearly as possible (expectation maximisation).
-
-    Args:
-        name: The model's name.
-        searched: The searched dimensions.
-        variables: All known variables, those that are columns in their order.
-        machine: The machine with all lines.
     """
     width = machine.parameters.prob_bits
     known = []
@@ -282,11 +256,7 @@ def recorded_readings(
 
 
 def reading_columns(names: Sequence[str], given: Sequence[str], flag: str = "--reading") -> dict[str, str]:
-    """Return the recording's column for each variable that is named, or for all by their own names.
-
-    Raises:
-        BuildError: A pattern that fits no variable.
-    """
+    """Return each variable's column, all by their own names without a pattern; a BuildError if one fits none."""
     if not given:
         return {name: name for name in names}
     columns: dict[str, str] = {}

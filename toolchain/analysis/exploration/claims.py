@@ -125,13 +125,7 @@ def machine_of(model: Model, counter_bits: int = 12) -> BM1Machine:
 
 
 def run_claims(*, frames: int, seed: int, advance: Callable[[str], None] = lambda _: None) -> Claims:
-    """Run all experiments.
-
-    Args:
-        frames: Frames of each size, and of each rate of flipped bits, there at most `FAULT_FRAMES`.
-        seed: Of readings and flips.
-        advance: Called with each experiment's name before it begins.
-    """
+    """Run all experiments; `advance` is called with the name of each before it begins."""
     fault_frames = min(frames, FAULT_FRAMES)
     lines, sensors, targets = [], [], []
     for grid in GRIDS:
@@ -172,12 +166,7 @@ def _course(x: float, model: Model, target: int, frames: int, seed: int) -> Cour
 
 
 class FaultyMachine:
-    """A reference machine with bits flipped in its random numbers and in its cells' streams.
-
-    Args:
-        machine: The machine; LFSRs or a table, shared by columns.
-        seed: Of the flips.
-    """
+    """A reference machine with bits flipped in its random numbers and in its cells' streams."""
 
     def __init__(self, machine: BM1Machine, *, seed: int) -> None:
         self._machine = machine
@@ -248,13 +237,7 @@ class FaultyMachine:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
-    """One frame of readings, for the different ways of computing.
-
-    Attributes:
-        codes: uint16[columns, lines], from a machine's tables.
-        likelihoods: float64[sensors, lines], from the model's tables.
-        bank: Set of seeds.
-    """
+    """A frame's codes, uint16[columns, lines], likelihoods, float64[sensors, lines], and bank."""
 
     codes: NDArray[np.uint16]
     likelihoods: NDArray[np.float64]
@@ -262,12 +245,7 @@ class Frame:
 
 
 class Faults:
-    """Ways of computing a posterior while bits are flipped; each returns None where there is none left.
-
-    Args:
-        machine: The machine of which streams, random numbers and tables are flipped.
-        seed: Of the flips.
-    """
+    """Ways of computing a posterior while bits are flipped; each returns None where there is none left."""
 
     def __init__(self, machine: BM1Machine, *, seed: int) -> None:
         self._machine = FaultyMachine(machine, seed=seed)

@@ -23,11 +23,7 @@ _KINDS_INSIDE: Final = 5
 
 
 def check_pictures_possible(path: Path | None = None) -> None:
-    """Refuse, before a long run, a picture that can't be drawn.
-
-    Raises:
-        BuildError: matplotlib is not installed, the file can't be written, or its name is not a picture's.
-    """
+    """Refuse, with a BuildError and before a long run, a picture that can't be drawn or written."""
     if find_spec("matplotlib") is None:
         raise BuildError(
             "a plot needs matplotlib, which is not installed: run pip install matplotlib, or leave out --plot"
@@ -49,11 +45,7 @@ def check_pictures_possible(path: Path | None = None) -> None:
 
 
 def draw_sweep(path: Path, name: str, points: Sequence[Point], front: Sequence[Point]) -> None:
-    """Draw accuracy against cycles, a point's size being its ALMs, and the Pareto front.
-
-    Raises:
-        BuildError: The file can't be written.
-    """
+    """Draw accuracy against cycles, a point's size being its ALMs, and the Pareto front."""
     shown = [point for point in points if point.total_variation is not None]
     largest = max((point.alms or 0.0 for point in shown), default=0.0) or 1.0
     several = any(point.replicas > 1 for point in points)
@@ -97,7 +89,6 @@ def draw_sweep(path: Path, name: str, points: Sequence[Point], front: Sequence[P
 
 
 def _kind(point: Point) -> tuple[str, int, str, str]:
-    """Return the properties of machines that share a colour."""
     return point.sensor_mode, point.replicas, point.scale, point.rng
 
 
@@ -108,11 +99,7 @@ def _label(kind: tuple[str, int, str, str]) -> str:
 
 
 def draw_claims(path: Path, claims: Claims) -> None:
-    """Draw the thesis's claims, a panel each.
-
-    Raises:
-        BuildError: The file can't be written.
-    """
+    """Draw the thesis's claims, a panel each."""
     figure = _figure((11.0, 7.4))
     panels = figure.subplots(2, 2)
     for axes, series, title, label in (

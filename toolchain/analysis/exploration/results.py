@@ -76,14 +76,7 @@ class Point(BaseModel):
 
 
 class Results:
-    """The results' file: one JSON object a line, appended whole, so that an interrupted sweep goes on where it was.
-
-    Args:
-        path: The file; made if it is not there.
-
-    Raises:
-        BuildError: It can't be read or written, or it holds something else.
-    """
+    """The results' file: one JSON object a line, appended whole, so that an interrupted sweep goes on where it was."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -107,22 +100,14 @@ class Results:
             self.points[point.key] = point
 
     def check_writable(self) -> None:
-        """Refuse, before a long run, a file that can't be written; make it if it is missing.
-
-        Raises:
-            BuildError: The file can't be written.
-        """
+        """Refuse, with a BuildError and before a long run, a file that can't be written; make it if it is missing."""
         try:
             os.close(self._opened())
         except OSError as reason:
             raise self._not_writable(reason) from None
 
     def append(self, point: Point) -> None:
-        """Append a point with one write, and wait until it is on the disk.
-
-        Raises:
-            BuildError: The file can't be written.
-        """
+        """Append a point with one write, and wait until it is on the disk."""
         line = point.model_dump_json() + "\n"
         try:
             if self._torn_at is not None:

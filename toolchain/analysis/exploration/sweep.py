@@ -66,11 +66,7 @@ class Sweep:
     banks: int
 
     def options(self) -> Iterator[BuildOptions]:
-        """Return the options of every machine, in order.
-
-        Raises:
-            BuildError: Nothing to combine, or too many machines.
-        """
+        """Return the options of every machine, in order; a BuildError if there are none or too many."""
         lists = (
             self.sensor_modes,
             self.replicas,
@@ -113,14 +109,7 @@ class Task:
 
 
 class Frames:
-    """The readings of a sweep; machines with inputs of the same kind get the same readings.
-
-    Args:
-        model: The model.
-        frames: Number of frames; of recorded readings at most.
-        seed: Of the readings that are drawn.
-        recorded: A function that returns so many recorded readings, or None to draw them from the model.
-    """
+    """The readings of a sweep, drawn or recorded; machines with inputs of the same kind get the same ones."""
 
     def __init__(
         self, model: Model, frames: int, *, seed: int, recorded: Callable[[int], Readings] | None = None
@@ -133,11 +122,7 @@ class Frames:
         self._fingerprints: dict[tuple[int, bool], str] = {}
 
     def columns(self, replicas: int) -> Readings:
-        """Return readings of whole columns: as many frames, each with one for every replica.
-
-        Raises:
-            ToolchainError: There are none.
-        """
+        """Return readings of whole columns: as many frames, each with one for every replica."""
         if replicas not in self._base:
             check_frames(self._frames)
             count = self._frames * replicas
@@ -149,22 +134,14 @@ class Frames:
         return self._base[replicas]
 
     def of(self, machine: BM1Machine, options: BuildOptions) -> Readings:
-        """Return the readings of a machine with these options.
-
-        Raises:
-            ToolchainError: There are none.
-        """
+        """Return the readings of a machine with these options."""
         base = self.columns(options.replicas)
         if options.sensor_mode is SensorMode.COLUMN:
             return base
         return readings_of_lines(base, self._model, machine, scale=options.scaling, seed=self._seed)
 
     def fingerprint(self, options: BuildOptions) -> str:
-        """Return a hash of the model and of the origin of these machines' readings.
-
-        Raises:
-            ToolchainError: There are none; recorded readings are those of columns.
-        """
+        """Return a hash of the model and of the origin of these machines' readings."""
         if self._recorded is not None and options.sensor_mode is not SensorMode.COLUMN:
             raise BuildError(
                 f"a recording's columns are numbers, and with --sensor-modes {options.sensor_mode} readings are arrays, one "
@@ -188,11 +165,7 @@ class Frames:
 
 
 def tasks(model: Model, sweep: Sweep, frames: Frames, device: Device) -> list[Task]:
-    """Return the machines of a sweep that can be built.
-
-    Raises:
-        BuildError: Nothing is left, or nothing was there.
-    """
+    """Return the machines of a sweep that can be built; a BuildError if there are none."""
     found: dict[str, Task] = {}
     refused = ""
     for options in sweep.options():
@@ -222,11 +195,7 @@ def tasks(model: Model, sweep: Sweep, frames: Frames, device: Device) -> list[Ta
 
 
 def run_task(model: Model, task: Task, frames: Frames, device: Device, banks: int) -> Point:
-    """Measure one machine.
-
-    Raises:
-        ToolchainError: It can't be built or run.
-    """
+    """Measure one machine; a ToolchainError if it can't be built or run."""
     options = task.options
     parameters = machine_parameters(model, options)
     quantised = quantise(

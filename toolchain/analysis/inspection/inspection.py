@@ -101,17 +101,7 @@ class Inspection:
 def inspect_deployment(
     deployment: Deployment, model: Model | None, options: InspectOptions, progress: Progress
 ) -> Inspection:
-    """Run a deployment's machine on readings, and estimate its costs.
-
-    Args:
-        deployment: The deployment, as it was loaded.
-        model: The model that it was built from; None where it is not at hand.
-        options: Readings and hardware.
-        progress: Given the number of readings, returns a context with a function to call after each.
-
-    Raises:
-        ToolchainError: Images that can't be read, a model that it was not built from, or readings that don't fit.
-    """
+    """Run a deployment's machine on readings, and estimate its costs; a ToolchainError if something does not fit."""
     machines = machines_of(deployment)
     whole = joined(machines)
     losses = None if model is None else _losses(deployment, whole, model)
@@ -170,11 +160,7 @@ def inspect_deployment(
 
 
 def machines_of(deployment: Deployment) -> tuple[BM1Machine, ...]:
-    """Return the boards' machines from a deployment's programming files.
-
-    Raises:
-        DeploymentError: A programming file can't be read.
-    """
+    """Return the boards' machines from a deployment's programming files."""
     from pcie_shim.errors import PcieShimError
     from pcie_shim.programming_file import read_image
 
@@ -187,11 +173,7 @@ def machines_of(deployment: Deployment) -> tuple[BM1Machine, ...]:
 
 
 def _losses(deployment: Deployment, whole: BM1Machine, model: Model) -> tuple[ColumnLoss, ...]:
-    """Return what quantising lost of the model, once its codes are the deployment's.
-
-    Raises:
-        BuildError: They are not.
-    """
+    """Return what quantising lost of the model, once its codes are the deployment's."""
     if model.lines == deployment.machine.lines and len(model.known) == whole.parameters.sensors:
         quantised = quantise(
             model,
@@ -258,7 +240,6 @@ def _is_slow(machine: BM1Machine) -> bool:
 
 
 def _reported(directory: Path) -> str:
-    """Return the losses in the build's report; empty where there is no report."""
     try:
         text = (directory / REPORT_NAME).read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError):

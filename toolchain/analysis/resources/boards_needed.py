@@ -30,19 +30,7 @@ def boards_needed(
     pcie: Pcie = Pcie.HARD,
     table_length: int = LENGTH,
 ) -> tuple[int, str]:
-    """Return the fewest boards that hold a machine, and the reason as a sentence.
-
-    Args:
-        parameters: The whole machine.
-        device: The boards' FPGA.
-        interface: Inputs and results of a board's registers, at least; a larger machine gets a larger one.
-        largest_lines: Lines that the register map has room for on a board.
-        pcie: The kind of PCIe controller.
-        table_length: Numbers in the table of random numbers, where one is played.
-
-    Raises:
-        BuildError: Not even a line a board fits, or generators that no FPGA has.
-    """
+    """Return the fewest boards that hold a machine, and the reason as a sentence; a BuildError if no number does."""
 
     def on(lines: int) -> Estimate:
         return estimate(

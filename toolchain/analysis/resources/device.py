@@ -10,17 +10,7 @@ from toolchain.errors import BuildError
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Device:
-    """An FPGA, and the board it is on.
-
-    Attributes:
-        name: The value of `--device`.
-        title: The name in reports.
-        alms: Adaptive logic modules.
-        registers_per_alm: Registers in each of those.
-        blocks: M20K memory blocks, 20,480 bits each.
-        usable: Share of each that a design can take before it no longer places and routes.
-        hard_pcie: Whether it has PCIe controllers of its own.
-    """
+    """An FPGA and its board; a design that takes more than the share `usable` no longer places and routes."""
 
     name: str
     title: str
@@ -47,11 +37,7 @@ DEVICES: Final = {
 
 
 def device_named(name: str) -> Device:
-    """Return a device by its name.
-
-    Raises:
-        BuildError: Not the name of a device.
-    """
+    """Return a device by its name, or raise a BuildError."""
     try:
         return DEVICES[name]
     except KeyError:

@@ -69,12 +69,7 @@ class Energy:
 
 
 def energy(machines: Sequence[BM1Machine], readings: Readings) -> Energy:
-    """Return the model of a machine on readings.
-
-    Args:
-        machines: Each board's machine.
-        readings: The readings that its codes' activity is averaged over; the first 50 frames are used.
-    """
+    """Return the energy model of all boards' machines; activity is averaged over the first 50 frames of readings."""
     toggles = clocked = 0.0
     ends = np.cumsum([machine.parameters.lines for machine in machines]).tolist()
     for machine, end in zip(machines, ends, strict=True):

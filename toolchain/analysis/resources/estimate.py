@@ -37,15 +37,7 @@ class Pcie(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Estimate:
-    """Resources of a machine on a board's FPGA.
-
-    Attributes:
-        device: The FPGA.
-        logic: Its logic, part by part.
-        memories: The memories of its tables.
-        pcie: The kind of PCIe controller.
-        pcie_alms: ALMs of that controller, at least and at most.
-    """
+    """Resources of a machine on a board's FPGA; `pcie_alms` are the controller's, at least and at most."""
 
     device: Device
     logic: Logic
@@ -102,19 +94,7 @@ def estimate(
     tables: Tables = Tables.CELL,
     table_length: int = LENGTH,
 ) -> Estimate:
-    """Return the resources that a machine takes of a device.
-
-    Args:
-        parameters: The machine; of one board.
-        device: The FPGA.
-        interface: Inputs and results of the interface; each is a register of 32 bits.
-        pcie: The kind of PCIe controller.
-        tables: How tables lie in memory blocks.
-        table_length: Numbers in the table of random numbers, where one is played.
-
-    Raises:
-        BuildError: Generators that no FPGA has, or a controller that the device lacks.
-    """
+    """Return the resources that a machine takes of a device; a BuildError for generators or a controller it lacks."""
     if pcie is Pcie.HARD and not device.hard_pcie:
         raise BuildError(f"{device.title} has no hard PCIe controller; use --soft-pcie")
     logic = logic_of(parameters, inputs=interface[0], results=interface[1], table_length=table_length)

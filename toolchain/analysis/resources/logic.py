@@ -86,14 +86,7 @@ COSTS: Final[Mapping[Of, Cost]] = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Part:
-    """Logic of one part of a machine.
-
-    Attributes:
-        name: The part's name.
-        counts: Units that its look-up tables are counted by.
-        sums: Bits of its carry chains.
-        registers: Its flip-flops.
-    """
+    """A part of a machine: its name, units of look-up tables, bits of carry chains, and flip-flops."""
 
     name: str
     counts: Mapping[Of, float] = field(default_factory=dict)

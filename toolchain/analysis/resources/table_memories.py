@@ -35,16 +35,7 @@ class Tables(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Memories:
-    """The memories that a machine's tables take.
-
-    Attributes:
-        tables: Their layout in memory blocks.
-        table_bits: Bits of all tables.
-        blocks: M20Ks that hold tables, of random numbers too.
-        logic_tables: Tables for which there was no block left, so that they lie in memory LABs.
-        mlabs: Memory LABs that those take.
-        alms: ALMs that those and their multiplexers take.
-    """
+    """The memories that a machine's tables take; `logic_tables` found no block, and lie in memory LABs."""
 
     tables: Tables
     table_bits: int
