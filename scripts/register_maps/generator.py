@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import sys
+import textwrap
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -245,7 +246,7 @@ def document_text(register_map: RegisterMap) -> str:
         "<!-- Generated from hdl/bm_registers.rdl by scripts/registers: change that file, not this one. -->",
         "# Board registers",
         "",
-        *register_map.text.splitlines(),
+        "\n\n".join(_wrapped(paragraph) for paragraph in register_map.text.split("\n\n")),
         "",
         f"The map occupies {register_map.bar_size // 1024} KiB (the size of the BAR). Hash of its definition:",
         f"`{register_map.hash}`.",
@@ -264,7 +265,7 @@ def document_text(register_map: RegisterMap) -> str:
             "",
             f"## {block.name}",
             "",
-            f"`{block.address:#06x}`, {_size(block)}. {block.title}: {block.text}",
+            _wrapped(f"`{block.address:#06x}`, {_size(block)}. {block.title}: {block.text}"),
         ]
         if block.fields:
             lines += ["", "| bits | field | access | reset | meaning |", "|---|---|---|---|---|"]
@@ -280,6 +281,10 @@ def document_text(register_map: RegisterMap) -> str:
                 ]
     lines.append("")
     return "\n".join(lines)
+
+
+def _wrapped(text: str) -> str:
+    return textwrap.fill(text, 100, break_long_words=False, break_on_hyphens=False)
 
 
 def _size(block: Block) -> str:
