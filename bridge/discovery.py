@@ -71,14 +71,9 @@ async def discover(
     *,
     interfaces: Sequence[str] | None = None,
 ) -> list[Robot]:
-    """Find rosbridge servers.
+    """Return the rosbridge servers that answer within `timeout` seconds, which are used up, sorted by name.
 
-    Args:
-        timeout: Seconds to wait for answers; it is always used up.
-        interfaces: Addresses of this machine to ask on; None for all.
-
-    Returns:
-        The servers that answered, sorted by name.
+    It asks on `interfaces`, addresses of this machine; None for all.
 
     Raises:
         DiscoveryError: `zeroconf` is not installed, or there is no network.
@@ -273,7 +268,5 @@ def _robot(info: AsyncServiceInfo) -> Robot | None:
         return None
     shown = f"[{host}]" if ":" in host else host
     uri = f"{'wss' if tls else 'ws'}://{shown}:{info.port}{path if path != '/' else ''}"
-    ros: Literal[1, 2] | None = (
-        2 if properties.get("ros") == "2" else 1 if properties.get("ros") == "1" else None
-    )
-    return Robot(name, uri, ros, properties.get("token") == "1")
+    versions: dict[str | None, Literal[1, 2]] = {"1": 1, "2": 2}
+    return Robot(name, uri, versions.get(properties.get("ros")), properties.get("token") == "1")

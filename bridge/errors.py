@@ -3,15 +3,8 @@
 `str(error)` states what happened, where, what was expected and, where it helps, what to do. `exit_code` is the exit code
 of a command that the error ends.
 
-* `BridgeError`
-    * `UriError`, `NameFormError`, `TypeConflictError`, `PathError`, `OptionError`,
-      `ConcurrentReadError`, `EncodeError` (2: usage)
-    * `UnreachableError`, `NotRosbridgeError`, `DisconnectedError` (3: the server cannot be reached)
-    * `AccessRefusedError` (2: the server wants a token or a certificate)
-    * `NoMessageError`, `NoAnswerError`, `SlowPeerError`, `StateTimeoutError` (3: a timeout)
-    * `ServiceError`, `GoalError` (3: a service or an action refused)
-    * `DefinitionError` (2: a message's type is not known here, or rosbags is missing)
-    * `DecodeError` (3: received bytes are not a message)
+* `BridgeError` (3: the server, or what it sent)
+    * `UsageError` (2: usage, configuration or credentials)
     * `FieldMissingError`, `FieldAmbiguousError` (4: a variable was not found in a message)
 """
 
@@ -24,40 +17,34 @@ class BridgeError(Exception):
     exit_code: ClassVar[int] = 3
 
 
-class UriError(BridgeError):
+class UsageError(BridgeError):
+    """Base of the errors that the caller or the configuration causes."""
+
+    exit_code = 2
+
+
+class UriError(UsageError):
     """Raised when a URI is not one of a WebSocket (`ws://host:port` or `wss://host:port`)."""
 
-    exit_code = 2
 
-
-class NameFormError(BridgeError):
+class NameFormError(UsageError):
     """Raised when the name of a topic, a service or a type is invalid in ROS."""
 
-    exit_code = 2
 
-
-class TypeConflictError(BridgeError):
+class TypeConflictError(UsageError):
     """Raised when one topic is advertised or subscribed twice by one client with different types."""
 
-    exit_code = 2
 
-
-class OptionError(BridgeError):
+class OptionError(UsageError):
     """Raised when an option is out of its range (a rate, a queue's size, a time)."""
 
-    exit_code = 2
 
-
-class ConcurrentReadError(BridgeError):
+class ConcurrentReadError(UsageError):
     """Raised when two tasks wait on one subscription, so that each message would reach only one of them."""
 
-    exit_code = 2
 
-
-class EncodeError(BridgeError):
+class EncodeError(UsageError):
     """Raised when an object cannot be encoded: its type, a NaN, an infinity, its depth or its size."""
-
-    exit_code = 2
 
 
 class DecodeError(BridgeError):
@@ -72,10 +59,8 @@ class NotRosbridgeError(BridgeError):
     """Raised when something answers at the URI, but not as a WebSocket server does."""
 
 
-class AccessRefusedError(BridgeError):
+class AccessRefusedError(UsageError):
     """Raised when a server refuses this client for its token or certificate."""
-
-    exit_code = 2
 
 
 class DisconnectedError(BridgeError):
@@ -121,21 +106,16 @@ class GoalError(BridgeError):
     """
 
     def __init__(self, reason: str, action: str) -> None:
-        """Store the reason apart from the sentence."""
         self.reason = reason
         super().__init__(f"action {action} has no result: {reason or 'it gave no reason'}")
 
 
-class DefinitionError(BridgeError):
+class DefinitionError(UsageError):
     """Raised when serialised bytes cannot be read: their type is unknown, or rosbags is not installed."""
 
-    exit_code = 2
 
-
-class PathError(BridgeError):
+class PathError(UsageError):
     """Raised when the path of a variable (`pose.position.x`, `ranges[3]`) is not well-formed."""
-
-    exit_code = 2
 
 
 class FieldMissingError(BridgeError):

@@ -49,18 +49,6 @@ class Field:
                 "(examples: pose.position.x, ranges[3])"
             )
 
-    def locate(self, message: dict[str, Any]) -> Place:
-        """Return the place in a message, and keep it.
-
-        Raises:
-            FieldMissingError: The message does not have it; the sentence lists its fields.
-            FieldAmbiguousError: A bare name occurs more than once; the sentence lists the places.
-        """
-        present, _value = self.value(message)
-        if not present or self.place is None:
-            raise self.missing(message)
-        return self.place
-
     def value(self, message: dict[str, Any]) -> tuple[bool, Any]:
         """Look the variable up.
 
@@ -86,10 +74,6 @@ class Field:
         for step in place:
             if isinstance(step, str):
                 if not isinstance(value, dict) or step not in value:
-                    return False, None
-                value = value[step]
-            elif type(value) is list:
-                if step >= len(value):
                     return False, None
                 value = value[step]
             else:
@@ -126,28 +110,6 @@ class Field:
                 continue
             return FieldMissingError(f"the message has no field {self.name!r}: {reason}")
         return FieldMissingError(f"the field {self.name!r} is there")
-
-
-def find_field(message: dict[str, Any], name: str) -> Any:
-    """Look a variable up once.
-
-    Args:
-        message: A ROS message.
-        name: A bare name or path.
-
-    Returns:
-        The unchanged value.
-
-    Raises:
-        PathError: The name is malformed.
-        FieldMissingError: The message does not have it.
-        FieldAmbiguousError: a bare name is there more than once.
-    """
-    field = Field(name)
-    present, value = field.value(message)
-    if not present:
-        raise field.missing(message)
-    return value
 
 
 def parse_path(path: str) -> Place:

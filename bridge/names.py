@@ -21,17 +21,7 @@ _EDGE_NAME_SIZE = 1024
 
 @lru_cache(maxsize=_EDGE_NAME_SIZE)
 def split_type(name: str) -> tuple[str, str, str]:
-    """Split a type's name.
-
-    Args:
-        name: `std_msgs/String`, `std_msgs/msg/String` or `std_srvs/srv/SetBool`.
-
-    Returns:
-        Package, kind (`msg`, `srv`, `action`, or nothing in the ROS 1 form) and the type's own name.
-
-    Raises:
-        NameFormError: the name has neither form.
-    """
+    """Return a type's package, kind (`msg`, `srv`, `action`, or nothing in the ROS 1 form) and own name."""
     match = _TYPE.fullmatch(name) if len(name) <= MAX_NAME else None
     if match is None:
         raise NameFormError(
@@ -74,14 +64,7 @@ def ros_version_of_type(name: str) -> Literal[1, 2] | None:
 
 
 def check_name(name: str) -> str:
-    """Refuse an invalid name of a topic or a service.
-
-    Returns:
-        The unchanged name; the server resolves a relative one.
-
-    Raises:
-        NameFormError: It is empty or too long, or has characters that ROS does not allow.
-    """
+    """Return the name of a topic or a service unless it is invalid in ROS; the server resolves a relative one."""
     if len(name) > MAX_NAME:
         raise NameFormError(
             f"name {name[:40]!r}... has {len(name)} characters, at most {MAX_NAME} are allowed"

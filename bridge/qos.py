@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any, Final, Literal
 
 from bridge.errors import OptionError
+from bridge.stamps import stamp
 
 _CHOICES: Final = {
     "history": ("keep_last", "keep_all"),
@@ -38,7 +39,6 @@ class Qos:
     lifespan: float | None = None
 
     def __post_init__(self) -> None:
-        """Refuse settings that servers would refuse, most of them silently."""
         for name, choices in _CHOICES.items():
             value = getattr(self, name)
             if value is not None and value not in choices:
@@ -60,10 +60,5 @@ class Qos:
         for name in ("deadline", "lifespan"):
             seconds = getattr(self, name)
             if seconds is not None:
-                wanted[name] = "infinite" if math.isinf(seconds) else _duration(seconds)
+                wanted[name] = "infinite" if math.isinf(seconds) else stamp(round(seconds * 1e9), 1)
         return wanted
-
-
-def _duration(seconds: float) -> dict[str, int]:
-    whole, part = divmod(round(seconds * 1_000_000_000), 1_000_000_000)
-    return {"secs": whole, "nsecs": part}

@@ -8,15 +8,7 @@ _KEYS: Final = (("sec", "nanosec", 2), ("secs", "nsecs", 1))
 
 
 def stamp(time_ns: int, ros_version: Literal[1, 2] | None = None) -> dict[str, int]:
-    """Return a ROS time.
-
-    Args:
-        time_ns: nanoseconds since 1970, as `time.time_ns()` gives them.
-        ros_version: ROS version of the keys; None uses both pairs, which all servers accept.
-
-    Returns:
-        The time as a message's `stamp` has it.
-    """
+    """Return nanoseconds since 1970 as a message's `stamp` of a ROS version; None has the keys of both."""
     seconds, nanoseconds = divmod(time_ns, _NS)
     time: dict[str, int] = {}
     for second, nanosecond, version in _KEYS:
@@ -32,14 +24,7 @@ def header(time_ns: int, frame_id: str = "", ros_version: Literal[1, 2] | None =
 
 
 def stamp_ns(time: object) -> int | None:
-    """Return the nanoseconds since 1970 of a message's time.
-
-    Args:
-        time: The time's object with the keys of either ROS; missing nanoseconds count as 0.
-
-    Returns:
-        The nanoseconds; None if the object is not a time.
-    """
+    """Return the nanoseconds since 1970 of a message's time of either ROS; None if it is not a time."""
     if not isinstance(time, Mapping):
         return None
     for second, nanosecond, _version in _KEYS:
@@ -47,7 +32,7 @@ def stamp_ns(time: object) -> int | None:
             seconds, nanoseconds = time[second], time.get(nanosecond, 0)
             if type(seconds) is int and type(nanoseconds) is int:
                 return seconds * _NS + nanoseconds
-            return None
+            break
     return None
 
 

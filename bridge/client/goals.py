@@ -42,7 +42,6 @@ class Goal:
     def __init__(
         self, session: Session, action: str, type_name: str, goal: Mapping[str, Any], *, feedback: bool
     ) -> None:
-        """Send the goal (see `bridge.client.Ros.send_goal`)."""
         self.action = action
         self.lost = 0
         self._session = session
@@ -86,13 +85,7 @@ class Goal:
         self._session.flush()
 
     async def result(self, timeout: float) -> GoalResult:  # noqa: ASYNC109  # part of the error
-        """Wait for the end of the goal. It may be called repeatedly.
-
-        Args:
-            timeout: Timeout in seconds.
-
-        Returns:
-            Status and result, even if it was canceled or aborted.
+        """Wait for the end of the goal, repeatedly if need be; return its status even if canceled or aborted.
 
         Raises:
             GoalError: The action refused the goal, or does not exist.
@@ -135,7 +128,6 @@ class Goal:
         return self
 
     async def __aexit__(self, *_exception: object) -> None:
-        """Cancel the goal unless it has ended."""
         if not self.done:
             await self.cancel()
         self._session.goals.pop(self._identity, None)

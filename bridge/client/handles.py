@@ -72,6 +72,12 @@ class _Handle:
         await self.close()
 
 
+def _check_queue_size(size: int, topic: str) -> int:
+    if size < 1:
+        raise OptionError(f"queue_size of topic {topic} must be at least 1, not {size}")
+    return size
+
+
 class Subscription(_Handle):
     """The messages of one topic, to be read by one task: `async for message in subscription`.
 
@@ -95,17 +101,14 @@ class Subscription(_Handle):
         queue_size: int,
         delivery: Delivery,
     ) -> None:
-        """Subscribe (see `bridge.client.Ros.subscribe`)."""
         super().__init__(session)
-        if queue_size < 1:
-            raise OptionError(f"queue_size of topic {topic} must be at least 1, not {queue_size}")
         self.topic = topic
+        self._size = _check_queue_size(queue_size, topic)
         self.lost = 0
         self.blind_seconds = 0.0
         self._blind = 0.0
         self._begun = time.monotonic()
         self._type = type_name
-        self._size = queue_size
         self._queue: deque[Message] = deque(maxlen=queue_size)
         self._waiter: asyncio.Future[None] | None = None
         self._deadline = inf  # of who waits
@@ -140,11 +143,10 @@ class Subscription(_Handle):
     def _keep_blind(self, message: Message) -> Message:
         """Move the blind seconds of the message that is dropped now to the one after it."""
         queue = self._queue
-        successor = queue[1] if self._size > 1 else message
-        successor = successor._replace(blind_seconds=successor.blind_seconds + queue[0].blind_seconds)
+        blind = queue[0].blind_seconds
         if self._size == 1:
-            return successor
-        queue[1] = successor
+            return message._replace(blind_seconds=message.blind_seconds + blind)
+        queue[1] = queue[1]._replace(blind_seconds=queue[1].blind_seconds + blind)
         return message
 
     def __aiter__(self) -> Self:
@@ -159,7 +161,6 @@ class Subscription(_Handle):
         return queue.popleft()
 
     async def _wait(self) -> None:
-        """Wait until a message has arrived, the subscription has ended, or the deadline is over (see `next`)."""
         self._check_alone()
         self._waiter = asyncio.get_running_loop().create_future()
         try:
@@ -189,8 +190,7 @@ class Subscription(_Handle):
                 return
             self._alarm.cancel()
         self._rings = self._deadline
-        delay = max(self._deadline - now, 0)
-        self._alarm = asyncio.get_running_loop().call_later(delay, self._ring)
+        self._alarm = asyncio.get_running_loop().call_later(max(self._deadline - now, 0), self._ring)
 
     def _ring(self) -> None:
         self._alarm = None
@@ -246,11 +246,7 @@ class Subscription(_Handle):
                 known_type = known.get("type")
                 if known_type == "":
                     return "; the server does not know the topic"
-                if (
-                    isinstance(known_type, str)
-                    and self._type is not None
-                    and not same_type(known_type, self._type)
-                ):
+                if isinstance(known_type, str) and self._type and not same_type(known_type, self._type):
                     return f"; the server knows it as {known_type[:80]}, not as {self._type}"
                 found = await ask_rosapi(session, "publishers", {"topic": self.topic}, EXPLAIN_TIMEOUT)
                 if found.get("publishers") == []:
@@ -292,12 +288,9 @@ class Publication(_Handle):
         queue_size: int,
         qos: Qos | None,
     ) -> None:
-        """Advertise (see `bridge.client.Ros.advertise`)."""
         super().__init__(session)
-        if queue_size < 1:
-            raise OptionError(f"queue_size of topic {topic} must be at least 1, not {queue_size}")
         self.topic = topic
-        self._size = queue_size
+        self._size = _check_queue_size(queue_size, topic)
         self._waiting = 0
         self._publications = session.core.publications
         self._number = self._publications.advertise(
@@ -338,8 +331,7 @@ class Publication(_Handle):
     @property
     def must_wait(self) -> bool:
         """Whether a message would have to wait for a slow server, or for a connection."""
-        session = self._session
-        return session.state is not State.CONNECTED or not session.is_open or session.must_wait()
+        return not self._session.is_open or self._session.must_wait()
 
     async def ready(self, timeout: float = 5.0) -> None:  # noqa: ASYNC109  # as above
         """Wait until the server has accepted what was sent before.
@@ -352,12 +344,7 @@ class Publication(_Handle):
             await self._session.wait_turn(f"a message of {self.topic}", timeout)
 
     def publish_nowait(self, msg: Mapping[str, Any]) -> None:
-        """Send one message at once or not at all.
-
-        Raises:
-            SlowPeerError: The server has not accepted what was sent before; nothing was sent.
-            DisconnectedError, EncodeError: As in `publish`.
-        """
+        """Send one message at once, or raise `SlowPeerError` instead of waiting (else as `publish`)."""
         session = self._session
         if session.must_wait():
             raise SlowPeerError(
@@ -384,7 +371,6 @@ class Service(_Handle):
     def __init__(
         self, session: Session, name: str, type_name: str, handler: Handler, handler_timeout: float
     ) -> None:
-        """Advertise (see `bridge.client.Ros.advertise_service`)."""
         super().__init__(session)
         self.name = name
         self._handler = handler

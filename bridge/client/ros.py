@@ -27,8 +27,8 @@ from bridge.client.handles import (
 from bridge.client.protocol import ClientCore, Compression, Delivery, RosVersion
 from bridge.client.protocol.events import StatusReceived
 from bridge.client.route import Path, make_route, shown
-from bridge.client.session import Limits, Message, Session, State, StateCallback
-from bridge.client.websocket import check_uri
+from bridge.client.session import Message, Session, State, StateCallback
+from bridge.client.websocket import Limits, check_uri
 from bridge.codecs.cbor_codec import Arrays
 from bridge.codecs.json_codec import MAX_SIZE
 from bridge.errors import OptionError
@@ -47,7 +47,6 @@ class Ros:
     """A client of one rosbridge server, made by `connect`, and opened and closed once by `async with`."""
 
     def __init__(self, session: Session) -> None:
-        """Use a session that is not open yet."""
         self._session = session
         self._publishes = False
 
@@ -304,10 +303,8 @@ class Ros:
             1 or 2; None without rosapi and without a message with a header.
         """
         if self.ros_version is None:
-            questions = [
-                asyncio.create_task(self._ask_version(timeout)),
-                asyncio.create_task(self._ask_rosout_type(timeout)),
-            ]
+            asked = (self._ask_version(timeout), self._ask_rosout_type(timeout))
+            questions = [asyncio.create_task(question) for question in asked]
             try:
                 for answer in asyncio.as_completed(questions):
                     self._session.core.wire.ros_version = await answer

@@ -12,7 +12,8 @@ import ssl
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from os import PathLike, fspath
-from typing import Final, TypeVar
+from socket import socket
+from typing import Any, Final, TypeVar
 
 from websockets.asyncio.client import connect_http_proxy, connect_socks_proxy
 from websockets.exceptions import InvalidHandshake, InvalidProxy, InvalidProxyStatus
@@ -72,23 +73,21 @@ def make_route(
         OptionError: An option is unusable; the sentence names it, but no secret.
     """
     fields = dict(headers or {})
-    if uri.user_info is not None and not any(name.lower() == "authorization" for name in fields):
-        if token is not None:
-            raise OptionError("token and a user in the URI exclude each other")
-        fields["Authorization"] = build_authorization_basic(*uri.user_info)
+    authorized = any(name.lower() == "authorization" for name in fields)
     if token is not None:
-        if any(name.lower() == "authorization" for name in fields):
-            raise OptionError("token and an Authorization header exclude each other")
+        if authorized or uri.user_info is not None:
+            raise OptionError("token and an Authorization header or a user in the URI exclude each other")
         if not token or not token.isascii() or not token.isprintable() or " " in token:
             raise OptionError("token must be printable ASCII characters without spaces")
         fields["Authorization"] = f"Bearer {token}"
+    elif uri.user_info is not None and not authorized:
+        fields["Authorization"] = build_authorization_basic(*uri.user_info)
     for name, value in fields.items():
         if _HEADER_NAME.fullmatch(name) is None:
             raise OptionError(f"{name!r} is not a header name")
         if not isinstance(value, str) or _HEADER_VALUE.fullmatch(value) is None:
             raise OptionError(f"the value of header {name} has characters that are not allowed in headers")
-    secret = any(name.lower() == "authorization" for name in fields)
-    if secret and not uri.secure and not _is_loopback(uri.host):
+    if (authorized or "Authorization" in fields) and not uri.secure and not _is_loopback(uri.host):
         _log.warning("credentials are sent to %s unencrypted: wss:// would protect them", uri.host)
     return Route(_tls(uri, ca_file, client_certificate, tls), tuple(fields.items()), _proxy(uri, proxy))
 
@@ -112,7 +111,7 @@ def _tls(
     try:
         context = ssl.create_default_context(cafile=None if ca_file is None else fspath(ca_file))
     except (OSError, ssl.SSLError) as error:
-        raise OptionError(f"ca_file {fspath(ca_file or '')} cannot be used: {_reason(error)}") from None
+        raise OptionError(f"ca_file {fspath(ca_file or '')} cannot be used: {reason_of(error)}") from None
     if client_certificate is not None:
         certificate, key = (
             client_certificate if isinstance(client_certificate, tuple) else (client_certificate, None)
@@ -122,7 +121,7 @@ def _tls(
             context.load_cert_chain(certificate, key, password=lambda: b"")
         except (OSError, ssl.SSLError, ValueError) as error:
             named = fspath(certificate) + (f" and {fspath(key)}" if key is not None else "")
-            raise OptionError(f"client_certificate {named} cannot be used: {_reason(error)}") from None
+            raise OptionError(f"client_certificate {named} cannot be used: {reason_of(error)}") from None
     return context
 
 
@@ -143,13 +142,7 @@ def _proxy(uri: WebSocketURI, proxy: str | None) -> Proxy | None:
 async def connect_along(
     route: Route, uri: WebSocketURI, shown_uri: str, factory: Callable[[], _ConnectionT]
 ) -> _ConnectionT:
-    """Open the transport of a WebSocket connection.
-
-    Args:
-        route: The route.
-        uri: The server.
-        shown_uri: The same for errors.
-        factory: Makes the connection.
+    """Open the transport of a WebSocket connection; `shown_uri` names the server in errors.
 
     Raises:
         UnreachableError: The proxy refuses or fails.
@@ -158,49 +151,40 @@ async def connect_along(
     """
     loop = asyncio.get_running_loop()
     hostname = uri.host if route.tls is not None else None
-    proxy = route.proxy
-    if proxy is None:
-        _transport, connection = await loop.create_connection(
-            factory, uri.host, uri.port, ssl=route.tls, server_hostname=hostname
-        )
-        return connection
+    passage = None if route.proxy is None else await _connect_proxy(route.proxy, uri, shown_uri)
+    if passage is None or isinstance(passage, socket):
+        end: dict[str, Any] = {"sock": passage} if passage else {"host": uri.host, "port": uri.port}
+        return (await loop.create_connection(factory, **end, ssl=route.tls, server_hostname=hostname))[1]
+    try:
+        connection = factory()
+        passage.set_protocol(connection)
+        if route.tls is not None:
+            passage = (
+                await loop.start_tls(passage, connection, route.tls, server_hostname=hostname) or passage
+            )
+        connection.connection_made(passage)
+    except BaseException:
+        passage.abort()
+        raise
+    return connection
+
+
+async def _connect_proxy(proxy: Proxy, uri: WebSocketURI, shown_uri: str) -> socket | asyncio.Transport:
     name = f"{proxy.scheme}://{proxy.host}:{proxy.port}"
     try:
         if proxy.scheme.startswith("socks"):
-            sock = await connect_socks_proxy(proxy, uri)
-        else:
-            to_proxy = ssl.create_default_context() if proxy.scheme == "https" else None
-            transport = await connect_http_proxy(proxy, uri, ssl=to_proxy)
+            return await connect_socks_proxy(proxy, uri)
+        to_proxy = ssl.create_default_context() if proxy.scheme == "https" else None
+        return await connect_http_proxy(proxy, uri, ssl=to_proxy)
     except ImportError:
         raise OptionError(
             f"the proxy {name} needs the package python-socks: pip install python-socks"
         ) from None
     except InvalidProxyStatus as error:
-        raise UnreachableError(
-            f"{shown_uri} is unreachable: the proxy {name} refuses (HTTP {error.response.status_code} "
-            f"{error.response.reason_phrase[:80]})"
-        ) from None
+        why = f"refuses (HTTP {error.response.status_code} {error.response.reason_phrase[:80]})"
     except (InvalidHandshake, OSError) as error:
-        raise UnreachableError(
-            f"{shown_uri} is unreachable: the proxy {name} fails: {_reason(error)}"
-        ) from None
-    if proxy.scheme.startswith("socks"):
-        _transport, connection = await loop.create_connection(
-            factory, sock=sock, ssl=route.tls, server_hostname=hostname
-        )
-        return connection
-    try:
-        connection = factory()
-        transport.set_protocol(connection)
-        if route.tls is not None:
-            transport = (
-                await loop.start_tls(transport, connection, route.tls, server_hostname=hostname) or transport
-            )
-        connection.connection_made(transport)
-    except BaseException:
-        transport.abort()
-        raise
-    return connection
+        why = f"fails: {reason_of(error)}"
+    raise UnreachableError(f"{shown_uri} is unreachable: the proxy {name} {why}")
 
 
 def _is_loopback(host: str) -> bool:
@@ -210,7 +194,13 @@ def _is_loopback(host: str) -> bool:
         return host == "localhost" or host.endswith(".localhost")
 
 
-def _reason(error: Exception) -> str:
-    if isinstance(error, ssl.SSLError):
-        return error.reason or "OpenSSL refuses it"
-    return (error.strerror if isinstance(error, OSError) else None) or str(error)
+def reason_of(error: Exception) -> str:
+    """Return the text of an error, without the operating system's number."""
+    match error:
+        case ConnectionRefusedError():
+            return "connection refused"
+        case ConnectionResetError():
+            return "the connection was reset"
+        case ssl.SSLError():
+            return error.reason or "OpenSSL refuses it"
+    return (error.strerror if isinstance(error, OSError) else None) or str(error) or type(error).__name__

@@ -7,7 +7,6 @@ import time
 from collections import deque
 from collections.abc import Callable, Coroutine, Mapping
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, fields
 from enum import StrEnum
 from typing import Any, Final, NamedTuple, Protocol
 
@@ -25,13 +24,12 @@ from bridge.client.protocol.events import (
     Unusable,
 )
 from bridge.client.route import Route
-from bridge.client.websocket import CLOSE_TIMEOUT, WebSocket, open_websocket
+from bridge.client.websocket import CLOSE_TIMEOUT, Limits, WebSocket, open_websocket
 from bridge.errors import (
     BridgeError,
     DecodeError,
     DisconnectedError,
     NoAnswerError,
-    OptionError,
     ServiceError,
     SlowPeerError,
     StateTimeoutError,
@@ -111,23 +109,6 @@ class Message(NamedTuple):
         return data
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Limits:
-    """Limits of a connection in seconds and bytes (see `bridge.client.connect`)."""
-
-    connect_timeout: float
-    max_size: int
-    ping_interval: float
-    ping_timeout: float
-
-    def __post_init__(self) -> None:
-        """Refuse limits that are not positive."""
-        for limit in fields(self):
-            value = getattr(self, limit.name)
-            if not value > 0:
-                raise OptionError(f"{limit.name} must be more than 0, not {value!r}")
-
-
 class Session:
     """The one connection of a client, over all of its WebSockets.
 
@@ -156,10 +137,8 @@ class Session:
         *,
         route: Route,
     ) -> None:
-        """Prepare the session; `open` connects."""
         self.uri = shown_uri
         self.core = core
-        self._wire = core.wire
         self.state = State.CONNECTING
         self.reconnections = 0
         self.last_error = ""
@@ -175,7 +154,7 @@ class Session:
         self.on_closed: set[Callable[[], None]] = set()
         self._parsed_uri = uri
         self._route = route
-        self._blind_since: float | None = None
+        self._blind_since = 0.0
         self._limits = limits
         self._on_state = on_state
         self._entered = False
@@ -189,18 +168,12 @@ class Session:
         self._waiting = 0
         self._serving: set[asyncio.Task[None]] = set()
         self._calls: dict[str, asyncio.Future[CallAnswered]] = {}
-        self._state_waiters: list[tuple[State, asyncio.Future[None]]] = []
+        self._state_changed = asyncio.Event()
 
     # Opening, losing, closing
 
     async def open(self) -> None:
-        """Connect for the first time.
-
-        Raises:
-            UnreachableError: Nothing answers at the URI.
-            NotRosbridgeError: Something answers, but not as a WebSocket server.
-            DisconnectedError: It was opened before.
-        """
+        """Connect for the first time (see `bridge.client.connect`)."""
         if self._entered:
             raise DisconnectedError(f"this client of {self.uri} was opened before: connect() makes a new one")
         self._entered = True
@@ -240,9 +213,7 @@ class Session:
             self.uri,
             route=self._route,
             timeout=seconds,
-            max_size=self._limits.max_size,
-            ping_interval=self._limits.ping_interval,
-            ping_timeout=self._limits.ping_timeout,
+            limits=self._limits,
             on_messages=self._take,
             on_lost=self._lost,
         )
@@ -250,17 +221,12 @@ class Session:
         self._connected_at = time.monotonic()
         if self.state is State.RECONNECTING:
             self.reconnections += 1
-            self._report_blind(time.monotonic())
+            for callback in self.on_blind:
+                callback(self._connected_at - self._blind_since)
         self.core.restore()
         self.flush()
         self.schedule_retry()
         self._set_state(State.CONNECTED, "")
-
-    def _report_blind(self, now: float) -> None:
-        if self._blind_since is not None:
-            seconds, self._blind_since = now - self._blind_since, None
-            for callback in self.on_blind:
-                callback(seconds)
 
     def _lost(self, websocket: WebSocket, reason: str) -> None:
         if websocket is not self._websocket:
@@ -269,10 +235,10 @@ class Session:
         self._blind_since = websocket.last_heard
         self.core.lost()
         self.last_error = reason
-        self._lost_at = time.monotonic()
+        self._lost_at = now = time.monotonic()
         _log.warning("the connection to %s is lost: %s", self.uri, reason)
         self._fail_calls(f"the connection to {self.uri} was lost ({reason})")
-        if time.monotonic() - self._connected_at >= STEADY:
+        if now - self._connected_at >= STEADY:
             self._delay = FIRST_DELAY
         self._reconnecting = asyncio.get_running_loop().create_task(self._reconnect())
         self._set_state(State.RECONNECTING, reason)
@@ -307,16 +273,8 @@ class Session:
 
     def _set_state(self, state: State, reason: str) -> None:
         self.state = state
-        waiters, self._state_waiters = self._state_waiters, []
-        for awaited, future in waiters:
-            if future.done():
-                continue
-            if awaited is state:
-                future.set_result(None)
-            elif state is State.CLOSED:
-                future.set_exception(DisconnectedError(f"the client of {self.uri} was closed"))
-            else:
-                self._state_waiters.append((awaited, future))
+        self._state_changed.set()
+        self._state_changed = asyncio.Event()
         if self._on_state is not None:
             try:
                 self._on_state(state, reason)
@@ -324,28 +282,18 @@ class Session:
                 _log.exception("on_state failed")
 
     async def wait_for_state(self, state: State, limit: float) -> None:
-        """Wait until the connection is in a state.
-
-        Raises:
-            StateTimeoutError: It was not within `limit` seconds.
-            DisconnectedError: It is closed, and will not reach it.
-        """
-        if self.state is state:
-            return
-        if self.state is State.CLOSED:
-            raise DisconnectedError(f"the client of {self.uri} was closed")
-        future: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        self._state_waiters.append((state, future))
+        """Wait until the connection is in a state (see `bridge.client.Ros.wait_for_state`)."""
         try:
             async with asyncio.timeout(limit):
-                await future
+                while self.state is not state:
+                    if self.state is State.CLOSED:
+                        raise DisconnectedError(f"the client of {self.uri} was closed")
+                    await self._state_changed.wait()
         except TimeoutError:
             because = f" ({self.last_error})" if self.last_error else ""
             raise StateTimeoutError(
                 f"the connection to {self.uri} was not {state} within {limit:g} s, it is {self.state}{because}"
             ) from None
-        finally:
-            self._state_waiters = [waiter for waiter in self._state_waiters if waiter[1] is not future]
 
     # Sending
 
@@ -355,42 +303,20 @@ class Session:
         return self._websocket is not None and self._websocket.is_open
 
     def must_wait(self) -> bool:
-        """Return whether a message has to wait for its turn.
-
-        Raises:
-            DisconnectedError: There is no connection.
-        """
-        websocket = self._websocket
-        if websocket is None or not websocket.is_open:
-            websocket = self._connected()
-        return websocket.paused or self._waiting > 0
+        """Return whether a message has to wait for its turn; an error without a connection."""
+        return self._connected().paused or self._waiting > 0
 
     def _connected(self) -> WebSocket:
         websocket = self._websocket
         if websocket is None or not websocket.is_open:
-            raise DisconnectedError(f"{self.uri} is not connected: {self._why_disconnected()}")
+            why = {State.CLOSED: "this client was closed", State.CONNECTING: "`async with` opens it"}
+            lost = self.last_error or "the server is closing it"
+            raise DisconnectedError(f"{self.uri} is not connected: {why.get(self.state, lost)}")
         return websocket
 
-    def _why_disconnected(self) -> str:
-        if self.state is State.CLOSED:
-            return "this client was closed"
-        if self.state is State.CONNECTING:
-            return "`async with` opens it"
-        return self.last_error or "the server is closing it"
-
     def send_now(self, data: bytes) -> None:
-        """Hand a message to the socket.
-
-        Raises:
-            DisconnectedError: There is no connection.
-        """
-        websocket = self._websocket
-        if websocket is None or not websocket.is_open:
-            websocket = self._connected()
-        if self._wire.fragment_size is None:
-            websocket.send((data,))
-        else:
-            websocket.send(tuple(self._wire.pieces(data)))
+        """Hand a message to the socket; an error without a connection."""
+        self._connected().send(tuple(self.core.wire.pieces(data)))
 
     def should_yield(self) -> bool:
         """Count a sent message, and return whether other tasks should get their turn."""
@@ -406,16 +332,7 @@ class Session:
         return nullcontext() if websocket is None else websocket.together()
 
     async def wait_turn(self, what: str, limit: float) -> None:
-        """Wait until the server has accepted everything that was sent before.
-
-        Args:
-            what: Description of the message, for errors.
-            limit: Timeout in seconds.
-
-        Raises:
-            SlowPeerError: It did not in time.
-            DisconnectedError: The connection was lost.
-        """
+        """Wait until the server has accepted everything that was sent before; `what` describes the message in errors."""
         self._waiting += 1
         try:
             async with asyncio.timeout(limit), self._turn:
@@ -428,11 +345,9 @@ class Session:
 
     def flush(self) -> None:
         """Send the core's output, which is small and rare enough never to wait."""
-        data = self.core.data_to_send()
-        websocket = self._websocket
-        if websocket is not None and websocket.is_open:
-            for message in data:
-                websocket.send(tuple(self._wire.pieces(message)))
+        for message in self.core.data_to_send():
+            if self.is_open:
+                self.send_now(message)
 
     def schedule_retry(self) -> None:
         """Repeat subscriptions to topics of unknown type until they have messages."""
@@ -446,15 +361,7 @@ class Session:
             self.schedule_retry()
 
     async def call(self, service: str, args: Mapping[str, Any], limit: float) -> Any:
-        """Call a service and wait for its answer.
-
-        Raises:
-            ServiceError: It answered that it failed.
-            NoAnswerError: It did not answer within `limit` seconds.
-            SlowPeerError: The server did not accept the call.
-            DisconnectedError: There is no connection, or it was lost meanwhile.
-            EncodeError: The arguments cannot be sent as JSON.
-        """
+        """Call a service and wait for its answer (see `bridge.client.Ros.call`)."""
         if self.must_wait():
             await self.wait_turn(f"a call of {service}", limit)
         begun = time.monotonic()

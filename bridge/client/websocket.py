@@ -13,6 +13,7 @@ import ssl
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import dataclass, fields
 from http import HTTPStatus
 from typing import Final
 
@@ -28,9 +29,16 @@ from websockets.frames import CloseCode
 from websockets.http11 import USER_AGENT, Request, Response
 from websockets.uri import WebSocketURI, parse_uri
 
-from bridge.client.route import Route, connect_along, shown
+from bridge.client.route import Route, connect_along, reason_of, shown
 from bridge.codecs.json_codec import excerpt
-from bridge.errors import AccessRefusedError, BridgeError, NotRosbridgeError, UnreachableError, UriError
+from bridge.errors import (
+    AccessRefusedError,
+    BridgeError,
+    NotRosbridgeError,
+    OptionError,
+    UnreachableError,
+    UriError,
+)
 from bridge.transport.websocket import WebSocketTransport
 
 WRITE_LIMIT: Final = 1 << 16
@@ -69,6 +77,22 @@ def check_uri(uri: str) -> WebSocketURI:
     return parsed
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Limits:
+    """Limits of a connection in seconds and bytes (see `bridge.client.connect`)."""
+
+    connect_timeout: float
+    max_size: int
+    ping_interval: float
+    ping_timeout: float
+
+    def __post_init__(self) -> None:
+        for limit in fields(self):
+            value = getattr(self, limit.name)
+            if not value > 0:
+                raise OptionError(f"{limit.name} must be more than 0, not {value!r}")
+
+
 class WebSocket(WebSocketTransport):
     """A WebSocket client connection that calls back for messages and for its end.
 
@@ -79,34 +103,25 @@ class WebSocket(WebSocketTransport):
     def __init__(
         self,
         uri: WebSocketURI,
-        *,
-        max_size: int,
-        ping_interval: float,
-        ping_timeout: float,
+        limits: Limits,
         on_messages: Callable[[list[bytes]], None],
         on_lost: Callable[["WebSocket", str], None],
     ) -> None:
-        """Prepare the connection; `open_websocket` makes and opens it."""
-        protocol = ClientProtocol(uri, max_size=max_size, logger=_log)
-        super().__init__(protocol, max_size=max_size, write_limit=WRITE_LIMIT)
+        protocol = ClientProtocol(uri, max_size=limits.max_size, logger=_log)
+        super().__init__(protocol, max_size=limits.max_size, write_limit=WRITE_LIMIT)
         self.opened = False
         self._client_protocol = protocol
         self._answered = asyncio.Event()
         self._early: list[bytes] = []
         self._on_messages = on_messages
         self._on_lost = on_lost
-        self._ping_interval = ping_interval
-        self._ping_timeout = ping_timeout
+        self._limits = limits
         self._pinged_at: float | None = None
         self._watchdog: asyncio.TimerHandle | None = None
         self._silent_for = 0.0
 
     async def handshake(self, headers: tuple[tuple[str, str], ...]) -> None:
-        """Ask the server for a WebSocket.
-
-        Raises:
-            InvalidHandshake: it does not answer as a WebSocket server.
-        """
+        """Ask the server for a WebSocket, or raise why it does not give one."""
         request = self._client_protocol.connect()
         request.headers.update(headers)
         request.headers.setdefault("User-Agent", USER_AGENT)
@@ -125,7 +140,7 @@ class WebSocket(WebSocketTransport):
         """Take up the connection after its handshake."""
         self.opened = True
         self.last_heard = time.monotonic()
-        self._schedule(self._ping_interval)
+        self._schedule(self._limits.ping_interval)
         early, self._early = self._early, []
         if early:  # they came in one piece with the handshake
             self._on_messages(early)
@@ -163,8 +178,7 @@ class WebSocket(WebSocketTransport):
     def ended(self, exc: Exception | None) -> None:
         """Report the end."""
         self._answered.set()
-        if self._watchdog is not None:
-            self._watchdog.cancel()
+        self._cancel_watchdog()
         if self.opened:
             self._on_lost(self, self._why_lost(exc))
 
@@ -182,28 +196,30 @@ class WebSocket(WebSocketTransport):
             return f"the server closed it (code {closed.rcvd.code})"
         if closed.sent is not None:
             return f"the server broke the WebSocket protocol ({closed.sent.reason})"
-        return _reason(exc) if isinstance(exc, OSError) else "the connection broke off"
+        return reason_of(exc) if isinstance(exc, OSError) else "the connection broke off"
 
     # Watching for silence
 
-    def _schedule(self, seconds: float) -> None:
+    def _cancel_watchdog(self) -> None:
         if self._watchdog is not None:
             self._watchdog.cancel()
+
+    def _schedule(self, seconds: float) -> None:
+        self._cancel_watchdog()
         due = time.monotonic() + seconds
         self._watchdog = asyncio.get_running_loop().call_later(seconds, self._check_liveness, due)
 
     def _check_liveness(self, due: float) -> None:
-        self._watchdog = None
         now = time.monotonic()
         silent = now - self.last_heard
         if not self.is_open:
             self.abort()
-        elif silent < self._ping_interval:
-            self._schedule(self._ping_interval - silent)
+        elif silent < self._limits.ping_interval:
+            self._schedule(self._limits.ping_interval - silent)
         elif self._pinged_at is None or self._pinged_at <= self.last_heard or now - due > _OVERSLEPT:
             self._pinged_at = now
             self.ping()
-            self._schedule(self._ping_timeout)
+            self._schedule(self._limits.ping_timeout)
         else:
             self._silent_for = silent
             self.abort()
@@ -215,9 +231,7 @@ async def open_websocket(
     *,
     route: Route,
     timeout: float,  # noqa: ASYNC109  # the limit is part of the errors' sentences
-    max_size: int,
-    ping_interval: float,
-    ping_timeout: float,
+    limits: Limits,
     on_messages: Callable[[list[bytes]], None],
     on_lost: Callable[[WebSocket, str], None],
 ) -> WebSocket:
@@ -228,14 +242,9 @@ async def open_websocket(
         shown_uri: the same without secrets, for the errors.
         route: TLS, headers and proxy.
         timeout: seconds for all of it.
-        max_size: largest incoming message in bytes; a larger one ends the connection.
-        ping_interval: seconds of silence after which the server is pinged.
-        ping_timeout: seconds that it then has to answer.
+        limits: limits of the open connection.
         on_messages: called with the messages, those that came together at once.
         on_lost: called once, with the reason, when the connection ends.
-
-    Returns:
-        The open connection.
 
     Raises:
         UnreachableError: nothing answers there.
@@ -246,14 +255,7 @@ async def open_websocket(
 
     def factory() -> WebSocket:
         nonlocal attempt
-        attempt = WebSocket(
-            uri,
-            max_size=max_size,
-            ping_interval=ping_interval,
-            ping_timeout=ping_timeout,
-            on_messages=on_messages,
-            on_lost=on_lost,
-        )
+        attempt = WebSocket(uri, limits, on_messages, on_lost)
         return attempt
 
     try:
@@ -261,17 +263,16 @@ async def open_websocket(
             websocket = await connect_along(route, uri, shown_uri, factory)
             await websocket.handshake(route.headers)
     except BaseException as error:
-        connected = attempt is not None and attempt.is_connected
-        heard = b""
+        answered, heard = False, b""
         if attempt is not None:
             attempt.abort()
-            heard = attempt.first_bytes
+            answered, heard = attempt.is_connected, attempt.first_bytes
             if isinstance(error, Exception) and attempt.handshake_error is not None:
                 # It says more than what came of it: a service that greets first breaks off the request.
                 error = attempt.handshake_error
         if isinstance(error, BridgeError) or not isinstance(error, OSError | InvalidHandshake):
             raise
-        raise _connect_error(error, shown_uri, heard, timeout, answered=connected) from error
+        raise _connect_error(error, shown_uri, heard, timeout, answered=answered) from error
     if not websocket.is_open:
         raise UnreachableError(f"{shown_uri} is unreachable: it closed the connection at once")
     websocket.begin()
@@ -316,16 +317,7 @@ def _connect_error(
         done = "it took the connection but did not answer" if answered else "it did not answer"
         return UnreachableError(f"{uri} is unreachable: {done} within {seconds:g} s")
     if isinstance(error, socket.gaierror):
-        return UnreachableError(f"{uri} is unreachable: its host name is not known ({_reason(error)})")
+        return UnreachableError(f"{uri} is unreachable: its host name is not known ({reason_of(error)})")
     return UnreachableError(
-        f"{uri} is unreachable: {_reason(error)}; is the rosbridge server running, and is the port right?"
+        f"{uri} is unreachable: {reason_of(error)}; is the rosbridge server running, and is the port right?"
     )
-
-
-def _reason(error: Exception) -> str:
-    """Return the text of an operating system's error, without its number."""
-    if isinstance(error, ConnectionRefusedError):
-        return "connection refused"
-    if isinstance(error, ConnectionResetError):
-        return "the connection was reset"
-    return (error.strerror if isinstance(error, OSError) else None) or str(error) or type(error).__name__

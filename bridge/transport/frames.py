@@ -49,7 +49,7 @@ def whole_messages(
     Args:
         data: bytes from the socket.
         at: index in `data` at which a frame begins.
-        masked: whether the peer is a client, which masks its frames, or a server, which does not.
+        masked: whether the peer is a client, which masks its frames.
         largest: largest message in bytes; a larger one ends the reading.
         count: most messages to read.
         until: index from which on no message may begin.
@@ -91,11 +91,6 @@ def only_message(data: bytes, *, masked: bool, largest: int) -> bytes | None:
     """Return the payload if the data is exactly one whole message in one frame, else None.
 
     This is `whole_messages` for the most frequent case.
-
-    Args:
-        data: bytes from the socket, beginning with a frame.
-        masked: whether the peer is a client.
-        largest: largest message in bytes.
     """
     size = len(data)
     if size < _LONGEST_HEADER or data[0] not in _WHOLE:
@@ -148,7 +143,6 @@ class Masker:
     """Writes a client's frames of whole text messages, each masked with a key that is used once."""
 
     def __init__(self) -> None:
-        """Draw the first keys when the first message is written."""
         self._keys = mask_keys()
 
     def __call__(self, payloads: Sequence[bytes]) -> bytes:

@@ -50,13 +50,7 @@ class WebSocketTransport(asyncio.Protocol):
     """Bytes that the library reads in one turn once it reads everything."""
 
     def __init__(self, protocol: ClientProtocol | ServerProtocol, *, max_size: int, write_limit: int) -> None:
-        """Prepare the connection; the event loop calls `connection_made` when there is a socket.
-
-        Args:
-            protocol: the library's state machine for this side.
-            max_size: largest incoming message in bytes, as `protocol` has it.
-            write_limit: bytes in the write buffer from which on `paused` holds.
-        """
+        """Prepare the connection: `max_size` is that of `protocol`; from `write_limit` bytes on `paused` holds."""
         self.last_heard = time.monotonic()
         self.is_open = False
         self.first_bytes = b""

@@ -17,7 +17,6 @@ class Calls:
     """The waiting calls, by identity on the wire."""
 
     def __init__(self, wire: Wire) -> None:
-        """Start without calls."""
         self._wire = wire
         self._waiting: set[str] = set()
 
@@ -25,16 +24,7 @@ class Calls:
         return len(self._waiting)
 
     def send(self, service: str, args: Mapping[str, Any]) -> str:
-        """Call a service.
-
-        Returns:
-            Identity of the call in its `CallAnswered`.
-
-        Raises:
-            NameFormError: The name of the service is malformed.
-            EncodeError: The arguments cannot be encoded as JSON.
-            SlowPeerError: `MAX_CALLS` calls wait already.
-        """
+        """Call a service, unless `MAX_CALLS` calls wait already; return the call's identity in its `CallAnswered`."""
         check_name(service)
         if len(self._waiting) >= MAX_CALLS:
             raise SlowPeerError(

@@ -41,17 +41,6 @@ class ClientCore:
         max_depth: int = MAX_DEPTH,
         fragment_size: int | None = None,
     ) -> None:
-        """Start without connection.
-
-        Args:
-            ros_version: ROS version of the server, if it is known.
-            max_size: Largest message in bytes, in both directions.
-            max_depth: Deepest nesting of a message, in both directions.
-            fragment_size: Characters beyond which `Wire.pieces` splits a message; None for never.
-
-        Raises:
-            OptionError: The fragment size is not a positive integer.
-        """
         self.wire = wire = Wire(
             ros_version=ros_version, max_size=max_size, max_depth=max_depth, fragment_size=fragment_size
         )
@@ -60,8 +49,6 @@ class ClientCore:
         self.calls = Calls(wire)
         self.goals = Goals(wire)
         self.services = Services(wire)
-        self._max_size = max_size
-        self._max_depth = max_depth
         self._fragments = Reassembler(max_size=max_size)
 
     @property
@@ -110,22 +97,22 @@ class ClientCore:
             if subscriptions.binary and data[:1] >= b"\x80":  # a map of CBOR begins so, but no JSON
                 return self._receive_cbor(data, now)
         try:
-            operation = decode(data, max_size=self._max_size, max_depth=self._max_depth)
+            operation = self._decode(data)
+            if operation.get("op") in ("fragment", "png"):
+                return self._receive_wrapped(operation, now)
         except DecodeError as error:
             return Unusable(str(error))
-        op = operation.get("op")
-        if op == "publish":
-            return self.subscriptions.receive(operation, now, data)
-        if op in ("fragment", "png"):
-            return self._receive_wrapped(operation, now, data)
-        return self._receive_other(operation, data)
+        return self._receive_plain(operation, now, data)
+
+    def _decode(self, data: bytes | str) -> dict[str, Any]:
+        return decode(data, max_size=self.wire.max_size, max_depth=self.wire.max_depth)
 
     def _receive_cbor(self, data: bytes, now: float) -> Event | None:
         try:
             operation = cbor_codec.decode(
                 data,
-                max_size=self._max_size,
-                max_depth=self._max_depth,
+                max_size=self.wire.max_size,
+                max_depth=self.wire.max_depth,
                 arrays="numpy" if self.subscriptions.numpy else "list",
             )
         except DecodeError as error:
@@ -134,22 +121,17 @@ class ClientCore:
             return self.subscriptions.receive(operation, now, data, from_cbor=True)
         return Unusable(f"a CBOR message other than publish arrived: {excerpt(data)}")
 
-    def _receive_wrapped(self, operation: dict[str, Any], now: float, data: bytes | str) -> Event | None:
+    def _receive_wrapped(self, operation: dict[str, Any], now: float) -> Event | None:
         """Handle a fragment or a PNG, which contain a message, perhaps one inside the other."""
         wrapped = ["fragment", "png"]
-        try:
-            while (op := operation.get("op")) in wrapped:
-                wrapped.remove(op)  # each at most once
-                whole = self._unwrapped(operation, now)
-                if whole is None:
-                    return None
-                operation = decode(whole, max_size=self._max_size, max_depth=self._max_depth)
-                data = whole
-        except DecodeError as error:
-            return Unusable(str(error))
-        if op == "publish":
-            return self.subscriptions.receive(operation, now, data)
-        return self._receive_other(operation, data)
+        data: bytes | str | None = None
+        while (op := operation.get("op")) in wrapped:
+            wrapped.remove(op)  # each at most once
+            data = self._unwrapped(operation, now)
+            if data is None:
+                return None
+            operation = self._decode(data)
+        return self._receive_plain(operation, now, data or "")
 
     def _unwrapped(self, operation: dict[str, Any], now: float) -> bytes | str | None:
         if operation["op"] == "fragment":
@@ -157,10 +139,12 @@ class ClientCore:
         picture = operation.get("data")
         if not isinstance(picture, str):
             raise DecodeError("a png without data arrived")
-        return png.decode(picture, max_size=self._max_size)
+        return png.decode(picture, max_size=self.wire.max_size)
 
-    def _receive_other(self, operation: dict[str, Any], data: bytes | str) -> Event | None:
+    def _receive_plain(self, operation: dict[str, Any], now: float, data: bytes | str) -> Event | None:
         match operation.get("op"):
+            case "publish":
+                return self.subscriptions.receive(operation, now, data)
             case "service_response":
                 return self.calls.receive(operation, data)
             case "call_service":

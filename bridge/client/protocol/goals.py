@@ -17,7 +17,6 @@ class Goals:
     """Actions of the active goals, by identity on the wire."""
 
     def __init__(self, wire: Wire) -> None:
-        """Start without goals."""
         self._wire = wire
         self._actions: dict[str, str] = {}
 
@@ -25,22 +24,7 @@ class Goals:
         return len(self._actions)
 
     def send(self, action: str, type_name: str, goal: Mapping[str, Any], *, feedback: bool) -> str:
-        """Send a goal to an action of ROS 2.
-
-        Args:
-            action: Name of the action.
-            type_name: Its type, in any form.
-            goal: Fields of the goal.
-            feedback: Whether to receive feedback.
-
-        Returns:
-            Identity of the goal in its events.
-
-        Raises:
-            NameFormError: The name or the type is malformed.
-            EncodeError: The goal cannot be encoded as JSON.
-            SlowPeerError: `MAX_GOALS` goals are active already.
-        """
+        """Send a goal (see `bridge.client.Ros.send_goal`), and return its identity in its events."""
         check_name(action)
         if len(self._actions) >= MAX_GOALS:
             raise SlowPeerError(f"{MAX_GOALS} goals are active already, so none was sent to {action}")

@@ -30,10 +30,7 @@ class Publications:
     """All advertisements of a client."""
 
     def __init__(self, wire: Wire) -> None:
-        """Start without advertisements."""
         self._wire = wire
-        self._max_size = wire.max_size
-        self._max_depth = wire.max_depth
         self._advertised: dict[str, _Advertised] = {}
         self._advertisements: dict[int, _Advertised] = {}
 
@@ -53,22 +50,7 @@ class Publications:
         queue_size: int = 100,
         qos: Qos | None = None,
     ) -> int:
-        """Advertise a topic.
-
-        Args:
-            topic: Name of the topic.
-            type_name: Type in the form of ROS 1 or ROS 2.
-            latch: Whether the server keeps the last message for later subscribers.
-            queue_size: Queue length of the server's ROS publisher.
-            qos: Quality of service in ROS 2.
-
-        Returns:
-            Number of the advertisement, for `publish` and `unadvertise`.
-
-        Raises:
-            NameFormError: The name or the type is malformed.
-            TypeConflictError: This client already advertises the topic with other options.
-        """
+        """Advertise a topic (see `bridge.client.Ros.advertise`), and return the advertisement's number."""
         check_name(topic)
         split_type(type_name)
         number = self._wire.number()
@@ -77,8 +59,9 @@ class Publications:
         if advertised is None:
             prefix = b'{"op":"publish","topic":"%b","msg":' % topic.encode()
             wire_id = f"advertise:{topic}:{number}"
-            advertised = _Advertised(topic, type_name, latch, queue_size, qos, wire_id, prefix)
-            self._advertised[key] = advertised
+            self._advertised[key] = advertised = _Advertised(
+                topic, type_name, latch, queue_size, qos, wire_id, prefix
+            )
             self._send_advertise(advertised)
         elif not same_type(advertised.type, type_name) or advertised.latch != latch or advertised.qos != qos:
             raise TypeConflictError(
@@ -102,19 +85,15 @@ class Publications:
         )
 
     def publish(self, advertisement: int, msg: Mapping[str, Any]) -> bytes:
-        """Return the bytes of a message of an advertised topic, which bypass the outbox.
-
-        Raises:
-            EncodeError: It cannot be encoded as JSON; a NaN or an infinity is named with its place.
-        """
+        """Return the bytes of a message of an advertised topic, which bypass the outbox."""
         advertised = self._advertisements[advertisement]
         prefix = advertised.prefix
         try:
             body = encode(
                 msg,
                 nonfinite="refuse",
-                max_size=self._max_size - len(prefix) - 1,
-                max_depth=self._max_depth - 1,
+                max_size=self._wire.max_size - len(prefix) - 1,
+                max_depth=self._wire.max_depth - 1,
             )
         except EncodeError as error:
             raise EncodeError(f"a message of {advertised.topic} cannot be published: {error}") from None

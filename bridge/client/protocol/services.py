@@ -17,7 +17,6 @@ class Services:
     """Types of the services by name, and requests by ticket; tickets are never reused."""
 
     def __init__(self, wire: Wire) -> None:
-        """Start without services."""
         self._wire = wire
         self._types: dict[str, str] = {}
         self._requests: dict[int, tuple[str, Any]] = {}
@@ -25,9 +24,7 @@ class Services:
     def __contains__(self, service: str) -> bool:
         return absolute(service) in self._types
 
-    @property
-    def waiting(self) -> int:
-        """Number of requests that wait for answers."""
+    def __len__(self) -> int:
         return len(self._requests)
 
     def restore(self) -> None:
@@ -40,12 +37,7 @@ class Services:
         self._requests.clear()
 
     def advertise(self, service: str, type_name: str) -> None:
-        """Serve a service.
-
-        Raises:
-            NameFormError: The name or the type is malformed.
-            TypeConflictError: This client already serves it.
-        """
+        """Serve a service (see `bridge.client.Ros.advertise_service`)."""
         check_name(service)
         split_type(type_name)
         key = absolute(service)

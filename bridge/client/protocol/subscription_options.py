@@ -29,7 +29,6 @@ class Delivery:
     qos: Qos | None = None
 
     def __post_init__(self) -> None:
-        """Refuse options that servers would silently ignore."""
         for name, choices in (("compression", get_args(Compression)), ("arrays", get_args(Arrays))):
             if getattr(self, name) not in choices:
                 raise OptionError(f"{name} must be one of {', '.join(choices)}, not {getattr(self, name)!r}")
@@ -39,10 +38,6 @@ class Delivery:
 
 
 def check_fragment_size(size: int | None) -> None:
-    """Refuse an invalid size of fragments.
-
-    Raises:
-        OptionError: It is neither None nor a positive integer.
-    """
+    """Refuse a size of fragments that is neither None nor a positive integer."""
     if size is not None and (type(size) is not int or size < 1):
         raise OptionError(f"fragment_size must be a whole number from 1 up, or None, not {size!r}")

@@ -96,15 +96,12 @@ class Subscriptions:
     """
 
     def __init__(self, wire: Wire) -> None:
-        """Start without subscriptions."""
         self.seen_version: RosVersion | None = None
         self.binary = False
         self.numpy = False
         self.envelopes: dict[bytes, _Known] = {}
         self._known = _UNKNOWN  # the last of these
         self._wire = wire
-        self._max_size = wire.max_size
-        self._max_depth = wire.max_depth
         self._subscribed: dict[str, _Subscribed] = {}
         self._subscriptions: dict[int, _Subscribed] = {}
 
@@ -124,47 +121,27 @@ class Subscriptions:
         queue_length: int = 0,
         delivery: Delivery | None = None,
     ) -> int:
-        """Subscribe to a topic.
+        """Subscribe to a topic (see `bridge.client.Ros.subscribe`), and return the subscription's number.
 
         The server gets the fastest rate and the longest queue of all this client's subscriptions to the topic;
         slower subscriptions are throttled here.
-
-        Args:
-            topic: Name of the topic.
-            type_name: Type in the form of ROS 1 or ROS 2; None leaves it to the server (see `retry_untyped`).
-            throttle_rate: Minimum of milliseconds between two messages.
-            queue_length: Throttled messages that the server keeps; 0 drops them.
-            delivery: Delivery options; None for the defaults.
-
-        Returns:
-            Number of the subscription.
-
-        Raises:
-            NameFormError: The name or the type is malformed.
-            TypeConflictError: This client already subscribes to the topic with another type or delivery.
-            OptionError: A rate or length is not an integer from 0 up (servers silently drop a subscription with
-                a float here).
         """
         check_name(topic)
         if type_name is not None:
             split_type(type_name)
         for name, value in (("throttle_rate", throttle_rate), ("queue_length", queue_length)):
-            if type(value) is not int or value < 0:
+            if type(value) is not int or value < 0:  # servers silently drop a subscription with a float here
                 raise OptionError(f"{name} of topic {topic} must be a whole number from 0 up, not {value!r}")
         number = self._wire.number()
         key = absolute(topic)
         subscribed = self._subscribed.get(key)
-        new = subscribed is None
+        new = subscribed is None or (subscribed.type is None and type_name is not None)
         delivery = delivery or Delivery()
         if subscribed is None:
             subscribed = _Subscribed(topic, type_name, delivery, f"subscribe:{topic}:{number}")
             self._subscribed[key] = subscribed
             self._note_deliveries()
-        elif (
-            type_name is not None
-            and subscribed.type is not None
-            and not same_type(subscribed.type, type_name)
-        ):
+        elif type_name and subscribed.type and not same_type(subscribed.type, type_name):
             raise TypeConflictError(
                 f"topic {topic} is already subscribed to as {subscribed.type}, not as {type_name}"
             )
@@ -173,9 +150,7 @@ class Subscriptions:
                 f"topic {topic} is already subscribed to with {subscribed.delivery}, not with {delivery}: "
                 "all subscriptions of a topic by one client share one on the wire"
             )
-        elif type_name is not None and subscribed.type is None:
-            subscribed.type = type_name
-            new = True
+        subscribed.type = subscribed.type or type_name
         subscribed.wanted[number] = _Wanted(throttle_rate, queue_length)
         self._subscriptions[number] = subscribed
         self.forget_envelopes()
@@ -217,12 +192,9 @@ class Subscriptions:
             self._wire.write(op="unsubscribe", id=subscribed.wire_id, topic=subscribed.topic)
 
     def retry_untyped(self) -> bool:
-        """Repeat subscriptions without a type to topics that have no messages yet.
+        """Repeat subscriptions without a type to topics that have no messages yet; return whether there are any.
 
         Servers forget such a subscription if they do not know the topic yet, most of them silently.
-
-        Returns:
-            Whether there are such topics, so that another retry makes sense.
         """
         waiting = [s for s in self._subscribed.values() if s.type is None and not s.has_messages]
         for subscribed in waiting:
@@ -238,14 +210,14 @@ class Subscriptions:
                 return None
             self._known = known = found
         subscribed = known.subscribed
-        if data[-1] != BRACE or len(data) > self._max_size or subscribed.has_throttled:
+        if data[-1] != BRACE or len(data) > self._wire.max_size or subscribed.has_throttled:
             return None
         message = data[known.size : -1]
         try:
             msg = orjson.loads(message)
         except orjson.JSONDecodeError:
             return None
-        if type(msg) is not dict or is_deeper(message, self._max_depth - 1):
+        if type(msg) is not dict or is_deeper(message, self._wire.max_depth - 1):
             return None
         if self.numpy and subscribed.delivery.arrays == "numpy":
             msg = with_arrays(msg)
@@ -270,13 +242,9 @@ class Subscriptions:
     def receive(
         self, operation: dict[str, Any], now: float, data: bytes | str, *, from_cbor: bool = False
     ) -> MessageReceived | Unusable | None:
-        """Handle a publish; None if it is not subscribed, or throttled.
+        """Handle a publish, decoded from `data` (from CBOR with arrays according to `numpy`).
 
-        Args:
-            operation: The decoded message, with lists or NumPy arrays.
-            now: Monotonic seconds, for throttled subscriptions.
-            data: The message as received.
-            from_cbor: Whether it is CBOR, with arrays according to `numpy`.
+        None if it is not subscribed, or throttled.
         """
         topic = operation.get("topic")
         msg = operation.get("msg")

@@ -27,7 +27,6 @@ class Wire:
     def __init__(
         self, *, ros_version: RosVersion | None, max_size: int, max_depth: int, fragment_size: int | None
     ) -> None:
-        """Start without connection."""
         check_fragment_size(fragment_size)
         self.connected = False
         self.ros_version: RosVersion | None = ros_version
@@ -42,14 +41,10 @@ class Wire:
         return ros2_type(name, kind) if self.ros_version == 2 else ros1_type(name)
 
     def write(self, **operation: Any) -> None:
-        """Write an operation.
-
-        Raises:
-            EncodeError: It cannot be encoded as JSON; a NaN or an infinity is named with its place.
-        """
-        data = encode(operation, nonfinite="refuse", max_size=self.max_size, max_depth=self.max_depth)
-        if self.connected:
-            self._outbox.append(data)
+        """Write an operation."""
+        self.write_bytes(
+            encode(operation, nonfinite="refuse", max_size=self.max_size, max_depth=self.max_depth)
+        )
 
     def write_bytes(self, data: bytes) -> None:
         """Write an encoded message."""

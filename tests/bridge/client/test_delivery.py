@@ -8,31 +8,21 @@ ClientCore ──data_to_send──▶ the test (plays the server)
 import json
 from typing import Any
 
-import cbor2
 import numpy as np
 import pytest
 
 from bridge.client.protocol import ClientCore, Delivery
 from bridge.client.protocol.events import GoalEnded, GoalFeedback, GoalStatus, MessageReceived, Unusable
 from bridge.client.protocol.goals import MAX_GOALS
-from bridge.codecs import cbor_codec, png
+from bridge.codecs import cbor_codec
 from bridge.codecs.fragments import split
-from bridge.errors import OptionError, SlowPeerError, TypeConflictError
+from bridge.errors import OptionError, SlowPeerError
 from bridge.qos import Qos
+from tests.bridge.client.cores import connected, sent, tell
 
 CBOR = Delivery(compression="cbor")
 ARRAYS = Delivery(compression="cbor", arrays="numpy")
 RAW = Delivery(compression="cbor-raw")
-
-
-def connected(**options: Any) -> ClientCore:
-    core = ClientCore(**options)
-    core.restore()
-    return core
-
-
-def sent(core: ClientCore) -> list[dict[str, Any]]:
-    return [json.loads(data) for data in core.data_to_send()]
 
 
 def publish(msg: Any, topic: str = "/a") -> dict[str, Any]:
@@ -50,12 +40,6 @@ def in_json(msg: Any, topic: str = "/a") -> bytes:
 # What is asked
 
 
-def test_nothing_more_is_asked_than_wanted():
-    core = connected()
-    core.subscriptions.subscribe("/a", "p/T")
-    assert set(sent(core)[0]) == {"op", "id", "topic", "type", "throttle_rate", "queue_length"}
-
-
 def test_everything_that_can_be_asked_is_asked_again_after_a_loss():
     core = connected()
     delivery = Delivery(compression="cbor", fragment_size=1000, qos=Qos(depth=3))
@@ -64,16 +48,10 @@ def test_everything_that_can_be_asked_is_asked_again_after_a_loss():
     before = sent(core)
     core.lost()
     core.restore()
-    again = sent(core)
-    assert sorted(again, key=str) == sorted(before, key=str)
-    subscribe = next(op for op in again if op["op"] == "subscribe")
-    assert (subscribe["compression"], subscribe["fragment_size"], subscribe["qos"]) == (
-        "cbor",
-        1000,
-        {"depth": 3},
-    )
-    advertise = next(op for op in again if op["op"] == "advertise")
-    assert advertise["qos"] == {"durability": "transient_local"}
+    advertise, subscribe = sent(core)
+    assert before == [subscribe, advertise]
+    assert (subscribe["compression"], subscribe["fragment_size"]) == ("cbor", 1000)
+    assert (subscribe["qos"], advertise["qos"]) == ({"depth": 3}, {"durability": "transient_local"})
 
 
 @pytest.mark.parametrize(
@@ -95,45 +73,7 @@ def test_what_cannot_be_asked(wrong):
             ClientCore(**wrong)
 
 
-def test_subscriptions_of_a_topic_agree_on_the_form():
-    core = connected()
-    core.subscriptions.subscribe("/a", "p/T", delivery=CBOR)
-    core.subscriptions.subscribe("a", delivery=CBOR)
-    with pytest.raises(TypeConflictError, match="share one on the wire"):
-        core.subscriptions.subscribe("/a", "p/T")
-    with pytest.raises(TypeConflictError):
-        core.subscriptions.subscribe("/a", "p/T", delivery=ARRAYS)
-    advertisement = core.publications.advertise("/b", "p/T", qos=Qos(depth=1))
-    with pytest.raises(TypeConflictError, match="qos"):
-        core.publications.advertise("/b", "p/T")
-    core.publications.unadvertise(advertisement)
-    core.publications.advertise("/b", "p/T")
-
-
 # What comes
-
-
-def test_cbor_as_lists_and_as_arrays():
-    msg = {"data": np.array([1.5, 2.5]), "image": b"\x01\x02"}
-    for delivery in (CBOR, ARRAYS):
-        core = connected()
-        number = core.subscriptions.subscribe("/a", "p/T", delivery=delivery)
-        event = core.receive(in_cbor(msg), 0.0)
-        assert isinstance(event, MessageReceived)
-        assert event.subscriptions == (number,)
-        if delivery is CBOR:
-            assert event.msg == {"data": [1.5, 2.5], "image": b"\x01\x02"}
-        else:
-            assert event.msg["data"].tolist() == [1.5, 2.5]
-            assert event.msg["image"].dtype == np.uint8
-
-
-def test_a_server_that_sends_json_all_the_same():
-    core = connected()
-    core.subscriptions.subscribe("/a", "p/T", delivery=ARRAYS)
-    event = core.receive(in_json({"data": [1.5, None]}), 0.0)
-    assert isinstance(event, MessageReceived)
-    np.testing.assert_array_equal(event.msg["data"], [1.5, np.nan])
 
 
 def test_topics_of_one_client_that_want_it_differently():
@@ -166,24 +106,6 @@ def test_cbor_that_nobody_asked_for_is_not_read():
     assert isinstance(core.receive(in_cbor({}), 0.0), Unusable)
 
 
-@pytest.mark.parametrize(
-    "data",
-    [
-        b"\xff",
-        b"\xa1",
-        cbor2.dumps({"op": "call_service", "service": "/a"}),
-        cbor2.dumps({"op": ["publish"]}),
-        cbor2.dumps({"op": "publish", "topic": "/a"}),
-        cbor2.dumps({"op": "publish", "topic": "/a", "msg": [1]}),
-        cbor2.dumps({"op": "publish", "topic": b"/a", "msg": {}}),
-    ],
-)
-def test_cbor_that_is_of_no_use(data):
-    core = connected()
-    core.subscriptions.subscribe("/a", "p/T", delivery=CBOR)
-    assert isinstance(core.receive(data, 0.0), Unusable)
-
-
 def test_a_message_in_fragments():
     core = connected()
     core.subscriptions.subscribe("/a", "p/T", delivery=Delivery(fragment_size=10))
@@ -201,58 +123,21 @@ def test_a_message_in_fragments():
         assert core.receive(piece, 0.0) is None, "fragments of the lost connection do not count"
 
 
-def test_a_message_in_a_picture_and_in_both():
-    core = connected()
-    core.subscriptions.subscribe("/a", "p/T", delivery=Delivery(compression="png"))
-    picture = json.dumps({"op": "png", "data": png.encode(in_json({"n": 1}))}).encode()
-    for pieces in ([picture], list(split(picture, 40, "p"))):
-        *rest, last = [core.receive(piece, 0.0) for piece in pieces]
-        assert rest == [None] * len(rest)
-        assert isinstance(last, MessageReceived)
-        assert last.msg == {"n": 1}
-
-
-def wrapped(inner: bytes) -> bytes:
-    return json.dumps({"op": "fragment", "id": 1, "num": 0, "total": 1, "data": inner.decode()}).encode()
-
-
-@pytest.mark.parametrize(
-    "data",
-    [
-        wrapped(wrapped(in_json({}))),
-        wrapped(b"no json"),
-        wrapped(b"[]"),
-        wrapped(b'{"op":["fragment"]}'),
-        b'{"op":"fragment"}',
-        b'{"op":["fragment"]}',
-        b'{"op":{"png":1}}',
-        b'{"op":"png"}',
-        b'{"op":"png","data":"xx"}',
-        json.dumps({"op": "png", "data": png.encode(b"no json")}).encode(),
-        json.dumps({"op": "png", "data": png.encode(b'{"op":"png","data":""}')}).encode(),
-    ],
-)
-def test_wrapping_without_a_message(data):
-    core = connected()
-    core.subscriptions.subscribe("/a", "p/T")
-    assert isinstance(core.receive(data, 0.0), Unusable)
-
-
 def test_large_messages_leave_in_fragments():
-    core = connected(fragment_size=40)
+    core, other = connected(fragment_size=60), connected()
     number = core.publications.advertise("/a", "p/T")
-    small, large = (
-        core.publications.publish(number, {"n": 1}),
-        core.publications.publish(number, {"text": "x" * 100}),
-    )
-    assert [len(list(core.wire.pieces(data))) > 1 for data in (small[:40], large)] == [False, True]
-    other = connected()
     other.subscriptions.subscribe("/a", "p/T")
-    *rest, last = [other.receive(piece, 0.0) for piece in core.wire.pieces(large)]
-    assert rest == [None] * len(rest)
-    assert isinstance(last, MessageReceived)
-    ids = {json.loads(piece)["id"] for _ in range(2) for piece in core.wire.pieces(large)}
-    assert len(ids) == 2, "each message has an id of its own"
+    room = 60 - len(core.publications.publish(number, {"d": ""}))
+    ids = []
+    for size, pieces in ((room, 1), (room + 1, 2), (100, 3)):
+        split_up = list(core.wire.pieces(core.publications.publish(number, {"d": "x" * size})))
+        assert len(split_up) >= pieces
+        *rest, last = [other.receive(piece, 0.0) for piece in split_up]
+        assert rest == [None] * len(rest)
+        assert last.msg == {"d": "x" * size}
+        ids.append(json.loads(split_up[0]).get("id"))
+    assert ids[0] is None
+    assert len(set(ids)) == 3, "each message has an id of its own"
 
 
 # Goals of actions
@@ -260,10 +145,6 @@ def test_large_messages_leave_in_fragments():
 
 def goal_of(core: ClientCore, **options: Any) -> str:
     return core.goals.send("/fly", "boat_msgs/Fly", {"to": [1, 2]}, feedback=True, **options)
-
-
-def told(core: ClientCore, **operation: Any) -> Any:
-    return core.receive(json.dumps(operation), 0.0)
 
 
 def test_a_goal_its_feedback_and_its_end():
@@ -279,15 +160,15 @@ def test_a_goal_its_feedback_and_its_end():
             "feedback": True,
         }
     ]
-    assert told(core, op="action_feedback", id=goal, action="/fly", values={"n": 1}) == GoalFeedback(
+    assert tell(core, op="action_feedback", id=goal, action="/fly", values={"n": 1}) == GoalFeedback(
         goal, {"n": 1}
     )
     core.goals.cancel(goal)
     assert sent(core) == [{"op": "cancel_action_goal", "id": goal, "action": "/fly"}]
-    ended = told(core, op="action_result", id=goal, action="/fly", values={"at": 2}, status=5, result=True)
+    ended = tell(core, op="action_result", id=goal, action="/fly", values={"at": 2}, status=5, result=True)
     assert ended == GoalEnded(goal, ok=True, status=GoalStatus.CANCELED, values={"at": 2})
-    assert told(core, op="action_feedback", id=goal, values={}) is None
-    assert told(core, op="action_result", id=goal, values={}) is None
+    assert tell(core, op="action_feedback", id=goal, values={}) is None
+    assert tell(core, op="action_result", id=goal, values={}) is None
     core.goals.cancel(goal)
     assert sent(core) == []
 
@@ -309,7 +190,7 @@ def test_how_a_goal_may_end(answer, ended):
     core = connected()
     goal = goal_of(core)
     ok, status, values = ended
-    assert told(core, op="action_result", id=goal, **answer) == GoalEnded(
+    assert tell(core, op="action_result", id=goal, **answer) == GoalEnded(
         goal, ok=ok, status=status, values=values
     )
 
@@ -323,6 +204,6 @@ def test_goals_are_bounded_and_forgotten_with_the_connection():
     goal_of(core)
     core.lost()
     core.restore()
-    assert told(core, op="action_result", id=goals[1], values={}) is None
-    assert isinstance(told(core, op="action_result", values={}), Unusable)
-    assert isinstance(told(core, op="action_feedback", id=5, values={}), Unusable)
+    assert tell(core, op="action_result", id=goals[1], values={}) is None
+    assert isinstance(tell(core, op="action_result", values={}), Unusable)
+    assert isinstance(tell(core, op="action_feedback", id=5, values={}), Unusable)

@@ -67,19 +67,18 @@ async def test_a_reader_that_never_reads(kind):
 
 
 @pytest.mark.asyncio(loop_factories=["asyncio"])
-async def test_calls_and_goals_that_come_and_go():
-    async with FakeRosbridge() as fake, connect(fake.uri) as ros:
-        fake.serve("/echo", lambda args: args)
-        take = ros._session._take
+async def test_calls_and_goals_that_come_and_go(fake, ros):
+    fake.serve("/echo", lambda args: args)
+    take = ros._session._take
 
-        def play(rounds: int) -> None:
-            core = ros._session.core
-            for number in range(rounds):
-                call = core.calls.send("/echo", {"n": number})
-                take([b'{"op":"service_response","id":"%b","values":{},"result":true}' % call.encode()])
-                goal = core.goals.send("/fly", "p/Fly", {}, feedback=True)
-                take([b'{"op":"action_result","id":"%b","values":{},"status":4}' % goal.encode()])
-                core.subscriptions.unsubscribe(core.subscriptions.subscribe("/b", "p/T"))
-                core.data_to_send()
+    def play(rounds: int) -> None:
+        core = ros._session.core
+        for number in range(rounds):
+            call = core.calls.send("/echo", {"n": number})
+            take([b'{"op":"service_response","id":"%b","values":{},"result":true}' % call.encode()])
+            goal = core.goals.send("/fly", "p/Fly", {}, feedback=True)
+            take([b'{"op":"action_result","id":"%b","values":{},"status":4}' % goal.encode()])
+            core.subscriptions.unsubscribe(core.subscriptions.subscribe("/b", "p/T"))
+            core.data_to_send()
 
-        assert growth(play, 1500) < SLACK
+    assert growth(play, 1500) < SLACK

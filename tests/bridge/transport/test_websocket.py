@@ -13,7 +13,7 @@ from websockets.protocol import State
 from websockets.uri import parse_uri
 from websockets.utils import accept_key
 
-from bridge.client.websocket import WebSocket
+from bridge.client.websocket import Limits, WebSocket
 
 LARGEST = 200
 """Bytes of a message at most, in what is generated here."""
@@ -158,14 +158,8 @@ async def test_client_reads_any_stream_as_the_library_does(
     """
     heard: list[bytes] = []
     lost: list[str] = []
-    client = WebSocket(
-        URI,
-        max_size=LARGEST,
-        ping_interval=1000,
-        ping_timeout=1000,
-        on_messages=heard.extend,
-        on_lost=lambda _, reason: lost.append(reason),
-    )
+    limits = Limits(connect_timeout=1000, max_size=LARGEST, ping_interval=1000, ping_timeout=1000)
+    client = WebSocket(URI, limits, heard.extend, lambda _, reason: lost.append(reason))
     ends = Ends()
     client.connection_made(ends)
     ours = client._client_protocol
