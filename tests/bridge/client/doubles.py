@@ -20,13 +20,6 @@ from rosbags.typesys import Stores, get_typestore
 from tests.fake_rosbridge import FakeRosbridge, _Client
 
 _STORES = {1: get_typestore(Stores.ROS1_NOETIC), 2: get_typestore(Stores.LATEST)}
-_KNOWN = {
-    "A": {"none", "png", "cbor", "cbor-raw"},
-    "B": {"none", "png", "cbor", "cbor-raw"},
-    "R": {"none", "png", "cbor", "cbor-raw"},
-}
-#: Messages that B (and ROS 2 under R) keeps of a burst.
-DEPTH = 10
 
 
 class Double(FakeRosbridge):
@@ -41,16 +34,10 @@ class Double(FakeRosbridge):
             refuses_null=True,
         )
         self.server = server
-        self.known = set(_KNOWN[server])
+        self.known = {"none", "png", "cbor", "cbor-raw"}
         self.fragment_sizes: dict[int, int] = {}
-        self._raw_first: dict[str, int] = {}
         self._fragment_ids = itertools.count()
         self._parts: dict[tuple[int, Any], dict[int, str]] = {}
-
-    async def burst(self, topic: str, messages: list[dict[str, Any]]) -> None:
-        """Publish as a native node does that does not wait: B and R deliver the last ones alone."""
-        for msg in messages if self.server == "A" else messages[-DEPTH:]:
-            await self._publish(topic, msg)
 
     async def _op_subscribe(self, client: _Client, op: dict[str, Any]) -> None:
         wanted = op.get("compression", "none")
@@ -72,16 +59,9 @@ class Double(FakeRosbridge):
     async def _publish(self, topic: str, msg: dict[str, Any]) -> int:
         reached = 0
         for client in sorted(self._clients, key=lambda client: client.number):
-            times = self._times(client, topic)
-            form = next(
-                (op.get("compression", "none") for op in client.subscribed.get(topic, {}).values()), "none"
-            )
-            if self.server in "AB" and times:
-                # JSON and serialised bytes of one topic: whoever comes second gets nothing.
-                raw = form == "cbor-raw"
-                if self._raw_first.setdefault(topic, raw) != raw:
-                    times = 0
-            for _ in range(times):
+            subscribed = client.subscribed.get(topic, {}).values()
+            form = next((op.get("compression", "none") for op in subscribed), "none")
+            for _ in range(self._times(client, topic)):
                 reached += await self._deliver(client, topic, msg, form)
         return reached
 
