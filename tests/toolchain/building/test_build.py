@@ -145,16 +145,12 @@ def test_a_folder_that_cannot_be_written(tmp_path):
             build_deployment(model(), folder, OPTIONS)
 
 
-def test_a_build_over_another_leaves_nothing_of_it(tmp_path):
+def test_a_build_over_another_leaves_nothing_of_it_even_if_it_fails_half_way(tmp_path):
     build_deployment(model(), tmp_path, replace(OPTIONS, partitions=4))
     (tmp_path / "boards" / "notes.txt").write_text("mine")
     build_deployment(model(), tmp_path, replace(OPTIONS, partitions=2))
     assert sorted(p.name for p in (tmp_path / "boards").iterdir()) == ["board0.bm", "board1.bm", "notes.txt"]
     load_deployment(tmp_path)
-
-
-def test_a_build_that_fails_half_way_leaves_no_deployment(tmp_path):
-    build_deployment(model(), tmp_path, replace(OPTIONS, partitions=2))
     (tmp_path / "boards" / "board1.bm").unlink()
     (tmp_path / "boards" / "board1.bm" / "in the way").mkdir(parents=True)
     with pytest.raises(BuildError, match="can't be written"):

@@ -220,34 +220,25 @@ def test_a_machine_of_cells_computes_what_the_model_says(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "options",
+    ("of", "options", "mended", "advice"),
     [
-        replace(CELL, scale=Scale.ADDRESS),
-        replace(THRESHOLD, scale=Scale.ADDRESS),
-        replace(CELL, replicas=3, interface=(35, 18)),
-        replace(OPTIONS, replicas=3, interface=(9000, 18)),
+        (model(), replace(CELL, scale=Scale.ADDRESS), {"scale": Scale.COLUMN}, "--scale"),
+        (model(), replace(THRESHOLD, scale=Scale.ADDRESS), {"scale": Scale.COLUMN}, "--scale"),
+        (model(), replace(CELL, replicas=3, interface=(35, 18)), {"interface": (36, 18)}, "36x18"),
+        (model(), replace(OPTIONS, replicas=3, interface=(9000, 18)), {"interface": (9, 18)}, "register map"),
+        (model(40), replace(CELL, replicas=200), {"partitions": 2}, "2 or more, or fewer --replicas"),
+        (
+            replace(model(), searched=(dimension(REPLICA, size=6),)),
+            replace(OPTIONS, replicas=2),
+            {"replicas": 1},
+            "'replica'",
+        ),
     ],
 )
-def test_what_is_impossible_is_one_sentence(options):
-    with pytest.raises(BuildError):
-        assemble(model(), options)
-
-
-def test_more_than_the_register_map_holds_is_refused_with_a_way_out():
-    with pytest.raises(
-        BuildError, match=r"room for 8192 and 4096: use --partitions 2 or more, or fewer --replicas"
-    ):
-        assemble(model(40), replace(CELL, replicas=200))
-    assemble(model(40), replace(CELL, replicas=200, partitions=2))
-
-
-def test_a_searched_variable_may_not_be_called_as_the_replicas_are():
-    named = Model(
-        name="m", searched=(dimension(REPLICA, size=2),), known=(Known(name="K", table=np.full((2, 2), 0.5)),)
-    )
-    assemble(named, OPTIONS)
-    with pytest.raises(BuildError, match="a searched variable is called 'replica'"):
-        assemble(named, replace(OPTIONS, replicas=2))
+def test_options_that_do_not_fit_have_a_way_out(of, options, mended, advice):
+    with pytest.raises(BuildError, match=advice):
+        assemble(of, options)
+    assemble(of, replace(options, **mended))
 
 
 # Regenerating

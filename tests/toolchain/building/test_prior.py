@@ -112,15 +112,11 @@ def test_a_question_selects_its_prior_by_a_variable():
         selecting = exact_posterior(asked, [1], prior_address=address)
         assert selecting == pytest.approx(exact_posterior(as_column, [1, address]))
     assert exact_posterior(asked, [1]) == pytest.approx(exact_posterior(as_column, [1, None]))
+    never = JointDistribution("r", (table(time, [1, 0]), table(room, PRIORS[:2].T, given=[time])))
+    plain = never.ask(["room"], prior_select="time").model()
+    assert plain.prior_select.table[1] == pytest.approx(PRIORS[0])
     words = asked.prior_select.as_variable()
     assert [to_address(words, each) for each in ("night", "day", 1, 0)] == [1, 0, 1, 0]
-
-
-def test_an_impossible_value_selects_the_plain_prior():
-    time, room = Symbol("time", IntegerType(0, 1)), Symbol("room", IntegerType(0, 3))
-    joint = JointDistribution("r", (table(time, [1, 0]), table(room, PRIORS[:2].T, given=[time])))
-    asked = joint.ask(["room"], prior_select="time").model()
-    assert asked.prior_select.table[1] == pytest.approx(PRIORS[0])
 
 
 @pytest.mark.parametrize("partitions", [1, 2])
@@ -136,6 +132,8 @@ def test_a_written_prior_stands_in_the_place_of_the_models(tmp_path, partitions)
     assert deployment.machine.prior_mode is PriorMode.WRITTEN
     assert deployment.prior == WrittenPrior(path="prior.data")
     wish = [0.1, 0.2, 0.3, 0.4]
+    ratios = written_prior([2e-300, 1e-300, 0, 5e-301], lines=4, prob_bits=8)
+    assert ratios.tolist() == [255, 128, 0, 64]
     codes = written_prior(wish, lines=4, prob_bits=14)
     found = on_boards(deployment, [1], codes=codes)
     assert found == pytest.approx(fuse(np.array(wish), [HEARD[1]]), abs=2e-3)
@@ -162,37 +160,25 @@ def test_a_prior_that_cannot_be_written(prior):
         written_prior(prior, lines=4, prob_bits=8)
 
 
-def test_only_the_ratios_of_a_written_prior_count():
-    codes = written_prior([2e-300, 1e-300, 0, 5e-301], lines=4, prob_bits=8)
-    assert codes.tolist() == [255, 128, 0, 64]
-
-
 @pytest.mark.parametrize(
-    ("options", "fields"),
+    ("error", "make"),
     [
-        ({"prior_path": "prior"}, {}),
-        ({"prior_mode": PriorMode.WRITTEN}, {"prior_select": selected()}),
-        ({"prior_mode": PriorMode.WRITTEN, "prior_path": ""}, {}),
+        (BuildError, lambda folder: build(folder, model(), prior_path="prior")),
+        (
+            BuildError,
+            lambda folder: build(folder, model(prior_select=selected()), prior_mode=PriorMode.WRITTEN),
+        ),
+        (BuildError, lambda folder: build(folder, model(), prior_mode=PriorMode.WRITTEN, prior_path="")),
+        (ModelError, lambda _: PriorSelect(name="a", table=PRIORS * 2)),
+        (ModelError, lambda _: PriorSelect(name="a", table=PRIORS, bits=1)),
+        (ModelError, lambda _: PriorSelect(name="a", table=PRIORS[0])),
+        (ModelError, lambda _: model(prior_select=PriorSelect(name="a", table=np.full((2, 3), 1 / 3)))),
+        (ModelError, lambda _: model(prior_select=PriorSelect(name="heard", table=PRIORS))),
     ],
 )
-def test_options_that_do_not_fit(tmp_path, options, fields):
-    with pytest.raises(BuildError):
-        build(tmp_path, model(**fields), **options)
-
-
-@pytest.mark.parametrize(
-    "make",
-    [
-        lambda: PriorSelect(name="a", table=PRIORS * 2),
-        lambda: PriorSelect(name="a", table=PRIORS, bits=1),
-        lambda: PriorSelect(name="a", table=PRIORS[0]),
-        lambda: model(prior_select=PriorSelect(name="a", table=np.full((2, 3), 1 / 3))),
-        lambda: model(prior_select=PriorSelect(name="heard", table=PRIORS)),
-    ],
-)
-def test_refused_selections(make):
-    with pytest.raises(ModelError):
-        make()
+def test_priors_that_do_not_fit(tmp_path, error, make):
+    with pytest.raises(error):
+        make(tmp_path)
 
 
 def test_a_deployment_whose_prior_does_not_agree_is_refused(tmp_path):

@@ -39,6 +39,7 @@ def test_a_conditional_normal_is_the_normal_of_a_model():
     assert made.table.shape == (10, 4, 3)
     assert made.table.reshape(10, -1) == pytest.approx(expected)
     assert made.normal.mean == pytest.approx(x + b)
+    assert conditional_normal(B, (), mean=1.0, sigma=0.1).table == pytest.approx([0, 1, 0], abs=1e-5)
 
 
 def test_a_conditional_normal_on_a_circle_wraps():
@@ -48,10 +49,6 @@ def test_a_conditional_normal_on_a_circle_wraps():
     assert made.table == pytest.approx(expected)
     plain = wrapped_normal("B", mean=90 * X.values(), sigma=20, values=36, step=10).table
     assert expected == pytest.approx(0.8 * plain + 0.2 / 36)
-
-
-def test_a_normal_without_givens_is_one_distribution():
-    assert conditional_normal(B, (), mean=1.0, sigma=0.1).table == pytest.approx([0, 1, 0], abs=1e-5)
 
 
 def test_a_function_has_one_value():
