@@ -106,7 +106,7 @@ class FastBM1(BM1Kernel):
 
     @property
     def kept_cycles(self) -> int:
-        """How many of a frame's first cycles, of every bank, have their words kept for later frames."""
+        """Number of a frame's first cycles, in every bank, whose words are kept for later frames."""
         return 0 if self._of_frame else self._kept_blocks * BLOCK_CYCLES
 
     def prepare(self) -> None:
@@ -223,6 +223,6 @@ def _occurring_codes(machine: BM1Machine) -> npt.NDArray[np.bool_]:
 
 
 def _blocks_in(kept_bytes: int, rows: int) -> int:
-    """How many blocks of so many rows fit into a memory."""
+    """Return the number of blocks of this many rows that fit into a memory."""
     block_bytes = max(rows, 1) * (BLOCK_WORDS * WORD_BITS // 8 + 1)
     return min(kept_bytes // block_bytes, KEPT_CYCLES // BLOCK_CYCLES)

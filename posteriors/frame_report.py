@@ -32,7 +32,7 @@ class StageTimes:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BoardReport:
-    """How one board computed a frame; with replicas, also how each of its machines did."""
+    """One board's outcome of a frame, with that of each machine if it has replicas."""
 
     name: str
     stopped: str

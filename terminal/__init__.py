@@ -1,1 +1,1 @@
-"""What every command line shares: start, flags, logs, errors and exit codes, end."""
+"""The parts that all command lines share: start, flags, logs, errors and exit codes, end."""

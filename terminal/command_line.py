@@ -51,7 +51,7 @@ class CommandLine(typer.Typer):
 
 
 class _WithEnd:
-    """What a command and a group share: `--help` without a placeholder, and an end that typer does not choose."""
+    """Behaviour that commands and groups share: `--help` without a placeholder, and an end that typer does not choose."""
 
     def get_help_option(self, ctx: Any) -> Any:
         option = super().get_help_option(ctx)  # type: ignore[misc]  # of typer's class

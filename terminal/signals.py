@@ -1,4 +1,4 @@
-"""How signals end a process: blocking code by an exception, a coroutine by cancellation."""
+"""Signals that end a process: an exception for blocking code, cancellation for a coroutine."""
 
 from __future__ import annotations
 

@@ -38,9 +38,9 @@ def model(
     Args:
         width: Cells along x; the thesis ran 32 and describes 64.
         height: Cells along y.
-        distance_step: Map units between the distances told apart; readings are whole numbers 0..100, those
+        distance_step: Map units between distinguishable distances; readings are whole numbers 0..100, those
             beyond clamp and the end bins hold the tails.
-        bearing_step: Degrees between the bearings told apart; must divide a turn.
+        bearing_step: Degrees between distinguishable bearings; must divide a turn.
         array: Whether the readings come as six numbers in a std_msgs/Float64MultiArray, in the columns' order,
             instead of fields with the sensors' names: for servers that know installed message types only.
 

@@ -21,7 +21,7 @@ def read_landmarks(path: Path) -> tuple[Landmark, ...]:
     """Return the landmarks of a CSV with the columns landmark, x_m and y_m, in the file's order.
 
     Raises:
-        ModelError: The file can't be read, has other columns, a line that is no landmark, one twice, or none.
+        ModelError: The file can't be read, has other columns, a line that is not a landmark, a landmark twice, or none at all.
     """
     found: list[Landmark] = []
     try:

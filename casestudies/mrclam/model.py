@@ -38,9 +38,9 @@ def model(
         height: Cells along y in [-7, 7] m.
         floor: What an outlier gets everywhere, relative to the peak of the bin likelihood. Codes of 8 bits
             round 1e-3 to 0, and then one wild reading makes every line impossible.
-        range_step: Metres between the ranges told apart, from 0 on; longer ones than the last clamp.
-        range_values: How many ranges are told apart.
-        bearing_values: How many bearings are told apart in a turn; readings are radians, any turn.
+        range_step: Metres between distinguishable ranges, from 0; longer ranges are clamped.
+        range_values: The number of distinguishable ranges.
+        bearing_values: The number of distinguishable bearings in a turn; readings are radians, any turn.
         fit: What `toolchain fit` learnt from a recording, in the place of the sigmas and floors set by hand.
 
     Raises:

@@ -42,7 +42,7 @@ def listen(
     save: Annotated[
         Path | None,
         typer.Option(
-            help="Save to this file: .jsonl and .csv are appended to, .npz is made anew.", metavar="FILE"
+            help="Save to this file: .jsonl and .csv are appended to, .npz is replaced.", metavar="FILE"
         ),
     ] = None,
     timeout: Annotated[

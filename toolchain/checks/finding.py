@@ -9,7 +9,7 @@ from typing import Final
 
 
 class Severity(StrEnum):
-    """How bad a finding is."""
+    """The severity of a finding."""
 
     ERROR = "error"
     """It can't be built, or computes something wrong."""

@@ -47,7 +47,7 @@ TargetCount: TypeAlias = Annotated[
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ModelFlags:
-    """How a model is read: a case study's parameters, or the question that a network is asked."""
+    """Flags for reading a model: a case study's parameters, or the question to a network."""
 
     settings: Settings = None
     searched: Annotated[
@@ -84,7 +84,7 @@ class ModelFlags:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BuildFlags(ModelFlags):
-    """How a model becomes a machine."""
+    """Flags for turning a model into a machine."""
 
     partitions: Partitions = 1
     device: Annotated[
