@@ -1,15 +1,6 @@
-import asyncio
-from collections.abc import Callable
-
 import pytest
-import uvloop
 
 from bridge.hub import server
-
-
-def pytest_asyncio_loop_factories() -> dict[str, Callable[[], asyncio.AbstractEventLoop]]:
-    """The hub's sockets are tested on both event loops: their transports differ."""
-    return {"asyncio": asyncio.new_event_loop, "uvloop": uvloop.new_event_loop}
 
 
 @pytest.fixture

@@ -5,7 +5,6 @@ Everything that must always hold is checked after each step; every call is answe
 
 import json
 import random
-from collections import Counter
 from typing import Any
 
 from hypothesis import example, given, settings
@@ -98,9 +97,8 @@ class _Visitor:
                 self.calls.add(call_number)
         self.peer.send(**operation)
 
-    def read(self, happened: Counter[str]) -> None:
+    def read(self) -> None:
         for operation in self.peer.read():
-            happened[operation["op"]] += 1
             if operation["op"] == "call_service":
                 self.requests.append(operation["id"])
             elif operation["op"] == "send_action_goal":
@@ -111,7 +109,6 @@ class _Visitor:
                 assert operation["id"] in self.calls - self.answered, "feedback after the end, or unasked"
             elif operation["op"] in {"service_response", "action_result"}:
                 assert operation["result"] is True or isinstance(operation["values"], str)
-                happened["failure"] += not operation["result"]
                 assert operation["id"] in self.calls - self.answered, "answered twice, or never asked"
                 self.answered.add(operation["id"])
             else:
@@ -139,8 +136,8 @@ class _Visitor:
         )
 
 
-def _live(seed: int, steps: int) -> Counter[str]:
-    """One life of a hub; what happened in it, counted."""
+def _live(seed: int, steps: int) -> None:
+    """One life of a hub."""
     rng = random.Random(seed)
     hub = Harness(
         topics=3,
@@ -157,7 +154,6 @@ def _live(seed: int, steps: int) -> Counter[str]:
         parameters=2,
     )
     visitors = [_Visitor(hub) for _ in range(4)]
-    happened: Counter[str] = Counter()
     for number in range(steps):
         who = rng.randrange(len(visitors))
         visitor = visitors[who]
@@ -171,30 +167,22 @@ def _live(seed: int, steps: int) -> Counter[str]:
         elif step == "answer" and visitor.goals:
             visitor.work(rng)
         elif step == "read":
-            visitor.read(happened)
+            visitor.read()
         elif step == "read all":
             for each in visitors:
-                each.read(happened)
+                each.read()
         elif step == "wait":
             hub.advance(rng.choice([0.01, 0.05, 1.0, 30.0]))
         elif step == "reconnect":
-            happened["doomed"] += bool(visitor.peer.client.close_reason)
-            happened["dropped"] += sum(
-                subscription.lane.dropped for subscription in visitor.peer.client.subscriptions.values()
-            )
             visitor.peer.disconnect()
             visitors[who] = _Visitor(hub)
         hub.check()
-        graph = hub.broker.graph
-        happened["latched"] += graph.latched_bytes > 0
-        happened["held"] += bool(hub.broker._dispatcher.throttled)
         ready = hub.broker.take_ready()
         assert len(set(ready)) == len(ready)
-    _end(hub, visitors, happened)
-    return happened
+    _end(hub, visitors)
 
 
-def _end(hub: Harness, visitors: list[_Visitor], happened: Counter[str]) -> None:
+def _end(hub: Harness, visitors: list[_Visitor]) -> None:
     for visitor in visitors:
         if (
             visitor.peer.client.close_reason
@@ -202,22 +190,19 @@ def _end(hub: Harness, visitors: list[_Visitor], happened: Counter[str]) -> None
             visitor.peer.disconnect()
     for _ in range(2):
         for visitor in visitors:
-            visitor.read(happened)
+            visitor.read()
             for key in visitor.goals:  # a goal has no time limit: who works on it ends it, or goes
                 visitor.peer.send(op="action_result", id=key, values={})
         hub.advance(120)
     for visitor in visitors:
-        visitor.read(happened)
+        visitor.read()
         if not visitor.peer.client.close_reason:
             assert visitor.calls == visitor.answered, "a call without an answer"
         visitor.peer.disconnect()
         hub.check()
     graph = hub.broker.graph
-    assert not graph.topics
-    assert not graph.services
-    assert not graph.actions
-    assert not hub.broker._actions.goals
-    assert not hub.broker._calls.pending
+    left = [graph.topics, graph.services, graph.actions, hub.broker._actions.goals, hub.broker._calls.pending]
+    assert not any(left)
     hub.advance(120)
     assert not hub.broker._dispatcher.throttled
 
@@ -227,22 +212,3 @@ def _end(hub: Harness, visitors: list[_Visitor], happened: Counter[str]) -> None
 @example(0)
 def test_a_hub_stays_well_all_its_life(seed: int) -> None:
     _live(seed, 400)
-
-
-def test_in_these_lives_everything_happens() -> None:
-    happened: Counter[str] = Counter()
-    for seed in range(20):
-        happened += _live(seed, 400)
-    expected = {
-        "publish",
-        "call_service",
-        "service_response",
-        "failure",
-        "doomed",
-        "dropped",
-        "latched",
-        "held",
-    }
-    expected |= {"send_action_goal", "cancel_action_goal", "action_feedback", "action_result"}
-    expected |= {"fragment", "png", "status"}
-    assert {what for what in expected if happened[what] >= 5} == expected, happened

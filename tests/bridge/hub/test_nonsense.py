@@ -50,6 +50,16 @@ NONSENSE = [
     b'{"op":"subscribe","topic":"/t","fragment_size":"small"}',
     b'{"op":"publish","topic":"/t","msg":{"a":1}}'.decode().encode("utf-16"),
     b" " * 1000 + b"x",
+    b'{"op":"advertise_service","service":"/rosapi/topics","type":"a/B"}',
+    b'{"op":"advertise_service","service":"rosapi/new","type":"a/B"}',
+    b'{"op":"advertise_service","service":"/a b","type":"a/B"}',
+    b'{"op":"advertise_service","service":"/s"}',
+    b'{"op":"advertise_service","service":"/s","type":"nonsense"}',
+    b'{"op":"call_service"}',
+    b'{"op":"call_service","service":7}',
+    b'{"op":"call_service","service":"/s","id":1.5}',
+    b'{"op":"service_response","id":7,"values":{},"result":true}',
+    b'{"op":"service_response","values":{},"result":true}',
 ]
 
 
@@ -63,6 +73,7 @@ def test_nonsense_is_refused_and_its_sender_served_on(data: bytes) -> None:
     sender.send_raw(data)
     assert sender.read() == other.read() == []
     assert sender.client.refused == 1
+    assert not hub.broker.graph.services
     sender.publish("/t", {"a": 1})
     assert sender.messages() == other.messages() == [{"a": 1}]
 

@@ -20,15 +20,6 @@ from bridge.transport import frames
 from tests.bridge.hub.sockets import PATIENCE, RawClient, client, running_hub
 
 
-async def test_a_message_passes_from_client_to_client() -> None:
-    async with running_hub() as port, client(port) as publisher, client(port) as subscriber:
-        await subscriber.send(op="subscribe", topic="/t", type="a/B")
-        await subscriber.sync()
-        await publisher.send(op="advertise", topic="/t", type="a/B")
-        await publisher.send(op="publish", topic="/t", msg={"data": [1.5, None]})
-        assert await subscriber.receive() == {"op": "publish", "topic": "/t", "msg": {"data": [1.5, None]}}
-
-
 @pytest.mark.parametrize("length", [1, 125, 126, 127, 65_535, 65_536, 1 << 20])
 def test_frames_are_those_of_the_standard(length: int) -> None:
     payload = b"{" * length
@@ -56,16 +47,6 @@ async def test_many_messages_arrive_in_order_through_many_clients() -> None:
             await clients[0].send(op="publish", topic="/t", msg={"i": index})
         for ears in clients:
             assert [(await ears.receive())["msg"]["i"] for _ in range(500)] == list(range(500))
-
-
-async def test_a_service_between_clients() -> None:
-    async with running_hub() as port, client(port) as offers, client(port) as caller:
-        await offers.send(op="advertise_service", service="/add", type="a/Add")
-        await offers.sync()
-        await caller.send(op="call_service", service="/add", args={"a": 1}, id="x")
-        request = await offers.receive()
-        await offers.send(op="service_response", id=request["id"], values={"sum": 2}, result=True)
-        assert (await caller.receive())["values"] == {"sum": 2}
 
 
 async def test_a_throttled_message_is_sent_later() -> None:
@@ -140,20 +121,10 @@ async def test_the_hub_ends_although_a_client_does_not(quick_sweeps: None) -> No
         assert await half.ended() == b""
 
 
-async def test_the_port_can_be_used_again_at_once() -> None:
-    async with running_hub() as port, client(port) as ears:
-        await ears.sync()
-    stop = asyncio.Event()
-    stop.set()
-    await serve_hub("127.0.0.1", port, stop=stop)
-
-
-async def test_an_address_in_use_is_an_error_with_an_exit_code() -> None:
+async def test_an_address_in_use_is_an_error() -> None:
     async with running_hub() as port:
-        with pytest.raises(HubError, match=f"port {port}") as caught:
+        with pytest.raises(HubError, match=f"port {port}"):
             await serve_hub("127.0.0.1", port, stop=asyncio.Event())
-        assert caught.value.exit_code == 2
-        assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from math import inf
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -22,67 +23,23 @@ def _lane(throttle: float = 0.0, queue_length: int = 3) -> Lane:
     return lane
 
 
-def test_order_is_kept_between_topics_and_answers() -> None:
-    outbox, one, other = Outbox(1000), _lane(), _lane()
-    outbox.offer(one, b"1", 0)
-    outbox.put(b"2")
-    outbox.offer(other, b"3", 0)
-    outbox.offer(one, b"4", 0)
-    assert _drain(outbox) == [b"1", b"2", b"3", b"4"]
-    assert (outbox.size, len(outbox)) == (0, 0)
-
-
-def test_a_throttle_with_a_queue_delays_early_messages() -> None:
-    outbox, lane = Outbox(1000), _lane(throttle=1.0, queue_length=2)
-    for index in range(5):
-        outbox.offer(lane, b"%d" % index, 100)
-    assert _drain(outbox) == [b"0"]
-    assert lane.dropped == 2
-    assert outbox.deadline == 101
-    outbox.release(100.5)
-    assert _drain(outbox) == []
-    outbox.release(101)
-    assert _drain(outbox) == [b"3"]
-    assert outbox.deadline == 102
-    outbox.release(110)
-    assert _drain(outbox) == [b"4"]
-    assert outbox.deadline == inf
-    outbox.offer(lane, b"5", 110.5)
-    assert outbox.deadline == 111
-
-
-def test_held_messages_count_towards_the_bytes_and_make_room() -> None:
-    outbox, held, queued = Outbox(10), _lane(throttle=1.0, queue_length=9), _lane(queue_length=9)
-    for _ in range(5):
-        outbox.offer(held, b"333", 0)
-    assert (outbox.size, held.dropped) == (9, 2)  # one queued and two held
-    outbox.put(b"1")
-    assert (outbox.size, held.dropped) == (10, 2)
-    outbox.offer(queued, b"8888 8888", 0)
-    assert outbox.size == 10
-    assert held.dropped == 5
-
-
-def test_lifting_a_throttle_queues_held_messages() -> None:
+@pytest.mark.parametrize(
+    ("throttle", "length", "deadline", "dropped", "released"),
+    [(0.5, 1, 0.5, 2, [b"3"]), (0.0, 5, inf, 0, [b"1", b"2", b"3"])],
+    ids=["shorter", "lifted"],
+)
+def test_an_adjusted_lane_drops_or_queues_what_it_held(
+    throttle: float, length: int, deadline: float, dropped: int, released: list[bytes]
+) -> None:
     outbox, lane = Outbox(1000), _lane(throttle=1.0, queue_length=5)
     for index in range(4):
         outbox.offer(lane, b"%d" % index, 0)
-    outbox.adjust(lane, 0.0, 5)
+    assert _drain(outbox) == [b"0"]
+    outbox.adjust(lane, throttle, length)
     outbox.release(0)
-    assert outbox.deadline == inf
-    assert _drain(outbox) == [b"0", b"1", b"2", b"3"]
-
-
-def test_shortening_a_queue_drops_the_oldest_held() -> None:
-    outbox, lane = Outbox(1000), _lane(throttle=1.0, queue_length=5)
-    for index in range(4):
-        outbox.offer(lane, b"%d" % index, 0)
-    assert _drain(outbox) == [b"0"]
-    outbox.adjust(lane, 0.5, 1)
-    assert lane.dropped == 2
-    assert outbox.deadline == 0.5
+    assert (lane.dropped, outbox.deadline) == (dropped, deadline)
     outbox.release(0.5)
-    assert _drain(outbox) == [b"3"]
+    assert _drain(outbox) == released
 
 
 def test_forgetting_a_lane_leaves_nothing_of_it() -> None:

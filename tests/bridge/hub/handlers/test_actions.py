@@ -52,11 +52,8 @@ def test_a_goal_its_feedback_and_its_result(action: Action) -> None:
         {"op": "action_feedback", "action": "/count", "values": {"part": 1}, "id": "g"}
     ]
     result = {"action": "/count", "values": {"all": 2}, "status": 4, "result": True}
-    assert action.end(request["id"], values={"all": 2}, status=4, result=True) == {
-        "op": "action_result",
-        "id": "g",
-        **result,
-    }
+    ended = action.end(request["id"], values={"all": 2}, status=4, result=True)
+    assert ended == {"op": "action_result", "id": "g", **result}
     assert not action.hub.broker._actions.goals
 
 
@@ -109,28 +106,29 @@ def test_fields_left_out_of_a_result_have_defaults(action: Action) -> None:
 
 
 @pytest.mark.parametrize(
-    ("goal", "part"),
+    "goal",
     [
-        ({"action": "/nowhere"}, "/nowhere"),
-        ({"action": "/count", "action_type": "a/action/Other"}, "a/action/Other"),
-        ({"action": "/count", "action_type": "nonsense"}, "nonsense"),
-        ({"action": "/count", "feedback": "much"}, "feedback"),
+        {"action": "/nowhere"},
+        {"action": "/count", "action_type": "a/action/Other"},
+        {"action": "/count", "action_type": "nonsense"},
+        {"action": "/count", "feedback": "much"},
     ],
 )
-def test_an_impossible_goal_is_answered(action: Action, goal: dict[str, Any], part: str) -> None:
+def test_an_impossible_goal_is_answered(action: Action, goal: dict[str, Any]) -> None:
     action.client.send(op="send_action_goal", id="g", **goal)
     assert action.server.read() == []
     (answer,) = action.client.read()
     assert (answer["result"], answer["status"]) == (False, GoalStatus.ABORTED)
-    assert part in answer["values"]
 
 
 def test_a_server_that_leaves_fails_its_goals(action: Action) -> None:
     action.started()
+    action.server.send(op="send_action_goal", id="own", action="/count")
     action.server.disconnect()
     (result,) = action.client.read()
     assert (result["result"], result["status"]) == (False, GoalStatus.ABORTED)
     assert not action.hub.broker.graph.actions
+    assert not action.hub.broker._actions.goals
 
 
 def test_a_client_that_leaves_cancels_its_goals(action: Action) -> None:
@@ -139,12 +137,6 @@ def test_a_client_that_leaves_cancels_its_goals(action: Action) -> None:
     assert action.server.read() == [{"op": "cancel_action_goal", "id": key, "action": "/count"}]
     action.server.send(op="action_result", id=key, values={})
     assert action.server.client.refused == 1
-
-
-def test_a_client_that_works_on_its_own_goal_leaves_nothing(action: Action) -> None:
-    action.server.send(op="send_action_goal", id="own", action="/count")
-    action.server.disconnect()
-    assert not action.hub.broker._actions.goals
 
 
 def test_the_newest_offer_of_an_action_counts(action: Action) -> None:
@@ -186,13 +178,6 @@ def test_goals_are_bounded_and_each_refusal_is_an_answer() -> None:
     other.send(op="send_action_goal", id="one more for the server", action="/count")
     assert other.read()[0]["result"] is False
     assert len(action.hub.broker._actions.goals) == 3
-
-
-def test_actions_are_bounded() -> None:
-    action = Action(services_per_client=2)
-    for name in ("/two", "/three", "/four"):
-        action.server.send(op="advertise_action", action=name, type=TYPE)
-    assert len(action.hub.broker.graph.actions) == 2
 
 
 def test_a_slow_client_loses_feedback_but_not_the_result() -> None:

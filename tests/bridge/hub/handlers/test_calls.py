@@ -46,26 +46,20 @@ def service() -> Service:
 
 
 @pytest.mark.parametrize("args", [{"a": 1, "b": 2}, {}, {"a": [1, {"b": None}]}, [1, 2]])
-def test_a_call_and_its_answer(service: Service, args: object) -> None:
-    service.call(args=args, id="call:7")
+@pytest.mark.parametrize(
+    "called", [{"service": "add"}, {"service": "/add", "id": 7}, {"service": "/add", "id": "x"}]
+)
+def test_a_call_and_its_answer_with_the_id_and_the_name_that_the_caller_used(
+    service: Service, args: object, called: dict[str, Any]
+) -> None:
+    service.caller.send(op="call_service", args=args, **called)
     request = request_of(service.server)
     assert (request["service"], request["args"]) == ("/add", args)
     assert service.caller.read() == []
     service.server.send(op="service_response", id=request["id"], values={"sum": 3}, result=True)
     assert service.caller.read() == [
-        {"op": "service_response", "id": "call:7", "service": "/add", "values": {"sum": 3}, "result": True}
+        {"op": "service_response", "values": {"sum": 3}, "result": True, **called}
     ]
-
-
-@pytest.mark.parametrize("identifier", [{"id": "x"}, {"id": 7}, {}])
-def test_the_answer_has_the_id_and_the_name_that_the_caller_used(
-    service: Service, identifier: dict[str, Any]
-) -> None:
-    service.caller.send(op="call_service", service="add", **identifier)
-    respond(service.server, values={}, result=True)
-    (answer,) = service.caller.read()
-    assert answer["service"] == "add"
-    assert {key: answer[key] for key in answer if key == "id"} == identifier
 
 
 def test_answers_may_come_in_any_order(service: Service) -> None:
@@ -106,9 +100,7 @@ def test_as_in_ros_1_an_answer_is_passed_on_whatever_its_result(service: Service
 
 @pytest.mark.parametrize("values", ["text", 3, [1], None])
 def test_values_that_are_not_an_object_fail_the_call(service: Service, values: object) -> None:
-    answer = service.answered(values=values, result=True)
-    assert answer["result"] is False
-    assert "/add" in answer["values"]
+    assert service.answered(values=values, result=True)["result"] is False
 
 
 def test_a_service_that_does_not_exist() -> None:
@@ -131,7 +123,6 @@ def test_a_call_without_an_answer_fails_in_time() -> None:
     service.hub.advance(0.2)
     (answer,) = service.caller.read()
     assert (answer["id"], answer["result"]) == ("short", False)
-    assert "/add" in answer["values"]
     service.hub.advance(8)
     assert [answer["id"] for answer in service.caller.read()] == ["long", "longer"]
     service.server.send(op="service_response", id=requests[0]["id"], values={}, result=True)  # too late
@@ -155,7 +146,6 @@ def test_a_server_that_vanishes_fails_its_calls_at_once(service: Service) -> Non
     service.server.disconnect()
     (answer,) = service.caller.read()
     assert answer["result"] is False
-    assert "/add" in answer["values"]
     assert service.caller.ask("/add")["result"] is False
 
 
@@ -197,30 +187,6 @@ def test_a_service_is_withdrawn_by_its_owner_alone_and_still_answers_pending_cal
     assert service.caller.read()[0]["values"] == {"n": 1}
 
 
-@pytest.mark.parametrize(
-    "operation",
-    [
-        {"op": "advertise_service", "service": "/rosapi/topics", "type": "a/B"},
-        {"op": "advertise_service", "service": "rosapi/new", "type": "a/B"},
-        {"op": "advertise_service", "service": "/a b", "type": "a/B"},
-        {"op": "advertise_service", "service": "/s"},
-        {"op": "advertise_service", "service": "/s", "type": "nonsense"},
-        {"op": "call_service"},
-        {"op": "call_service", "service": 7},
-        {"op": "call_service", "service": "/s", "id": 1.5},
-        {"op": "service_response", "id": 7, "values": {}, "result": True},
-        {"op": "service_response", "values": {}, "result": True},
-    ],
-)
-def test_malformed_operations_are_refused_silently(operation: dict[str, Any]) -> None:
-    hub = Harness()
-    peer = hub.connect()
-    peer.send(**operation)
-    assert peer.read() == []
-    assert peer.client.refused == 1
-    assert not hub.broker.graph.services
-
-
 def test_a_timeout_that_is_not_a_number_fails_the_call(service: Service) -> None:
     assert service.caller.ask("/add", timeout="soon")["result"] is False
     assert service.server.read() == []
@@ -257,9 +223,7 @@ def test_an_answer_or_a_request_that_is_too_large_fails_the_call() -> None:
 
 def test_a_failure_fits_into_a_message() -> None:
     service = Service(message_bytes=800)
-    service.call(id="i" * 100)
-    respond(service.server, values="x" * 700, result=False)
-    (answer,) = service.caller.read()
+    answer = service.answered(values="x" * 700, result=False)
     assert (answer["values"], answer["result"]) == ("x" * 100, False)
     assert service.caller.ask("/" + "x" * 600)["result"] is False
 
@@ -270,6 +234,5 @@ def test_a_client_that_reads_no_answers_must_be_closed() -> None:
     for _ in range(100):
         deaf.send(op="call_service", service="/rosapi/get_time")
         reader.rosapi("get_time")
-    assert deaf.client.close_reason
     assert deaf.client in hub.broker.take_ready()
-    assert not reader.client.close_reason
+    assert (bool(deaf.client.close_reason), bool(reader.client.close_reason)) == (True, False)

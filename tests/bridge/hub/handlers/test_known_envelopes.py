@@ -130,9 +130,7 @@ def test_a_latched_message_with_a_known_envelope() -> None:
     late = hub.broker.connect("c")
     late.outbox.wire = []
     hub.ask(late, op="subscribe", topic="t", compression="none")
-    assert [orjson.loads(payload) for payload in late.outbox.wire] == [
-        {"op": "publish", "topic": "t", "msg": {"n": 1}}
-    ]
     hub.ask(late, op="subscribe", topic="t", compression="cbor", id="as CBOR")
     hub.say(PUBLISH + b'{"n":2}}')
+    assert orjson.loads(late.outbox.wire[0]) == {"op": "publish", "topic": "t", "msg": {"n": 1}}
     assert late.outbox.wire[-1][:1] == b"\xa3"
