@@ -3,6 +3,7 @@
 A message is encoded once in each form, however many subscribers want it.
 """
 
+from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import lru_cache
 from typing import Any, Final
@@ -50,37 +51,22 @@ AROUND: Final = len(json_prefix("")) + 1
 """Bytes around a topic's name and a message's JSON."""
 
 
+@dataclass(eq=False, slots=True)
 class Message:
     """One published message, encoded on demand."""
 
-    __slots__ = ("_definitions", "_max_size", "_parsed", "_payloads", "_time_ns", "_type", "data")
-
-    def __init__(
-        self,
-        data: bytes,
-        parsed: dict[str, Any] | None,
-        type_name: str,
-        time_ns: int,
-        definitions: Definitions,
-        max_size: int,
-    ) -> None:
-        """Store the sources of all encodings.
-
-        Args:
-            data: The message as JSON.
-            parsed: The same, or None if it was not parsed yet.
-            type_name: Its type, or the empty string.
-            time_ns: Its receipt in nanoseconds since 1970, for cbor-raw.
-            definitions: The known types.
-            max_size: Maximum of bytes on the wire.
-        """
-        self.data = data
-        self._parsed = parsed
-        self._type = type_name
-        self._time_ns = time_ns
-        self._definitions = definitions
-        self._max_size = max_size
-        self._payloads: dict[tuple[Compression, str], bytes | BridgeError] = {}
+    data: bytes
+    """The message as JSON."""
+    _parsed: dict[str, Any] | None
+    """The same, or None if it was not parsed yet."""
+    _type: str
+    """Its type, or the empty string."""
+    _time_ns: int
+    """Its receipt in nanoseconds since 1970, for cbor-raw."""
+    _definitions: Definitions
+    _max_size: int
+    """Maximum of bytes on the wire."""
+    _payloads: dict[tuple[Compression, str], bytes | BridgeError] = field(default_factory=dict)
 
     def payload(self, compression: Compression, name: str) -> bytes:
         """Return the message in one encoding, under the topic's name as a client uses it.

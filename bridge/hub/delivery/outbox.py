@@ -10,6 +10,7 @@ wants in fragments is queued whole, and counts towards the bound until its last 
 
 import itertools
 from collections import deque
+from dataclasses import dataclass
 from math import inf
 from typing import TYPE_CHECKING, Final
 
@@ -28,15 +29,13 @@ def is_text(payload: bytes) -> bool:
     return payload[0] == _BRACE
 
 
+@dataclass(eq=False, slots=True)
 class _Entry:
     """One message in the order; a `payload` of None is a gap."""
 
-    __slots__ = ("fragment_size", "lane", "payload")
-
-    def __init__(self, payload: bytes, lane: "Lane | None", fragment_size: int) -> None:
-        self.payload: bytes | None = payload
-        self.lane = lane
-        self.fragment_size = fragment_size
+    payload: bytes | None
+    lane: "Lane | None"
+    fragment_size: int
 
 
 class Lane:

@@ -6,7 +6,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from bridge.client.protocol import ClientCore
-from bridge.client.protocol.events import MessageReceived, Unusable
+from bridge.client.protocol.events import MessageReceived
 from bridge.codecs.envelope import LONGEST, envelope_of, topic_of
 
 CANONICAL = b'{"op":"publish","topic":"/t","msg":'
@@ -84,26 +84,6 @@ def core_that_knows() -> ClientCore:
     return core
 
 
-def test_errors_are_found_behind_a_known_envelope():
-    core = core_that_knows()
-    for message in (
-        b"{",
-        b"[1]",
-        b'{"a":[[[[]]]]}',
-        b'"x"',
-        b'{"a":"\xff"}',
-        b'{"a":"' + b"x" * 2000 + b'"}',
-    ):
-        assert isinstance(core.receive(CANONICAL + message + b"}", 0.0), Unusable)
-    for end in (b"", b"]", b"}}", b"} x"):
-        assert isinstance(core.receive(CANONICAL + b"{}" + end, 0.0), Unusable)
-    assert core.receive(CANONICAL + b'{"a":[NaN,1e999]}}', 0.0) == MessageReceived(
-        "/t", {"a": [None, None]}, (1,)
-    )
-    assert core.receive(CANONICAL + b'{"a":1},"topic":"/u"}', 0.0) is None
-    assert core.receive(CANONICAL + b'{"a":1},"msg":{"b":2}}', 0.0) == MessageReceived("/t", {"b": 2}, (1,))
-
-
 def test_a_known_envelope_is_ignored_after_unsubscribing():
     core = core_that_knows()
     core.subscriptions.unsubscribe(1)
@@ -119,11 +99,3 @@ def test_throttles_apply_with_a_known_envelope():
     slow = core.subscriptions.subscribe("/t", throttle_rate=1000)
     heard = [core.receive(CANONICAL + b"{}}", now) for now in (10.0, 10.1, 10.2, 11.1)]
     assert [event.subscriptions for event in heard] == [(1, slow), (1,), (1,), (1, slow)]
-
-
-def test_envelopes_that_never_come_again_are_not_gathered():
-    core = core_that_knows()
-    for number in range(100):
-        odd = b'{%b"op":"publish","topic":"/t","msg":{}}' % (b" " * number)
-        assert core.receive(odd, 0.0) == MessageReceived("/t", {}, (1,))
-    assert len(core.subscriptions.envelopes) <= 8

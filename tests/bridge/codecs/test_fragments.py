@@ -5,7 +5,7 @@ import math
 import random
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from bridge.codecs.fragments import MAX_FRAGMENTS, Reassembler, split
@@ -172,32 +172,3 @@ def test_messages_that_never_end_are_bounded_in_time():
     assert (len(box), box.given_up) == (1, 1)
     box.clear()
     assert (len(box), box.waiting_bytes) == (0, 0)
-
-
-values = st.one_of(
-    st.none(),
-    st.booleans(),
-    st.integers(-2, 6),
-    st.floats(),
-    st.text(max_size=3),
-    st.sampled_from(["0", "1", "2.0"]),
-)
-
-
-@settings(max_examples=100)
-@given(
-    st.lists(
-        st.fixed_dictionaries({"id": values, "data": values, "num": values, "total": values}), max_size=40
-    )
-)
-def test_nothing_makes_it_grow_or_fail_otherwise(fragments):
-    box = Reassembler(max_size=8, max_sets=3, max_age=5)
-    for now, each in enumerate(fragments):
-        try:
-            whole = box.take(each, float(now))
-        except DecodeError:
-            whole = None
-        assert whole is None or len(whole) <= 8
-        assert len(box) <= 3
-        assert 0 <= box.waiting_bytes <= 4 * (8 + 128)
-        assert (len(box) == 0) == (box.waiting_bytes == 0)

@@ -50,20 +50,6 @@ def test_output_of_the_standard_library_is_read(message):
     assert read == json.loads(encode(message))
 
 
-@given(st.binary() | st.text() | values.map(json.dumps))
-def test_any_input_is_an_object_or_an_error(data):
-    try:
-        message = decode(data, max_size=300)
-    except DecodeError as error:
-        assert len(str(error)) < 500
-    else:
-        assert type(message) is dict
-        assert len(data) <= 300
-        assert all(map(math.isfinite, numbers_of(message)))
-        json.dumps(message, allow_nan=False)
-        encode(message)
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [

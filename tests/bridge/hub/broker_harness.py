@@ -171,3 +171,14 @@ class Harness:
             assert len(lane.queued) <= max(lane.queue_length, 1)
             assert len(lane.held) <= lane.queue_length
             assert lane.queue_length <= self.broker.limits.longest_queue
+
+
+def publisher_and_subscriber(
+    type_name: str, ros_version: Any = 1, limits: dict[str, int] | None = None, **wish: Any
+) -> tuple[Peer, Peer]:
+    """Connect a client that advertises /t to a new hub, and one that subscribes to it with a wish."""
+    hub = Harness(ros_version=ros_version, **limits or {})
+    publisher, subscriber = hub.connect(), hub.connect()
+    publisher.advertise("/t", type_name)
+    subscriber.subscribe("/t", **wish)
+    return publisher, subscriber

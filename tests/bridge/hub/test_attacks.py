@@ -25,7 +25,7 @@ from bridge.hub import server
 from bridge.hub.broker import TURN_WORK
 from bridge.hub.delivery.definitions import Definitions
 from bridge.hub.limits import HubLimits
-from tests.bridge.hub.broker_harness import Harness, Peer
+from tests.bridge.hub.broker_harness import Harness, Peer, publisher_and_subscriber
 from tests.bridge.hub.sockets import PATIENCE, RawClient, client, running_hub
 
 MEBIBYTE = 1 << 20
@@ -49,10 +49,7 @@ def memory_bounded(budget: int = 0) -> Iterator[None]:
 
 
 def subscribed(compression: str, type_name: str, ros_version: Any = 1) -> tuple[Peer, Peer]:
-    hub = Harness(ros_version=ros_version)
-    publisher, subscriber = hub.connect(), hub.connect()
-    publisher.advertise("/t", type_name)
-    subscriber.subscribe("/t", compression=compression)
+    publisher, subscriber = publisher_and_subscriber(type_name, ros_version, compression=compression)
     publisher.publish("/t", {})  # loads the definitions
     subscriber.read()
     return publisher, subscriber
@@ -145,10 +142,8 @@ def test_incomplete_messages_expire_without_another_fragment() -> None:
 
 
 def test_a_message_in_fragments_counts_until_its_last_fragment_has_left() -> None:
-    hub = Harness(client_bytes=2 * MEBIBYTE)
-    publisher, subscriber = hub.connect(), hub.connect()
-    publisher.advertise("/t")
-    subscriber.subscribe("/t", fragment_size=1)
+    limits = {"client_bytes": 2 * MEBIBYTE}
+    publisher, subscriber = publisher_and_subscriber("a/B", limits=limits, fragment_size=1)
     outbox = subscriber.client.outbox
     publisher.publish("/t", {"data": "x" * 1_000_000})
     fragment = outbox.pop()

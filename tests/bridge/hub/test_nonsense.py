@@ -79,8 +79,7 @@ def test_nonsense_is_refused_and_its_sender_served_on(data: bytes) -> None:
 
 
 def test_depth_up_to_the_limit_passes() -> None:
-    hub = Harness(depth=10)
-    peer = hub.connect()
+    peer = Harness(depth=10).connect()
     peer.advertise("/t")
     peer.subscribe("/t")
     for levels, passes in ((8, True), (9, False)):  # the operation and its message are two more
@@ -89,8 +88,7 @@ def test_depth_up_to_the_limit_passes() -> None:
 
 
 def test_a_message_beyond_the_limit_is_refused() -> None:
-    hub = Harness(message_bytes=100)
-    peer = hub.connect()
+    peer = Harness(message_bytes=100).connect()
     peer.send_raw(b'{"op":"subscribe","topic":"/t"%b}' % (b" " * 100))
     assert peer.client.refused == 1
 

@@ -14,19 +14,9 @@ from rosbags.typesys import Stores, get_typestore
 from bridge.codecs import cbor_codec, png
 from bridge.codecs.fragments import Reassembler
 from bridge.hub.handlers import topics
-from tests.bridge.hub.broker_harness import WALL_CLOCK, Harness, Peer
+from tests.bridge.hub.broker_harness import WALL_CLOCK, Harness, Peer, publisher_and_subscriber
 
 ARRAY = "std_msgs/Float64MultiArray"
-
-
-def _publisher_and_subscriber(
-    type_name: str, ros_version: Any = 1, limits: dict[str, int] | None = None, **wish: Any
-) -> tuple[Peer, Peer]:
-    hub = Harness(ros_version=ros_version, **limits or {})
-    publisher, subscriber = hub.connect(), hub.connect()
-    publisher.advertise("/t", type_name)
-    subscriber.subscribe("/t", **wish)
-    return publisher, subscriber
 
 
 def _raw(peer: Peer) -> list[bytes]:
@@ -48,7 +38,7 @@ def _whole(payloads: list[bytes]) -> bytes:
 
 
 def test_cbor_has_typed_arrays_of_the_types_elements() -> None:
-    publisher, subscriber = _publisher_and_subscriber("sensor_msgs/LaserScan", compression="cbor")
+    publisher, subscriber = publisher_and_subscriber("sensor_msgs/LaserScan", compression="cbor")
     scan = {"ranges": [1.5, 2, None], "intensities": [], "angle_min": -1.5, "header": {"frame_id": "é"}}
     publisher.publish("/t", scan)
     (payload,) = _raw(subscriber)
@@ -61,7 +51,7 @@ def test_cbor_has_typed_arrays_of_the_types_elements() -> None:
 
 
 def test_cbor_has_bytes_and_nested_arrays() -> None:
-    publisher, subscriber = _publisher_and_subscriber("sensor_msgs/PointCloud2", compression="cbor")
+    publisher, subscriber = publisher_and_subscriber("sensor_msgs/PointCloud2", compression="cbor")
     cloud = {"data": "AAH/", "fields": [{"name": "x", "offset": 0}], "width": 3}
     publisher.publish("/t", cloud)
     publisher.publish("/t", {"data": [0, 1, 255]})
@@ -78,7 +68,7 @@ def test_cbor_has_bytes_and_nested_arrays() -> None:
     ],
 )
 def test_of_an_unknown_field_floats_alone_are_packed(type_name: str, message: Any) -> None:
-    publisher, subscriber = _publisher_and_subscriber(type_name, compression="cbor")
+    publisher, subscriber = publisher_and_subscriber(type_name, compression="cbor")
     publisher.publish("/t", message)
     (payload,) = _raw(subscriber)
     msg = cbor_codec.decode(payload, arrays="numpy")["msg"]
@@ -88,7 +78,7 @@ def test_of_an_unknown_field_floats_alone_are_packed(type_name: str, message: An
 
 def test_without_rosbags_floats_are_packed_and_the_rest_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "rosbags.typesys", None)
-    publisher, subscriber = _publisher_and_subscriber(ARRAY, compression="cbor")
+    publisher, subscriber = publisher_and_subscriber(ARRAY, compression="cbor")
     publisher.publish("/t", {"data": [1.5, 2.5]})
     (payload,) = _raw(subscriber)
     assert cbor_codec.decode(payload, arrays="numpy")["msg"]["data"].tolist() == [1.5, 2.5]
@@ -100,7 +90,7 @@ def test_without_rosbags_floats_are_packed_and_the_rest_is_refused(monkeypatch: 
 
 @pytest.mark.parametrize("ros_version", [1, 2])
 def test_cbor_raw_is_what_ros_would_send(ros_version: Any) -> None:
-    publisher, subscriber = _publisher_and_subscriber(
+    publisher, subscriber = publisher_and_subscriber(
         "geometry_msgs/PoseStamped", ros_version, compression="cbor-raw"
     )
     own, other = (("secs", "nsecs"), ("sec", "nanosec"))[:: 1 if ros_version == 1 else -1]
@@ -122,7 +112,7 @@ def test_cbor_raw_is_what_ros_would_send(ros_version: Any) -> None:
 
 
 def test_arrays_are_serialised_with_their_type_and_length() -> None:
-    publisher, subscriber = _publisher_and_subscriber("sensor_msgs/Imu", 2, compression="cbor-raw")
+    publisher, subscriber = publisher_and_subscriber("sensor_msgs/Imu", 2, compression="cbor-raw")
     publisher.publish("/t", {"orientation_covariance": [0.5, *[None] * 8]})
     imu: Any = get_typestore(Stores.ROS2_JAZZY).deserialize_cdr(
         cbor_codec.decode(_raw(subscriber)[0])["msg"]["bytes"], "sensor_msgs/msg/Imu"
@@ -143,7 +133,7 @@ def test_arrays_are_serialised_with_their_type_and_length() -> None:
     ],
 )
 def test_a_message_that_cannot_be_serialised_is_reported_once(type_name: str, message: Any) -> None:
-    publisher, subscriber = _publisher_and_subscriber(type_name, compression="cbor-raw", id="the one")
+    publisher, subscriber = publisher_and_subscriber(type_name, compression="cbor-raw", id="the one")
     for _ in range(3):
         publisher.publish("/t", message)
     (status,) = subscriber.read()
@@ -157,7 +147,7 @@ def test_a_message_that_cannot_be_serialised_is_reported_once(type_name: str, me
 
 @pytest.mark.parametrize("size", [0, 1, 2, 100, 10_000])
 def test_png_holds_the_operation(size: int) -> None:
-    publisher, subscriber = _publisher_and_subscriber("a/B", compression="png")
+    publisher, subscriber = publisher_and_subscriber("a/B", compression="png")
     publisher.publish("/t", {"data": "é" * size})
     (operation,) = subscriber.read()
     assert set(operation) == {"op", "data"}
@@ -168,7 +158,7 @@ def test_png_holds_the_operation(size: int) -> None:
 
 
 def test_a_png_that_is_larger_than_may_be_is_refused() -> None:
-    publisher, subscriber = _publisher_and_subscriber("a/B", limits={"message_bytes": 400}, compression="png")
+    publisher, subscriber = publisher_and_subscriber("a/B", limits={"message_bytes": 400}, compression="png")
     publisher.publish("/t", {"data": base64.b85encode(bytes(range(256))).decode()[:300]})
     assert subscriber.read()[0]["op"] == "status"
     assert subscriber.client.refused == 1
@@ -180,7 +170,7 @@ def test_a_png_that_is_larger_than_may_be_is_refused() -> None:
 @pytest.mark.parametrize(("asked", "size"), [(1, 256), (256, 256), (300, 300)])
 @pytest.mark.parametrize("compression", ["none", "png"])
 def test_a_message_in_fragments(asked: int, size: int, compression: str) -> None:
-    publisher, subscriber = _publisher_and_subscriber("a/B", fragment_size=asked, compression=compression)
+    publisher, subscriber = publisher_and_subscriber("a/B", fragment_size=asked, compression=compression)
     messages = [{"data": os.urandom(600).hex() + letter} for letter in "é☃"]
     for message in messages:
         publisher.publish("/t", message)
@@ -199,16 +189,16 @@ def test_a_message_in_fragments(asked: int, size: int, compression: str) -> None
 
 
 def test_small_messages_and_cbor_are_not_cut() -> None:
-    publisher, subscriber = _publisher_and_subscriber("a/B", fragment_size=60)
+    publisher, subscriber = publisher_and_subscriber("a/B", fragment_size=60)
     publisher.publish("/t", {"a": 1})
     assert subscriber.messages() == [{"a": 1}]
-    publisher, subscriber = _publisher_and_subscriber("a/B", fragment_size=256, compression="cbor")
+    publisher, subscriber = publisher_and_subscriber("a/B", fragment_size=256, compression="cbor")
     publisher.publish("/t", {"data": "x" * 1000})
     assert subscriber.messages() == [{"data": "x" * 1000}]
 
 
 def test_fragments_are_dropped_as_messages_are() -> None:
-    publisher, slow = _publisher_and_subscriber("a/B", limits={"queue_length": 2}, fragment_size=256)
+    publisher, slow = publisher_and_subscriber("a/B", limits={"queue_length": 2}, fragment_size=256)
     for index in range(10):
         publisher.publish("/t", {"i": index, "data": "x" * 1000})
     payloads = _raw(slow)
@@ -241,7 +231,7 @@ def test_fragments_are_one_operation() -> None:
 
 
 def test_of_several_wishes_the_last_form_and_the_least_size_count() -> None:
-    publisher, subscriber = _publisher_and_subscriber("a/B", id=1, fragment_size=640)
+    publisher, subscriber = publisher_and_subscriber("a/B", id=1, fragment_size=640)
     subscriber.subscribe("/t", id=2, compression="cbor")
     subscriber.subscribe("/t", id=3, compression="png", fragment_size=320)
     noise = os.urandom(500).hex()
@@ -256,13 +246,13 @@ def test_of_several_wishes_the_last_form_and_the_least_size_count() -> None:
 
 @pytest.mark.parametrize("compression", ["bson", "", None, 7, ["png"], {}])
 def test_an_unknown_compression_is_plain_json(compression: object) -> None:
-    publisher, subscriber = _publisher_and_subscriber("a/B", compression=compression)
+    publisher, subscriber = publisher_and_subscriber("a/B", compression=compression)
     publisher.publish("/t", {"a": 1})
     assert subscriber.messages() == [{"a": 1}]
 
 
 def test_a_dropped_message_is_not_encoded(monkeypatch: pytest.MonkeyPatch) -> None:
-    publisher, subscriber = _publisher_and_subscriber(ARRAY, compression="cbor", throttle_rate=1000)
+    publisher, subscriber = publisher_and_subscriber(ARRAY, compression="cbor", throttle_rate=1000)
     publisher.publish("/t", {"data": [1.5]})
     monkeypatch.setattr(topics.Message, "payload", None)
     publisher.publish("/t", {"data": [2.5]})
@@ -293,7 +283,7 @@ def test_a_dropped_message_is_not_encoded(monkeypatch: pytest.MonkeyPatch) -> No
 @pytest.mark.parametrize("size", [1000, 10_000])  # searched at once, or from quote to quote
 def test_large_messages_are_cut_out_only_where_that_is_sure(raw: bytes, cut: bool, size: int) -> None:
     raw %= b"x" * size
-    publisher, subscriber = _publisher_and_subscriber("a/B")
+    publisher, subscriber = publisher_and_subscriber("a/B")
     publisher.send_raw(raw)
     (payload,) = _raw(subscriber)
     operation = json.loads(payload, parse_constant=lambda name: pytest.fail(f"{name} on the wire"))
@@ -304,7 +294,7 @@ def test_large_messages_are_cut_out_only_where_that_is_sure(raw: bytes, cut: boo
 
 
 def test_a_message_of_many_quotes_is_rewritten() -> None:
-    publisher, subscriber = _publisher_and_subscriber("a/B")
+    publisher, subscriber = publisher_and_subscriber("a/B")
     publisher.publish("/t", {"data": ["word"] * 1000})
     assert subscriber.messages() == [{"data": ["word"] * 1000}]
 
@@ -375,7 +365,7 @@ def test_a_failure_on_rosout_is_not_reported_there(
     ],
 )
 def test_depth_is_the_length_of_the_queue(wish: dict[str, Any], length: int) -> None:
-    publisher, slow = _publisher_and_subscriber(
+    publisher, slow = publisher_and_subscriber(
         "a/B", limits={"queue_length": 20, "longest_queue": 40}, **wish
     )
     for index in range(100):

@@ -121,16 +121,3 @@ def test_each_topic_has_its_envelope_and_one_alone() -> None:
     for spaces in range(20):
         hub.say(b'{%b"op":"publish","topic":"/t","msg":{}}' % (b" " * spaces))
     assert len(hub.publisher.envelopes) == 2
-
-
-def test_a_latched_message_with_a_known_envelope() -> None:
-    hub = Hub(knowing=True)
-    hub.ask(hub.publisher, op="advertise", topic="/t", type="p/T", latch=True, id="latching")
-    hub.say(PUBLISH + b'{"n":1}}')
-    late = hub.broker.connect("c")
-    late.outbox.wire = []
-    hub.ask(late, op="subscribe", topic="t", compression="none")
-    hub.ask(late, op="subscribe", topic="t", compression="cbor", id="as CBOR")
-    hub.say(PUBLISH + b'{"n":2}}')
-    assert orjson.loads(late.outbox.wire[0]) == {"op": "publish", "topic": "t", "msg": {"n": 1}}
-    assert late.outbox.wire[-1][:1] == b"\xa3"
