@@ -114,34 +114,20 @@ def _listen(path: str) -> socket.socket:
     Raises:
         OSError: Another process listens there, or the system refuses.
     """
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+        probe.setblocking(False)  # a full backlog is a process that listens
+        if probe.connect_ex(path) == errno.ECONNREFUSED:
+            os.unlink(path)  # noqa: PTH108 - see above
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
         # Linux gives the socket's file the mode of the socket: at no time can another user connect
         os.fchmod(listener.fileno(), 0o600)
-        try:
-            listener.bind(path)
-        except OSError as error:
-            if error.errno != errno.EADDRINUSE or _is_served(path):
-                raise
-            os.unlink(path)  # noqa: PTH108 - see above
-            listener.bind(path)
+        listener.bind(path)
         listener.listen()
     except OSError:
         listener.close()
         raise
     return listener
-
-
-def _is_served(path: str) -> bool:
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
-        probe.setblocking(False)
-        try:
-            probe.connect(path)
-        except ConnectionRefusedError:
-            return False
-        except BlockingIOError:
-            pass  # its backlog is full
-        return True
 
 
 @contextlib.contextmanager

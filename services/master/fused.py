@@ -6,9 +6,9 @@ Their records are passed by calls instead of over local sockets. Boards remain p
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import threading
 from collections.abc import Callable, Coroutine
+from concurrent.futures import Future
 from types import TracebackType
 from typing import Any, Self, TypeVar, cast
 
@@ -32,7 +32,7 @@ Result = TypeVar("Result")
 TakeRecord = Callable[[AnyRecord], None]
 
 
-class FusedLink:
+class FusedLink(Link):
     """A service's link to the master of its own process."""
 
     def __init__(self, to_master: TakeRecord) -> None:
@@ -68,10 +68,6 @@ class FusedLink:
     def keep(self, record: Record) -> None:
         """Pass a record to the master; there are no later ones."""
         self.send(record)
-
-    def notice(self, level: str, sentence: str) -> None:
-        """Send a message for the user that does not end the run."""
-        self.send(Notice(level, sentence))
 
     def serve(self, deployment: Deployment) -> None:
         """Do nothing: there are no later masters to greet."""
@@ -217,29 +213,17 @@ class FusedBoards:
 
 async def _in_thread(work: Callable[[], Result]) -> Result:
     """Do slow work in a thread, which does not delay the end of the run."""
-    loop = asyncio.get_running_loop()
-    future: asyncio.Future[Result] = loop.create_future()
-
-    def finish(result: Result | None, error: BaseException | None) -> None:
-        if future.done():
-            return
-        if error is not None:
-            future.set_exception(error)
-        else:
-            future.set_result(cast("Result", result))
+    done: Future[Result] = Future()
+    done.set_running_or_notify_cancel()  # from now on a cancelled waiter does not cancel it
 
     def run() -> None:
-        result: Result | None = None
-        failure: BaseException | None = None
         try:
-            result = work()
+            done.set_result(work())
         except BaseException as error:
-            failure = error
-        with contextlib.suppress(RuntimeError):  # the run has ended, and its loop is closed
-            loop.call_soon_threadsafe(finish, result, failure)
+            done.set_exception(error)
 
     threading.Thread(target=run, daemon=True).start()
-    return await future
+    return await asyncio.wrap_future(done)
 
 
 def fused_services(

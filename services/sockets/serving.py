@@ -41,6 +41,7 @@ class Link(Protocol):
 
     def notice(self, level: str, sentence: str) -> None:
         """Send a message for the user that does not end the run."""
+        self.send(Notice(level, sentence))
 
     def serve(self, deployment: Deployment) -> None:
         """Greet later masters with another deployment from now on."""
@@ -58,7 +59,7 @@ MakeLink = Callable[[Callable[[AnyRecord], None]], Link]
 """Makes a service's link, given a function that takes the master's records, its greeting first."""
 
 
-class MasterLink:
+class MasterLink(Link):
     """Listens for a master, greets it, and passes its records on.
 
     A second master is refused; when a master goes, the next may come. A service ends by an error when its folder has
@@ -171,10 +172,6 @@ class MasterLink:
         """Send a record now and to every later master: a state that lasts, such as readiness."""
         self._last[type(record)] = record
         self.send(record)
-
-    def notice(self, level: str, sentence: str) -> None:
-        """Send a message for the user that does not end the run."""
-        self.send(Notice(level, sentence))
 
     def serve(self, deployment: Deployment) -> None:
         """Greet later masters with another deployment from now on."""

@@ -148,13 +148,11 @@ class _Answerer:
         self._samples: deque[tuple[float, int]] = deque(maxlen=_SAMPLES)
 
     def sample(self) -> None:
-        """Note how many frames there were."""
         frames = self._get_status().frames
         if frames is not None:
             self._samples.append((time.monotonic(), frames.completed))
 
     def answer(self) -> bytes:
-        """Return the JSON object."""
         status = self._get_status()
         frames = status.frames
         if frames is not None and self._samples:

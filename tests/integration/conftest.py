@@ -5,6 +5,7 @@ Robot (websockets + json) <--> hub (a process) <--> master and its children (pro
 
 import asyncio
 import contextlib
+import fcntl
 import json
 import os
 import re
@@ -27,6 +28,7 @@ MARK = "ROSBAYES_TEST_RUN"
 PATIENCE = 180.0
 """Seconds for what happens within one where nothing else runs."""
 PID_MAX = int(Path("/proc/sys/kernel/pid_max").read_text())
+LOOP = ("master", "--loop", "--connect-timeout", "30")
 READING = {"D1": 71, "D2": 50, "D3": 50, "B1": 45, "B2": 0, "B3": 90}
 """What a boat in the middle of the map sees."""
 
@@ -38,7 +40,7 @@ class Running:
         self, where: Path, run: str, *command: str, environment: dict[str, str] | None = None
     ) -> None:
         self.name = command[0]
-        self._out, self._err = where / f"{self.name}-{uuid.uuid4().hex[:6]}.out", where / f"{self.name}.err"
+        self._out = where / f"{self.name}-{uuid.uuid4().hex[:6]}.out"
         self._err = self._out.with_suffix(".err")
         with self._out.open("wb") as out, self._err.open("wb") as err:
             self.process = subprocess.Popen(
@@ -138,14 +140,22 @@ class Stage:
         # process numbers begin again from below now and then
         return sorted(found.values(), key=lambda each: (each.pid - first.pid) % PID_MAX)
 
-    async def loop(self, boat: Path, *options: str, robot: type["Robot"] | None = None, rate: float = 20):
+    async def loop(
+        self,
+        boat: Path,
+        *options: str,
+        robot: Callable[[str], "Robot"] | None = None,
+        rate: float = 20,
+        reading: dict = READING,
+        environment: dict[str, str] | None = None,
+    ):
         """Start a hub, a robot that publishes and a master in --loop, and wait for the first results."""
         hub, uri = await self.hub()
         publishing = (robot or Robot)(uri)
         await publishing.connect()
-        await publishing.keep_publishing(rate=rate, **READING)
-        command = ("master", "--loop", "--connect-timeout", "30", "-d", str(boat), "--uri", uri, *options)
-        master = self.start(*command, environment={"BM_RUN_DIRECTORY": str(self.runs)})
+        await publishing.keep_publishing(rate=rate, **reading)
+        command = (*LOOP, "-d", str(boat), "--uri", uri, *options)
+        master = self.start(*command, environment={"BM_RUN_DIRECTORY": str(self.runs)} | (environment or {}))
         await publishing.have(3)
         return hub, publishing, master
 
@@ -160,6 +170,13 @@ class Stage:
                 return found
             assert time.monotonic() < deadline, f"{name}: {found}"
             await asyncio.sleep(0.05)
+
+    def start_boards(self) -> tuple[Path, str]:
+        """Start four boards; return the folder of their sockets, and their endpoints."""
+        sockets = self.where / "s"
+        sockets.mkdir(mode=0o700)
+        self.start("board", "--boards", "4", "--directory", str(sockets))
+        return sockets, endpoints_in(sockets)
 
     async def restarted(self, role: str, times: int = 1) -> None:
         """Wait until the master has restarted a service so many times."""
@@ -304,6 +321,18 @@ def stamp_of(message: dict) -> int:
     return seconds * 10**9 + rest
 
 
+def endpoints_in(folder: Path) -> str:
+    """Four boards' endpoints, as --boards takes them."""
+    return ",".join(f"unix:{folder}/board{at}.sock" for at in range(4))
+
+
+def only_error(running: Running) -> str:
+    """The last line of standard error, which has the only error."""
+    assert "Traceback" not in running.err
+    assert running.err.count("error: ") == 1, running.err
+    return running.err.splitlines()[-1]
+
+
 async def until_subscribed(uri: str, topic: str) -> None:
     """Wait until somebody hears a topic at a hub."""
     async with asyncio.timeout(PATIENCE), websockets.connect(uri, open_timeout=None) as asking:
@@ -332,28 +361,53 @@ def stage(tmp_path_factory):
     made.end_all()
 
 
+def toolchain(*arguments: str | Path) -> None:
+    subprocess.run([BIN / "toolchain", *arguments], check=True, capture_output=True, timeout=240)
+
+
 def build(model: Path, directory: Path, *options: str) -> Path:
-    """A deployment for four boards, built by the command as a user builds it."""
-    subprocess.run(
-        [
-            *(str(BIN / "toolchain"), "build", str(model), "-o", str(directory), "--partitions", "4"),
-            *("--uri", "ws://127.0.0.1:9090", "--topic", "/boat/sensors", "--type", "boat_msgs/Sensors"),
-            *options,
-        ],
-        check=True,
-        capture_output=True,
-        timeout=240,
-    )
+    """A deployment, built by the command as a user builds it."""
+    topic = ("--uri", "ws://127.0.0.1:9090", "--topic", "/boat/sensors", "--type", "boat_msgs/Sensors")
+    toolchain("build", model, "-o", directory, *topic, *options)
     return directory
 
 
 def build_boat(directory: Path, *options: str, cells: int = 8) -> Path:
-    """The boat on a square map of few cells."""
+    """The boat on a square map of few cells, for four boards."""
     size = ("--set", f"width={cells}", "--set", f"height={cells}")
-    return build(ROOT / "casestudies/boat", directory, *size, *options)
+    return build(ROOT / "casestudies/boat", directory, "--partitions", "4", *size, *options)
+
+
+def made_once(tmp_path_factory, name: str, make: Callable[[Path], object]) -> Path:
+    """A folder that the first of all workers makes; nobody changes it."""
+    shared = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        shared = shared.parent
+    done = shared / f"{name}.done"
+    with (shared / f"{name}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not done.exists():
+            make(shared / name)
+            done.touch()
+    return shared / name
+
+
+def the_boat(tmp_path_factory) -> Path:
+    return made_once(tmp_path_factory, "boat-8x8", build_boat)
 
 
 @pytest.fixture(scope="session")
 def boat(tmp_path_factory):
     """The boat on 8 x 8 cells, four boards."""
-    return build_boat(tmp_path_factory.mktemp("boat") / "deployment")
+    return the_boat(tmp_path_factory)
+
+
+@pytest.fixture(scope="session")
+def other_boat(tmp_path_factory):
+    """The boat with other tables, another target, and the first two readings in each other's column."""
+
+    def make(folder: Path) -> None:
+        build_boat(folder, "--scale", "column", "--target-count", "100")
+        toolchain("regenerate", "deployment", folder, "--order", "D2,D1,D3,B1,B2,B3")
+
+    return made_once(tmp_path_factory, "other-boat", make)

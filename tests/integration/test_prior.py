@@ -3,13 +3,12 @@
 message ──▶ subscriber ──▶ master ──▶ pcie-app ──▶ PRIOR_SELECT or PRIOR_CODES of two boards ──▶ posterior on the wire
 """
 
-import subprocess
 import textwrap
 
 import numpy as np
 import pytest
 
-from tests.integration.conftest import BIN, Robot
+from tests.integration.conftest import Robot, build
 
 PRIORS = np.array([[0.7, 0.1, 0.1, 0.1], [0.1, 0.1, 0.1, 0.7]])
 HEARD = np.array([[0.9, 0.4, 0.4, 0.1], [0.1, 0.6, 0.6, 0.9]])
@@ -39,17 +38,7 @@ def built(folder, *, select, options=()):
                 )
             """)
     )
-    subprocess.run(
-        [
-            *(BIN / "toolchain", "build", folder, "-o", folder / "built", "--partitions", "2", *FINE),
-            *("--uri", "ws://127.0.0.1:9090", "--topic", "/boat/sensors", "--type", "boat_msgs/Sensors"),
-            *options,
-        ],
-        check=True,
-        capture_output=True,
-        timeout=240,
-    )
-    return folder / "built"
+    return build(folder, folder / "built", "--partitions", "2", *FINE, *options)
 
 
 async def posteriors(stage, deployment, messages, *flags):
@@ -62,11 +51,9 @@ async def posteriors(stage, deployment, messages, *flags):
         await robot.keep_publishing(**messages[0])
         await robot.have(1)
         await robot.stop_publishing()
-        found = []
-        for message in messages:
-            _, result = await robot.answer(await robot.publish(**message))
-            found.append(result["data"])
-        return found, master
+        return [
+            (await robot.answer(await robot.publish(**message)))[1]["data"] for message in messages
+        ], master
 
 
 @pytest.mark.parametrize("flags", [(), ("--fused",)])
@@ -88,12 +75,6 @@ async def test_a_prior_is_written_with_every_frame(stage, tmp_path):
     for message, posterior in zip(messages, found, strict=True):
         assert posterior == pytest.approx(exact(message["belief"], message["heard"]), abs=0.02)
     assert "unusable" not in master.err
-
-
-async def test_a_belief_of_the_wrong_length_ends_a_run_of_one_frame(stage, tmp_path):
-    deployment = built(
-        tmp_path / "rooms", select=False, options=("--prior-mode", "written", "--prior-path", "belief")
-    )
     _, uri = await stage.hub()
     async with Robot(uri) as robot:
         await robot.keep_publishing(heard=1, belief=[1, 2, 3])

@@ -5,10 +5,8 @@ robot ──▶ hub ──▶ master, subscriber, publisher, pcie-app, boards   
 """
 
 import asyncio
-import json
 import shutil
 import signal
-import subprocess
 import time
 from collections import Counter
 from functools import cache
@@ -19,36 +17,22 @@ import pytest
 from pcie_shim.programming_file import read_image
 from services.sockets.records import LossReason
 from tests.integration.conftest import (
-    BIN,
+    LOOP,
     PATIENCE,
     READING,
     ROOT,
     Robot,
     build,
     build_boat,
+    endpoints_in,
+    only_error,
     stamp_of,
     status_of,
+    toolchain,
 )
 from toolchain.analysis.accuracy.emulation import EmulatedBoards
 from toolchain.deployment import load_deployment
 from toolchain.deployment.address import to_address
-
-LOOP = ("master", "--loop", "--connect-timeout", "30")
-
-
-@pytest.fixture(scope="session")
-def other_boat(tmp_path_factory):
-    """The boat with other tables, another target, and the first two readings in each other's column."""
-    made = build_boat(
-        tmp_path_factory.mktemp("other") / "deployment", "--scale", "column", "--target-count", "100"
-    )
-    regenerate("deployment", made, "--order", "D2,D1,D3,B1,B2,B3")
-    return made
-
-
-def regenerate(part, directory, *options):
-    command = [BIN / "toolchain", "regenerate", part, directory, *options]
-    subprocess.run(command, check=True, capture_output=True, timeout=240)
 
 
 @cache
@@ -82,15 +66,9 @@ class Witness(Robot):
     async def publish(self, **values):
         at = len(self.sent)
         values |= {"D1": 68 + at % 5, "D2": 48 + at % 3}
-        stamp = time.time_ns()
-        self.sent[stamp] = values
-        header = {
-            "stamp": dict(zip(("sec", "nanosec"), divmod(stamp, 10**9), strict=True)),
-            "frame_id": "map",
-        }
-        message = {"op": "publish", "topic": "/boat/sensors", "msg": {"header": header, **values}}
-        await self._socket.send(json.dumps(message))
-        return stamp
+        stamp_ns = await super().publish(**values)
+        self.sent[stamp_ns] = values
+        return stamp_ns
 
     def generations(self):
         """How many results there were of each generation; each must be that one's, to the bit."""
@@ -113,20 +91,24 @@ class Witness(Robot):
         return found
 
 
-async def looping(stage, boat, *options, witness=None, rate=40):
+async def looping(stage, boat, *options, witness, rate=40):
     """A hub, a witness that publishes, a master in --loop, and its first results."""
-    hub, robot, master = await stage.loop(
-        boat, *options, robot=lambda uri: Witness(uri, *(witness or (boat,))), rate=rate
-    )
-    return hub, robot, master, stage.runs
+    return await stage.loop(boat, *options, robot=lambda uri: Witness(uri, *witness), rate=rate)
 
 
-def reload_(stage, runs, *options):
-    return stage.start("master", "reload", "--directory", str(runs), *options)
+async def reload_(stage, *options, code=0, runs=None):
+    """Reload, and wait for the command's end."""
+    reloading = start_reload(stage, *options, runs=runs)
+    assert await reloading.end() == code, reloading.err
+    return reloading
 
 
-async def until(true, timeout=PATIENCE):
-    deadline = time.monotonic() + timeout
+def start_reload(stage, *options, runs=None):
+    return stage.start("master", "reload", "--directory", str(runs or stage.runs), *options)
+
+
+async def until(true):
+    deadline = time.monotonic() + PATIENCE
     while not await true():
         assert time.monotonic() < deadline
         await asyncio.sleep(0.02)
@@ -143,11 +125,11 @@ def pids(stage):
 )
 async def test_every_frame_is_of_one_deployment(stage, boat, other_boat, options, victim):
     folders = boat, other_boat, boat, other_boat, boat
-    _, robot, master, runs = await looping(stage, boat, *options, witness=folders, rate=80)
+    _, robot, master = await looping(stage, boat, *options, witness=folders, rate=80)
+    runs = stage.runs
     before = pids(stage)
     for generation in (1, 2, 3):
-        reloading = reload_(stage, runs, "-d", str(folders[generation]))
-        assert await reloading.end() == 0, reloading.err + master.err
+        reloading = await reload_(stage, "-d", str(folders[generation]))
         assert str(folders[generation]) in reloading.out
         await robot.have(len(robot.results) + 10)
     assert sorted(robot.generations()) == [0, 1, 2, 3]
@@ -170,22 +152,22 @@ async def test_every_frame_is_of_one_deployment(stage, boat, other_boat, options
 
     await until(all_accounted_for)
     # no frame may wait for the board that stops now
-    await a_death_while_boards_are_programmed(stage, robot, master, runs, boat, victim)
+    await a_death_while_boards_are_programmed(stage, robot, boat, victim)
     assert sorted(robot.generations()) == [0, 1, 2, 3, 4]
     master.send(signal.SIGKILL)
     await stage.nothing_left("hub")
 
 
-async def a_death_while_boards_are_programmed(stage, robot, master, runs, folder, victim):
+async def a_death_while_boards_are_programmed(stage, robot, folder, victim):
     """The reload fails, the run goes on with what it had, and the next reload is well."""
-    boards = stage.boards()
+    boards, runs = stage.boards(), stage.runs
     images = [board.image_hash for board in load_deployment(folder, images=False).boards]
     generation = (await status_of(runs, "master"))["generation"]
     endpoint = (await status_of(runs, "pcie-app"))["boards"][2]["endpoint"]
     programmed_at = endpoint.removeprefix("unix:").replace(".sock", ".program.sock")
     dies = boards[2] if victim == "board" else stage.processes()["pcie-app"][0]
     boards[2].suspend()
-    reloading = reload_(stage, runs, "-d", str(folder))
+    reloading = start_reload(stage, "-d", str(folder))
 
     async def half_way():
         # board 1 has its new image, and somebody waits for board 2 to take its own
@@ -205,8 +187,7 @@ async def a_death_while_boards_are_programmed(stage, robot, master, runs, folder
     assert max(robot.generations()) == generation
     # the old images are back when the command has answered, or when pcie-app is: no frame fails for that
     assert LossReason.FAILED not in (await status_of(runs, "master"))["frames"]["lost"]
-    again = reload_(stage, runs, "-d", str(folder))
-    assert await again.end() == 0, again.err
+    await reload_(stage, "-d", str(folder))
     await robot.have(len(robot.results) + 5)
 
 
@@ -215,7 +196,7 @@ def unfit(boat, where):
     larger = build_boat(where / "larger", cells=12)
     elsewhere, damaged = where / "elsewhere", where / "damaged"
     shutil.copytree(boat, elsewhere)
-    regenerate("deployment", elsewhere, "--topic", "/other/topic", "--output", "/other/results")
+    toolchain("regenerate", "deployment", elsewhere, "--topic", "/other/topic", "--output", "/other/results")
     shutil.copytree(boat, damaged)
     image = damaged / "boards/board2.bm"
     data = bytearray(image.read_bytes())
@@ -226,7 +207,7 @@ def unfit(boat, where):
 
 async def test_what_is_refused_changes_nothing(stage, boat, other_boat, tmp_path):
     # nothing to do with each other, and two processors have time for both
-    (hub, robot, master, runs), (larger, elsewhere, damaged) = await asyncio.gather(
+    (hub, robot, master), (larger, elsewhere, damaged) = await asyncio.gather(
         looping(stage, boat, witness=(boat, other_boat, boat)), asyncio.to_thread(unfit, boat, tmp_path)
     )
     for folder, *named in (
@@ -235,23 +216,20 @@ async def test_what_is_refused_changes_nothing(stage, boat, other_boat, tmp_path
         (damaged, f"{damaged}/boards/board2.bm"),
         (tmp_path, str(tmp_path)),
     ):
-        reloading = reload_(stage, runs, "-d", str(folder))
-        assert await reloading.end() == 2, reloading.err
+        reloading = await reload_(stage, "-d", str(folder), code=2)
         assert reloading.err.count("\n") == 1
         assert [each for each in named if each not in reloading.err] == []
         assert await stage.status("master", lambda status: status["generation"] == 0)
     await robot.have(len(robot.results) + 5)
     assert set(robot.generations()) == {0}
-    reloading = reload_(stage, runs, "-d", str(other_boat))
-    assert await reloading.end() == 0, reloading.err
+    await reload_(stage, "-d", str(other_boat))
     await robot.have(len(robot.results) + 5)
     assert set(robot.generations()) == {0, 1}
     # rosbridge may be away
     hub.send(signal.SIGKILL)
     await hub.end()
     await stage.status("publisher", lambda status: not status["ready"])
-    reloading = reload_(stage, runs, "-d", str(boat))
-    assert await reloading.end() == 0, reloading.err
+    await reload_(stage, "-d", str(boat))
     before = len(robot.results)
     await stage.hub(int(robot.uri.rsplit(":", 1)[1]))
     await robot.have(before + 5)
@@ -266,20 +244,19 @@ async def test_a_corrected_table_in_the_same_folder(stage, boat, tmp_path):
     model = tmp_path / "boat"
     shutil.copytree(ROOT / "casestudies/boat", model)
     size = ("--set", "width=8", "--set", "height=8")
-    build(model, folder, *size)
+    build(model, folder, "--partitions", "4", *size)
     shutil.copytree(folder, before)
-    _, robot, master, runs = await looping(stage, folder, witness=(before, folder))
+    _, robot, master = await looping(stage, folder, witness=(before, folder))
     source = model / "model.py"
     source.write_text(source.read_text().replace("sigma=BEARING_SIGMA", "sigma=2 * BEARING_SIGMA"))
-    await asyncio.to_thread(regenerate, "memories", folder, "--model", str(model), *size)
+    await asyncio.to_thread(toolchain, "regenerate", "memories", folder, "--model", str(model), *size)
     assert load_deployment(folder).hash != load_deployment(before).hash
     # a service that dies now still finds the deployment that is in force
     stage.processes()["subscriber"][0].kill()
     await stage.restarted("subscriber")
     await robot.have(len(robot.results) + 5)
     robot._deployments[1] = load_deployment(folder)
-    reloading = reload_(stage, runs)
-    assert await reloading.end() == 0, reloading.err
+    await reload_(stage)
     await robot.have(len(robot.results) + 5)
     # and after it, the new one
     for victim in ("pcie-app", "subscriber"):
@@ -297,12 +274,9 @@ async def test_a_corrected_table_in_the_same_folder(stage, boat, tmp_path):
     await stage.nothing_left("hub")
 
 
-async def test_services_that_the_master_did_not_start(stage, boat, other_boat):
+async def test_services_that_the_master_did_not_start_are_used_and_left_running(stage, boat, other_boat):
     _, uri = await stage.hub()
-    sockets = stage.where / "s"
-    sockets.mkdir(mode=0o700)
-    boards = ",".join(f"unix:{sockets}/board{at}.sock" for at in range(4))
-    stage.start("board", "--boards", "4", "--directory", str(sockets))
+    sockets, boards = stage.start_boards()
     stage.start("pcie-app", "-d", str(boat), "--boards", boards, "--listen", f"unix:{sockets}/pcie-app.sock")
     for role in ("subscriber", "publisher"):
         stage.start(role, "-d", str(boat), "--uri", uri, "--listen", f"unix:{sockets}/{role}.sock")
@@ -313,8 +287,7 @@ async def test_services_that_the_master_did_not_start(stage, boat, other_boat):
     started = (*LOOP, "--connect", str(sockets))
     master = stage.start(*started, "-d", str(boat), environment=environment)
     await robot.have(3)
-    reloading = reload_(stage, sockets, "-d", str(other_boat))
-    assert await reloading.end() == 0, reloading.err
+    await reload_(stage, "-d", str(other_boat), runs=sockets)
     await robot.have(len(robot.results) + 5)
     assert set(robot.generations()) == {0, 1}
     master.send(signal.SIGTERM)
@@ -324,6 +297,10 @@ async def test_services_that_the_master_did_not_start(stage, boat, other_boat):
     assert await refused.end() == 2
     last = stage.start(*started, "-d", str(other_boat), "--count", "2")
     assert await last.end() == 0, last.err
+    await stage.nothing_left("hub", "board", "pcie-app", "subscriber", "publisher")
+    refused = stage.start(*started, "--fused", "-d", str(other_boat))
+    assert await refused.end() == 2
+    assert "--fused" in only_error(refused)
 
 
 async def test_there_must_be_a_run(stage, boat, tmp_path):
@@ -334,8 +311,7 @@ async def test_there_must_be_a_run(stage, boat, tmp_path):
     assert await reloading.end() == 2
     _, uri = await stage.hub()
     # boards that are not there are waited for, and the run has not begun
-    boards = ",".join(f"unix:{tmp_path}/board{at}.sock" for at in range(4))
-    options = ("--boards", boards, "--peer-timeout", "60")
+    options = ("--boards", endpoints_in(tmp_path), "--peer-timeout", "60")
     master = stage.start("master", "--loop", "-d", str(boat), "--uri", uri, *options, environment=environment)
     control = orders / "master.control.sock"
 

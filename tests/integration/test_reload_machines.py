@@ -12,26 +12,11 @@ import numpy as np
 import pytest
 import websockets
 
-from machines.posterior import joint_posterior
 from posteriors.posterior import read_posterior
 from tests.integration import test_prior, test_replicas
-from tests.integration.conftest import PATIENCE, READING, Robot, status_of
-from tests.integration.test_reload import LOOP, looping, other_boat, regenerate, reload_, until
+from tests.integration.conftest import LOOP, PATIENCE, READING, status_of, toolchain
+from tests.integration.test_reload import looping, reload_, start_reload, until
 from toolchain.deployment import load_deployment
-
-__all__ = ["other_boat"]  # a fixture
-
-
-async def run_of(stage, deployment, message):
-    """A hub, a robot that publishes a message, a master, and its first results."""
-    _, uri = await stage.hub()
-    robot = Robot(uri)
-    await robot.connect()
-    await robot.keep_publishing(rate=40, **message)
-    environment = {"BM_RUN_DIRECTORY": str(stage.where)}
-    master = stage.start(*LOOP, "-d", str(deployment), "--uri", uri, environment=environment)
-    await robot.have(3)
-    return robot, master
 
 
 def by_generation(robot):
@@ -51,10 +36,9 @@ async def test_a_written_prior(stage, tmp_path, monkeypatch):
     monkeypatch.undo()
     heard[0] = test_prior.HEARD[1]
     belief = np.array([4, 2, 1, 1])
-    robot, master = await run_of(stage, before, {"heard": 1, "belief": belief.tolist()})
+    _, robot, _ = await stage.loop(before, rate=40, reading={"heard": 1, "belief": belief.tolist()})
     async with robot:
-        reloading = reload_(stage, stage.where, "-d", str(after))
-        assert await reloading.end() == 0, reloading.err + master.err
+        await reload_(stage, "-d", str(after))
         await have_of(robot, 1)
         found = list(by_generation(robot))
     assert {generation for generation, _, _ in found} == {0, 1}
@@ -80,23 +64,17 @@ async def test_replicas_of_cells(stage, tmp_path):
     ]
     text = (tmp_path / "after" / "model.py").read_text()
     (tmp_path / "after" / "model.py").write_text(text.replace("default_rng(3)", "default_rng(4)"))
-    regenerate("memories", folders[1], "--model", str(tmp_path / "after"))
+    toolchain("regenerate", "memories", folders[1], "--model", str(tmp_path / "after"))
     deployments = [load_deployment(folder) for folder in folders]
     message = test_replicas.message_of(deployments[0], 2)
-    robot, master = await run_of(stage, folders[0], message)
+    _, robot, _ = await stage.loop(folders[0], rate=40, reading=message)
     async with robot:
-        reloading = reload_(stage, stage.where, "-d", str(folders[1]))
-        assert await reloading.end() == 0, reloading.err + master.err
+        await reload_(stage, "-d", str(folders[1]))
         await have_of(robot, 1)
         found = list(by_generation(robot))
     assert {generation for generation, _, _ in found} == {0, 1}
     for generation, number, result in (*found[:2], *found[-2:]):
-        exact = [
-            joint_posterior(
-                [np.array(board[0], np.uint32) for board in of_replica], [board[1] for board in of_replica]
-            )
-            for of_replica in test_replicas.wanted(deployments[generation], message, number)
-        ]
+        exact = test_replicas.exact_posteriors(test_replicas.wanted(deployments[generation], message, number))
         posterior = read_posterior(result, 0)
         assert posterior.probabilities == tuple(np.concatenate(exact).tolist())
         assert posterior.replicas == 3
@@ -108,15 +86,13 @@ async def test_several_outputs(stage, boat, other_boat, tmp_path):
         shutil.copytree(made, folder)
         with (folder / "deployment.toml").open("a") as file:
             file.write('\n[[output]]\ntopic = "/second"\n')
-        regenerate("deployment", folder)
-    _, robot, master, runs = await looping(stage, folders[0], witness=folders)
+        toolchain("regenerate", "deployment", folder)
+    _, robot, _ = await looping(stage, folders[0], witness=folders)
     second = []
     async with websockets.connect(robot.uri, open_timeout=PATIENCE) as listener:
         await listener.send(json.dumps({"op": "subscribe", "topic": "/second"}))
-        reloading = reload_(stage, runs, "-d", str(folders[1]))
-        assert await reloading.end() == 0, reloading.err + master.err
-        refused = reload_(stage, runs, "-d", str(boat))
-        assert await refused.end() == 2
+        await reload_(stage, "-d", str(folders[1]))
+        refused = await reload_(stage, "-d", str(boat), code=2)
         assert "[[output]]" in refused.err
         await have_of(robot, 1)
         await robot.stop_publishing()
@@ -127,51 +103,56 @@ async def test_several_outputs(stage, boat, other_boat, tmp_path):
 
 async def test_boards_over_tcp(stage, boat, other_boat):
     ports = [stage.place() for _ in range(4)]  # each with the next one, for programming
-    boards = []
-    for at, port in enumerate(ports):
-        boards.append(stage.start("board", "--listen", f"tcp://127.0.0.1:{port}", "--index", str(at)))
+    boards = [
+        stage.start("board", "--listen", f"tcp://127.0.0.1:{port}", "--index", str(at))
+        for at, port in enumerate(ports)
+    ]
     for board in boards:
         await board.says("listens")
     endpoints = ",".join(f"tcp://127.0.0.1:{port}" for port in ports)
     folders = boat, other_boat, boat
-    _, robot, master, runs = await looping(stage, boat, "--boards", endpoints, witness=folders)
+    _, robot, master = await looping(stage, boat, "--boards", endpoints, witness=folders)
     for generation in (1, 2):
-        reloading = reload_(stage, runs, "-d", str(folders[generation]))
-        assert await reloading.end() == 0, reloading.err + master.err
+        await reload_(stage, "-d", str(folders[generation]))
         await have_of(robot, generation)
     assert sorted(robot.generations()) == [0, 1, 2]
     master.send(signal.SIGINT)
     assert await master.end() == 130
     # they hold the last image, which a master of another deployment takes for somebody else's
-    refused = stage.start(
-        "master", "--once", "-d", str(other_boat), "--uri", robot.uri, "--boards", endpoints
-    )
-    assert await refused.end() == 2
-    again = stage.start("master", "--once", "-d", str(boat), "--uri", robot.uri, "--boards", endpoints)
-    assert await again.end() == 0, again.err
+    loader = ("loader", str(other_boat / "boards/board1.bm"), f"tcp://127.0.0.1:{ports[1]}")
+    for command, deployment, code in (
+        (None, other_boat, 2),
+        (None, boat, 0),
+        (loader, boat, 2),
+    ):
+        if command is not None:
+            loading = stage.start(*command)
+            assert await loading.end() == 0, loading.err
+        last = stage.start(
+            "master", "--once", "-d", str(deployment), "--uri", robot.uri, "--boards", endpoints
+        )
+        assert await last.end() == code, last.err
+    assert "board 1" in last.err.lower()
 
 
 @pytest.mark.parametrize("flags", [(), ("--fused",)], ids=["processes", "fused"])
 async def test_a_master_that_is_killed_in_a_reload_leaves_nothing(stage, boat, other_boat, flags):
-    _, robot, master, runs = await looping(stage, boat, *flags, witness=(boat, other_boat))
+    _, robot, master = await looping(stage, boat, *flags, witness=(boat, other_boat))
     images = [board.image_hash for board in load_deployment(other_boat, images=False).boards]
     boards = stage.boards()
     await robot.stop_publishing()  # no frame may wait for the board that stops now
     boards[3].suspend()
-    reloading = reload_(stage, runs, "-d", str(other_boat))
+    reloading = start_reload(stage, "-d", str(other_boat))
 
     async def half_way():
-        return (await status_of(runs, "board1"))["boards"][0]["image"] == images[1]
+        return (await status_of(stage.runs, "board1"))["boards"][0]["image"] == images[1]
 
     await until(half_way)
     master.send(signal.SIGKILL)
     assert await reloading.end() == 6
     boards[3].resume()
     await stage.nothing_left("hub")
-    assert not list(runs.iterdir())
+    assert not list(stage.runs.iterdir())
     await robot.keep_publishing(rate=40, **READING)
-    environment = {"BM_RUN_DIRECTORY": str(runs)}
-    again = stage.start(
-        *LOOP, *flags, "-d", str(boat), "--uri", robot.uri, "--count", "3", environment=environment
-    )
+    again = stage.start(*LOOP, *flags, "-d", str(boat), "--uri", robot.uri, "--count", "3")
     assert await again.end() == 0, again.err

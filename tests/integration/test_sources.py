@@ -8,7 +8,6 @@ import asyncio
 import contextlib
 import json
 import signal
-import subprocess
 import time
 
 import numpy as np
@@ -19,9 +18,8 @@ from bridge.errors import BridgeError
 from bridge.stamps import header
 from posteriors.listening import posteriors
 from tests.fake_rosbridge import FakeRosbridge
-from tests.integration.conftest import BIN
+from tests.integration.conftest import PATIENCE, only_error, toolchain
 
-PATIENCE = 180
 MODEL = """
 import numpy as np
 from toolchain.models.model import Known, Model, dimension
@@ -142,8 +140,7 @@ async def deployment(stage, robots):
 
 async def build(case, directory, sources, *options):
     """Build a deployment, while the robots go on publishing."""
-    command = [BIN / "toolchain", "build", case, "-o", directory, "--sources", sources, *options]
-    await asyncio.to_thread(subprocess.run, command, check=True, capture_output=True, timeout=240)
+    await asyncio.to_thread(toolchain, "build", case, "-o", directory, "--sources", sources, *options)
 
 
 async def test_the_subscriber_alone(stage, deployment):
@@ -151,25 +148,26 @@ async def test_the_subscriber_alone(stage, deployment):
     assert await subscriber.end() == 0
     printed = [json.loads(line) for line in subscriber.out.splitlines()]
     assert [each["addresses"] for each in printed] == [ADDRESSES] * 3
-
-
-async def test_a_topic_may_come_as_cbor(stage, deployment):
-    async with FakeRosbridge() as server:
+    async with FakeRosbridge() as server:  # a topic may come as CBOR
         stage.start("subscriber", "-d", str(deployment), "--uri", server.uri)
         for topic, asked in (("/scan", "cbor"), ("/imu", None)):
             await server.wait_for_op("subscribe", topic=topic, timeout=PATIENCE)
             (operation,) = server.ops("subscribe", topic=topic)
             assert operation.get("compression") == asked
+    # and a beam that is not there
+    sources = stage.where / "sources.toml"
+    sources.write_text(sources.read_text().replace("ranges[90]", "ranges[360]"))
+    await build(stage.where / "corridor", deployment, sources)
+    subscriber = stage.start("subscriber", "-d", str(deployment))
+    assert await subscriber.end() == 4
+    assert "/scan: the message has no field 'ranges[360]'" in only_error(subscriber)
 
 
 async def test_clocks_that_disagree_are_named_and_what_is_unpaired_is_counted(stage, deployment, robots):
     robots.late_s = 5.0
     async with connect(robots.uris[0]) as ros, posteriors(ros) as heard:
         master = stage.start("master", "--loop", "--count", "3", "-d", str(deployment))
-        await master.says(
-            r"messages come on all topics but make no frame: the newest of /(scan|imu) is \S+ s older than that of "
-            r"/(range|cells) \(/cells without a header, so by receipt\), and the tolerance is 0.5 s"
-        )
+        await master.says("messages come on all topics but make no frame")
         await asyncio.sleep(1)
         robots.late_s = 0.0
         for _ in range(3):
@@ -192,11 +190,9 @@ async def test_one_server_may_go_and_come(stage, deployment, robots):
         second.send(signal.SIGKILL)
         await second.end()
         await master.says(rf"rosbridge at ws://127.0.0.1:{port} is gone")
-        while True:  # what was under way
-            with contextlib.suppress(BridgeError):
+        with contextlib.suppress(BridgeError):  # what was under way
+            while True:
                 await heard.next(1.0)
-                continue
-            break
         await stage.hub(port)
         await master.says(rf"rosbridge at ws://127.0.0.1:{port} is connected again")
         for _ in range(3):
@@ -205,16 +201,3 @@ async def test_one_server_may_go_and_come(stage, deployment, robots):
         assert await master.end() == 130
     assert "make no frame" not in master.err
     await stage.nothing_left("hub")
-
-
-async def test_a_beam_that_is_not_there(stage, deployment):
-    path = deployment / "deployment.toml"
-    assert "ranges[90]" in path.read_text()
-    sources = stage.where / "sources.toml"
-    sources.write_text(sources.read_text().replace("ranges[90]", "ranges[360]"))
-    case = stage.where / "corridor"
-    await build(case, deployment, sources)
-    subscriber = stage.start("subscriber", "-d", str(deployment))
-    assert await subscriber.end() == 4
-    said = subscriber.err.splitlines()[-1]
-    assert "/scan: the message has no field 'ranges[360]': 'ranges' has 360 elements" in said

@@ -39,7 +39,8 @@ async def ready_exit(stage, name, directory):
     return await asked.end(), asked.out.strip()
 
 
-async def test_a_stack_is_ready_while_results_flow_and_says_what_it_waits_for(stage, boat):
+async def test_the_status_of_a_stack(stage, boat):
+    """Ready, waiting for readings, with a process that does not answer, after deaths, and ended."""
     _, uri = await stage.hub()
     async with Robot(uri) as robot:
         await robot.keep_publishing()
@@ -48,104 +49,88 @@ async def test_a_stack_is_ready_while_results_flow_and_says_what_it_waits_for(st
             environment={"BM_READY_TIMEOUT": "6"},
         )
         await robot.have(3)
-        code, stack = await ask_until(stage, lambda stack: stack["ready"])
-        deadline = time.monotonic() + PATIENCE
-        assert code == 0
-        assert set(by_name(stack)) == SERVICES
-        while (answer := await ready_exit(stage, "master", stack["directory"])) != (
-            0,
-            "master: results flow",
-        ):
-            assert time.monotonic() < deadline, answer
-        assert by_name(stack)["publisher"]["connections"] == [
-            {"uri": uri, "state": "connected", "reconnections": 0}
-        ]
-        boards = by_name(stack)["pcie-app"]["boards"]
-        assert [board["index"] for board in boards] == [0, 1, 2, 3]
-        assert {board["state"] for board in boards} == {"programmed"}
-        assert len({board["image"] for board in boards}) == 4
-
-        deadline = time.monotonic() + PATIENCE
-        while (answer := await ask(stage))[0] != 0:
-            assert time.monotonic() < deadline, answer
-        screen = answer[1]
-        assert "all 8 processes are ready" in screen
-        assert boards[2]["image"][:12] in screen
-
+        await is_ready(stage, uri)
         robot._tasks.pop().cancel()
-        code, stack = await ask_until(
-            stage, lambda stack: any(why.startswith("master: no result for") for why in stack["why"])
-        )
-        assert code == 6
-        assert any(
-            re.match(r"subscriber: no complete reading .* /boat/sensors", why) for why in stack["why"]
-        ), stack["why"]
-        published = by_name(stack)["publisher"]["frames"]
-        assert published["completed"] == len(robot.results) > 3
-        assert published["last_number"] == by_name(stack)["pcie-app"]["frames"]["last_number"]
-        code, why = await ready_exit(stage, "master", stack["directory"])
-        assert code == 1
-        assert why.startswith("master: no result for")
-
+        stack = await waits_for_readings(stage, robot)
         # one frame through all processes, as grep finds it
         lines = [line for line in master.err.splitlines() if "frame=3 " in line]
         assert {line.split()[1] for line in lines} == {"master:", "subscriber:", "pcie-app:", "publisher:"}
         assert len(lines) == 4
-
+        await robot.keep_publishing()
+        await shows_the_silent_and_the_dead(stage, by_name(stack)["subscriber"]["pid"])
         master.send(signal.SIGTERM)
         assert await master.end() == 143
-        code, printed = await ask(stage)
-        assert code == 2
-        assert "no run of this user was found" in printed
+        assert (await ask(stage))[0] == 2
         await stage.nothing_left("hub")
 
 
-async def test_a_killed_board_and_a_killed_service_are_shown(stage, boat):
-    _, uri = await stage.hub()
-    async with Robot(uri) as robot:
-        await robot.keep_publishing()
-        stage.start("master", "--loop", "-d", str(boat), "--uri", uri)
-        await robot.have(2)
-        _, stack = await ask_until(stage, lambda stack: stack["ready"])
-        os.kill(by_name(stack)["board2"]["pid"], signal.SIGKILL)
-        os.kill(by_name(stack)["publisher"]["pid"], signal.SIGKILL)
+async def is_ready(stage, uri):
+    code, stack = await ask_until(stage, lambda stack: stack["ready"])
+    assert code == 0
+    assert set(by_name(stack)) == SERVICES
+    deadline = time.monotonic() + PATIENCE
+    while (answer := await ready_exit(stage, "master", stack["directory"])) != (
+        0,
+        "master: results flow",
+    ):
+        assert time.monotonic() < deadline, answer
+    assert by_name(stack)["publisher"]["connections"] == [
+        {"uri": uri, "state": "connected", "reconnections": 0}
+    ]
+    boards = by_name(stack)["pcie-app"]["boards"]
+    assert [board["index"] for board in boards] == [0, 1, 2, 3]
+    assert {board["state"] for board in boards} == {"programmed"}
+    assert len({board["image"] for board in boards}) == 4
 
-        def shown(stack):
-            processes = by_name(stack)
-            if not stack["ready"] or len(processes) < len(SERVICES):
-                return False
-            return processes["board2"]["boards"][0]["restarts"] == 1
+    deadline = time.monotonic() + PATIENCE
+    while (answer := await ask(stage))[0] != 0:
+        assert time.monotonic() < deadline, answer
+    screen = answer[1]
+    assert "all 8 processes are ready" in screen
+    assert boards[2]["image"][:12] in screen
 
-        code, stack = await ask_until(stage, shown)
-        assert code == 0
+
+async def waits_for_readings(stage, robot):
+    code, stack = await ask_until(
+        stage, lambda stack: any(why.startswith("master: no result for") for why in stack["why"])
+    )
+    assert code == 6
+    assert any(re.match(r"subscriber: no complete reading .* /boat/sensors", why) for why in stack["why"]), (
+        stack["why"]
+    )
+    published = by_name(stack)["publisher"]["frames"]
+    assert published["completed"] == len(robot.results) > 3
+    assert published["last_number"] == by_name(stack)["pcie-app"]["frames"]["last_number"]
+    code, why = await ready_exit(stage, "master", stack["directory"])
+    assert code == 1
+    assert why.startswith("master: no result for")
+
+    return stack
+
+
+async def shows_the_silent_and_the_dead(stage, subscriber):
+    os.kill(subscriber, signal.SIGSTOP)
+    try:
+        code, stack = await ask_until(
+            stage, lambda stack: [silent["name"] for silent in stack["silent"]] == ["subscriber"]
+        )
+    finally:
+        os.kill(subscriber, signal.SIGCONT)
+    assert code == 6
+
+    os.kill(by_name(stack)["board2"]["pid"], signal.SIGKILL)
+    os.kill(by_name(stack)["publisher"]["pid"], signal.SIGKILL)
+
+    def shown(stack):
         processes = by_name(stack)
-        boards = processes["pcie-app"]["boards"]
-        assert [board["restarts"] for board in boards] == [0, 0, 1, 0]
-        peers = {peer["name"]: peer["restarts"] for peer in processes["master"]["peers"]}
-        assert peers == {"subscriber": 0, "publisher": 1, "pcie-app": 0}
-        assert processes["master"]["frames"]["lost"].keys() <= {
-            "failed on a board",
-            "lost with the publisher",
-            "passed over",
-        }
+        if not stack["ready"] or len(processes) < len(SERVICES):
+            return False
+        return processes["board2"]["boards"][0]["restarts"] == 1
 
-
-async def test_a_process_that_does_not_answer_is_named(stage, boat):
-    _, uri = await stage.hub()
-    async with Robot(uri) as robot:
-        await robot.keep_publishing()
-        stage.start("master", "--loop", "-d", str(boat), "--uri", uri)
-        await robot.have(2)
-        _, stack = await ask_until(stage, lambda stack: stack["ready"])
-        stopped = by_name(stack)["subscriber"]["pid"]
-
-        def only_the_subscriber_is_silent(stack):
-            return [silent["name"] for silent in stack["silent"]] == ["subscriber"]
-
-        os.kill(stopped, signal.SIGSTOP)
-        try:
-            code, stack = await ask_until(stage, only_the_subscriber_is_silent)
-        finally:
-            os.kill(stopped, signal.SIGCONT)
-        assert code == 6
-        assert "does not answer" in stack["silent"][0]["why"]
+    code, stack = await ask_until(stage, shown)
+    assert code == 0
+    processes = by_name(stack)
+    boards = processes["pcie-app"]["boards"]
+    assert [board["restarts"] for board in boards] == [0, 0, 1, 0]
+    peers = {peer["name"]: peer["restarts"] for peer in processes["master"]["peers"]}
+    assert peers == {"subscriber": 0, "publisher": 1, "pcie-app": 0}

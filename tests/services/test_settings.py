@@ -18,11 +18,6 @@ def test_flag_over_variable_over_default(monkeypatch):
     assert load_settings(connect_timeout=4).connect_timeout == 4
 
 
-def test_boards_are_split_at_commas(monkeypatch):
-    monkeypatch.setenv("BM_BOARDS", "unix:/tmp/a.sock, tcp://10.0.0.2:7000")
-    assert load_settings().boards == ("unix:/tmp/a.sock", "tcp://10.0.0.2:7000")
-
-
 @pytest.mark.parametrize(
     ("name", "value", "expected"),
     [
@@ -55,10 +50,16 @@ def test_a_path_too_long_for_a_socket_is_refused(tmp_path):
         endpoint_in(tmp_path / ("x" * 120), "board0")
 
 
-@pytest.mark.parametrize("name", ["deployment", "run_directory", "control_directory"])
-def test_an_empty_variable_does_not_name_a_folder(name, monkeypatch):
-    monkeypatch.setenv(f"BM_{name.upper()}", "")
-    assert getattr(load_settings(), name) is None
+@pytest.mark.parametrize(
+    ("name", "text", "value"),
+    [
+        *((name, "", None) for name in ("deployment", "run_directory", "control_directory")),
+        ("boards", "unix:/tmp/a.sock, tcp://10.0.0.2:7000", ("unix:/tmp/a.sock", "tcp://10.0.0.2:7000")),
+    ],
+)
+def test_a_variable_may_be_empty_or_a_list(name, text, value, monkeypatch):
+    monkeypatch.setenv(f"BM_{name.upper()}", text)
+    assert getattr(load_settings(), name) == value
 
 
 def test_a_command_refuses_an_unknown_variable_in_one_sentence_with_the_nearest():

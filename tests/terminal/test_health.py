@@ -79,20 +79,16 @@ def status(*, is_ready=True, why="programmed"):
 
 def test_every_connection_gets_one_object(server, tmp_path):
     path = status_socket(tmp_path, "board0")
-    with server.serving(tmp_path, status()):
+    with socket.socket(socket.AF_UNIX) as dead:
+        dead.bind(path)  # that of a killed process is replaced
+    with server.serving(tmp_path, status()), contextlib.ExitStack() as stack:
+        for _ in range(20):  # those that do not read keep nobody from asking
+            stack.enter_context(socket.socket(socket.AF_UNIX)).connect(path)
         assert is_ready(path, PATIENCE) == (True, "programmed")
         assert json.loads(read_status(path, PATIENCE)) == status()
         assert stat.S_IMODE(Path(path).stat().st_mode) == 0o600
         assert server.samples
     assert not list(tmp_path.iterdir())
-
-
-def test_connections_that_do_not_read_keep_nobody_from_asking(server, tmp_path):
-    path = status_socket(tmp_path, "board0")
-    with server.serving(tmp_path, status()), contextlib.ExitStack() as stack:
-        for _ in range(20):
-            stack.enter_context(socket.socket(socket.AF_UNIX)).connect(path)
-        assert is_ready(path, PATIENCE)[0]
 
 
 def test_a_second_process_of_a_name_warns_and_leaves_it_to_the_first(server, tmp_path, capsys):
@@ -102,14 +98,6 @@ def test_a_second_process_of_a_name_warns_and_leaves_it_to_the_first(server, tmp
             assert is_ready(path, PATIENCE)[1] == "first"
         assert is_ready(path, PATIENCE)[1] == "first"
     assert capsys.readouterr().err.count("warning") == 1
-
-
-def test_the_socket_of_a_killed_process_is_replaced(server, tmp_path):
-    path = status_socket(tmp_path, "board0")
-    with socket.socket(socket.AF_UNIX) as dead:
-        dead.bind(path)
-    with server.serving(tmp_path, status()):
-        assert is_ready(path, PATIENCE)[0]
 
 
 def test_nothing_is_served_without_a_directory(server, tmp_path, monkeypatch):
@@ -128,7 +116,7 @@ def test_the_thread_takes_no_signals(tmp_path):
 
 @contextlib.contextmanager
 def answering(path, data):
-    """A process that answers one connection with some bytes; with None it does not answer."""
+    """A process that answers one connection with some bytes."""
     with socket.socket(socket.AF_UNIX) as listener:
         listener.bind(path)
         listener.listen()
@@ -139,11 +127,9 @@ def answering(path, data):
                 connection.sendall(data)
 
         thread = threading.Thread(target=answer)
-        if data is not None:
-            thread.start()
+        thread.start()
         yield
-        if data is not None:
-            thread.join(PATIENCE)
+        thread.join(PATIENCE)
 
 
 @pytest.mark.parametrize(
@@ -173,7 +159,9 @@ def test_silence_has_a_reason(tmp_path):
         return silent.value.reason
 
     assert reason(PATIENCE) is Silence.NO_SOCKET
-    with answering(path, None):
+    with socket.socket(socket.AF_UNIX) as stuck:
+        stuck.bind(path)
+        stuck.listen()
         assert reason(0.1) is Silence.TIMEOUT
     assert reason(PATIENCE) is Silence.NO_LISTENER
 
@@ -181,15 +169,13 @@ def test_silence_has_a_reason(tmp_path):
 # --- python -m services.ready ----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("said", "code"), [(status(), 0), (status(is_ready=False, why="no result for 12 s"), 1)]
-)
+@pytest.mark.parametrize("is_ready", [True, False])
 @pytest.mark.parametrize("flag", [["--directory", "{}"], ["--directory={}"], []])
-def test_the_exit_code_is_the_health(tmp_path, capsys, monkeypatch, said, code, flag):
+def test_the_exit_code_is_the_health(tmp_path, capsys, monkeypatch, is_ready, flag):
     monkeypatch.setenv("BM_RUN_DIRECTORY", "" if flag else str(tmp_path))
-    with Server("thread").serving(tmp_path, said, "master"):
-        assert ready.main([*(part.format(tmp_path) for part in flag), "master"]) == code
-    assert capsys.readouterr().out == f"master: {said['why']}\n"
+    with Server("thread").serving(tmp_path, status(is_ready=is_ready, why="here"), "master"):
+        assert ready.main([*(part.format(tmp_path) for part in flag), "master"]) == (not is_ready)
+    assert capsys.readouterr().out == "master: here\n"
 
 
 @pytest.mark.parametrize("arguments", [["hub"], [], ["a", "b"], ["../x"], ["--what"]])

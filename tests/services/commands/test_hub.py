@@ -10,7 +10,6 @@ import pytest
 from websockets.asyncio.client import connect
 
 from bridge.discovery import UnknownRobotError
-from services import settings
 from services.errors import SettingsError
 from services.settings import load_settings
 from services.supervision.child import own_command
@@ -53,18 +52,10 @@ async def test_a_hub_with_tokens_on_another_address(tmp_path: Path) -> None:
     tokens = tmp_path / "tokens"
     tokens.write_text(TOKEN + "\n")
     tokens.chmod(0o600)
-    arguments = [
-        "--host",
-        EVERYWHERE,
-        "--insecure",
-        "--port",
-        "0",
-        "--ros-version",
-        "2",
-        "--token-file",
-        str(tokens),
-    ]
-    hub = await asyncio.create_subprocess_exec(*HUB, *arguments, stderr=asyncio.subprocess.PIPE)
+    options = ("--insecure", "--port", "0", "--ros-version", "2", "--token-file", str(tokens))
+    hub = await asyncio.create_subprocess_exec(
+        *HUB, "--host", EVERYWHERE, *options, stderr=asyncio.subprocess.PIPE
+    )
     try:
         assert hub.stderr is not None
         line = (await asyncio.wait_for(hub.stderr.readline(), PATIENCE)).decode()
@@ -118,8 +109,11 @@ def test_a_network_without_robots_is_one_sentence() -> None:
     assert "within 0.2 s" in done.stderr
 
 
-def test_a_robots_name_stands_for_its_uri(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_robots_name_stands_for_its_uri(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where a loop runs already, as here."""
+
     async def resolve(name: str) -> str:
+        await asyncio.sleep(0)
         if name != "Zoë":
             raise UnknownRobotError(f"no robot called {name}")
         return "ws://192.0.2.7:9090"
@@ -132,17 +126,5 @@ def test_a_robots_name_stands_for_its_uri(monkeypatch: pytest.MonkeyPatch) -> No
     assert load_settings(uri=None).uri == "ws://192.0.2.7:9090"
     assert load_settings().uri == "robot:Zoë", "who takes no --uri asks for nobody"
     assert load_settings(uri="ws://127.0.0.1:9090").uri == "ws://127.0.0.1:9090"
-
-
-async def test_a_robots_name_is_resolved_where_a_loop_runs_already(monkeypatch: pytest.MonkeyPatch) -> None:
-    async def resolve(_name: str) -> str:
-        await asyncio.sleep(0)
-        return "ws://192.0.2.7:9090"
-
-    monkeypatch.setattr("bridge.discovery.resolve", resolve)
-    assert settings.load_settings(uri="robot:Zoë").uri == "ws://192.0.2.7:9090"
-
-
-def test_what_is_no_uri_is_refused() -> None:
     with pytest.raises(SettingsError):
         load_settings(uri="robots:Zoë")

@@ -1,7 +1,6 @@
 """A run whose peers are in the test's hands."""
 
 import asyncio
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -10,8 +9,6 @@ from services.master.peers import Peer
 from services.master.run import Master
 from services.settings import Settings
 from services.sockets.records import Frame, Prepare, Prepared, Reading, Switch, Switched
-from tests.integration.conftest import build_boat
-from toolchain.deployment import load_deployment
 
 
 class Service:
@@ -80,16 +77,6 @@ class Run:
     @property
     def error(self):
         return self.flow.end.exception() if self.flow.end.done() else None
-
-
-@pytest.fixture(scope="session")
-def built(tmp_path_factory) -> Path:
-    return build_boat(tmp_path_factory.mktemp("boat") / "deployment")
-
-
-@pytest.fixture(scope="session")
-def boat(built):
-    return load_deployment(built)
 
 
 @pytest.fixture

@@ -3,6 +3,8 @@
 import asyncio
 import sys
 import time
+from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 
@@ -31,14 +33,11 @@ class Events:
     """A run that only notes what happens."""
 
     def __init__(self):
-        self.error = None
-        self.records = []
-        self.pending = None
+        self.error = self.pending = None
 
     def ready(self, peer): ...
 
-    def received(self, peer, record):
-        self.records.append(record)
+    def received(self, peer, record): ...
 
     def lost(self, peer): ...
 
@@ -79,20 +78,24 @@ async def test_a_process_of_its_own_may_start_slowly(peers, events, tmp_path, ow
         child.close()
 
 
+class Process:
+    """A process of the master's own."""
+
+    def __init__(self):
+        self.killed = asyncio.Event()
+        self.kill = self.killed.set
+
+
 @pytest.mark.parametrize("own", [True, False])
 async def test_a_peer_that_does_not_answer_in_time_is_cut_off(peers, events, own):
-    cut = asyncio.Event()
-
-    class Process:
-        kill = staticmethod(cut.set)
-
+    process = Process()
     peers._once = False
-    peer = Peer("pcie-app", endpoint_from("unix:/x", ""), Process() if own else None)
+    peer = Peer("pcie-app", endpoint_from("unix:/x", ""), process if own else None)
     peer.greeted = peer.ready = True
-    peer.protocol = type("Connection", (), {"close": lambda _: cut.set()})()
+    peer.protocol = SimpleNamespace(close=process.kill)
     events.pending = Awaited("answer frame 3", time.monotonic(), 0.2)
     watching = asyncio.ensure_future(peers._watch(peer))
-    await asyncio.wait_for(cut.wait(), 50)
+    await asyncio.wait_for(process.killed.wait(), 50)
     assert isinstance(events.error, ChildDiedError) is not own
     peer.closed.set()
     await asyncio.wait_for(watching, 50)
@@ -102,13 +105,6 @@ async def test_a_peer_that_does_not_answer_in_time_is_cut_off(peers, events, own
 def connected(peers):
     """A service of the master's own that has just connected."""
     peer = peers._by_role["publisher"] = Peer("publisher", None, None)
-
-    class Process:
-        killed = 0
-
-        def kill(self):
-            self.killed += 1
-
     peer.child, peer.since = Process(), time.monotonic()
     return peer
 
@@ -117,13 +113,14 @@ async def test_a_child_that_was_started_before_a_reload_is_restarted(peers, even
     in_force = peers._in_force
     in_force.former_hash, in_force.generation = "f" * 64, 1
     peers._take(connected, own_hello("publisher", in_force.former_hash))
-    assert (connected.outdated, connected.greeted, connected.child.killed) == (True, False, 1)
+    assert (connected.outdated, connected.greeted, connected.child.killed.is_set()) == (True, False, True)
     peers._take(connected, Ready("publishing"))
     assert not connected.ready
     # and its successor is taken
     connected.outdated = False
+    connected.child.killed.clear()
     peers._take(connected, own_hello("publisher", boat.hash))
-    assert (connected.greeted, connected.generation, connected.child.killed) == (True, 1, 1)
+    assert (connected.greeted, connected.generation, connected.child.killed.is_set()) == (True, 1, False)
     assert events.error is None
 
 
@@ -140,7 +137,7 @@ async def test_only_a_child_of_the_former_deployment_is_restarted(peers, connect
     else:
         with pytest.raises(OtherPeerError):
             peers._take(connected, own_hello("publisher", hash_))
-    assert child.killed == 0
+    assert not child.killed.is_set()
 
 
 async def test_the_subscriber_begins_when_all_are_ready(peers, events):
@@ -148,8 +145,7 @@ async def test_the_subscriber_begins_when_all_are_ready(peers, events):
     for role in ("subscriber", "publisher", "pcie-app"):
         peer = peers._by_role[role] = Peer(role, None, None)
         peer.greeted = True
-        send = lambda _, record, role=role: order.append((role, record))  # noqa: E731
-        peer.protocol = type("Connection", (), {"send": send})()
+        peer.protocol = SimpleNamespace(send=lambda record, role=role: order.append((role, record)))
     for role in ("subscriber", "pcie-app", "publisher"):
         assert not peers.begun.is_set()
         assert order == []
@@ -160,18 +156,11 @@ async def test_the_subscriber_begins_when_all_are_ready(peers, events):
     assert order[2:] == [("subscriber", Begin(once=True))]
 
 
-async def test_trouble_ends_the_run_with_its_exit_code(peers, events, connected):
+async def test_trouble_and_an_error_in_taking_a_record_end_the_run(peers, events, connected):
     peers._take(connected, Trouble(4, "no luck"))
     assert isinstance(events.error, ReportedError)
     assert events.error.exit_code == 4
-
-
-async def test_an_error_in_taking_a_record_ends_the_run(peers, events, connected):
     connected.greeted = True
-
-    def closed(*_):
-        raise BrokenPipeError
-
-    events.received = closed
+    events.received = Mock(side_effect=BrokenPipeError)
     peers._take(connected, Begin(once=False))
     assert isinstance(events.error, BrokenPipeError)

@@ -62,11 +62,12 @@ EMPTY = FrameReport(stamp_ns=9, heard_ns=0, outcome="no posterior: impossible", 
 
 
 class TestLine:
-    def test_indices_where_nobody_says_what_they_stand_for(self):
+    def test_indices_or_values_in_their_units(self):
         posterior = made([[0, 0, 1], [1, 0, 2]], "y", "x")
         assert line(posterior, axes_of(posterior, None)) == (
             "frame 7: y 1, x 2 with 0.5; mean y 0.75, x 1.5; 812 cycles; 3.21 ms"
         )
+        assert "y 2.5, x -0.5 with 0.5; mean y 2, x -0.625;" in line(posterior, axes_of(posterior, GRID))
 
     def test_replicas_have_a_posterior_each(self):
         posterior = made([[0, 0, 1], [0, 0, 0], [1, 2, 1]], "replica", "x")
@@ -78,15 +79,9 @@ class TestLine:
         many = replace(posterior, probabilities=(1.0,) * 200, sizes=(200, 1))
         assert "replica 3 x 0 with 1; and 196 more; 812 cycles" in line(many, axes_of(many, None))
 
-    def test_values_in_their_units(self):
-        posterior = made([[0, 0, 1], [1, 0, 2]], "y", "x")
-        assert "y 2.5, x -0.5 with 0.5; mean y 2, x -0.625;" in line(posterior, axes_of(posterior, GRID))
-
-    def test_states_have_names_and_no_mean(self):
+    def test_states_have_names_and_no_mean_and_a_frame_may_have_no_posterior(self):
         posterior = made([1, 3, 0], "room", number=None)
         assert line(posterior, axes_of(posterior, ROOMS)) == "frame -: room hall with 0.75"
-
-    def test_a_frame_without_a_posterior(self):
         assert line(EMPTY, []) == "frame 8: no posterior: impossible"
 
     def test_what_came_over_the_wire_does_not_reach_the_terminal(self):
@@ -198,13 +193,11 @@ class TestFiles:
         assert empty == {"frame": 8, "stamp_ns": 9, "cycles": None, "outcome": "no posterior: impossible"}
         assert last["frame"] == 9
 
-    def test_without_a_deployment_there_are_no_values(self):
-        assert "best_value" not in record(A, axes_of(A, None))
-
-    def test_states(self):
+    def test_states_and_no_deployment(self):
         posterior = made([1, 3, 0], "room")
         said = record(posterior, axes_of(posterior, ROOMS))
         assert (said["best_value"], said["mean_value"]) == ({"room": "hall"}, {})
+        assert "best_value" not in record(A, axes_of(A, None))
 
     def test_csv(self, tmp_path):
         path = tmp_path / "out.csv"
@@ -215,13 +208,9 @@ class TestFiles:
         assert (first["y"], first["x"], first["probability"]) == ("0.5", "-0.5", "0.5")
         assert (first["y=0 x=2"], first["y=1 x=2"]) == ("0.5", "0.375")
         assert last["frame"] == "9"
-
-    def test_csv_of_another_model(self, tmp_path):
-        path = tmp_path / "out.csv"
-        save(path, A)
-        with pytest.raises(SettingsError):
+        with pytest.raises(SettingsError):  # another model
             save(path, made([1, 0], "x"), deployment=None)
-        assert len(path.read_text().splitlines()) == 2
+        assert len(path.read_text().splitlines()) == 3
 
     def test_archive(self, tmp_path):
         path = tmp_path / "out.npz"
@@ -236,18 +225,13 @@ class TestFiles:
             assert there["axis1"].tolist() == [-1, -0.75, -0.5]
         assert [each.name for each in tmp_path.iterdir()] == ["out.npz"]
 
-    def test_an_archive_is_whole_before_its_end(self, tmp_path, monkeypatch):
+    def test_an_archive_is_whole_before_its_end_and_has_a_limit_and_one_form(self, tmp_path, monkeypatch):
         monkeypatch.setattr(posterior_file, "_EVERY", 0.0)
-        path = tmp_path / "out.npz"
-        file = open_result_file(path)
-        file.add(A, axes_of(A, None))
-        with np.load(path) as there:
-            assert there["probabilities"].shape == (1, 2, 3)
-
-    def test_an_archive_has_a_limit_and_one_form(self, tmp_path, monkeypatch):
         monkeypatch.setattr(posterior_file, "MOST_NUMBERS", 12)
         file = open_result_file(tmp_path / "out.npz")
         file.add(A, axes_of(A, None))
+        with np.load(tmp_path / "out.npz") as there:
+            assert there["probabilities"].shape == (1, 2, 3)
         with pytest.raises(SettingsError):
             file.add(made([1, 0], "x"), [Axis("x", 2)])
         file.add(B, axes_of(B, None))
@@ -266,15 +250,12 @@ class TestFiles:
             assert np.isnan(there["latency_us"]).all()
         assert next(csv.DictReader((tmp_path / "out.csv").open()))["frame"] == ""
 
-    @pytest.mark.parametrize("name", ["out.txt", "out", "out.jsonl.gz"])
-    def test_another_ending(self, tmp_path, name):
+    @pytest.mark.parametrize(
+        "name", ["out.txt", "out", "out.jsonl.gz", "none/out.jsonl", "none/out.csv", "none/out.npz"]
+    )
+    def test_another_ending_or_no_such_folder(self, tmp_path, name):
         with pytest.raises(SettingsError):
             open_result_file(tmp_path / name)
-
-    @pytest.mark.parametrize("name", ["out.jsonl", "out.csv", "out.npz"])
-    def test_no_such_folder(self, tmp_path, name):
-        with pytest.raises(SettingsError):
-            open_result_file(tmp_path / "none" / name)
 
     def test_half_a_line_is_not_added_to(self, tmp_path):
         (tmp_path / "out.jsonl").write_text('{"frame": 1')

@@ -21,14 +21,8 @@ REASON = 1
 
 @asynccontextmanager
 async def topics_of(boat, first, second):
-    deployment = boat.model_copy(
-        update={
-            "outputs": (
-                Output(topic="/BMresults", uri=first.uri),
-                Output(topic="/second", uri=second.uri),
-            )
-        }
-    )
+    outputs = Output(topic="/BMresults", uri=first.uri), Output(topic="/second", uri=second.uri)
+    deployment = boat.model_copy(update={"outputs": outputs})
     topics = ResultTopics(Settings(), deployment)
     async with topics.opened():
         yield topics

@@ -26,13 +26,8 @@ def test_a_reading():
 @pytest.mark.parametrize(
     "line",
     [
-        b"3",
-        b"x",
-        b"{}",
-        b'{"addresses": [71.9]}',
-        b'{"addresses": [true]}',
-        b'{"addresses": ["1"]}',
-        b"[" * 10**5,
+        *(b"3", b"x", b"{}", b"[" * 10**5),
+        *(b'{"addresses": [71.9]}', b'{"addresses": [true]}', b'{"addresses": ["1"]}'),
     ],
 )
 def test_a_line_that_is_not_a_reading_is_refused(line):
@@ -47,6 +42,9 @@ def test_a_result_and_an_array():
     (board,) = Inference(counted).boards
     assert (board.words, board.cycles, stamp) == (b"\1\0\0\0\2\1\0\0", 5, None)
     assert result_from_line(b"[0.25, 0.75]", 1, 2) == [0.25, 0.75]
+    counted, _ = result_from_line(board([1, 2, 3, 4], **OF_REPLICAS).encode(), 1, 4, 2)
+    assert Inference(counted).boards[0].replica_cycles == (9, 5)
+    assert Inference(counted).posterior == pytest.approx([1 / 3, 2 / 3, 3 / 7, 4 / 7])
 
 
 def board(counts, reason=1, **more):
@@ -96,24 +94,23 @@ def deployment(tmp_path_factory):
     return where / "built"
 
 
+def run(*command, **options):
+    return subprocess.run(
+        [BIN / command[0], *command[1:]], capture_output=True, text=True, timeout=240, check=False, **options
+    )
+
+
 def test_a_line_with_too_few_addresses_is_named(deployment, tmp_path):
     socket = tmp_path / "b.sock"
     board = subprocess.Popen([BIN / "board", "--listen", f"unix:{socket}"], stderr=subprocess.PIPE)
     try:
         assert b"listens" in board.stderr.readline()
-        done = subprocess.run(
-            [BIN / "pcie-app", "-d", deployment, "--boards", f"unix:{socket}"],
-            input='{"addresses": [0, 1, 0]}\n\n{"addresses": [0, 1]}\n',
-            capture_output=True,
-            text=True,
-            timeout=240,
-            check=False,
-        )
+        lines = '{"addresses": [0, 1, 0]}\n\n{"addresses": [0, 1]}\n'
+        done = run("pcie-app", "-d", deployment, "--boards", f"unix:{socket}", input=lines)
     finally:
         board.kill()
         board.communicate()
-    assert done.returncode == 2
-    assert done.stdout.count("\n") == 1
+    assert (done.returncode, done.stdout.count("\n")) == (2, 1)
     assert done.stderr.splitlines()[-1].startswith("error: line 3 of standard input: ")
 
 
@@ -126,23 +123,10 @@ def test_a_line_with_too_few_addresses_is_named(deployment, tmp_path):
     ],
 )
 def test_flags_without_a_meaning_are_refused_at_once(deployment, command):
-    done = subprocess.run(
-        [BIN / command[0], *command[1:], "-d", deployment],
-        capture_output=True,
-        text=True,
-        timeout=240,
-        check=False,
-    )
+    done = run(*command, "-d", deployment)
     assert done.returncode == 2
     assert done.stderr.startswith(f"error: {' '.join(command[-2:])} ")
     assert done.stderr.count("\n") == 1
-
-
-def test_a_result_of_replicas():
-    counted, _ = result_from_line(board([1, 2, 3, 4], **OF_REPLICAS).encode(), 1, 4, 2)
-    inference = Inference(counted)
-    assert inference.boards[0].replica_cycles == (9, 5)
-    assert inference.posterior == pytest.approx([1 / 3, 2 / 3, 3 / 7, 4 / 7])
 
 
 async def test_a_line_has_a_limit_however_it_arrives(monkeypatch, tmp_path):

@@ -37,13 +37,9 @@ async def answer_to(path, data):
     return json.loads(answer)
 
 
-@given(st.text(max_size=60))
-def test_a_folder_is_an_order(folder):
+@given(st.text(max_size=60), st.binary(max_size=200))
+def test_any_bytes_are_an_order_or_refused(folder, data):
     assert order_of(json.dumps({"order": "reload", "folder": folder}).encode()).folder == folder
-
-
-@given(st.binary(max_size=200))
-def test_any_bytes_are_an_order_or_refused(data):
     with contextlib.suppress(ControlError):
         order_of(data)
 

@@ -11,17 +11,11 @@ from services.sockets import serving
 from services.sockets.local_socket import RecordProtocol, open_connection, own_hello
 from services.sockets.records import Hello, Notice, Trouble
 from services.sockets.serving import MasterLink, outdated
-from tests.integration.conftest import build_boat
 from toolchain.building.edits import DeploymentEdits
 from toolchain.building.regenerate import regenerate_deployment
 from toolchain.deployment import load_deployment
 
 PATIENCE = 120
-
-
-@pytest.fixture(scope="module")
-def built(tmp_path_factory):
-    return build_boat(tmp_path_factory.mktemp("boat") / "deployment")
 
 
 @pytest.fixture
@@ -43,6 +37,12 @@ def test_only_a_restart_would_help(changed):
     assert outdated(before, Trouble(2, "no greeting")) is None
     shutil.rmtree(now.directory)
     assert outdated(before, own_hello("master", now.hash)) is None
+
+
+async def until(true):
+    async with asyncio.timeout(PATIENCE):
+        while not true():
+            await asyncio.sleep(0.01)
 
 
 class Served:
@@ -114,17 +114,14 @@ async def test_one_master_is_served_at_a_time(changed, serve):
     assert [type(each) for each in refused] == [Trouble]
     assert service.link.has_master
     assert service.link.send(Notice("info", "more"))
-    while len(records) < 3:
-        await asyncio.sleep(0.01)
+    await until(lambda: len(records) == 3)
     assert [type(each) for each in records] == [Hello, Notice, Notice]
     first.close()
     await asyncio.wait_for(closed.wait(), PATIENCE)
-    while service.link.has_master:
-        await asyncio.sleep(0.01)
+    await until(lambda: not service.link.has_master)
     assert not service.link.send(Notice("info", "lost"))
     _, records, _ = await service.connect(now.hash)
-    while len(records) < 2:
-        await asyncio.sleep(0.01)
+    await until(lambda: len(records) == 2)
     assert records[1].sentence == "state"
     assert [type(each) for each in service.records] == [Hello, Hello]
 

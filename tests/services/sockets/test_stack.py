@@ -37,6 +37,13 @@ def process(*, is_ready=True, why="fine", **more):
     return ProcessStatus(ready=is_ready, why=why, **more)
 
 
+def listener(directory, name):
+    """The socket of a process that answers nothing: it was killed, or listens and is stuck."""
+    silent = socket.socket(socket.AF_UNIX)
+    silent.bind(str(directory / f"{name}.status.sock"))
+    return silent
+
+
 @contextlib.asynccontextmanager
 async def served(directory, **processes):
     async with contextlib.AsyncExitStack() as stack:
@@ -58,34 +65,26 @@ FRAMES = FrameCounts(
 )
 
 
-async def test_everyone_is_asked_and_all_is_ready(tmp_path):
+async def test_everyone_is_asked_and_says_what_it_waits_for(tmp_path):
+    peers = [
+        PeerStatus(name="pcie-app", endpoint="unix:/run/pcie-app.sock", pid=0, restarts=0, ready=False),
+        PeerStatus(name="hub", endpoint="unix:/run/hub.sock", pid=0, restarts=0, ready=True),
+    ]
+    listener(tmp_path, "subscriber").close()
     async with served(
-        tmp_path, master=process(), subscriber=process(frames=FRAMES), board10=process(), board2=process()
+        tmp_path,
+        master=process(peers=peers),
+        publisher=process(is_ready=False, why="waiting for ws://robot:9090"),
+        board10=process(),
+        board2=process(),
     ):
         stack = await status.ask_stack(tmp_path)
-    assert stack.ready
-    assert not stack.why
-    assert [each.name for each in stack.processes] == ["master", "subscriber", "board2", "board10"]
-
-
-async def test_what_is_not_ready_says_why(tmp_path):
-    waiting = process(is_ready=False, why="waiting for the rosbridge server at ws://robot:9090")
-    async with served(tmp_path, master=process(), publisher=waiting):
-        stack = await status.ask_stack(tmp_path)
     assert not stack.ready
-    assert stack.why == ["publisher: waiting for the rosbridge server at ws://robot:9090"]
-    assert "ws://robot:9090" in shown(stack)
-
-
-async def test_a_killed_process_is_named(tmp_path):
-    with socket.socket(socket.AF_UNIX) as dead:
-        dead.bind(str(tmp_path / "pcie-app.status.sock"))
-    async with served(tmp_path, master=process()):
-        stack = await status.ask_stack(tmp_path)
-    assert not stack.ready
-    assert [each.name for each in stack.silent] == ["pcie-app"]
-    assert "nobody listens" in stack.why[0]
-    assert "no answer" in shown(stack)
+    assert [each.name for each in stack.processes] == ["master", "publisher", "board2", "board10"]
+    assert [each.name for each in stack.silent] == ["subscriber", "pcie-app"]
+    assert "unix:/run/pcie-app.sock" in stack.silent[1].why  # it has no socket at all
+    assert [why.split(":")[0] for why in stack.why] == ["publisher", "subscriber", "pcie-app"]
+    assert "publisher: waiting for ws://robot:9090" in shown(stack)
 
 
 async def test_those_who_do_not_answer_are_waited_for_together(tmp_path, monkeypatch):
@@ -101,24 +100,11 @@ async def test_those_who_do_not_answer_are_waited_for_together(tmp_path, monkeyp
     silent = ("subscriber", "publisher", "pcie-app", "board0")
     with contextlib.ExitStack() as sockets:
         for name in silent:
-            stuck = sockets.enter_context(socket.socket(socket.AF_UNIX))
-            stuck.bind(str(tmp_path / f"{name}.status.sock"))
-            stuck.listen()
+            sockets.enter_context(listener(tmp_path, name)).listen()
         async with served(tmp_path, master=process()):
             stack = await status.ask_stack(tmp_path)
     assert [each.name for each in stack.processes] == ["master"]
     assert tuple(each.name for each in stack.silent) == silent
-
-
-async def test_a_peer_that_the_master_waits_for_is_named_even_without_a_socket(tmp_path):
-    peers = [
-        PeerStatus(name="pcie-app", endpoint="unix:/run/pcie-app.sock", pid=0, restarts=0, ready=False),
-        PeerStatus(name="publisher", endpoint="unix:/run/publisher.sock", pid=0, restarts=0, ready=True),
-    ]
-    async with served(tmp_path, master=process(is_ready=False, why="waiting for pcie-app", peers=peers)):
-        stack = await status.ask_stack(tmp_path)
-    assert [each.name for each in stack.silent] == ["pcie-app"]
-    assert "unix:/run/pcie-app.sock" in stack.silent[0].why
 
 
 async def test_one_screen_has_services_boards_rates_and_losses(tmp_path):
@@ -134,16 +120,14 @@ async def test_one_screen_has_services_boards_rates_and_losses(tmp_path):
         hub=process(hub=HubStatus(3, 5, 7)),
     ):
         text = shown(await status.ask_stack(tmp_path))
-    for words in (
+    words = (
         "hub: 3 clients, 5 topics, 7 services",
         "100, 0.2 s ago",
         "19 passed over",
         "ws://robot:9090",
-        "abababababab",
-        "tcp://10.0.0.2:7000",
         "512",
-    ):
-        assert words in text
+    )
+    assert [each for each in words if each not in text] == []
     row = next(line.split() for line in text.splitlines() if "tcp://" in line)
     assert row[:4] == ["1", "programmed", "abababababab", "3"]
 
@@ -173,31 +157,20 @@ def make_run(places, name):
 
 
 async def test_the_only_live_run_is_found(places):
-    make_run(places, "dead")
-    alive = make_run(places, "alive")
-    async with served(alive, master=process()):
-        assert await status.find_run() == alive
-
-
-async def test_several_runs_are_listed(places):
-    one, two = make_run(places, "one"), make_run(places, "two")
-    async with served(one, master=process()), served(two, master=process()):
-        with pytest.raises(SettingsError, match="2 runs"):
-            await status.find_run()
-
-
-async def test_no_run_names_those_that_were_killed(places):
-    dead = make_run(places, "dead")
+    dead, one, two = (make_run(places, name) for name in ("dead", "one", "two"))
     with pytest.raises(SettingsError, match=str(dead)):
         await status.find_run()
+    async with served(one, master=process()):
+        assert await status.find_run() == one
+        async with served(two, master=process()):
+            with pytest.raises(SettingsError, match="2 runs"):
+                await status.find_run()
 
 
 async def test_exit_codes_and_json(places):
     run = make_run(places, "it")
     nothing = await asyncio.to_thread(subprocess_status, places)
-    assert nothing.returncode == 2
-    assert nothing.stderr.count("\n") == 1
-    assert nothing.stderr.startswith("error: no run")
+    assert (nothing.returncode, nothing.stderr.count("\n")) == (2, 1)
     async with served(run, master=process()):
         async with asyncio.timeout(120):
             # on a busy machine the answer may come too late for it once
@@ -205,10 +178,8 @@ async def test_exit_codes_and_json(places):
                 pass
         assert whole.returncode == 0
         stack = msgspec.json.decode(whole.stdout, type=status.StackStatus)
-        assert stack.directory == str(run)
-        assert stack.processes[0].name == "master"
+        assert (stack.directory, stack.processes[0].name) == (str(run), "master")
     async with served(run, master=process(is_ready=False, why="waiting")):
-        assert (await asyncio.to_thread(subprocess_status, places)).returncode == 6
         assert (await asyncio.to_thread(subprocess_status, places, "--directory", str(run))).returncode == 6
 
 
@@ -242,18 +213,15 @@ async def test_watching_prints_a_line_every_second_until_it_is_ended(places):
         assert b"Traceback" not in await watching.stderr.read()
 
 
-def test_a_run_that_ends_while_runs_are_looked_for_is_none(tmp_path, monkeypatch):
-    for name in ("rosbayes-aaaaaaaa", "rosbayes-bbbbbbbb"):
-        (tmp_path / name).mkdir()
-    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
+def test_a_run_that_ends_while_runs_are_looked_for_is_none(places, monkeypatch):
+    ending, run = make_run(places, "aaaaaaaa"), make_run(places, "bbbbbbbb")
     is_directory = Path.is_dir
 
     def and_then_it_goes(path):
         seen = is_directory(path)
-        if path.name == "rosbayes-aaaaaaaa" and seen:
+        if path == ending and seen:
             path.rmdir()
         return seen
 
     monkeypatch.setattr(Path, "is_dir", and_then_it_goes)
-    assert status.run_directories() == [tmp_path / "rosbayes-bbbbbbbb"]
+    assert status.run_directories() == [run]

@@ -14,7 +14,6 @@ from services.sockets.status import (
     FrameCounts,
     ProcessStatus,
     read_process_status,
-    reasons,
     seconds_since,
     status_served,
     status_thread,
@@ -54,8 +53,7 @@ def test_a_status_of_another_version_is_refused(tmp_path):
 
 async def test_a_directory_that_is_not_there_is_the_users_mistake(tmp_path):
     with pytest.raises(SettingsError):
-        async with status_served(tmp_path / "missing", "hub", get_status):
-            pass
+        await status_served(tmp_path / "missing", "hub", get_status).__aenter__()
     with pytest.raises(SettingsError), status_thread(tmp_path / "missing", "hub", get_status):
         pass
 
@@ -83,12 +81,6 @@ def test_a_rate_is_of_the_last_seconds(monkeypatch):
     assert (found.frames.rate, found.uptime_s) == (5, 26)
 
 
-def test_only_reasons_that_occurred_are_shown():
-    assert reasons({"passed over": 0, "failed on a board": 3}) == {"failed on a board": 3}
-
-
 def test_the_age_of_nothing_is_none():
     assert seconds_since(0) is None
-    age = seconds_since(time.monotonic_ns() - 2_000_000_000)
-    assert age is not None
-    assert age >= 2
+    assert seconds_since(time.monotonic_ns() - 2_000_000_000) >= 2

@@ -45,18 +45,8 @@ async def failure_of(code: str, number: int = 0) -> ReportedError:
 @pytest.mark.parametrize(
     ("code", "number", "exit_code", "sentence"),
     [
-        (
-            "print('starting\\nerror: no luck', file=sys.stderr); sys.exit(3)",
-            0,
-            ExitCode.ROSBRIDGE,
-            "no luck",
-        ),
-        (
-            "sys.stderr.write('starting\\nerror: half a line'); sys.exit(4)",
-            0,
-            ExitCode.VARIABLE,
-            "half a line",
-        ),
+        ("print('starting\\nerror: no luck', file=sys.stderr); sys.exit(3)", 0, 3, "no luck"),
+        ("sys.stderr.write('starting\\nerror: half a line'); sys.exit(4)", 0, 4, "half a line"),
         ("print('starting', file=sys.stderr)", 0, ExitCode.CHILD, "tester ended by itself with exit code 0"),
         ("time.sleep(60)", signal.SIGKILL, ExitCode.CHILD, "tester was killed by SIGKILL"),
         ("time.sleep(60)", signal.SIGRTMIN + 1, ExitCode.CHILD, "tester was killed by signal 35"),

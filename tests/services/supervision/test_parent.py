@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 
 import psutil
+import pytest
 
 PATIENCE = 50.0
 
@@ -72,13 +73,14 @@ ctypes.CDLL(None).syscall(exit_of_this_thread, 0)
 '''
 
 
-def test_a_parent_of_which_a_thread_still_dies_is_waited_for():
+@pytest.fixture
+def place():
     # a socket's path has 107 bytes at most: pytest's own folders may be too deep
     with tempfile.TemporaryDirectory(dir="/tmp") as place:
-        _leave_when_the_last_thread_is_dead(Path(place))
+        yield Path(place)
 
 
-def _leave_when_the_last_thread_is_dead(place: Path) -> None:
+def test_a_parent_of_which_a_thread_still_dies_is_waited_for(place):
     done = subprocess.run(
         [sys.executable, "-c", KILLED_IN_PART],
         env=os.environ | {"TMPDIR": str(place), "XDG_RUNTIME_DIR": ""},

@@ -1,0 +1,19 @@
+"""The deployment that the services' tests share; nobody changes its folder."""
+
+from pathlib import Path
+
+import pytest
+
+from tests.integration.conftest import the_boat
+from toolchain.deployment import load_deployment
+
+
+@pytest.fixture(scope="session")
+def built(tmp_path_factory) -> Path:
+    return the_boat(tmp_path_factory)
+
+
+@pytest.fixture(scope="session")
+def boat(built):
+    """The boat's deployment on 8 x 8 cells and four boards."""
+    return load_deployment(built)
