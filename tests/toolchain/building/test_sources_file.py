@@ -118,6 +118,7 @@ def test_a_prior_of_one_of_them(tmp_path, written):
         ('variables = { left = "ranges[3]" }\n', "", 14),
         ("\n[[source]]\n", "\n[[sources]]\n", 6),
         ("[[source]]", "[[source", 1),
+        ("variables = { ", 'prior = "p"\nvariables = { ', 12),
         ('{ near = "range" }', '{ near = "range", turn = "x" }', 13),
     ],
 )
