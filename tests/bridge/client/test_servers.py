@@ -12,7 +12,7 @@ import pytest
 
 from bridge.client import Ros, connect
 from bridge.codecs.serialised import MessageTypes
-from bridge.errors import NoAnswerError, NoMessageError, ServiceError
+from bridge.errors import DecodeError, NoAnswerError, NoMessageError, ServiceError
 from tests.bridge.client.doubles import Double
 
 PATIENCE = 60.0
@@ -51,7 +51,10 @@ async def test_messages_come_from_every_server(double, ros, compression, arrays,
     await double.wait_for_op("subscribe", count=2)
     for topic, reader in (("/a", subscription), ("/b", whole), ("/a", subscription)):
         await double.publish(topic, MSG)
-        data = (await reader.next(PATIENCE)).msg["data"]
+        message = await reader.next(PATIENCE)
+        with pytest.raises(DecodeError, match=f"{topic} has no serialised bytes"):
+            _ = message.raw
+        data = message.msg["data"]
         assert isinstance(data, np.ndarray if reader is subscription and arrays == "numpy" else list)
         assert list(data) == VALUES
     assert ros.unusable == 0

@@ -4,7 +4,6 @@ Ros ◀──WebSocket──▶ hub ◀──WebSocket──▶ another Ros, or 
 """
 
 import asyncio
-import contextlib
 import json
 from collections.abc import AsyncIterator
 from typing import Any
@@ -16,11 +15,9 @@ from websockets.asyncio.client import connect as plain_connect
 
 from bridge.client import Ros, State, connect
 from bridge.client.goals import FEEDBACK_QUEUE_SIZE
-from bridge.client.protocol.events import GoalStatus
-from bridge.codecs.serialised import MessageTypes
+from bridge.client.protocol.events import GoalFeedback, GoalStatus
 from bridge.errors import (
     ConcurrentReadError,
-    DecodeError,
     DisconnectedError,
     EncodeError,
     GoalError,
@@ -39,12 +36,22 @@ SCAN = {
 }
 
 
-@contextlib.asynccontextmanager
-async def two_clients() -> AsyncIterator[tuple[Ros, Ros]]:
+@pytest.fixture
+async def uri() -> AsyncIterator[str]:
     async with running_hub(ros_version=2) as port:
-        uri = f"ws://127.0.0.1:{port}"
-        async with connect(uri) as one, connect(uri, fragment_size=64) as other:
-            yield one, other
+        yield f"ws://127.0.0.1:{port}"
+
+
+@pytest.fixture
+async def one(uri: str) -> AsyncIterator[Ros]:
+    async with connect(uri) as one:
+        yield one
+
+
+@pytest.fixture
+async def other(uri: str) -> AsyncIterator[Ros]:
+    async with connect(uri, fragment_size=64) as other:
+        yield other
 
 
 async def settled(ros: Ros) -> None:
@@ -57,67 +64,47 @@ async def settled(ros: Ros) -> None:
 @pytest.mark.parametrize("compression", ["none", "png", "cbor"])
 @pytest.mark.parametrize("fragment_size", [None, 50])
 @pytest.mark.parametrize("arrays", ["list", "numpy"])
-async def test_a_scan_comes_as_it_was_sent(compression, fragment_size, arrays):
-    async with two_clients() as (one, other):
-        scans = one.subscribe(
-            "/scan",
-            "sensor_msgs/LaserScan",
-            compression=compression,
-            fragment_size=fragment_size,
-            arrays=arrays,
-            qos=Qos(reliability="best_effort"),
-        )
-        await settled(one)
-        publication = await other.advertise("/scan", "sensor_msgs/LaserScan", qos=Qos(depth=5))
-        await publication.publish(SCAN)
-        msg = (await scans.next(PATIENCE)).msg
-        assert (msg["header"]["frame_id"], msg["angle_min"]) == ("laser", -1.5)
-        assert isinstance(msg["ranges"], np.ndarray if arrays == "numpy" else list)
-        assert list(msg["ranges"]) == [0.5, 1.5, 2.5]
-        if arrays == "numpy" and compression == "cbor":
-            assert msg["ranges"].dtype == np.float32
+async def test_a_scan_comes_as_it_was_sent(one, other, compression, fragment_size, arrays):
+    scans = one.subscribe(
+        "/scan",
+        "sensor_msgs/LaserScan",
+        compression=compression,
+        fragment_size=fragment_size,
+        arrays=arrays,
+        qos=Qos(reliability="best_effort"),
+    )
+    await settled(one)
+    publication = await other.advertise("/scan", "sensor_msgs/LaserScan", qos=Qos(depth=5))
+    await publication.publish(SCAN)
+    msg = (await scans.next(PATIENCE)).msg
+    assert (msg["header"]["frame_id"], msg["angle_min"]) == ("laser", -1.5)
+    assert isinstance(msg["ranges"], np.ndarray if arrays == "numpy" else list)
+    assert list(msg["ranges"]) == [0.5, 1.5, 2.5]
+    if arrays == "numpy" and compression == "cbor":
+        assert msg["ranges"].dtype == np.float32
 
 
-async def test_serialised_bytes_are_read_by_their_type():
-    types = MessageTypes()
-    async with two_clients() as (one, other):
-        scans = one.subscribe("/scan", "sensor_msgs/LaserScan", compression="cbor-raw")
-        await settled(one)
-        publication = await other.advertise("/scan", "sensor_msgs/LaserScan")
-        await publication.publish(SCAN)
-        message = await scans.next(PATIENCE)
-        scan = types.read(message.raw, "sensor_msgs/LaserScan")
-        assert (scan["header"]["frame_id"], scan["ranges"].tolist()) == ("laser", [0.5, 1.5, 2.5])
-        lists = one.subscribe("/json", "std_msgs/String")
-        await settled(one)
-        await (await other.advertise("/json", "std_msgs/String")).publish({"data": "x"})
-        with pytest.raises(DecodeError, match="/json has no serialised bytes"):
-            _ = (await lists.next(PATIENCE)).raw
+async def test_a_large_message_leaves_in_fragments_and_arrives(one, other):
+    texts = one.subscribe("/text", "std_msgs/String")
+    await settled(one)
+    text = "\u00e4\U0001f600x" * 1000
+    await (await other.advertise("/text", "std_msgs/String")).publish({"data": text})
+    assert (await texts.next(PATIENCE)).msg == {"data": text}
 
 
-async def test_a_large_message_leaves_in_fragments_and_arrives():
-    async with two_clients() as (one, other):
-        texts = one.subscribe("/text", "std_msgs/String")
-        await settled(one)
-        text = "\u00e4\U0001f600x" * 1000
-        await (await other.advertise("/text", "std_msgs/String")).publish({"data": text})
-        assert (await texts.next(PATIENCE)).msg == {"data": text}
-
-
-async def test_numpy_out_and_in():
+async def test_numpy_out_and_in(one, other):
     values = np.linspace(0, 1, 1024)
-    async with two_clients() as (one, other):
-        arrays = one.subscribe("/a", "std_msgs/Float64MultiArray", compression="cbor", arrays="numpy")
-        await settled(one)
-        publication = await other.advertise("/a", "std_msgs/Float64MultiArray")
-        for sent in (values, values.astype(">f8"), values.reshape(32, 32).T.reshape(-1), values[::-1]):
-            await publication.publish({"data": sent})
-            received = (await arrays.next(PATIENCE)).msg["data"]
-            np.testing.assert_array_equal(received, sent)
-            assert not received.flags.writeable
-        for wrong in (np.array([1.0, np.nan]), np.array([1.0, np.inf])[::-1]):
-            with pytest.raises(EncodeError, match=r"data\[[01]\] is NaN or infinite"):
-                await publication.publish({"data": wrong})
+    arrays = one.subscribe("/a", "std_msgs/Float64MultiArray", compression="cbor", arrays="numpy")
+    await settled(one)
+    publication = await other.advertise("/a", "std_msgs/Float64MultiArray")
+    for sent in (values, values.astype(">f8"), values.reshape(32, 32).T.reshape(-1), values[::-1]):
+        await publication.publish({"data": sent})
+        received = (await arrays.next(PATIENCE)).msg["data"]
+        np.testing.assert_array_equal(received, sent)
+        assert not received.flags.writeable
+    for wrong in (np.array([1.0, np.nan]), np.array([1.0, np.inf])[::-1]):
+        with pytest.raises(EncodeError):
+            await publication.publish({"data": wrong})
 
 
 # Actions
@@ -132,6 +119,10 @@ class ActionServer:
     async def say(self, **operation: Any) -> None:
         await self.socket.send(json.dumps(operation))
 
+    async def end(self, goal: dict[str, Any], *, status: int, values: Any = None) -> None:
+        answer = {"id": goal["id"], "action": "/fly", "values": values or {}, "status": status}
+        await self.say(op="action_result", result=True, **answer)
+
     async def hear(self, op: str) -> dict[str, Any]:
         async with asyncio.timeout(PATIENCE):
             while True:
@@ -140,31 +131,23 @@ class ActionServer:
                     return operation
 
 
-@contextlib.asynccontextmanager
-async def action(name: str = "/fly") -> AsyncIterator[tuple[Ros, ActionServer]]:
-    async with running_hub(ros_version=2) as port:
-        uri = f"ws://127.0.0.1:{port}"
-        async with connect(uri) as ros, plain_connect(uri) as socket:
-            server = ActionServer(socket)
-            await server.say(op="advertise_action", action=name, type="boat_msgs/action/Fly")
-            await server.say(op="call_service", service="/rosapi/get_time", id="x")
-            await server.hear("service_response")
-            yield ros, server
+@pytest.fixture
+async def server(uri: str) -> AsyncIterator[ActionServer]:
+    async with plain_connect(uri) as socket:
+        server = ActionServer(socket)
+        await server.say(op="advertise_action", action="/fly", type="boat_msgs/action/Fly")
+        await server.say(op="call_service", service="/rosapi/get_time", id="x")
+        await server.hear("service_response")
+        yield server
 
 
-async def test_a_goal_with_feedback_and_result():
-    async with (
-        action() as (ros, server),
-        await ros.send_goal("/fly", "boat_msgs/Fly", {"to": np.array([1.5, 2.5])}) as goal,
-    ):
+async def test_a_goal_with_feedback_and_result(one, server):
+    async with await one.send_goal("/fly", "boat_msgs/Fly", {"to": np.array([1.5, 2.5])}) as goal:
         asked = await server.hear("send_action_goal")
         assert asked["args"] == {"to": [1.5, 2.5]}
         for n in range(3):
             await server.say(op="action_feedback", id=asked["id"], action="/fly", values={"n": n})
-        values = {"reached": True}
-        await server.say(
-            op="action_result", id=asked["id"], action="/fly", values=values, status=4, result=True
-        )
+        await server.end(asked, status=4, values={"reached": True})
         assert [feedback["n"] async for feedback in goal] == [0, 1, 2]
         for _ in range(2):
             result = await goal.result(timeout=PATIENCE)
@@ -172,78 +155,64 @@ async def test_a_goal_with_feedback_and_result():
         assert goal.done
 
 
-async def test_a_goal_is_cancelled_by_hand_and_by_leaving():
-    async with action() as (ros, server):
-        goal = await ros.send_goal("/fly", "boat_msgs/Fly", feedback=False)
+async def test_a_goal_is_cancelled_by_hand_and_by_leaving(one, server):
+    goal = await one.send_goal("/fly", "boat_msgs/Fly", feedback=False)
+    asked = await server.hear("send_action_goal")
+    assert asked.get("feedback", False) is False
+    with pytest.raises(NoAnswerError, match="/fly .* did not end within 0.05 s"):
+        await goal.result(0.05)
+    await goal.cancel()
+    cancelled = await server.hear("cancel_action_goal")
+    assert cancelled["id"] == asked["id"]
+    await server.end(asked, status=5)
+    assert (await goal.result(PATIENCE)).status is GoalStatus.CANCELED
+    async with await one.send_goal("/fly", "boat_msgs/Fly"):
         asked = await server.hear("send_action_goal")
-        assert asked.get("feedback", False) is False
-        with pytest.raises(NoAnswerError, match="/fly .* did not end within 0.05 s"):
-            await goal.result(0.05)
-        await goal.cancel()
-        cancelled = await server.hear("cancel_action_goal")
-        assert cancelled["id"] == asked["id"]
-        await server.say(op="action_result", id=asked["id"], action="/fly", values={}, status=5, result=True)
-        assert (await goal.result(PATIENCE)).status is GoalStatus.CANCELED
-        async with await ros.send_goal("/fly", "boat_msgs/Fly"):
-            asked = await server.hear("send_action_goal")
-        assert (await server.hear("cancel_action_goal"))["id"] == asked["id"]
-        assert not ros._session.goals
+    assert (await server.hear("cancel_action_goal"))["id"] == asked["id"]
+    assert not one._session.goals
 
 
-async def test_a_goal_that_nobody_takes():
-    async with running_hub(ros_version=2) as port, connect(f"ws://127.0.0.1:{port}") as ros:
-        goal = await ros.send_goal("/nowhere", "boat_msgs/Fly")
-        with pytest.raises(GoalError, match="action /nowhere at ws://.* has no result") as caught:
-            await goal.result(PATIENCE)
-        assert caught.value.reason
-        assert [feedback async for feedback in goal] == []
-
-
-async def test_feedback_that_nobody_reads_is_bounded():
-    async with action() as (ros, server):
-        goal = await ros.send_goal("/fly", "boat_msgs/Fly")
-        asked = await server.hear("send_action_goal")
-        for n in range(FEEDBACK_QUEUE_SIZE + 30):
-            goal.receive(_feedback(goal, n))
-        await server.say(op="action_result", id=asked["id"], action="/fly", values={}, status=4, result=True)
+async def test_a_goal_that_nobody_takes(one):
+    goal = await one.send_goal("/nowhere", "boat_msgs/Fly")
+    with pytest.raises(GoalError, match="action /nowhere at ws://.* has no result") as caught:
         await goal.result(PATIENCE)
-        read = [feedback["n"] async for feedback in goal]
-        assert read == list(range(30, FEEDBACK_QUEUE_SIZE + 30))
-        assert goal.lost == 30
+    assert caught.value.reason
+    assert [feedback async for feedback in goal] == []
 
 
-def _feedback(goal: Any, n: int) -> Any:
-    from bridge.client.protocol.events import GoalFeedback
+async def test_feedback_that_nobody_reads_is_bounded(one, server):
+    goal = await one.send_goal("/fly", "boat_msgs/Fly")
+    asked = await server.hear("send_action_goal")
+    for n in range(FEEDBACK_QUEUE_SIZE + 30):
+        goal.receive(GoalFeedback(goal._identity, {"n": n}))
+    await server.end(asked, status=4)
+    await goal.result(PATIENCE)
+    read = [feedback["n"] async for feedback in goal]
+    assert read == list(range(30, FEEDBACK_QUEUE_SIZE + 30))
+    assert goal.lost == 30
 
-    return GoalFeedback(goal._identity, {"n": n})
 
+async def test_the_server_goes_while_a_goal_is_on_its_way(one, server):
+    goal = await one.send_goal("/fly", "boat_msgs/Fly")
+    await server.hear("send_action_goal")
 
-async def test_the_server_goes_while_a_goal_is_on_its_way():
-    async with contextlib.AsyncExitStack() as life:
-        ros, server = await life.enter_async_context(action())
-        goal = await ros.send_goal("/fly", "boat_msgs/Fly")
-        await server.hear("send_action_goal")
+    async def read() -> list[Any]:
+        return [feedback async for feedback in goal]
 
-        async def read() -> list[Any]:
-            return [feedback async for feedback in goal]
-
-        reading = asyncio.create_task(read())
-        waiting = asyncio.create_task(goal.result(PATIENCE))
-        await asyncio.sleep(0)
-        with pytest.raises(ConcurrentReadError):
-            await goal.__anext__()
-        ros._session._websocket.abort()
-        for task in (reading, waiting):
-            with pytest.raises(DisconnectedError):
-                await asyncio.wait_for(task, PATIENCE)
+    tasks = [asyncio.create_task(read()), asyncio.create_task(goal.result(PATIENCE))]
+    await asyncio.sleep(0)
+    with pytest.raises(ConcurrentReadError):
+        await goal.__anext__()
+    one._session._websocket.abort()
+    for waiting in (*tasks, goal.result(1)):
         with pytest.raises(DisconnectedError):
-            await goal.result(1)
-        await goal.cancel()
-        await ros.wait_for_state(State.CONNECTED, PATIENCE)
-        another = await ros.send_goal("/fly", "boat_msgs/Fly")
-        await server.hear("send_action_goal")
-        await ros.close()
-        with pytest.raises(DisconnectedError, match="was closed"):
-            await another.result(1)
-        with pytest.raises(DisconnectedError):
-            await ros.send_goal("/fly", "boat_msgs/Fly")
+            await asyncio.wait_for(waiting, PATIENCE)
+    await goal.cancel()
+    await one.wait_for_state(State.CONNECTED, PATIENCE)
+    another = await one.send_goal("/fly", "boat_msgs/Fly")
+    await server.hear("send_action_goal")
+    await one.close()
+    with pytest.raises(DisconnectedError):
+        await another.result(1)
+    with pytest.raises(DisconnectedError):
+        await one.send_goal("/fly", "boat_msgs/Fly")
