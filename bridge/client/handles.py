@@ -334,12 +334,7 @@ class Publication(_Handle):
         return not self._session.is_open or self._session.must_wait()
 
     async def ready(self, timeout: float = 5.0) -> None:  # noqa: ASYNC109  # as above
-        """Wait until the server has accepted what was sent before.
-
-        Raises:
-            DisconnectedError: There is no connection now, or it was lost meanwhile.
-            SlowPeerError: The server did not within `timeout` seconds.
-        """
+        """Wait until the server has accepted what was sent before; it fails as `publish` does."""
         if self._session.must_wait():
             await self._session.wait_turn(f"a message of {self.topic}", timeout)
 

@@ -296,11 +296,8 @@ class Ros:
         form of the type of `/rosout`. Later advertisements and subscriptions, and those restored after a reconnection,
         use type names of the detected form.
 
-        Args:
-            timeout: Timeout in seconds.
-
         Returns:
-            1 or 2; None without rosapi and without a message with a header.
+            1 or 2; None without rosapi and without a message with a header, and after `timeout` seconds.
         """
         if self.ros_version is None:
             asked = (self._ask_version(timeout), self._ask_rosout_type(timeout))
