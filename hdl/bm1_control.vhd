@@ -185,10 +185,7 @@ begin
             state <= running;
           end if;
         elsif (state = loading) then
-          if (stopped = '1') then
-            state   <= standing;
-            has_run <= '1';
-          elsif (loaded = '1') then
+          if (loaded = '1') then
             state <= running;
           end if;
         else
@@ -204,9 +201,8 @@ begin
 
   end process sequence_of_frame;
 
-  -- A frame of which no replica can count ends without a cycle.
-  stopped <= '1' when (state /= standing and state /= loading and (or enable) = '0')
-                      or (loaded = '1' and (and impossible_i) = '1') else
+  -- A frame of which no replica can count ends here too, without a cycle.
+  stopped <= '1' when state /= standing and state /= loading and (or enable) = '0' else
              '0';
 
   join_reasons : process (all) is

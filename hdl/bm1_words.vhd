@@ -44,7 +44,7 @@ architecture rtl of bm1_words is
 
   type memory_t is array (0 to 2 ** INDEX_BITS - 1) of std_logic_vector(31 downto 0);
 
-  signal memory        : memory_t                                    := (others => (others => '0'));
+  signal memory        : memory_t;
   signal next_initial  : unsigned(INDEX_BITS downto 0)               := (others => '0');
   signal place         : unsigned(INITIAL_ADDRESS_BITS - 1 downto 0) := (others => '0');
   signal initial_valid : std_logic                                   := '0';

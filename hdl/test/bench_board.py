@@ -283,6 +283,28 @@ class Session:
             if await self.while_running(due):
                 return
 
+    async def frame_of_many_slices(self) -> None:
+        """Run a frame in slices of few cycles; what is halted after the first one stays so."""
+        p, both = self.parameters, self.both
+        await self.write_inputs()
+        for address, value in ((rm.TARGET_COUNT, p.target_count_max), (rm.BANK, 0), (rm.PRIOR_SELECT, 0)):
+            await both.write(address, value)
+        await both.write_long(rm.MAX_CYCLES, 400)
+        end = 1
+        await both.write_long(rm.RUN_UNTIL, end)
+        doorbell, mask = rm.START, 0
+        for at in range(5):
+            due = next_doorbell(both.board.done)
+            if not await both.write(doorbell, due):
+                return  # the frame is over: nobody can go on
+            await both.finish()
+            end += self.pick([1, 2, 9])
+            await both.write_long(rm.RUN_UNTIL, end)
+            if p.replicas > 1:
+                mask = 1 << int(self.random.integers(p.replicas)) if at in {0, 2} else 0
+                await both.write(rm.HALT, mask & 0xFFFFFFFF)
+            doorbell = rm.RESUME
+
     # ---- what a host writes -----------------------------------------------------------------------------
 
     async def write_inputs(self) -> None:
@@ -565,4 +587,6 @@ async def same_as_the_emulated_board(dut: Any) -> None:
             await both.write(rm.CONTROL, rm.CONTROL_RESET_MASK)
             await both.compare_outcome()
         await session.frame()
+        if session.chance(0.3):
+            await session.frame_of_many_slices()
     await both.compare_everything()

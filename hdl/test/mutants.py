@@ -125,8 +125,8 @@ MUTANTS: Final = (
     Mutant(
         "an impossible frame runs",
         "bm1_control.vhd",
-        "(loaded = '1' and (and impossible_i) = '1')",
-        "(loaded = '1' and false)",
+        "going(r) <= not impossible_i(r);",
+        "going(r) <= '1';",
     ),
     Mutant(
         "one line that cannot count makes a frame impossible",
