@@ -37,7 +37,7 @@ def image(parameters):
 )
 @pytest.mark.parametrize(
     ("parameters", "aluts", "registers"),
-    [(PLAIN, 2175, 1298), (REPLICAS, 2224, 1580)],
+    [(PLAIN, 2247, 1234), (REPLICAS, 2072, 1388)],
     ids=["plain", "replicas"],
 )
 def test_a_small_board_takes_as_much_logic_as_it_did(tmp_path, parameters, aluts, registers):
