@@ -236,3 +236,12 @@ def test_a_client_that_reads_no_answers_must_be_closed() -> None:
         reader.rosapi("get_time")
     assert deaf.client in hub.broker.take_ready()
     assert (bool(deaf.client.close_reason), bool(reader.client.close_reason)) == (True, False)
+
+
+def test_a_client_waits_for_at_most_as_many_calls_as_the_limit() -> None:
+    service = Service(calls_per_client=2)
+    for _ in range(3):
+        service.call()
+    assert len(service.server.read()) == 2
+    (refused,) = service.caller.read()
+    assert refused["result"] is False
