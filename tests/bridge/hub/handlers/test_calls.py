@@ -240,8 +240,10 @@ def test_a_client_that_reads_no_answers_must_be_closed() -> None:
 
 def test_a_client_waits_for_at_most_as_many_calls_as_the_limit() -> None:
     service = Service(calls_per_client=2)
-    for _ in range(3):
-        service.call()
-    assert len(service.server.read()) == 2
+    other = service.hub.connect()
+    serve(other, "/multiply")
+    for name in ("/add", "/multiply", "/add"):  # so that no server reaches its own limit first
+        service.caller.send(op="call_service", service=name)
+    assert len(service.server.read()) == len(other.read()) == 1
     (refused,) = service.caller.read()
     assert refused["result"] is False
