@@ -47,18 +47,12 @@ def kinds(service):
 
 async def test_readings_that_come_while_boards_are_programmed_wait_or_are_counted(begun, order):
     begun.flow._losses[LossReason.IN_RELOAD] = 40  # of an earlier reload
-    in_switch = []
-
-    def programming():
-        begun.read(QUEUE_ALL_DEPTH + 3, generation=1)
-        in_switch.extend(begun.app.frames)
-
-    begun.app.before_switch = programming
+    begun.app.before_switch = lambda: begun.read(QUEUE_ALL_DEPTH + 3, generation=1)
     sentence = await begun.reloads.order(order)
     assert f"0 frames were in flight and finished before{MEANWHILE}, " in sentence
     assert begun.master.status().generation == 1
     assert begun.lost == {LossReason.IN_RELOAD: 43}
-    assert (in_switch, begun.app.frames) == ([], [1])
+    assert begun.app.frames == [1]
     assert begun.flow.waiting == QUEUE_ALL_DEPTH - 1
     assert kinds(begun.subscriber) == kinds(begun.publisher) == kinds(begun.app) == [Prepare, Switch]
     assert [peer.generation for peer in begun.peers] == [1, 1, 1]
@@ -83,6 +77,12 @@ async def test_readings_that_still_wait_after_the_drain_are_lost(begun, order, m
     begun.read(3)
     assert f"; {fates(3, 3)}, " in await begun.reloads.order(order)
     assert begun.lost == {LossReason.IN_RELOAD: 3}
+
+
+async def test_boards_get_no_frame_while_they_are_programmed(begun, order):
+    begun.app.before_switch = begun.read
+    assert f"; {fates(0, 1)}, " in await begun.reloads.order(order)
+    assert begun.app.frames == []
 
 
 async def test_a_second_order_is_refused_meanwhile(begun, order):
