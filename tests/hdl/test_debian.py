@@ -1,0 +1,39 @@
+"""Installing what a verification needs: one sentence where that cannot be done."""
+
+import pytest
+
+from scripts.verifications import debian
+
+
+def only(found):
+    return lambda program: f"/usr/bin/{program}" if program in found else None
+
+
+def test_nothing_is_installed_where_nothing_is_missing(monkeypatch):
+    monkeypatch.setattr(debian.shutil, "which", only({"ghdl"}))
+    monkeypatch.setattr(debian.subprocess, "run", lambda *_, **__: pytest.fail("something was installed"))
+    debian.install({"ghdl": "ghdl"})
+
+
+def test_another_system_is_told_what_to_install(monkeypatch):
+    monkeypatch.setattr(debian.shutil, "which", only(set()))
+    with pytest.raises(
+        debian.MissingToolError, match=r"^iverilog and yosys not found; install iverilog yosys \(Debian"
+    ):
+        debian.install({"iverilog": "iverilog", "yosys": "yosys"})
+
+
+def test_debian_installs_what_is_missing(monkeypatch):
+    found, said = {"apt-get", "yosys"}, []
+
+    def run(command, **_):
+        said.append(command)
+        if "install" in command:
+            found.add("iverilog")
+
+    monkeypatch.setattr(debian.shutil, "which", lambda program: only(found)(program))
+    monkeypatch.setattr(debian.os, "geteuid", lambda: 0)
+    monkeypatch.setattr(debian.subprocess, "run", run)
+    debian.install({"iverilog": "iverilog", "yosys": "yosys"})
+    assert [command[:2] for command in said] == [["apt-get", "update"], ["apt-get", "install"]]
+    assert said[1][-1] == "iverilog"
