@@ -49,7 +49,7 @@ def test_one_topic_every_message_is_a_frame_with_its_stamp():
     assert reading.addresses == [3, 7]
     assert reading.stamp_ns == 100_005_000_000
     assert (reading.received_ns, reading.received_tick) == (11, 12)
-    assert frames.take(0, {"D1": 1, "D2": 1}, 77, 0).stamp_ns == 77  # without a stamp, the receipt
+    assert frames.take(0, {"D2": 1, "deep": {"D1": 1}}, 77, 0).stamp_ns == 77  # without a stamp, the receipt
 
 
 @pytest.mark.parametrize("message", [{}, {"D1": None}, {"D1": float("nan")}, {"D1": []}])

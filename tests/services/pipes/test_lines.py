@@ -39,8 +39,8 @@ def test_a_result_and_an_array():
     counted, stamp = result_from_line(
         b'{"number": 1, "boards": [{"counts": [1, 258], "cycles": 5, "reason": 1}]}', 1, 2
     )
-    (board,) = Inference(counted).boards
-    assert (board.words, board.cycles, stamp) == (b"\1\0\0\0\2\1\0\0", 5, None)
+    (one,) = Inference(counted).boards
+    assert (one.words, one.cycles, stamp) == (b"\1\0\0\0\2\1\0\0", 5, None)
     assert result_from_line(b"[0.25, 0.75]", 1, 2) == [0.25, 0.75]
     counted, _ = result_from_line(board([1, 2, 3, 4], **OF_REPLICAS).encode(), 1, 4, 2)
     assert Inference(counted).boards[0].replica_cycles == (9, 5)
