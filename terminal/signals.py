@@ -94,5 +94,10 @@ def run_async(main: Coroutine[Any, Any, int | None]) -> int:
                 return int(code or 0)
         raise stopped_by(received[0])
 
-    with contextlib.closing(main), asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
-        return runner.run(guarded())
+    handlers = {number: signal.getsignal(number) for number in _ENDS}
+    try:
+        with contextlib.closing(main), asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
+            return runner.run(guarded())
+    finally:  # closing the loop has installed the system's own handlers
+        for number, handler in handlers.items():
+            signal.signal(number, handler)

@@ -1,6 +1,6 @@
 """The deployments that a service holds: the one in force, and the one that is prepared for a reload.
 
-The master numbers a run's deployments, and sends the current number in its greeting (docs/how-to/operating.md, Reload).
+The master numbers a run's deployments, and sends the current number in its greeting (docs/how-to/operating.md, Another deployment without stopping).
 """
 
 from __future__ import annotations

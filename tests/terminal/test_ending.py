@@ -50,8 +50,16 @@ def end_of(body, *, stdout=subprocess.DEVNULL):
         "import ctypes\nctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(signal.SIGTERM))()\ncheck_signals()\ntime.sleep(20)",
         "class Held:\n    def __del__(self):\n        signal.raise_signal(signal.SIGTERM)\nHeld()\ncheck_signals()\ntime.sleep(20)",
         "signal.raise_signal(signal.SIGTERM)\ntime.sleep(20)",
+        "run_async(work())\nsignal.raise_signal(signal.SIGTERM)\ntime.sleep(20)",
     ],
-    ids=["waiting", "catching Exception", "in a C callback", "in a finaliser", "at once"],
+    ids=[
+        "waiting",
+        "catching Exception",
+        "in a C callback",
+        "in a finaliser",
+        "at once",
+        "after a coroutine",
+    ],
 )
 def test_a_signal_ends_a_command_wherever_it_is(place):
     code, lines = end_of(place)
