@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import signal
+import sys
 from typing import TYPE_CHECKING, Any
 
 import uvloop
@@ -32,8 +33,9 @@ def raise_on_signals() -> None:
     """Make SIGINT, SIGTERM and SIGHUP raise `StoppedError` in the main thread.
 
     A second signal is ignored, since cleaning up is bounded. Python drops an exception that is raised while the thread
-    runs a callback from C code or a finaliser, so code that blocks calls `check_signals` first.
+    runs a callback from C code, forks, or runs a finaliser, so code that blocks calls `check_signals` first.
     """
+    sys.unraisablehook = _report_dropped
     for number in _ENDS:
         signal.signal(number, _stop)
 
@@ -42,6 +44,12 @@ def _stop(number: int, _frame: object) -> None:
     _received.append(number)
     if len(_received) == 1:
         raise stopped_by(number)
+
+
+def _report_dropped(dropped: sys.UnraisableHookArgs) -> None:
+    """Report an exception that Python drops, unless it is a signal's, which is not lost."""
+    if not isinstance(dropped.exc_value, StoppedError):
+        sys.__unraisablehook__(dropped)
 
 
 def check_signals() -> None:

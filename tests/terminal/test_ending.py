@@ -51,6 +51,7 @@ def end_of(body, *, stdout=subprocess.DEVNULL):
         "class Held:\n    def __del__(self):\n        signal.raise_signal(signal.SIGTERM)\nHeld()\ncheck_signals()\ntime.sleep(20)",
         "signal.raise_signal(signal.SIGTERM)\ntime.sleep(20)",
         "run_async(work())\nsignal.raise_signal(signal.SIGTERM)\ntime.sleep(20)",
+        "os.register_at_fork(after_in_parent=lambda: signal.raise_signal(signal.SIGTERM))\nos.fork() or os._exit(0)\ncheck_signals()",
     ],
     ids=[
         "waiting",
@@ -59,12 +60,13 @@ def end_of(body, *, stdout=subprocess.DEVNULL):
         "in a finaliser",
         "at once",
         "after a coroutine",
+        "while forking",
     ],
 )
 def test_a_signal_ends_a_command_wherever_it_is(place):
     code, lines = end_of(place)
     assert code == ExitCode.TERMINATED
-    assert lines[-1] == "asked to end (SIGTERM)"
+    assert lines == ["asked to end (SIGTERM)"]
 
 
 def test_a_dropped_signal_counts_at_the_end_of_a_command():
