@@ -159,8 +159,15 @@ def _counts(frames: FrameCounts | None) -> tuple[str, str, str, str, str]:
         return "", "", "", "", ""
     number = "" if frames.last_number is None else f"{frames.last_number}, "
     last = "none yet" if frames.last_age_s is None else f"{number}{_duration(frames.last_age_s)} ago"
-    lost = ", ".join(f"{count} {plain(reason)}" for reason, count in frames.lost.items())
-    return str(frames.received), str(frames.completed), f"{frames.rate:.1f}", last, lost or "none"
+    counted = [f"{count} {plain(reason)}" for reason, count in frames.lost.items()]
+    counted += [f"({count} without {topic})" for topic, count in frames.without.items()]
+    return (
+        str(frames.received),
+        str(frames.completed),
+        f"{frames.rate:.1f}",
+        last,
+        ", ".join(counted) or "none",
+    )
 
 
 async def show(directory: Path, *, watch: bool, json: bool) -> int:

@@ -5,7 +5,7 @@ There is no socket and no clock here: messages go in, complete sets of addresses
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
@@ -13,6 +13,7 @@ from bridge.errors import BridgeError
 from bridge.fields import Field
 from bridge.stamps import header_stamp_ns
 from services.errors import OverflowedQueueError, VariableError
+from services.pipeline.synchroniser import Synchroniser
 from services.sockets.records import Addresses, Reading
 from toolchain.deployment import Deployment, Variable
 from toolchain.deployment.address import to_address
@@ -20,9 +21,6 @@ from toolchain.errors import ReadingError
 
 QUEUE_ALL_DEPTH = 256
 """Frames that wait with `queue = all` before the run ends with an error."""
-
-UNPAIRED_DEPTH = 64
-"""Messages per topic that wait for those of the other topics."""
 
 UNPAIRED_WARNING = 8
 """Messages of every needed topic without a pair after which the stamps are reported as too far apart."""
@@ -112,9 +110,8 @@ class StampGap:
 class FrameAssembler:
     """Assembles the messages of a deployment's topics to complete readings.
 
-    With one topic every message makes a frame. With several, messages are paired by stamp: a frame is complete when
-    each topic that may not be missing has a fresh message within the deployment's tolerance of the newest arrival. A
-    message without a partner is counted in `unpaired`.
+    With one topic every message makes a frame. With several, messages are paired by stamp (see `Synchroniser`), and one
+    without a partner is counted in `unpaired`.
     """
 
     def __init__(self, deployment: Deployment) -> None:
@@ -122,15 +119,28 @@ class FrameAssembler:
         self._readers = [_SourceReader(deployment, source) for source in range(count)]
         self._width = len(deployment.variables)
         self._tolerance_ns = int(deployment.tolerance_s * 1e9)
-        self._fresh: list[deque[Reading]] = [deque() for _ in range(count)]
+        self._synchroniser: Synchroniser[Reading] = Synchroniser(
+            [reader.needed for reader in self._readers], self._tolerance_ns
+        )
         self._newest: list[tuple[int, bool]] = [(0, True)] * count  # stamp, and whether a header had it
         self._since_pair = [0] * count  # messages
-        self.unpaired = 0
+        self.absent: Counter[str] = Counter()
+        """Frames without a topic that was alive, by topic."""
+
+    @property
+    def unpaired(self) -> int:
+        """Number of messages that found no partner."""
+        return self._synchroniser.unpaired
+
+    @property
+    def deadline(self) -> int | None:
+        """Monotonic ns at which `due` has a reading, unless messages complete it before; None for never."""
+        return self._synchroniser.deadline
 
     def take(
         self, source: int, message: dict[str, Any], received_ns: int, received_tick: int
-    ) -> Reading | None:
-        """Take one message of one source, and return the reading that it completes, if any.
+    ) -> list[Reading]:
+        """Take one message of one source, and return the readings that are complete now.
 
         Args:
             source: Index of the message's source in the deployment.
@@ -150,38 +160,28 @@ class FrameAssembler:
             addresses=addresses,
             prior_codes=prior_codes,
         )
-        if len(self._fresh) == 1:
-            return taken
+        if len(self._readers) == 1:
+            return [taken]
         self._newest[source] = taken.stamp_ns, stamp_ns is not None
         self._since_pair[source] += 1
-        queue = self._fresh[source]
-        if len(queue) == UNPAIRED_DEPTH:
-            queue.popleft()
-            self.unpaired += 1
-        queue.append(taken)
-        return self._pair(source, taken)
+        self._synchroniser.add(source, taken.stamp_ns, received_tick, taken)
+        return self.due(received_tick)
 
-    def _pair(self, newest: int, arrived: Reading) -> Reading | None:
-        chosen = {newest: arrived}
-        for source, queue in enumerate(self._fresh):
-            if source == newest:
-                continue
-            near = min(queue, key=lambda each: abs(each.stamp_ns - arrived.stamp_ns), default=None)
-            if near is not None and abs(near.stamp_ns - arrived.stamp_ns) <= self._tolerance_ns:
-                chosen[source] = near
-            elif self._readers[source].needed:
-                return None
+    def due(self, tick: int) -> list[Reading]:
+        """Return the readings that are complete at this monotonic time (ns)."""
+        readings = []
+        while (chosen := self._synchroniser.take_set(tick)) is not None:
+            readings.append(self._joined(chosen))
+            self.absent.update(self._readers[source].topic for source in self._synchroniser.absent)
+        return readings
+
+    def _joined(self, chosen: dict[int, Reading]) -> Reading:
         addresses: Addresses = [None] * self._width
         prior_codes = b""
         for source, reading in chosen.items():
             prior_codes = prior_codes or reading.prior_codes
             for column, address in zip(self._readers[source].columns, reading.addresses, strict=True):
                 addresses[column] = address
-            queue = self._fresh[source]
-            while queue:
-                if queue.popleft() is reading:
-                    break
-                self.unpaired += 1
         self._since_pair = [0] * len(self._since_pair)
         last = max(chosen.values(), key=lambda each: each.received_tick)
         return Reading(
@@ -194,9 +194,7 @@ class FrameAssembler:
 
     def forget(self) -> None:
         """Drop the messages that wait for partners, and count them as unpaired."""
-        for queue in self._fresh:
-            self.unpaired += len(queue)
-            queue.clear()
+        self._synchroniser.forget()
 
     def needs(self, source: int) -> bool:
         """Whether no frame is complete without a message of this source."""

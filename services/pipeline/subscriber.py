@@ -12,8 +12,8 @@ from bridge.client import Message, Ros, State, Subscription
 from bridge.errors import BridgeError, NoMessageError
 from services.errors import RosbridgeLostError, VariableError
 from services.pipeline.connections import connect_all, report_failure
-from services.pipeline.frames import FrameAssembler
 from services.pipeline.generations import Generations
+from services.pipeline.timed_frames import TimedFrames
 from services.settings import Settings
 from services.sockets.local_socket import MAX_RECORD
 from services.sockets.records import (
@@ -24,6 +24,7 @@ from services.sockets.records import (
     Notice,
     NotReloaded,
     Prepare,
+    Reading,
     Ready,
     Switch,
     Switched,
@@ -72,7 +73,7 @@ class Subscriber:
 
     def __init__(self, settings: Settings, deployment: Deployment, link: MakeLink) -> None:
         self._settings = settings
-        self._generations = Generations(deployment, FrameAssembler)
+        self._generations = Generations(deployment, self._frames_of)
         self._queue_all = (settings.queue or deployment.queue) == "all"
         self._begun = asyncio.Event()
         self._once = False
@@ -86,13 +87,17 @@ class Subscriber:
         self._unpaired_before_reload = self._unpaired_sent = 0
         self._last_tick = 0
         self._gap_reported = False
+        self._absent_reported: set[str] = set()
 
     @property
     def _deployment(self) -> Deployment:
         return self._generations.deployment
 
+    def _frames_of(self, deployment: Deployment) -> TimedFrames:
+        return TimedFrames(deployment, self._forward)
+
     @property
-    def _assembler(self) -> FrameAssembler:
+    def _assembler(self) -> TimedFrames:
         return self._generations.derived
 
     @property
@@ -147,6 +152,7 @@ class Subscriber:
                         LossReason.UNPAIRED: self._unpaired,
                     }
                 ),
+                without=dict(self._assembler.absent),
                 last_number=None,
                 last_age_s=age,
             ),
@@ -232,25 +238,29 @@ class Subscriber:
                 self._passed_over += older
             self._passed_over += subscription.lost - lost_before
             lost_before = subscription.lost
-            self._forward(at, message)
+            self._read(at, message)
 
-    def _forward(self, at: int, message: Message) -> None:
+    def _read(self, at: int, message: Message) -> None:
         try:
-            reading = self._assembler.take(
-                at, message.msg, message.received_ns, message.received_monotonic_ns
-            )
+            self._assembler.add(at, message)
         except VariableError as error:
             self._unusable += 1
             cause = f"{type(error.__cause__).__name__} {at}"
             self._link.send(Unusable(cause, str(error)))
             return
-        if reading is None:
-            gap = self._assembler.stamp_gap()
-            if gap is not None and not self._gap_reported:
-                self._link.notice("warning", str(gap))
-                self._gap_reported = True
-            return
+        gap = self._assembler.stamp_gap()
+        if gap is not None and not self._gap_reported:
+            self._link.notice("warning", str(gap))
+            self._gap_reported = True
+
+    def _forward(self, reading: Reading) -> None:
         self._gap_reported = False
+        for topic in self._assembler.absent.keys() - self._absent_reported:
+            self._absent_reported.add(topic)
+            self._link.notice(
+                "warning",
+                f"frames go on without {topic}: it brought nothing within {self._deployment.tolerance_s:g} s of the others",
+            )
         self._last_tick = reading.received_tick
         if self._link.backlog > _BACKLOG_LIMIT and not self._queue_all:
             self._passed_over += 1

@@ -9,9 +9,10 @@ from typing import Any
 from bridge.client import connect
 from bridge.fields import Field
 from services.pipeline.connections import connect_all
-from services.pipeline.frames import FrameAssembler
 from services.pipeline.subscriber import RECEIVED_QUEUE
+from services.pipeline.timed_frames import TimedFrames
 from services.settings import Settings
+from services.sockets.records import Reading
 from terminal.output import put_json
 from toolchain.deployment import Deployment, Source
 
@@ -49,35 +50,39 @@ async def print_addresses(settings: Settings, deployment: Deployment, count: int
         NoMessageError: No message came in time.
         VariableError: A variable is missing or unusable.
     """
-    assembler = FrameAssembler(deployment)
     printed = 0
+
+    def put(reading: Reading) -> None:
+        nonlocal printed
+        if count is not None and printed >= count:
+            return
+        printed += 1
+        codes = list(memoryview(reading.prior_codes).cast("H"))
+        put_json(
+            {"stamp_ns": reading.stamp_ns, "addresses": reading.addresses}
+            | ({"prior_codes": codes} if codes else {})
+        )
+        if printed == count:
+            finished.set_result(None)
+
+    finished: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+    frames = TimedFrames(deployment, put)
     async with contextlib.AsyncExitStack() as stack:
         by_uri = await connect_all(stack, settings, [source.uri for source in deployment.sources])
 
         async def follow(at: int, source: Source) -> None:
-            nonlocal printed
             subscription = by_uri[settings.uri or source.uri].subscribe(
                 source.topic, source.type, queue_size=RECEIVED_QUEUE, compression=source.compression
             )
-            while count is None or printed < count:
-                message = await subscription.next(timeout=settings.first_data_timeout)
-                reading = assembler.take(at, message.msg, message.received_ns, message.received_monotonic_ns)
-                if reading is not None and (count is None or printed < count):
-                    printed += 1
-                    codes = list(memoryview(reading.prior_codes).cast("H"))
-                    put_json(
-                        {"stamp_ns": reading.stamp_ns, "addresses": reading.addresses}
-                        | ({"prior_codes": codes} if codes else {})
-                    )
+            while True:
+                frames.add(at, await subscription.next(timeout=settings.first_data_timeout))
 
-        followers = [
-            asyncio.ensure_future(follow(at, source)) for at, source in enumerate(deployment.sources)
-        ]
+        tasks = [asyncio.ensure_future(follow(at, source)) for at, source in enumerate(deployment.sources)]
         try:
-            ended, _ = await asyncio.wait(followers, return_when=asyncio.FIRST_COMPLETED)
+            ended, _ = await asyncio.wait([*tasks, finished], return_when=asyncio.FIRST_COMPLETED)
             for each in ended:
                 each.result()
         finally:
-            for follower in followers:
-                follower.cancel()
+            for task in tasks:
+                task.cancel()
     return 0

@@ -43,6 +43,7 @@ class FrameCounts(msgspec.Struct, frozen=True, kw_only=True):
     (pcie-app), requested and published results (publisher), readings and published results (master). `lost` counts
     the others by `LossReason`. `last_number` is that of the last completed one (None: none yet, or the subscriber,
     which does not know numbers), `last_age_s` the seconds since. `rate` is completed ones per second, lately.
+    `without` counts the readings that lack a topic which may be missing and was alive, by topic (subscriber).
     All counts start from zero when a process is restarted.
     """
 
@@ -52,6 +53,7 @@ class FrameCounts(msgspec.Struct, frozen=True, kw_only=True):
     last_number: int | None
     last_age_s: float | None
     rate: float = 0.0
+    without: dict[str, int] = msgspec.field(default_factory=dict)
 
 
 class BoardStatus(msgspec.Struct, frozen=True, kw_only=True):

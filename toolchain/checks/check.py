@@ -22,6 +22,7 @@ from toolchain.checks.checked_machine import CheckedMachine
 from toolchain.checks.codes import code_findings, loss_findings
 from toolchain.checks.finding import Check, Finding, Severity, error, warning
 from toolchain.checks.generators import generator_findings
+from toolchain.checks.sources import source_findings
 from toolchain.checks.variables import variable_findings
 from toolchain.deployment import load_deployment
 from toolchain.errors import ToolchainError
@@ -101,6 +102,7 @@ def _machine(deployment: Deployment, images: Sequence[Image], model: Model | Non
 def _check(machine: CheckedMachine) -> Iterator[Finding]:
     yield from code_findings(machine)
     yield from variable_findings(machine.deployment)
+    yield from source_findings(machine.deployment)
     yield from generator_findings(machine)
 
 

@@ -30,6 +30,7 @@ class Check(StrEnum):
     SAME_READING = "same-reading"
     ADDRESS_BITS = "address-bits"
     RANGE = "range"
+    PAIRING = "pairing"
     STOPPING = "stopping"
     VANISHED_FLOOR = "vanished-floor"
     LOST_MASS = "lost-mass"

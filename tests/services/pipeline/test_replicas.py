@@ -42,7 +42,7 @@ CELLS = deployment(replicas=3, sensor_mode=SensorMode.CELL)
 
 def test_a_message_becomes_rows():
     message = {"K": [0, 1, 2, 2, None, None], "P": [1, None, 0]}
-    reading = FrameAssembler(CELLS).take(0, message, 5, 6)
+    (reading,) = FrameAssembler(CELLS).take(0, message, 5, 6)
     assert reading.addresses == [[0, 1, 2, 2, -1, -1], [1, -1, 0]]
     inputs, rows = machine_inputs(CELLS, reading.addresses)
     assert inputs.tolist() == [[[0, 1]], [[2, 2]], [[-1, -1]]]
@@ -52,7 +52,7 @@ def test_a_message_becomes_rows():
 def test_a_written_prior_is_for_all_replicas_or_each():
     of = deployment(written=True, replicas=2, prior_mode="written", prior_path="belief")
     for belief, codes in (([1, 2], [128, 255, 128, 255]), ([1, 2, 3, 0], [128, 255, 255, 0])):
-        reading = FrameAssembler(of).take(0, {"K": [0, 1], "belief": belief}, 5, 6)
+        (reading,) = FrameAssembler(of).take(0, {"K": [0, 1], "belief": belief}, 5, 6)
         assert np.frombuffer(reading.prior_codes, "<u2").tolist() == codes
 
 

@@ -15,9 +15,9 @@ def test_passed_over_readings_are_reported_once_and_counted_in_all(boat, link):
     for passed_over in (2, 3, 0):
         link.backlog = BUSY
         for _ in range(passed_over):
-            subscriber._forward(0, Message("/boat/sensors", dict(READING), 1, 2))
+            subscriber._read(0, Message("/boat/sensors", dict(READING), 1, 2))
         link.backlog = 0
-        subscriber._forward(0, Message("/boat/sensors", dict(READING), 1, 2))
+        subscriber._read(0, Message("/boat/sensors", dict(READING), 1, 2))
     assert [reading.passed_over for reading in link.sent] == [2, 3, 0]
     frames = subscriber.status().frames
     assert (frames.completed, frames.lost) == (3, {LossReason.PASSED_OVER: 5})
@@ -26,7 +26,7 @@ def test_passed_over_readings_are_reported_once_and_counted_in_all(boat, link):
 def test_an_unusable_message_is_reported_by_its_cause(boat, link):
     subscriber = Subscriber(Settings(), boat, link.make)
     for value in ("x", "y"):
-        subscriber._forward(0, Message("/boat/sensors", READING | {"D2": value}, 1, 2))
+        subscriber._read(0, Message("/boat/sensors", READING | {"D2": value}, 1, 2))
     first, second = link.sent
     assert isinstance(first, Unusable)
     assert first.cause == second.cause

@@ -1,0 +1,182 @@
+"""The synchroniser: messages of several topics become sets of one instant, by their stamps.
+
+There is no clock here: every call brings the time. Messages of one topic must be added in the order in which they were sent;
+between topics any order gives the same sets, as long as delays differ by less than the tolerance.
+
+A topic's period is the median of its last intervals. A topic is *alive* until it was silent for `ALIVE_PERIODS` of its periods.
+"""
+
+from __future__ import annotations
+
+import statistics
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Final, Generic, TypeVar
+
+DEPTH: Final = 64
+"""Messages of a topic that wait for those of the others."""
+ALIVE_PERIODS: Final = 4
+_INTERVALS: Final = 8
+_UNKNOWN_PERIOD_NS: Final = 1_000_000_000
+"""Assumed of a topic until its second message."""
+
+Item = TypeVar("Item")
+
+
+@dataclass(frozen=True, slots=True)
+class Stamped(Generic[Item]):
+    """A message: `stamp` and `tick` (its receipt, on the monotonic clock) are in ns."""
+
+    stamp: int
+    tick: int
+    item: Item
+
+
+@dataclass(slots=True)
+class _Topic(Generic[Item]):
+    """One topic: its messages without partners, the oldest first, and its rhythm."""
+
+    needed: bool
+    waiting: deque[Stamped[Item]] = field(default_factory=deque)
+    newest: int | None = None
+    heard: int | None = None
+    intervals: deque[int] = field(default_factory=lambda: deque(maxlen=_INTERVALS))
+
+    @property
+    def period(self) -> int | None:
+        """Nanoseconds between two messages, or None before the second one."""
+        return int(statistics.median(self.intervals)) if self.intervals else None
+
+    def is_alive(self, tick: int, begun: int) -> bool:
+        """Return whether a message can be expected; until it is heard, silence counts from `begun`."""
+        silence = tick - (begun if self.heard is None else self.heard)
+        return silence <= ALIVE_PERIODS * (self.period or _UNKNOWN_PERIOD_NS)
+
+    def nearest(self, stamp: int, reach: int) -> Stamped[Item] | None:
+        """Return the waiting message nearest to a stamp and within reach of it."""
+        near = min(self.waiting, key=lambda each: abs(each.stamp - stamp), default=None)
+        return near if near is not None and abs(near.stamp - stamp) <= reach else None
+
+    def may_bring(self, stamp: int, reach: int) -> bool:
+        """Return whether its next message may lie within reach of a stamp, as far as its rhythm tells."""
+        if self.newest is None:
+            return True
+        return self.newest < stamp and self.newest + (self.period or 0) < stamp + reach
+
+
+class Synchroniser(Generic[Item]):
+    """Finds sets of messages within a tolerance of each other.
+
+    Each set has a *pivot*: the newest among the oldest waiting messages of the needed topics, or the oldest waiting message
+    of all if none is needed. Every other topic adds its message nearest to the pivot. A needed topic's lies within the
+    tolerance; another topic's also has to be nearer to this pivot than to the next one of the pivot's topic. A set waits for a
+    message that would be nearer, for the tolerance at most, as long as its topic is alive. Each message is used once.
+
+    Attributes:
+        unpaired: messages that found no partner.
+        deadline: tick at which `take_set` has to be called again, or None.
+        absent: the topics that were alive and not in the last set.
+    """
+
+    def __init__(self, needed: Sequence[bool], tolerance_ns: int) -> None:
+        """Start without messages; `needed` says of each topic whether no set is complete without it."""
+        self.unpaired = 0
+        self.deadline: int | None = None
+        self.absent: list[int] = []
+        self._topics: list[_Topic[Item]] = [_Topic(each) for each in needed]
+        self._tolerance = tolerance_ns
+        self._begun: int | None = None
+        self._done = -1
+        """Stamp up to which messages are too late to begin a set, if no topic is needed."""
+
+    def add(self, at: int, stamp: int, tick: int, item: Item) -> None:
+        """Add a message of the topic with index `at`."""
+        if self._begun is None:
+            self._begun = tick
+        topic = self._topics[at]
+        if topic.newest is not None:
+            if stamp < topic.newest - self._tolerance:
+                self._begin_again()
+            elif stamp > topic.newest:
+                topic.intervals.append(stamp - topic.newest)
+        topic.newest, topic.heard = stamp, tick
+        if len(topic.waiting) == DEPTH:
+            self._drop(topic, 1)
+        topic.waiting.append(Stamped(stamp, tick, item))
+
+    def take_set(self, tick: int) -> dict[int, Item] | None:
+        """Return the next set at this time, by the topics' indices, or None."""
+        self.deadline = None
+        while (found := self._pivot()) is not None:
+            at, pivot = found
+            needed_are_there = True
+            for topic in self._topics:
+                stale = sum(each.stamp < pivot.stamp - self._tolerance for each in topic.waiting)
+                self._drop(topic, stale)
+                needed_are_there = needed_are_there and (bool(topic.waiting) or not topic.needed)
+            if needed_are_there:
+                return self._set(at, pivot, tick)
+        return None
+
+    def forget(self) -> None:
+        """Drop the waiting messages, as unpaired."""
+        for topic in self._topics:
+            self._drop(topic, len(topic.waiting))
+        self.deadline = None
+
+    def _begin_again(self) -> None:
+        """Forget the stamps of all topics: a bag or a simulation begins again."""
+        self.forget()
+        self._done = -1
+        for topic in self._topics:
+            topic.newest = None
+            topic.intervals.clear()
+
+    def _pivot(self) -> tuple[int, Stamped[Item]] | None:
+        needed = [topic for topic in self._topics if topic.needed]
+        if not all(topic.waiting for topic in needed):
+            return None
+        if not needed:
+            for topic in self._topics:
+                self._drop(topic, sum(each.stamp <= self._done for each in topic.waiting))
+        heads = [
+            (at, topic.waiting[0])
+            for at, topic in enumerate(self._topics)
+            if topic.waiting and (topic.needed or not needed)
+        ]
+        choose = max if needed else min
+        return choose(heads, key=lambda head: head[1].stamp, default=None)
+
+    def _set(self, at: int, pivot: Stamped[Item], tick: int) -> dict[int, Item] | None:
+        own_period = self._topics[at].period
+        half = self._tolerance if own_period is None else min(self._tolerance, own_period // 2)
+        chosen = {at: pivot}
+        expected: list[int] = []
+        for other, topic in enumerate(self._topics):
+            if other == at:
+                continue
+            reach = self._tolerance if topic.needed else half
+            near = topic.nearest(pivot.stamp, reach)
+            if near is not None:
+                chosen[other] = near
+                reach = abs(near.stamp - pivot.stamp)
+            if topic.is_alive(tick, self._begun or 0) and topic.may_bring(pivot.stamp, reach):
+                expected.append(other)
+        # The first message of each needed topic completed the set; a nearer one that came later does not prolong the wait.
+        complete = max((topic.waiting[0].tick for topic in self._topics if topic.needed), default=pivot.tick)
+        if expected and tick < complete + self._tolerance:
+            self.deadline = complete + self._tolerance
+            return None
+        self.absent = [other for other in expected if other not in chosen]
+        for other, each in chosen.items():
+            waiting = self._topics[other].waiting
+            while waiting.popleft() is not each:
+                self.unpaired += 1
+        self._done = pivot.stamp + half if self.absent else max(each.stamp for each in chosen.values())
+        return {other: each.item for other, each in chosen.items()}
+
+    def _drop(self, topic: _Topic[Item], count: int) -> None:
+        for _ in range(count):
+            topic.waiting.popleft()
+        self.unpaired += count

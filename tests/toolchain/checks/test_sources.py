@@ -1,0 +1,38 @@
+"""What `toolchain check` says of topics whose messages have to be paired."""
+
+import pytest
+
+from toolchain.checks.finding import Check, Severity
+from toolchain.checks.sources import source_findings
+from toolchain.deployment import Board, Deployment, Dimension, MachineSection, Source, Variable
+
+
+def deployment(*types, tolerance_s=0.05):
+    return Deployment(
+        name="test",
+        source=[Source(uri="ws://robot:9090", topic=f"/t{at}", type=type_) for at, type_ in enumerate(types)],
+        variable=[Variable(name=f"D{at}", source=at, bits=7, values=101) for at in range(len(types))],
+        searched=[Dimension(label="x", size=4)],
+        machine=MachineSection(lines=4),
+        board=[Board(image="boards/board0.bm", image_hash="0" * 64, line_offset=0, lines=4)],
+        tolerance_s=tolerance_s,
+    )
+
+
+@pytest.mark.parametrize(
+    ("types", "tolerance_s", "severity"),
+    [
+        (["std_msgs/msg/Float64"], 0.0, None),
+        (["sensor_msgs/Imu", "sensor_msgs/LaserScan"], 0.0, None),
+        (["std_msgs/msg/Float64", "sensor_msgs/msg/Imu"], 0.05, Severity.NOTE),
+        (["geometry_msgs/Twist", "sensor_msgs/Imu"], 0.05, Severity.NOTE),
+        (["geometry_msgs/TwistStamped", "sensor_msgs/Imu"], 0.05, None),
+        (["std_msgs/Float64", "std_msgs/Float64"], 0.05, None),
+        (["std_msgs/Float64", "std_msgs/Float64"], 0.001, Severity.WARNING),
+    ],
+)
+def test_topics_that_pair_by_receipt(types, tolerance_s, severity):
+    findings = list(source_findings(deployment(*types, tolerance_s=tolerance_s)))
+    assert [(each.check, each.severity) for each in findings] == (
+        [(Check.PAIRING, severity)] if severity else []
+    )
