@@ -16,6 +16,7 @@ import asyncio
 import ipaddress
 import re
 import socket
+from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Final, Literal
@@ -23,8 +24,6 @@ from typing import TYPE_CHECKING, ClassVar, Final, Literal
 from bridge.errors import BridgeError
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Sequence
-
     from zeroconf.asyncio import AsyncServiceInfo, AsyncZeroconf
 
 SERVICE_TYPE: Final = "_rosbridge._tcp.local."

@@ -16,10 +16,12 @@ import math
 import os
 import struct
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from importlib.metadata import version
-from typing import TYPE_CHECKING, Annotated, Any, Final, TypeAlias
+from pathlib import Path
+from typing import Annotated, Any, Final, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -30,10 +32,6 @@ from machines.errors import MachineError
 from machines.parameters import BM1Parameters, RngKind, SensorMode
 from pcie_shim import register_map
 from pcie_shim.errors import DamagedImageError, ImageError, ImageMismatchError
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
 
 MAGIC: Final = b"BMIMAGE\x01"
 """First bytes of a programming file; the last of them is the format's version."""

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 import sys
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
-from typing import TYPE_CHECKING, Any, NoReturn, cast
+from typing import Any, NoReturn, cast
 
 import typer
 from typer.core import TyperCommand, TyperGroup
@@ -18,9 +19,6 @@ from terminal.logs import escape_last_resort
 from terminal.output import open_standard_streams
 from terminal.signals import raise_on_signals
 from terminal.usage import RefusedValueError, metavar
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
 
 
 class CommandLine(typer.Typer):

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import logging
-from typing import TYPE_CHECKING
+from collections.abc import Callable
 
 from terminal.logs import log_libraries
 from terminal.output import say
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 
 def report_connection(uri: str) -> Callable[[str, str], None]:

@@ -6,7 +6,8 @@ import errno
 import os
 import sys
 import traceback
-from typing import TYPE_CHECKING, Final
+from collections.abc import Callable
+from typing import Final
 
 import typer
 
@@ -14,9 +15,6 @@ from terminal.errors import ExitCode, ReaderGoneError, StoppedError, exit_code_o
 from terminal.output import discard_output, say, say_lines
 from terminal.signals import check_signals, ignore_signals
 from terminal.usage import usage_sentence
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 PARENT_VARIABLE: Final = "ROSBAYES_PARENT"
 """Environment variable that a process sets for its children; they end with it, and without comment."""

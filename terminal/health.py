@@ -15,12 +15,12 @@ import signal
 import socket
 import threading
 import time
+from collections.abc import AsyncIterator, Callable, Iterator
 from enum import StrEnum
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     import asyncio
-    from collections.abc import AsyncIterator, Callable, Iterator
 
 SUFFIX = ".status.sock"
 ANSWER_LIMIT = 1 << 20

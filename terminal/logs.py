@@ -5,15 +5,13 @@ from __future__ import annotations
 import json
 import logging
 import sys
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import structlog
+from structlog.typing import FilteringBoundLogger
 
 from terminal.one_line import lines_of, one_line
 from terminal.output import SurvivingStream
-
-if TYPE_CHECKING:
-    from structlog.typing import FilteringBoundLogger
 
 
 class _OneLine(logging.Formatter):

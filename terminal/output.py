@@ -7,16 +7,14 @@ import json
 import os
 import sys
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import Any, TextIO
 
 import orjson
 
 from terminal.errors import OutputError
 from terminal.one_line import lines_of, one_line
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
 
 
 class SurvivingStream:

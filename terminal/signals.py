@@ -6,14 +6,12 @@ import asyncio
 import contextlib
 import signal
 import sys
-from typing import TYPE_CHECKING, Any
+from collections.abc import Coroutine
+from typing import Any
 
 import uvloop
 
 from terminal.errors import ExitCode, StoppedError
-
-if TYPE_CHECKING:
-    from collections.abc import Coroutine
 
 _ENDS = {
     signal.SIGINT: (ExitCode.INTERRUPTED, "interrupted (Ctrl-C)"),

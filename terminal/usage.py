@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import typer
 from typer.core import TyperArgument, TyperOption
 
 from terminal.one_line import one_line, shown
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 Parameter = TyperOption | TyperArgument
 

@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
+from bridge.client import Publication
+from bridge.client.protocol import RosVersion
 from casestudies.mrclam.recording import (
     MAP_FRAME,
     SIGHTINGS_MSG,
@@ -25,17 +27,15 @@ from casestudies.mrclam.recording import (
     sightings_message,
 )
 from posteriors.errors import BadResultError, NoResultError
+from posteriors.posterior import Posterior
 from terminal.command_line import CommandLine
 from terminal.connection import report_connection
 from terminal.output import check_writable, say, write_json
 from terminal.signals import run_async
 
 if TYPE_CHECKING:
-    from bridge.client import Publication
-    from bridge.client.protocol import RosVersion
     from casestudies.listening import Listener
     from casestudies.truths import Instance
-    from posteriors.posterior import Posterior
 
 LOST_DISTANCE: Final = 9.0
 """Distance in metres that a frame without a result counts as: the width of the area."""

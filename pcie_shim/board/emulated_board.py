@@ -10,17 +10,19 @@ from __future__ import annotations
 import math
 import struct
 import time
-from typing import TYPE_CHECKING, Final, NoReturn
+from collections.abc import Callable, Collection
+from typing import Final, NoReturn
 
 import numpy as np
+import numpy.typing as npt
 
-from machines.bm1 import Start, StopReason, missing_inputs
+from machines.bm1 import BM1Machine, Start, StopReason, missing_inputs
 from machines.errors import MachineError, StartError
-from machines.kernel import make_kernel
-from machines.parameters import CYCLES_MAX, PriorMode, RngReset
+from machines.kernel import BM1Kernel, make_kernel
+from machines.parameters import CYCLES_MAX, BM1Parameters, PriorMode, RngReset
 from pcie_shim import register_map as rm
 from pcie_shim.errors import ImageError, PcieShimError
-from pcie_shim.programming_file import image_from_bytes, is_plain
+from pcie_shim.programming_file import Image, image_from_bytes, is_plain
 from pcie_shim.register_layout import (
     ALL_ONES,
     DONE_BLOCK,
@@ -30,16 +32,6 @@ from pcie_shim.register_layout import (
     next_doorbell,
 )
 from pcie_shim.register_map import BoardState, ErrorCode, MachineKind, RngKind, SensorMode
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Collection
-
-    import numpy.typing as npt
-
-    from machines.bm1 import BM1Machine
-    from machines.kernel import BM1Kernel
-    from machines.parameters import BM1Parameters
-    from pcie_shim.programming_file import Image
 
 CHUNK_S: Final = 0.05
 """Seconds that the machine runs before the board reads from its host again."""

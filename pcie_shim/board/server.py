@@ -14,23 +14,20 @@ import select
 import socket
 import struct
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from pcie_shim import framing, register_map
 from pcie_shim.board.emulated_board import EmulatedBoard, RefusedError
 from pcie_shim.board.misbehaviour import Misbehaviour, MisbehaviourKind
 from pcie_shim.endpoint import Endpoint, listen, no_delay, parse_endpoint, remove_listener
 from pcie_shim.errors import FramingError
+from pcie_shim.framing import Frame, ProgramBegin
 from pcie_shim.programming_file import MAX_IMAGE_BYTES
 from pcie_shim.register_layout import ALL_ONES
 from pcie_shim.register_map import ErrorCode
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from pcie_shim.framing import Frame, ProgramBegin
 
 _LOG: Final = logging.getLogger(__name__)
 

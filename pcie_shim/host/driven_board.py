@@ -8,9 +8,11 @@ import time
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+import numpy.typing as npt
 
 from machines.bm1 import StopReason, joint_reason
 from pcie_shim import register_map as rm
+from pcie_shim.endpoint import Endpoint
 from pcie_shim.errors import (
     AccessError,
     BoardError,
@@ -37,19 +39,15 @@ from pcie_shim.errors import (
     UnreachableError,
 )
 from pcie_shim.host.frame import BoardResult
+from pcie_shim.host.link import Done, Link, RegisterWrite
 from pcie_shim.host.loader import program
 from pcie_shim.host.socket_link import SocketLink
-from pcie_shim.programming_file import interface_words, is_plain
+from pcie_shim.programming_file import Image, interface_words, is_plain
 from pcie_shim.register_layout import ALL_ONES, REPLICA_OUTCOME, next_doorbell
 from pcie_shim.register_map import BoardState
 
 if TYPE_CHECKING:
-    import numpy.typing as npt
-
-    from pcie_shim.endpoint import Endpoint
     from pcie_shim.host.frame_encoder import BoardWords
-    from pcie_shim.host.link import Done, Link, RegisterWrite
-    from pcie_shim.programming_file import Image
 
 _ASSUMED_SPEED: Final = 1e4  # cycles per second of a board that does not say its own
 _START: Final = struct.Struct("<QI")  # RUN_UNTIL, START

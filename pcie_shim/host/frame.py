@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import msgspec
 import numpy as np
+import numpy.typing as npt
 
-from machines.bm1 import StopReason  # noqa: TC001 - msgspec reads the annotation
-
-if TYPE_CHECKING:
-    import numpy.typing as npt
+from machines.bm1 import StopReason
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

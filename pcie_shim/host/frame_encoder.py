@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import numpy as np
+import numpy.typing as npt
 
 from machines.parameters import CYCLES_MAX, PriorMode, SensorMode
 from pcie_shim.errors import FrameInputError
-from pcie_shim.programming_file import is_plain
+from pcie_shim.programming_file import Image, is_plain
 from pcie_shim.register_layout import SETTINGS
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    import numpy.typing as npt
-
     from pcie_shim.host.frame import FrameInput
-    from pcie_shim.programming_file import Image
 
 
 _Scalar = TypeVar("_Scalar", bound=np.generic)

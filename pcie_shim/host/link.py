@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Final, NamedTuple, Protocol, TypeAlias
 
 from pcie_shim import register_map
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
     from pcie_shim.endpoint import Endpoint
     from pcie_shim.errors import LinkTimeoutError
     from pcie_shim.framing import Octets

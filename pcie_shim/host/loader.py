@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 import hashlib
-from typing import TYPE_CHECKING, Final
+from pathlib import Path
+from typing import Final
 
 from pcie_shim import framing, register_map
-from pcie_shim.endpoint import parse_endpoint
+from pcie_shim.endpoint import Endpoint, parse_endpoint
 from pcie_shim.errors import AccessError, ImageMismatchError
 from pcie_shim.host.socket_link import SocketLink
 from pcie_shim.programming_file import Image, image_bytes, image_from_bytes, read_bytes
 from pcie_shim.register_map import ErrorCode
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from pcie_shim.endpoint import Endpoint
 
 PART_BYTES: Final = 4 * framing.MAX_PAYLOAD_WORDS
 

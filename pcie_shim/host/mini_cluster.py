@@ -9,12 +9,14 @@ from __future__ import annotations
 
 import select
 import time
-from typing import TYPE_CHECKING, Final, NoReturn, Self
+from collections.abc import Sequence
+from types import TracebackType
+from typing import Final, NoReturn, Self
 
 import numpy as np
 
 from machines.bm1 import StopReason, first_slice
-from pcie_shim.endpoint import parse_endpoint
+from pcie_shim.endpoint import Endpoint, parse_endpoint
 from pcie_shim.errors import (
     AccessError,
     BoardGoneError,
@@ -25,17 +27,10 @@ from pcie_shim.errors import (
     StaleHandleError,
 )
 from pcie_shim.host.driven_board import DrivenBoard, board_error
-from pcie_shim.host.frame import FrameOutput
+from pcie_shim.host.frame import FrameInput, FrameOutput
 from pcie_shim.host.frame_encoder import FrameEncoder
 from pcie_shim.host.link import LONGEST_POLL_S
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from types import TracebackType
-
-    from pcie_shim.endpoint import Endpoint
-    from pcie_shim.host.frame import FrameInput
-    from pcie_shim.programming_file import Image
+from pcie_shim.programming_file import Image
 
 SLACK_S: Final = 5.0
 """Seconds that a board may take beyond the time of its cycles at its measured speed."""

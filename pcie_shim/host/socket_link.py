@@ -6,8 +6,10 @@ import select
 import socket
 import struct
 import time
+from collections.abc import Iterable
 from contextlib import suppress
-from typing import TYPE_CHECKING, Final, NoReturn, Self
+from types import TracebackType
+from typing import Final, NoReturn, Self
 
 from pcie_shim import framing, register_map
 from pcie_shim.endpoint import Endpoint, connect
@@ -25,16 +27,10 @@ from pcie_shim.errors import (
     ShortReadError,
     StaleHandleError,
 )
-from pcie_shim.host.link import LONGEST_POLL_S, Done, Link
+from pcie_shim.framing import Frame, Octets
+from pcie_shim.host.link import LONGEST_POLL_S, Done, Link, RegisterWrite
 from pcie_shim.register_layout import ALL_ONES, DONE_BLOCK, WORD
 from pcie_shim.register_map import ErrorCode
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-    from types import TracebackType
-
-    from pcie_shim.framing import Frame, Octets
-    from pcie_shim.host.link import RegisterWrite
 
 _CLOSING_CODES: Final = (ErrorCode.STALE, ErrorCode.HELD, ErrorCode.BAD_FRAME)
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
 
 from pcie_shim.programming_file import Image, Partition, read_image
 from toolchain.errors import DeploymentError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from toolchain.deployment import Deployment
 
 _MACHINE_KEYS: Final = (

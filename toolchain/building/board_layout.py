@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
-from machines.parameters import RngKind, SensorMode
+from machines.parameters import BM1Parameters, RngKind, SensorMode
 from pcie_shim.programming_file import interface_room, interface_words
 from toolchain.building.partition import Block, partition_lines
 from toolchain.errors import BuildError
 from toolchain.outputs.memories import generators
-
-if TYPE_CHECKING:
-    from machines.parameters import BM1Parameters
 
 DEFAULT_INTERFACE: Final = (20, 1200)
 """Inputs and results of the thesis's PCIe interface (3.2)."""

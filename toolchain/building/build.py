@@ -9,25 +9,20 @@ from __future__ import annotations
 import os
 import time
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from pathlib import Path
 
+from pcie_shim.programming_file import Image
 from toolchain.building.board_layout import board_layout
 from toolchain.building.describe import describe
 from toolchain.building.images import board_images
 from toolchain.building.machine import machine_parameters, whole_machine
-from toolchain.building.options import check_options
+from toolchain.building.options import BuildOptions, check_options
 from toolchain.building.quantise import Quantised, quantise
 from toolchain.building.report import REPORT_NAME, build_report, with_remark
 from toolchain.deployment import FILE_NAME, Deployment, write_deployment
 from toolchain.errors import BuildError, DeploymentError
+from toolchain.models.model import Model
 from toolchain.outputs.output_files import image_files, memory_files, quartus_files, text_file, write_files
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from pcie_shim.programming_file import Image
-    from toolchain.building.options import BuildOptions
-    from toolchain.models.model import Model
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

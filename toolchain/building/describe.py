@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from pydantic import ValidationError
 
-from machines.parameters import SensorMode
-from toolchain.building.options import refused_option
+from machines.parameters import BM1Parameters, SensorMode
+from toolchain.building.options import BuildOptions, refused_option
 from toolchain.deployment import Board, Deployment, MachineSection, Output, Variable
 from toolchain.deployment.deployment_hash import with_hash
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from machines.parameters import BM1Parameters
     from pcie_shim.programming_file import Image
     from toolchain.building.board_layout import BoardLayout
-    from toolchain.building.options import BuildOptions
     from toolchain.models.model import Model
 
 

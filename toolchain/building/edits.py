@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from pydantic import ValidationError
 
 from toolchain.building.options import refused_option
+from toolchain.deployment import Deployment, Queue, Stop, Variable
 from toolchain.deployment.deployment_hash import with_hash
 from toolchain.errors import BuildError
-
-if TYPE_CHECKING:
-    from toolchain.deployment import Deployment, Queue, Stop, Variable
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -6,12 +6,12 @@ import hashlib
 import json
 from typing import TYPE_CHECKING
 
+from machines.bm1 import BM1Machine
 from machines.parameters import SensorMode
 from pcie_shim.programming_file import Image, Partition, tool_version
 from toolchain.building.partition import split
 
 if TYPE_CHECKING:
-    from machines.bm1 import BM1Machine
     from toolchain.building.board_layout import BoardLayout
     from toolchain.models.model import Model
 

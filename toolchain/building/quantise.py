@@ -8,19 +8,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from machines.encode import decode_code, encode_probability
 from machines.parameters import PROB_BITS_MAX, SensorMode
 from toolchain.deployment import Scale
 from toolchain.models.conditional import middle_bin
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from toolchain.models.model import Known, Model
+from toolchain.models.model import Known, Model
 
 _HALVINGS: Final = 12
 """Halvings of the range of a floor, on a logarithmic scale: finer than the two digits that are reported."""

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from machines.parameters import SensorMode
+from pcie_shim.programming_file import Image
 from toolchain.building.agreement import check_agreement, read_images
 from toolchain.building.board_layout import board_layout
 from toolchain.building.build import assemble
@@ -15,6 +17,7 @@ from toolchain.building.report import REPORT_NAME, build_report, remark_of, with
 from toolchain.deployment import FILE_NAME, Deployment, deployment_text, load_deployment
 from toolchain.deployment.deployment_hash import with_hash
 from toolchain.errors import BuildError, ModelError
+from toolchain.models.model import Model
 from toolchain.outputs.output_files import (
     Change,
     image_files,
@@ -23,13 +26,6 @@ from toolchain.outputs.output_files import (
     text_file,
     write_files,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-
-    from pcie_shim.programming_file import Image
-    from toolchain.models.model import Model
 
 Changes = list[tuple[str, Change]]
 

@@ -3,20 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, Literal
+from pathlib import Path
+from typing import Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from toolchain.deployment import Source, WrittenPrior
-from toolchain.deployment.fields import MessagePath, MessageType, Name, Sequence, Topic, WebSocketUri  # noqa: TC001 - pydantic evaluates annotations
-from toolchain.errors import BuildError
+from toolchain.deployment import Source, Variable, WrittenPrior
+from toolchain.deployment.fields import MessagePath, MessageType, Name, Sequence, Topic, WebSocketUri
+from toolchain.errors import BuildError, ToolchainError
 from toolchain.files.toml_file import TomlFile, nearest_name
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from toolchain.deployment import Variable
-    from toolchain.errors import ToolchainError
 
 MOST_SOURCES: Final = 256
 

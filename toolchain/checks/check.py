@@ -7,16 +7,19 @@ called dead never counts.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
 
 import numpy as np
 
 from machines.errors import MachineError
 from pcie_shim.errors import PcieShimError
+from pcie_shim.programming_file import Image
 from toolchain.building.agreement import check_agreement, read_images
 from toolchain.building.board_layout import board_layout
 from toolchain.building.build import assemble
 from toolchain.building.machine import machine_parameters
+from toolchain.building.options import BuildOptions
 from toolchain.building.partition import partition_lines
 from toolchain.checks.checked_machine import CheckedMachine
 from toolchain.checks.codes import code_findings, loss_findings
@@ -24,18 +27,10 @@ from toolchain.checks.finding import Check, Finding, Severity, error, warning
 from toolchain.checks.generators import generator_findings
 from toolchain.checks.sources import source_findings
 from toolchain.checks.variables import variable_findings
-from toolchain.deployment import load_deployment
+from toolchain.deployment import Deployment, load_deployment
 from toolchain.errors import ToolchainError
+from toolchain.models.model import Model
 from toolchain.outputs.output_files import Change, compare_files, memory_files, quartus_files
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Sequence
-    from pathlib import Path
-
-    from pcie_shim.programming_file import Image
-    from toolchain.building.options import BuildOptions
-    from toolchain.deployment import Deployment
-    from toolchain.models.model import Model
 
 
 def check_model(model: Model, options: BuildOptions) -> list[Finding]:

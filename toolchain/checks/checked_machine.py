@@ -6,10 +6,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from machines.bm1 import BM1Machine
     from machines.parameters import BM1Parameters
     from toolchain.deployment import Deployment, Variable

@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from machines.parameters import PriorMode, SensorMode
 from toolchain.checks.finding import Check, Finding, error, note, warning
-from toolchain.deployment import Scale
+from toolchain.deployment import Deployment, Dimension, Scale, Variable
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from numpy.typing import NDArray
-
     from toolchain.building.options import BuildOptions
     from toolchain.building.quantise import Quantised
     from toolchain.checks.checked_machine import CheckedMachine
-    from toolchain.deployment import Deployment, Dimension, Variable
 
 _MOST_RANGES: Final = 4
 _LOST_OFTEN: Final = 0.02

@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from itertools import pairwise
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
+from machines.bm1 import BM1Machine
 from machines.parameters import RngKind, RngReset
 from toolchain.checks.finding import Check, Finding, Severity, error, note, warning
 from toolchain.checks.rng_relations import relations
 from toolchain.outputs.memories import seed_words
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from numpy.typing import NDArray
-
-    from machines.bm1 import BM1Machine
     from toolchain.checks.checked_machine import CheckedMachine
 
 _RANDOM_SIGMAS: Final = 5

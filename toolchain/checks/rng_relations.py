@@ -8,16 +8,13 @@ independent, and no number of cycles averages that out.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
+from machines.parameters import RngKind
 from machines.rng import LFSR
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from machines.parameters import RngKind
 
 Bit = tuple[int, int]
 """A column, 0 being the prior, and a bit of its numbers."""

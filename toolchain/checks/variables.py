@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 from toolchain.checks.finding import Check, Finding, note, warning
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from toolchain.deployment import Deployment
 
 

@@ -2,15 +2,13 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
+from toolchain.building.options import BuildOptions
 from toolchain.commands.flags import BuildFlags, ModelPath
 from toolchain.deployment import Queue
-
-if TYPE_CHECKING:
-    from toolchain.building.options import BuildOptions
 
 
 def build(

@@ -1,5 +1,6 @@
 """The `toolchain explore` command: a sweep over a model's machines, or the thesis's claims as experiments."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -14,8 +15,6 @@ from toolchain.deployment import Scale, Stop
 from toolchain.errors import BuildError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
     from toolchain.analysis.accuracy.readings import Readings
     from toolchain.analysis.exploration.claims import Course
     from toolchain.analysis.exploration.results import Point

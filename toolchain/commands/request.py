@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from dataclasses import fields, replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from machines.errors import MachineError
@@ -17,15 +19,12 @@ from toolchain.deployment import parse_interface
 from toolchain.errors import BuildError
 from toolchain.flag_values import key_values, names_in
 from toolchain.models.case_study import load_model, model_path
+from toolchain.models.model import Model
 from toolchain.networks import is_network, read_network
 from toolchain.outputs.rng_table import LENGTH, read_table
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-    from pathlib import Path
-
     from toolchain.commands.flags import BuildFlags, ModelFlags
-    from toolchain.models.model import Model
 
 
 def model_file(path: Path) -> Path:

@@ -7,12 +7,9 @@ check. The subscriber applies it to every frame, the tests to every table.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
+from toolchain.deployment import Variable
 from toolchain.errors import NotANumberError, ReadingMissingError, ValueOutOfRangeError
-
-if TYPE_CHECKING:
-    from toolchain.deployment import Variable
 
 _SHOWN = 60
 

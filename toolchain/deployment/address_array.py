@@ -9,19 +9,16 @@ from __future__ import annotations
 import base64
 import binascii
 import math
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from machines.parameters import SensorMode
+from toolchain.deployment import Deployment, Scale, Variable
 from toolchain.deployment.address import to_address
 from toolchain.deployment.written_codes import written_codes
 from toolchain.errors import NotANumberError, ReadingError, ReadingMissingError
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from toolchain.deployment import Deployment, Scale, Variable
 
 MISSING: Final = -1
 """The address of a missing reading, in all lines of its machine."""

@@ -8,10 +8,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from toolchain.deployment.deployment import Deployment, DeploymentFile
+from toolchain.deployment.deployment import Deployment, DeploymentFile
 
 
 def deployment_hash(deployment: DeploymentFile) -> str:

@@ -8,16 +8,16 @@ default.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import Enum
 from typing import TYPE_CHECKING, Final
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator
+from toolchain.deployment import Deployment
 
+if TYPE_CHECKING:
     from pydantic import BaseModel
 
-    from toolchain.deployment import Deployment
 
 _DEPLOYMENT_FREE: Final = {"name", "hash", "tolerance_s", "prior", "directory"}
 _VARIABLE_FREE: Final = {

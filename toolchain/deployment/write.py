@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import tomli_w
 
+from toolchain.deployment.deployment import Deployment, DeploymentFile
 from toolchain.deployment.deployment_hash import with_hash
 from toolchain.errors import DeploymentError
 from toolchain.files.whole_file import whole_file
-
-if TYPE_CHECKING:
-    from toolchain.deployment.deployment import Deployment, DeploymentFile
 
 _HEADER: Final = """\
 # Written by `toolchain build`. URIs and endpoints may be changed here; the rest belongs to the boards' images

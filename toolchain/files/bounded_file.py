@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import os
 import stat
+from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, Final
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from toolchain.errors import ToolchainError
 
 _PIECE: Final = 1 << 18

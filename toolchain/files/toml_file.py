@@ -5,7 +5,9 @@ from __future__ import annotations
 import difflib
 import re
 import tomllib
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Self, TypeVar, get_args
 
 from pydantic import BaseModel, ValidationError
@@ -13,9 +15,6 @@ from pydantic import BaseModel, ValidationError
 from toolchain.files.bounded_file import read_bounded
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-
     from pydantic_core import ErrorDetails
 
     from toolchain.errors import ToolchainError

@@ -12,24 +12,20 @@ looks like q, the model's own table or a uniform one.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
+from toolchain.deployment import Dimension
 from toolchain.deployment.address import to_address
 from toolchain.errors import ModelError, ReadingError
 from toolchain.learning.fit_options import FitMethod, FitOptions, FitPrior
 from toolchain.learning.fitted import Fit, FitFile, FittedRecording, FittedVariable, mean_slopes, wrapped
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from numpy.typing import NDArray
-
-    from toolchain.deployment import Dimension
-    from toolchain.models.model import Known, Model
+from toolchain.models.model import Known, Model
 
 LEAST_READINGS: Final = 10
 """A pool with fewer readings keeps what was set by hand."""

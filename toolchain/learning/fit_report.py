@@ -5,29 +5,23 @@ from __future__ import annotations
 import hashlib
 import math
 import shlex
+from collections.abc import Mapping, Sequence
 from itertools import chain
+from pathlib import Path
 from statistics import fmean, median
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from toolchain.analysis.accuracy.readings import reading_columns
 from toolchain.deployment.address import to_address
 from toolchain.errors import BuildError, ModelError, ReadingError
 from toolchain.flag_values import key_values
 from toolchain.learning.fit import LEAST_READINGS, Support, fit_model, locate
-from toolchain.learning.fit_options import FitMethod
-from toolchain.learning.fitted import FittedRecording, apply_fit, write_fit
+from toolchain.learning.fit_options import FitMethod, FitOptions
+from toolchain.learning.fitted import Fit, FittedRecording, apply_fit, write_fit
 from toolchain.learning.recording import Recording, read_recording
 from toolchain.models.case_study import load_model
 from toolchain.models.fusion import exact_posterior
-from toolchain.models.model import cell_centres
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-    from pathlib import Path
-
-    from toolchain.learning.fit_options import FitOptions
-    from toolchain.learning.fitted import Fit
-    from toolchain.models.model import Model
+from toolchain.models.model import Model, cell_centres
 
 _CHUNK: Final = 1 << 20
 

@@ -5,14 +5,17 @@ from __future__ import annotations
 import json
 import math
 import zipfile
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Final, Literal
+from pathlib import Path
+from typing import Any, Final, Literal
 
 import numpy as np
 import tomli_w
+from numpy.typing import NDArray
 from pydantic import Field, ValidationError
 
-from toolchain.deployment.fields import Sequence  # noqa: TC001 - pydantic evaluates annotations
+from toolchain.deployment.fields import Sequence
 from toolchain.deployment.sections import Section
 from toolchain.errors import ModelError
 from toolchain.files.bounded_file import open_regular
@@ -20,12 +23,6 @@ from toolchain.files.toml_file import TomlFile
 from toolchain.files.whole_file import whole_file
 from toolchain.models.conditional import normal_table, wrapped_normal_table
 from toolchain.models.model import Known, Model, Normal
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from pathlib import Path
-
-    from numpy.typing import NDArray
 
 FORMAT: Final = 1
 MAX_TABLE_BYTES: Final = 1 << 28

@@ -10,17 +10,15 @@ import csv
 import math
 import re
 from bisect import bisect_left
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from io import TextIOWrapper
-from typing import TYPE_CHECKING, Any, Final, TextIO
+from pathlib import Path
+from typing import Any, Final, TextIO
 
 from toolchain.errors import ModelError
 from toolchain.files.bounded_file import open_regular
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-    from pathlib import Path
 
 MAX_ROWS: Final = 2_000_000
 _LONGEST_LINE: Final = 1 << 20

@@ -7,19 +7,16 @@ import importlib.util
 import inspect
 import sys
 import traceback
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from enum import Enum
 from pathlib import Path
-from types import UnionType
-from typing import TYPE_CHECKING, Any, Literal, Union, get_args, get_origin, get_type_hints
+from types import ModuleType, UnionType
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from toolchain.errors import ModelError, ToolchainError
 from toolchain.models.joint import Question
 from toolchain.models.model import Model
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
-    from types import ModuleType
 
 FILE_NAME = "model.py"
 _TOOLCHAIN = Path(__file__).parent.parent

@@ -7,15 +7,13 @@ the density at its middle, so that coarse bins stay exact.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Final, Literal
+from typing import Final, Literal
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from toolchain.errors import ModelError
 from toolchain.models.model import Known, Normal, check_table
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
 
 # Copies of a wrapped normal whose nearest point is further than this many sigma add less than 1e-32.
 _FARTHEST_COPY: Final = 12.0

@@ -6,10 +6,12 @@ Continuous distributions become tables here: a normal's integral over each value
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, TypeAlias
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from toolchain.errors import ModelError
 from toolchain.models.conditional import normal_table, wrapped_normal_table
@@ -17,10 +19,6 @@ from toolchain.models.limits import MAX_ENTRIES, check_size
 from toolchain.models.model import Normal
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from numpy.typing import ArrayLike, NDArray
-
     from toolchain.models.symbol import Symbol
 
     Formula: TypeAlias = Callable[..., ArrayLike] | ArrayLike

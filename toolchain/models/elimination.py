@@ -6,20 +6,16 @@ Exact, in float64. The next name is always the one whose table is the smallest; 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from heapq import heapify, heappop, heappush
 from itertools import count
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from toolchain.errors import ModelError
 from toolchain.models.limits import MAX_ENTRIES
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
-
-    from numpy.typing import NDArray
 
 _NAMED = 6
 

@@ -8,12 +8,14 @@ with the path that joins two known symbols.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from graphlib import CycleError, TopologicalSorter
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from toolchain.errors import ModelError
 from toolchain.models.distribution import Distribution, Factor
@@ -23,10 +25,6 @@ from toolchain.models.model import Known, Model, Normal, PriorSelect, dimension
 from toolchain.models.separation import Links, relevant, without_idle
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from numpy.typing import NDArray
-
     from toolchain.models.symbol import Symbol
 
     Named: TypeAlias = Symbol | str

@@ -9,18 +9,16 @@ from __future__ import annotations
 import math
 from collections import Counter
 from dataclasses import dataclass, field, fields
-from typing import TYPE_CHECKING, Final, Literal
+from typing import Final, Literal
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 from pydantic import ValidationError
 
 from toolchain.deployment import Dimension, Variable
 from toolchain.deployment.fields import NAME_MAX
 from toolchain.errors import ModelError
 from toolchain.models.limits import MAX_LINES, MAX_TABLE_ENTRIES, MAX_VALUES, check_size
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
 
 _SUM_TOLERANCE: Final = 1e-6
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, Final
@@ -12,8 +13,6 @@ import numpy as np
 from toolchain.models.distribution import Distribution, Factor
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
     from toolchain.models.elimination import Term
 
 _LONGEST_DRAWN: Final = 12

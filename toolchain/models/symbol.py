@@ -6,15 +6,13 @@ import math
 import re
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING, Final, Literal, TypeAlias
+from typing import Final, Literal, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from toolchain.errors import ModelError
 from toolchain.models.limits import MAX_ENTRIES, check_size
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 _NUMBER: Final = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d{1,3})?")
 _NO_AND_YES: Final = ({"false", "true"}, {"no", "yes"}, {"off", "on"})

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
-from toolchain.networks.builder import MAX_PARENTS, MAX_STATES
+from toolchain.networks.builder import MAX_PARENTS, MAX_STATES, NetworkBuilder
 from toolchain.networks.scanner import Scanner
-
-if TYPE_CHECKING:
-    from toolchain.networks.builder import NetworkBuilder
 
 _COMMENTS: Final = r"//[^\n]*|/\*"
 

@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from itertools import chain
-from typing import TYPE_CHECKING, Final, Literal, Protocol
+from pathlib import Path
+from typing import Final, Literal, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from toolchain.errors import ModelError, NetworkFileError
 from toolchain.models.distribution import Factor, potential, table
 from toolchain.models.joint import JointDistribution
 from toolchain.models.limits import MAX_ENTRIES
 from toolchain.models.symbol import IntegerType, LabelType, Symbol
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-
-    from numpy.typing import NDArray
 
 MAX_VARIABLES: Final = 20_000
 MAX_STATES: Final = 65_535

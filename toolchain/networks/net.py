@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from collections.abc import Iterator
+from typing import Final
 
 import numpy as np
 
-from toolchain.networks.builder import MAX_PARENTS, MAX_STATES
+from toolchain.networks.builder import MAX_PARENTS, MAX_STATES, NetworkBuilder
 from toolchain.networks.scanner import Scanner
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from toolchain.networks.builder import NetworkBuilder
 
 _COMMENTS: Final = r"%[^\n]*"
 _OTHER_NODES: Final = {"continuous", "utility", "decision", "function"}

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
-from toolchain.networks.builder import MAX_PARENTS, MAX_STATES, MAX_VARIABLES
+from toolchain.networks.builder import MAX_PARENTS, MAX_STATES, MAX_VARIABLES, NetworkBuilder
 from toolchain.networks.scanner import Scanner
-
-if TYPE_CHECKING:
-    from toolchain.networks.builder import NetworkBuilder
 
 _MAX_FACTORS: Final = 4 * MAX_VARIABLES
 _COMMENTS: Final = r"#[^\n]*|(?m:^c\b[^\n]*)"

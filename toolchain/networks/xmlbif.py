@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import re
-from typing import TYPE_CHECKING, Final
+from pathlib import Path
+from typing import Final
 from xml.parsers import expat
 
 import numpy as np
 
 from toolchain.errors import NetworkFileError
-from toolchain.networks.builder import MAX_PARENTS, MAX_STATES
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from toolchain.networks.builder import NetworkBuilder
+from toolchain.networks.builder import MAX_PARENTS, MAX_STATES, NetworkBuilder
 
 _TEXTS: Final = {"NAME", "OUTCOME", "FOR", "GIVEN", "TABLE"}
 _MAX_DEPTH: Final = 16

@@ -7,22 +7,19 @@ each line has a reading of its own, a tile is a memory by itself: its bits of th
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
-from machines.parameters import PriorMode, RngKind, SensorMode
+from machines.bm1 import BM1Machine
+from machines.parameters import BM1Parameters, PriorMode, RngKind, SensorMode
 from machines.rng import LFSR, POLYNOMIALS, generator_numbers, random_numbers
 from toolchain.outputs.mif import mif_lines
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Sequence
-
-    from numpy.typing import NDArray
-
-    from machines.bm1 import BM1Machine
-    from machines.parameters import BM1Parameters
     from pcie_shim.programming_file import Image
     from toolchain.deployment import Deployment
 

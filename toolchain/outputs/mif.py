@@ -7,15 +7,13 @@ radices, runs (`A : D0 D1;`), ranges (`[A0..A1] : D;`) and both kinds of comment
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, NoReturn
+from pathlib import Path
+from typing import Final, NoReturn
 
 from toolchain.errors import MifError
 from toolchain.files.bounded_file import read_bounded
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
-    from pathlib import Path
 
 MOST_BYTES: Final = 1 << 30
 """Larger files are not read."""

@@ -4,29 +4,26 @@ from __future__ import annotations
 
 import filecmp
 import re
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import partial
 from itertools import zip_longest
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from machines.parameters import RngKind
-from pcie_shim.programming_file import image_bytes
+from pcie_shim.programming_file import Image, image_bytes
 from toolchain.errors import BuildError
 from toolchain.files.whole_file import whole_file
 from toolchain.outputs.memories import FOLDER as MEMORIES_FOLDER
-from toolchain.outputs.memories import memories
+from toolchain.outputs.memories import Memory, memories
 from toolchain.outputs.quartus import PROJECT, project_files
 from toolchain.outputs.vhdl_parameters import FILE as PARAMETERS_FILE
 from toolchain.outputs.vhdl_parameters import parameters_vhd
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Sequence
-    from pathlib import Path
-
-    from pcie_shim.programming_file import Image
     from toolchain.deployment import Deployment
-    from toolchain.outputs.memories import Memory
 
 
 class Change(StrEnum):

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
 
 from toolchain.outputs.mif import printable
 from toolchain.outputs.vhdl_parameters import FILE as PARAMETERS_FILE
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from toolchain.deployment import Deployment
 
 FAMILY: Final = "Stratix V"

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from pathlib import Path
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
+from machines.bm1 import BM1Machine
 from machines.rng import GOLDEN, mix
 from toolchain.errors import BuildError
 from toolchain.outputs.mif import read_mif
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from machines.bm1 import BM1Machine
 
 LENGTH: Final = 1 << 16
 """Numbers of a generated table: a multiple of every number of codes."""

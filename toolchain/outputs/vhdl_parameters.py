@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Final
 
 from machines.parameters import BM1Parameters, PriorMode, RngKind, RngReset
@@ -10,8 +11,6 @@ from toolchain.outputs.memories import column_name, generators, seed_width, seed
 from toolchain.outputs.mif import printable
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
     from pcie_shim.programming_file import Image
     from toolchain.deployment import Deployment
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from machines.bm1 import BM1Machine, Start, StopReason, first_slice
 from machines.kernel import make_kernel
@@ -13,12 +15,6 @@ from machines.parameters import COUNTER_BITS_MAX, CYCLES_MAX, BM1Parameters
 from machines.posterior import joint_posterior
 from toolchain.deployment import Stop
 from toolchain.errors import BuildError
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
-
 
 Inputs: TypeAlias = "tuple[int, ...] | NDArray[np.int64]"
 """Inputs of a frame: an address per column, or int64[sensors, all lines] where lines have readings of their own."""

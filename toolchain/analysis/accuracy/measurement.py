@@ -8,26 +8,22 @@ sampling.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
-from machines.bm1 import Start, addressed_codes
+from machines.bm1 import BM1Machine, Start, addressed_codes
 from machines.encode import decode_code
 from machines.parameters import RngReset
-from toolchain.analysis.accuracy.emulation import inputs_of_boards
+from toolchain.analysis.accuracy.emulation import EmulatedBoards, Inputs, inputs_of_boards
 from toolchain.analysis.accuracy.intervals import Interval, bootstrap, bootstrap_rows, share_of_frames
 from toolchain.errors import BuildError, ModelError
 from toolchain.models.fusion import exact_posterior, fuse
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from numpy.typing import NDArray
-
-    from machines.bm1 import BM1Machine
-    from toolchain.analysis.accuracy.emulation import EmulatedBoards, Inputs
     from toolchain.analysis.accuracy.readings import Readings
     from toolchain.models.model import Model
 

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from machines.encode import decode_code
+from toolchain.deployment import Dimension, Scale, Variable
 from toolchain.deployment.address import to_address
 from toolchain.deployment.written_codes import written_codes
 from toolchain.errors import BuildError, ModelError, ReadingError
@@ -16,14 +20,8 @@ from toolchain.learning.recording import read_recording
 from toolchain.models.model import Known, Model, PriorSelect
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
     from machines.bm1 import BM1Machine
     from toolchain.analysis.accuracy.emulation import Inputs
-    from toolchain.deployment import Dimension, Scale, Variable
 
 MISSING: Final = -1
 MOST_FRAMES: Final = 100_000

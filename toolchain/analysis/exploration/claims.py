@@ -8,29 +8,24 @@ reference does; the kernels know nothing of faults.
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Final, TypeVar
+from typing import Final, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from machines.bm1 import BM1Machine
 from machines.encode import decode_code
 from machines.parameters import BM1Parameters
 from machines.rng import random_numbers
 from toolchain.analysis.accuracy.emulation import EmulatedBoards
-from toolchain.analysis.accuracy.readings import sample_readings
+from toolchain.analysis.accuracy.readings import Readings, sample_readings
 from toolchain.building.quantise import quantise
 from toolchain.deployment import Scale, Stop
 from toolchain.models.conditional import normal
 from toolchain.models.fusion import exact_posterior
 from toolchain.models.model import Model, cell_centres, interval
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from numpy.typing import NDArray
-
-    from toolchain.analysis.accuracy.readings import Readings
 
 _Word = TypeVar("_Word", np.uint16, np.uint32)
 

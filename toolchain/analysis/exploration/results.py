@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import math
 import os
-from typing import TYPE_CHECKING, Final, Literal
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from toolchain.errors import BuildError
 from toolchain.files.bounded_file import read_bounded
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
 
 MAX_FILE_BYTES: Final = 1 << 28
 

@@ -6,13 +6,15 @@ import hashlib
 import itertools
 import json
 import math
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
+from machines.bm1 import BM1Machine
 from machines.parameters import RngKind, SensorMode
 from toolchain.analysis.accuracy.emulation import EmulatedBoards, one_replica
 from toolchain.analysis.accuracy.measurement import measure
-from toolchain.analysis.accuracy.readings import check_frames, readings_of_lines, sample_readings
+from toolchain.analysis.accuracy.readings import Readings, check_frames, readings_of_lines, sample_readings
 from toolchain.analysis.exploration.results import Point
 from toolchain.analysis.resources.boards_needed import with_lines
 from toolchain.analysis.resources.estimate import Pcie, estimate
@@ -21,16 +23,12 @@ from toolchain.building.machine import machine_parameters, whole_machine
 from toolchain.building.options import BuildOptions, check_options
 from toolchain.building.partition import partition_lines, split
 from toolchain.building.quantise import quantise
+from toolchain.deployment import Scale, Stop
 from toolchain.errors import BuildError
+from toolchain.models.model import Model
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
-
-    from machines.bm1 import BM1Machine
-    from toolchain.analysis.accuracy.readings import Readings
     from toolchain.analysis.resources.device import Device
-    from toolchain.deployment import Scale, Stop
-    from toolchain.models.model import Model
 
 MAX_POINTS: Final = 10_000
 

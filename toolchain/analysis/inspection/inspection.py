@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from machines.bm1 import BM1Machine
 from machines.parameters import SensorMode
 from toolchain.analysis.accuracy.emulation import EmulatedBoards, joined, one_replica
-from toolchain.analysis.accuracy.measurement import measure
+from toolchain.analysis.accuracy.measurement import Accuracy, measure
 from toolchain.analysis.accuracy.readings import (
+    Readings,
     check_columns,
     check_frames,
     model_of_codes,
@@ -18,29 +23,18 @@ from toolchain.analysis.accuracy.readings import (
     recorded_readings,
     sample_readings,
 )
-from toolchain.analysis.resources.energy import energy
-from toolchain.analysis.resources.estimate import estimate
+from toolchain.analysis.resources.energy import Energy, energy
+from toolchain.analysis.resources.estimate import Estimate, Pcie, estimate
 from toolchain.analysis.resources.table_memories import Tables
-from toolchain.building.quantise import quantise
+from toolchain.building.quantise import ColumnLoss, quantise
 from toolchain.building.report import REPORT_NAME
-from toolchain.deployment import Scale
+from toolchain.deployment import Deployment, Scale
 from toolchain.errors import BuildError, DeploymentError
+from toolchain.models.model import Model
 from toolchain.outputs.rng_table import table_length
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-    from contextlib import AbstractContextManager
-    from pathlib import Path
-
-    from machines.bm1 import BM1Machine
-    from toolchain.analysis.accuracy.measurement import Accuracy
-    from toolchain.analysis.accuracy.readings import Readings
     from toolchain.analysis.resources.device import Device
-    from toolchain.analysis.resources.energy import Energy
-    from toolchain.analysis.resources.estimate import Estimate, Pcie
-    from toolchain.building.quantise import ColumnLoss
-    from toolchain.deployment import Deployment
-    from toolchain.models.model import Model
 
     Progress = Callable[[int], AbstractContextManager[Callable[[str], None]]]
 
