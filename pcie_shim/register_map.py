@@ -12,119 +12,67 @@ BAR_SIZE: Final = 0x20000
 
 
 class MachineKind(IntEnum):
-    """Values of CAP_MACHINE.KIND.
+    """Values of CAP_MACHINE.KIND."""
 
-    Attributes:
-        NONE: blank: no image has been loaded.
-        BM1: exact inference with approximate computations (thesis 2.1.2).
-    """
-
-    NONE = 0
-    BM1 = 1
+    NONE = 0  # blank: no image has been loaded
+    BM1 = 1  # exact inference with approximate computations (thesis 2.1.2)
 
 
 class RngKind(IntEnum):
-    """Values of CAP_MACHINE.RNG.
+    """Values of CAP_MACHINE.RNG."""
 
-    Attributes:
-        NONE: blank: no image has been loaded.
-        LFSR8: 8-bit Fibonacci LFSR.
-        LFSR16: 16-bit Fibonacci LFSR.
-        LFSR24: 24-bit Fibonacci LFSR.
-        LFSR32: 32-bit Fibonacci LFSR.
-        TABLE: a table of random numbers that all columns read cyclically.
-        IDEAL: a hash of seed, column and cycle; only on emulated boards.
-    """
-
-    NONE = 0
-    LFSR8 = 1
-    LFSR16 = 2
-    LFSR24 = 3
-    LFSR32 = 4
-    TABLE = 5
-    IDEAL = 6
+    NONE = 0  # blank: no image has been loaded
+    LFSR8 = 1  # 8-bit Fibonacci LFSR
+    LFSR16 = 2  # 16-bit Fibonacci LFSR
+    LFSR24 = 3  # 24-bit Fibonacci LFSR
+    LFSR32 = 4  # 32-bit Fibonacci LFSR
+    TABLE = 5  # a table of random numbers that all columns read cyclically
+    IDEAL = 6  # a hash of seed, column and cycle; only on emulated boards
 
 
 class SensorMode(IntEnum):
-    """Values of CAP_MACHINE.SENSOR_MODE.
+    """Values of CAP_MACHINE.SENSOR_MODE."""
 
-    Attributes:
-        COLUMN: one address for all cells of a sensor column.
-        CELL: an address for each cell.
-        THRESHOLD: a probability code for each cell; there are no tables.
-    """
-
-    COLUMN = 0
-    CELL = 1
-    THRESHOLD = 2
+    COLUMN = 0  # one address for all cells of a sensor column
+    CELL = 1  # an address for each cell
+    THRESHOLD = 2  # a probability code for each cell; there are no tables
 
 
 class BoardState(IntEnum):
-    """Values of STATUS.STATE.
+    """Values of STATUS.STATE."""
 
-    Attributes:
-        BLANK: no image: only identity and control registers are usable.
-        IDLE: reset; nothing has run.
-        RUNNING: the machine is running; writes are refused, except CONTROL.RESET.
-        DONE: the machine has stopped for the reason in STOP_REASON.
-    """
-
-    BLANK = 0
-    IDLE = 1
-    RUNNING = 2
-    DONE = 3
+    BLANK = 0  # no image: only identity and control registers are usable
+    IDLE = 1  # reset; nothing has run
+    RUNNING = 2  # the machine is running; writes are refused, except CONTROL.RESET
+    DONE = 3  # the machine has stopped for the reason in STOP_REASON
 
 
 class StopReason(IntEnum):
-    """Values of STATUS.STOP_REASON.
+    """Values of STATUS.STOP_REASON."""
 
-    Attributes:
-        NONE: nothing has run since the reset.
-        OVERFLOW: a counter reached TARGET_COUNT.
-        MAX_CYCLES: MAX_CYCLES cycles have run.
-        SLICE: RUN_UNTIL was reached; RESUME continues.
-        IMPOSSIBLE: no line can count for these readings; nothing has run.
-    """
-
-    NONE = 0
-    OVERFLOW = 1
-    MAX_CYCLES = 2
-    SLICE = 3
-    IMPOSSIBLE = 4
+    NONE = 0  # nothing has run since the reset
+    OVERFLOW = 1  # a counter reached TARGET_COUNT
+    MAX_CYCLES = 2  # MAX_CYCLES cycles have run
+    SLICE = 3  # RUN_UNTIL was reached; RESUME continues
+    IMPOSSIBLE = 4  # no line can count for these readings; nothing has run
 
 
 class ErrorCode(IntEnum):
-    """Values of STATUS.ERROR.
+    """Values of STATUS.ERROR."""
 
-    Attributes:
-        NONE: nothing was refused since the reset.
-        OUTSIDE: the address is not in the map, or not implemented by this image.
-        MISALIGNED: the address is not a multiple of 4.
-        TOO_LONG: the access runs past the end of its block.
-        READ_ONLY: the register cannot be written.
-        BUSY: the machine is running; only CONTROL.RESET may be written.
-        BLANK: no image has been loaded.
-        DOORBELL: the number is not DONE + 1, or there is nothing to resume.
-        BAD_VALUE: a value is not valid for the machine: address, target, bank, cycles.
-        STALE: the board was programmed after this handle was opened.
-        HELD: another host holds the board, or another loader is programming it.
-        BAD_FRAME: the frame is invalid: operation, length, CRC or sequence number; the link is closed.
-        BAD_IMAGE: the image is damaged, or was built for another map or board.
-    """
-
-    NONE = 0
-    OUTSIDE = 1
-    MISALIGNED = 2
-    TOO_LONG = 3
-    READ_ONLY = 4
-    BUSY = 5
-    BLANK = 6
-    DOORBELL = 7
-    BAD_VALUE = 8
-    STALE = 9
-    HELD = 10
-    BAD_FRAME = 11
-    BAD_IMAGE = 12
+    NONE = 0  # nothing was refused since the reset
+    OUTSIDE = 1  # the address is not in the map, or not implemented by this image
+    MISALIGNED = 2  # the address is not a multiple of 4
+    TOO_LONG = 3  # the access runs past the end of its block
+    READ_ONLY = 4  # the register cannot be written
+    BUSY = 5  # the machine is running; only CONTROL.RESET may be written
+    BLANK = 6  # no image has been loaded
+    DOORBELL = 7  # the number is not DONE + 1, or there is nothing to resume
+    BAD_VALUE = 8  # a value is not valid for the machine: address, target, bank, cycles
+    STALE = 9  # the board was programmed after this handle was opened
+    HELD = 10  # another host holds the board, or another loader is programming it
+    BAD_FRAME = 11  # the frame is invalid: operation, length, CRC or sequence number; the link is closed
+    BAD_IMAGE = 12  # the image is damaged, or was built for another map or board
 
 
 class Block(NamedTuple):
@@ -138,24 +86,18 @@ class Block(NamedTuple):
 
 ID: Final = 0x0000
 ID_VALUE: Final = 0x31304d42
-
 MAP_VERSION: Final = 0x0004
 MAP_VERSION_VALUE: Final = 0x10001
 MAP_VERSION_MINOR_SHIFT: Final = 0
 MAP_VERSION_MINOR_MASK: Final = 0xffff
 MAP_VERSION_MAJOR_SHIFT: Final = 16
 MAP_VERSION_MAJOR_MASK: Final = 0xffff0000
-
 LIVENESS: Final = 0x0008
-
 PROGRAMMED: Final = 0x000c
-
 MAP_HASH: Final = 0x0020
 MAP_HASH_WORDS: Final = 8
-
 IMAGE_HASH: Final = 0x0040
 IMAGE_HASH_WORDS: Final = 8
-
 CAP_MACHINE: Final = 0x0080
 CAP_MACHINE_KIND_SHIFT: Final = 0
 CAP_MACHINE_KIND_MASK: Final = 0xff
@@ -169,21 +111,15 @@ CAP_MACHINE_PRIOR_WRITTEN_SHIFT: Final = 18
 CAP_MACHINE_PRIOR_WRITTEN_MASK: Final = 0x40000
 CAP_MACHINE_SENSOR_MODE_SHIFT: Final = 19
 CAP_MACHINE_SENSOR_MODE_MASK: Final = 0x180000
-
 CAP_LINES: Final = 0x0084
-
 CAP_TOTAL_LINES: Final = 0x0088
-
 CAP_LINE_OFFSET: Final = 0x008c
-
 CAP_PARTITION: Final = 0x0090
 CAP_PARTITION_INDEX_SHIFT: Final = 0
 CAP_PARTITION_INDEX_MASK: Final = 0xffff
 CAP_PARTITION_COUNT_SHIFT: Final = 16
 CAP_PARTITION_COUNT_MASK: Final = 0xffff0000
-
 CAP_SENSORS: Final = 0x0094
-
 CAP_WIDTHS: Final = 0x0098
 CAP_WIDTHS_PROB_BITS_SHIFT: Final = 0
 CAP_WIDTHS_PROB_BITS_MASK: Final = 0xff
@@ -191,21 +127,15 @@ CAP_WIDTHS_COUNTER_BITS_SHIFT: Final = 8
 CAP_WIDTHS_COUNTER_BITS_MASK: Final = 0xff00
 CAP_WIDTHS_PRIOR_BITS_SHIFT: Final = 16
 CAP_WIDTHS_PRIOR_BITS_MASK: Final = 0xff0000
-
 CAP_BANKS: Final = 0x009c
-
 CAP_REPLICAS: Final = 0x00a0
-
 CAP_INTERFACE: Final = 0x00a4
 CAP_INTERFACE_SENSORS_SHIFT: Final = 0
 CAP_INTERFACE_SENSORS_MASK: Final = 0xffff
 CAP_INTERFACE_RESULTS_SHIFT: Final = 16
 CAP_INTERFACE_RESULTS_MASK: Final = 0xffff0000
-
 CAP_SPEED: Final = 0x00a8
-
 CAP_STEPS: Final = 0x00ac
-
 CAP_SENSOR_BITS: Final = 0x00c0
 CAP_SENSOR_BITS_WORDS: Final = 16
 CAP_SENSOR_BITS_FIRST_SHIFT: Final = 0
@@ -216,31 +146,21 @@ CAP_SENSOR_BITS_THIRD_SHIFT: Final = 16
 CAP_SENSOR_BITS_THIRD_MASK: Final = 0xff0000
 CAP_SENSOR_BITS_FOURTH_SHIFT: Final = 24
 CAP_SENSOR_BITS_FOURTH_MASK: Final = 0xff000000
-
 CONTROL: Final = 0x0100
 CONTROL_RESET_SHIFT: Final = 0
 CONTROL_RESET_MASK: Final = 0x1
 CONTROL_INTERRUPT_ENABLE_SHIFT: Final = 1
 CONTROL_INTERRUPT_ENABLE_MASK: Final = 0x2
-
 TARGET_COUNT: Final = 0x0104
-
 MAX_CYCLES: Final = 0x0108
 MAX_CYCLES_WORDS: Final = 2
-
 BANK: Final = 0x0110
-
 PRIOR_SELECT: Final = 0x0114
-
 RUN_UNTIL: Final = 0x0118
 RUN_UNTIL_WORDS: Final = 2
-
 START: Final = 0x0120
-
 RESUME: Final = 0x0124
-
 DONE: Final = 0x0140
-
 STATUS: Final = 0x0144
 STATUS_STATE_SHIFT: Final = 0
 STATUS_STATE_MASK: Final = 0xf
@@ -248,31 +168,22 @@ STATUS_STOP_REASON_SHIFT: Final = 4
 STATUS_STOP_REASON_MASK: Final = 0xf0
 STATUS_ERROR_SHIFT: Final = 8
 STATUS_ERROR_MASK: Final = 0xff00
-
 CYCLES: Final = 0x0148
 CYCLES_WORDS: Final = 2
-
 COMPUTE_NS: Final = 0x0150
 COMPUTE_NS_WORDS: Final = 2
-
 HALT: Final = 0x0180
 HALT_WORDS: Final = 8
-
 SENSORS: Final = 0x0200
 SENSORS_WORDS: Final = 64
-
 PRIOR_SELECTS: Final = 0x0400
 PRIOR_SELECTS_WORDS: Final = 256
-
 OUTCOMES: Final = 0x1000
 OUTCOMES_WORDS: Final = 1024
-
 RESULTS: Final = 0x4000
 RESULTS_WORDS: Final = 4096
-
 PRIOR_CODES: Final = 0x8000
 PRIOR_CODES_WORDS: Final = 4096
-
 INPUTS: Final = 0x10000
 INPUTS_WORDS: Final = 8192
 

@@ -194,11 +194,8 @@ def module_text(register_map: RegisterMap) -> str:
     ]
     for encoding in register_map.encodings:
         lines += ["", "", f"class {encoding.class_name}(IntEnum):"]
-        described = [f"    {member.name}: {member.text}" for member in encoding.members]
-        lines += [f'    """Values of {_first_user(register_map, encoding)}.', "", "    Attributes:"]
-        lines += [f"    {line}." for line in described]
-        lines += ['    """', ""]
-        lines += [f"    {member.name} = {member.value}" for member in encoding.members]
+        lines += [f'    """Values of {_first_user(register_map, encoding)}."""', ""]
+        lines += [f"    {member.name} = {member.value}  # {member.text}" for member in encoding.members]
     lines += [
         "",
         "",
@@ -210,9 +207,10 @@ def module_text(register_map: RegisterMap) -> str:
         "    words: int",
         "    writable: bool",
         "",
+        "",
     ]
     for block in register_map.blocks:
-        lines += ["", f"{block.name}: Final = {block.address:#06x}"]
+        lines.append(f"{block.name}: Final = {block.address:#06x}")
         if block.words > 1:
             lines.append(f"{block.name}_WORDS: Final = {block.words}")
         default = sum((field.reset or 0) << field.low for field in block.fields)
