@@ -116,12 +116,7 @@ async def resolve(
     *,
     interfaces: Sequence[str] | None = None,
 ) -> str:
-    """Return the URI of the rosbridge server that a robot announces.
-
-    Args:
-        name: Name of the robot.
-        timeout: Seconds to wait for its answer.
-        interfaces: Addresses of this machine to ask on; None for all.
+    """Return the URI of the rosbridge server that a robot announces; without `interfaces`, it is asked for on all.
 
     Raises:
         UnknownRobotError: No robot of that name answers in time.

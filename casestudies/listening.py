@@ -89,12 +89,9 @@ class Listener:
 async def listen(
     ros: Ros, *, truth_topic: str | None = None, truth_tolerance_s: float = 0.0
 ) -> AsyncIterator[Listener]:
-    """Subscribe to `/bm/frame`, `/BMresults` and, if given, the truth's topic.
+    """Subscribe to `/bm/frame`, `/BMresults` and, if given, a topic of geometry_msgs/PoseStamped with the truth.
 
-    Args:
-        ros: The open client.
-        truth_topic: A topic of geometry_msgs/PoseStamped with the readings' stamps; None for no truth.
-        truth_tolerance_s: Seconds by which a true pose may be older than the frame's stamp.
+    A true pose has the stamp of a frame's readings, or one older by at most the tolerance.
     """
     async with contextlib.AsyncExitStack() as stack:
         heard = await stack.enter_async_context(posteriors(ros, queue_size=_QUEUE_SIZE))

@@ -36,17 +36,10 @@ def encode_probability(p: npt.ArrayLike, prob_bits: int) -> npt.NDArray[np.uint1
 
 
 def decode_code(codes: npt.ArrayLike, prob_bits: int) -> npt.NDArray[np.float64]:
-    """Return the probability that a cell with this code makes: code / 2**W, and 1 for the all-ones code.
-
-    Args:
-        codes: Codes of any shape.
-        prob_bits: Bits of a code (W), 1 to 16.
-
-    Returns:
-        float64 probabilities, of the same shape.
+    """Return the probability that a cell with this code makes: code / 2**W, and 1 for the all-ones code; float64.
 
     Raises:
-        ParameterError: A code has more bits, or `prob_bits` is out of range.
+        ParameterError: A code has more bits, or `prob_bits` is not 1 to 16.
     """
     _check_bits(prob_bits)
     array = np.asarray(codes)

@@ -40,15 +40,7 @@ def joint_posterior(
 def posterior_of_lines(
     counts: npt.NDArray[np.uint32], lines: Sequence[int], cycles: Sequence[int]
 ) -> npt.NDArray[np.float64] | None:
-    """Return `joint_posterior` of counts that are concatenated already.
-
-    Args:
-        counts: uint32[all lines], board after board.
-        lines: Lines of each board.
-        cycles: Cycles that each board ran.
-
-    Returns:
-        float64[all lines] with the sum 1, or None if every count is 0.
+    """Return `joint_posterior` of counts that are concatenated already: uint32[all lines], board after board.
 
     Raises:
         MachineError: A board has counts and ran no cycle.

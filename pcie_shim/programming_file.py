@@ -268,11 +268,7 @@ def read_bytes(path: Path) -> bytes:
 
 
 def image_from_bytes(content: bytes, name: str = "the image") -> Image:
-    """Decode the image in the bytes of a programming file, and check all hashes.
-
-    Args:
-        content: The file's bytes.
-        name: Its name in errors, such as a path.
+    """Decode the image in the bytes of a programming file, and check all hashes; `name` is its name in errors.
 
     Raises:
         DamagedImageError: A hash is wrong.

@@ -26,16 +26,7 @@ async def serve(
     ros_version: Literal[1, 2],
     announce: str | None,
 ) -> int:
-    """Serve rosbridge until this is cancelled.
-
-    Args:
-        host: Address to listen on.
-        port: Port; 0 takes any free one.
-        access: The access rules.
-        message_bytes: Largest message.
-        ros_version: The ROS that it plays.
-        announce: Name under which it is announced on the network; None for no announcement.
-    """
+    """Serve rosbridge until this is cancelled; `port` 0 takes any free one, `announce` is its name on the network."""
     # a refused client gets no explanation (as from the reference server): it is in the log only
     log_libraries(logging.WARNING, "hub: %(message)s")
     listening = asyncio.get_running_loop().create_future()

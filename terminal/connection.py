@@ -10,11 +10,7 @@ from terminal.output import say
 
 
 def report_connection(uri: str) -> Callable[[str, str], None]:
-    """Return a callback for a client's `on_state` that reports each loss of the connection once, and its return.
-
-    Args:
-        uri: The server's, for the sentences.
-    """
+    """Return a callback for a client's `on_state` that reports each loss of the connection once, and its return."""
     # the client logs warnings of the same losses
     log_libraries(logging.ERROR, "%(name)s: %(message)s")
     lost = False

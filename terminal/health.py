@@ -161,11 +161,7 @@ async def health_served(
 ) -> AsyncIterator[None]:
     """Answer in the running loop while the context lasts, so that an answer shows that the loop turns.
 
-    Args:
-        directory: The run directory; without one, nothing is served.
-        name: The name of the process.
-        answer: Gives the JSON object.
-        sample: Is called once a second.
+    `answer` gives the JSON object, and `sample` is called once a second. Without a directory nothing is served.
     """
     import asyncio
 

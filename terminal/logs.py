@@ -31,12 +31,7 @@ def escape_last_resort() -> None:
 
 
 def log_libraries(level: int, form: str) -> None:
-    """Write what libraries log to standard error, one line for each record.
-
-    Args:
-        level: The lowest level that is written.
-        form: The format of a line, as in `logging`.
-    """
+    """Write what libraries log from a level on to standard error, a line for each record in the form of `logging`."""
     handler = logging.StreamHandler()
     handler.setFormatter(_OneLine(form))
     logging.basicConfig(level=level, handlers=[handler])
@@ -45,9 +40,7 @@ def log_libraries(level: int, form: str) -> None:
 def get_logger(role: str, level: str = "info") -> FilteringBoundLogger:
     """Return the logger of a process; every line names the process, and the frame if there is one.
 
-    Args:
-        role: The process's name, for example "subscriber".
-        level: The lowest level that is written: debug, info or warning. The first call in a process decides.
+    The first call in a process decides on the lowest level that is written: debug, info or warning.
     """
     # our own records cover what the libraries warn of; only their errors are new
     log_libraries(logging.ERROR, "%(name)s: %(message)s")

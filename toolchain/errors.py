@@ -19,14 +19,7 @@ class ToolchainError(Exception):
         line: int | None = None,
         place: tuple[str | int, ...] = (),
     ) -> None:
-        """Put the place before the sentence.
-
-        Args:
-            sentence: What is wrong, what was expected, what to do.
-            path: The file in which the mistake is, where there is one.
-            line: Its line, from 1, where it is known.
-            place: The key of a configuration file, as `("variable", 2, "bits")`; only for callers.
-        """
+        """Put file and line before the sentence; `place` is the key of a configuration file, as `("variable", 2, "bits")`."""
         where = f"{path}" + ("" if line is None else f", line {line}")
         super().__init__(f"{where}: {sentence}" if where else sentence)
         self.path = path

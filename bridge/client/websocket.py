@@ -237,14 +237,8 @@ async def open_websocket(
 ) -> WebSocket:
     """Connect, without permessage-deflate: on a local network it costs more than it saves.
 
-    Args:
-        uri: the server's URI.
-        shown_uri: the same without secrets, for the errors.
-        route: TLS, headers and proxy.
-        timeout: seconds for all of it.
-        limits: limits of the open connection.
-        on_messages: called with the messages, those that came together at once.
-        on_lost: called once, with the reason, when the connection ends.
+    `shown_uri` is the URI without secrets, for the errors. `on_messages` is called with messages that came together,
+    `on_lost` once with the reason when the connection ends.
 
     Raises:
         UnreachableError: nothing answers there.

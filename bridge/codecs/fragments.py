@@ -160,12 +160,7 @@ class Reassembler:
 
 
 def split(message: bytes, fragment_size: int, fragment_id: FragmentId) -> Iterator[bytes]:
-    """Cut a message into fragments, one at a time.
-
-    Args:
-        message: An operation as JSON.
-        fragment_size: Maximum of the message's bytes in one fragment, which always holds one character at least.
-        fragment_id: Name of the message, unique among those on the way.
+    """Cut an operation as JSON into fragments of at most so many bytes, which always hold one character at least.
 
     Yields:
         The message itself if it fits into one fragment, else its fragments as JSON, in order, numbered from 0.

@@ -27,14 +27,7 @@ _CHANNELS: Final = {0: 1, 2: 3, 4: 2, 6: 4}
 
 
 def decode(data: str, *, max_size: int = MAX_SIZE) -> bytes:
-    """Extract a message from its picture.
-
-    Args:
-        data: The picture in base64.
-        max_size: Maximum of bytes in the message.
-
-    Returns:
-        The message's JSON, perhaps followed by newlines.
+    """Extract a message's JSON, perhaps followed by newlines, from its picture in base64.
 
     Raises:
         DecodeError: The picture is too large or not one of a message.

@@ -118,11 +118,7 @@ def read_tokens(path: Path) -> tuple[str, ...]:
 
 
 def tls_context(certificate: Path, key: Path) -> ssl.SSLContext:
-    """Make the context for encrypting with TLS 1.2 or later.
-
-    Args:
-        certificate: The hub's certificate and the intermediate ones, as PEM.
-        key: The certificate's private key, as PEM, without a passphrase.
+    """Make the context for TLS 1.2 or later of the hub's certificate and its key, which has no passphrase (both PEM).
 
     Raises:
         HubError: A file cannot be read, or the two do not belong together.

@@ -52,14 +52,9 @@ def in_region(true_lines: ArrayLike, posteriors: ArrayLike, mass: float = REGION
 
 
 def means(posteriors: ArrayLike, width: int) -> NDArray[np.float64]:
-    """Return the mean (column, row) of each posterior, in cells; a cell's centre is its whole number.
+    """Return the mean (column, row) of each posterior, float64[frames, 2] in cells; a cell's centre is its whole number.
 
-    Args:
-        posteriors: float64[frames, lines], row-major.
-        width: cells in a row.
-
-    Returns:
-        float64[frames, 2].
+    Posteriors are float64[frames, lines], row-major.
     """
     probabilities = _two_dimensional(posteriors)
     rows, columns = np.divmod(np.arange(probabilities.shape[1]), width)

@@ -62,12 +62,9 @@ def true_pose(x: float, y: float, head: dict[str, Any]) -> dict[str, Any]:
 def readings_message(
     values: Sequence[float], head: Mapping[str, Any] | None, *, array: bool
 ) -> dict[str, Any]:
-    """Return six readings in the order of `SENSOR_NAMES` as a message.
+    """Return six readings in the order of `SENSOR_NAMES` as a message, with this header if any.
 
-    Args:
-        values: the readings.
-        head: the header, kept as it is; None where there is none. Arrays have no place for one.
-        array: a std_msgs/Float64MultiArray instead of named fields.
+    With `array` it is a std_msgs/Float64MultiArray, which has no place for a header.
     """
     if array:
         return {

@@ -57,12 +57,9 @@ def far_apart(instances: Iterable[Instance], count: int = POSITIONS_SHOWN) -> tu
 
 
 def draw_positions(path: Path, instances: Sequence[Instance], *, route: Sequence[Truth] = ()) -> None:
-    """Write figure 4.4: for each instance the true position on the map, and beside it the posterior.
+    """Write figure 4.4: for each instance the true position on the map, and beside it the posterior over y and x.
 
-    Args:
-        path: of the PNG.
-        instances: at least one, each with a posterior of two dimensions, y and x.
-        route: all true positions in the order of time, drawn faintly.
+    The true positions of the whole route are drawn faintly.
 
     Raises:
         OutputError: matplotlib is missing, a posterior is not two-dimensional, or the file cannot be written.
@@ -95,12 +92,7 @@ def draw_positions(path: Path, instances: Sequence[Instance], *, route: Sequence
 
 
 def draw_shares(path: Path, shares: Sequence[StageShare], *, frames: int) -> None:
-    """Write figure 4.5: the mean time of each stage and its share of a frame.
-
-    Args:
-        path: of the PNG.
-        shares: the stages in the order of a frame's way.
-        frames: how many frames the means are of.
+    """Write figure 4.5: the mean time of each stage, in the order of a frame's way, and its share of a frame.
 
     Raises:
         OutputError: matplotlib is missing, or the file cannot be written.

@@ -43,12 +43,7 @@ class Boat:
     """
 
     def __init__(self, seed: int, speed: float) -> None:
-        """Put the boat into the middle of the map.
-
-        Args:
-            seed: The seed of waypoints and noise.
-            speed: Map units per second.
-        """
+        """Put the boat into the middle of the map; `speed` is in map units per second."""
         self._random = random.Random(seed)
         self._speed = speed
         self.x = (MAP_LOW + MAP_HIGH) / 2
@@ -97,17 +92,8 @@ async def simulate(
 ) -> None:
     """Sail and publish `count` readings, or without end.
 
-    Each step publishes the true pose and then the readings, with the same stamp. While the server is away the boat
-    sails on.
-
-
-    Args:
-        uri: The rosbridge server's.
-        boat: The boat.
-        rate: Steps per second.
-        topic: The topic of the raw readings.
-        array: Publish std_msgs/Float64MultiArray instead of `boat_msgs/Raw`.
-        count: The number of readings; None for no end.
+    Each step publishes the true pose and then the readings, with the same stamp, on `topic`: `boat_msgs/Raw`, or with
+    `array` std_msgs/Float64MultiArray. While the server is away the boat sails on.
 
     Raises:
         BridgeError: No rosbridge server answers at the URI.

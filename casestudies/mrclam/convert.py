@@ -90,10 +90,6 @@ class Window:
 def read_columns(path: Path, names: Sequence[str]) -> Iterator[tuple[str, tuple[float, ...]]]:
     """Read a file of the collection: numbers with spaces between them, comments after `#`.
 
-    Args:
-        path: The file.
-        names: The names of its columns.
-
     Yields:
         Each line's place, for error messages, and its numbers.
 
@@ -201,11 +197,6 @@ def windows(
     track: Track, measured: Sequence[Measured], *, length_s: float = WINDOW_S
 ) -> tuple[list[Window], Counter[str]]:
     """Cut a robot's track into windows, and keep those in which it stood nearly still and saw enough landmarks.
-
-    Args:
-        track: The robot's positions.
-        measured: Its sightings, in the order of time.
-        length_s: A window's length, in seconds.
 
     Returns:
         The windows, and the number of others for each reason.

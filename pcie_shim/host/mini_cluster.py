@@ -128,11 +128,7 @@ class MiniCluster:
         return self._boards[board].link is not None or self._boards[board] in self._interrupted
 
     def reopen(self, board: int, *, timeout: float | None = None) -> None:
-        """Reopen a board after its restart or a broken link, and program it if it is blank.
-
-        Args:
-            board: Its number.
-            timeout: Seconds for it to listen and greet; None: those given to `open`.
+        """Reopen a board after its restart or a broken link, programming a blank one; without a timeout, in that of `open`.
 
         Raises:
             BoardError: It cannot be opened.

@@ -21,15 +21,7 @@ def boards_command(boards: int, directory: Path, *, once: bool) -> list[str]:
 def service_command(
     role: str, endpoint: Endpoint, settings: Settings, *, compiling_time: float, reprogram: bool
 ) -> list[str]:
-    """Return the command of a service.
-
-    Args:
-        role: Which service.
-        endpoint: Where it listens.
-        settings: The run's settings, with the boards' endpoints.
-        compiling_time: Seconds that boards may take to compile their kernels.
-        reprogram: Whether boards that hold another image are programmed.
-    """
+    """Return the command of a service; boards may take `compiling_time` seconds more to compile their kernels."""
     command = [*own_command(role), "--listen", str(endpoint)]
     command += ["--deployment", str(settings.deployment), "--log-level", settings.log_level]
     if role == "pcie-app":

@@ -83,17 +83,7 @@ class FrameFlow:
         count: int | None,
         show: Callable[[Published], None],
     ) -> None:
-        """Begin with no frame.
-
-        Args:
-            settings: The settings of the run.
-            in_force: Its deployment.
-            peers: Its peers.
-            log: Its log.
-            once: Whether it ends with its first frame, whatever that comes to.
-            count: Results after which it ends.
-            show: Is called with each published result.
-        """
+        """Begin with no frame; `once` ends the run with the first one, `count` after so many results."""
         self._settings = settings
         self._in_force = in_force
         self._peers = peers

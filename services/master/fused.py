@@ -231,10 +231,7 @@ def fused_services(
 ) -> dict[str, tuple[FusedEnd, Coroutine[Any, Any, int]]]:
     """Return the three services by role: the master's end of each link, and the coroutine that serves it.
 
-    Args:
-        settings: The master's, with the boards' endpoints filled in.
-        deployment: The deployment.
-        to_master: Returns the function that takes the records of a role.
+    `to_master` returns the function that takes the records of a role.
 
     Raises:
         SettingsError: The boards' endpoints are wrong.

@@ -20,10 +20,7 @@ _NAMED = 4
 def read_new(folder: Path, in_force: Deployment, as_used: Callable[[Deployment], Deployment]) -> Deployment:
     """Read a deployment of the shape of the one in force; pcie-app checks its images.
 
-    Args:
-        folder: Its folder.
-        in_force: The deployment that it is to replace.
-        as_used: Gives a deployment without the fields that this run's flags override.
+    `as_used` gives a deployment without the fields that this run's flags override.
 
     Raises:
         ToolchainError: It is damaged, of another version, or not there.
@@ -45,15 +42,9 @@ def read_new(folder: Path, in_force: Deployment, as_used: Callable[[Deployment],
 
 
 def keep(deployment: Deployment, directory: Path, generation: int) -> Path:
-    """Copy the files of a deployment that services read, so that a restarted child is independent of its folder.
+    """Copy the files of a deployment that services read into the run's directory, and return the folder with the copy.
 
-    Args:
-        deployment: The deployment.
-        directory: The run's private directory.
-        generation: Its number in the run.
-
-    Returns:
-        The folder with the copy.
+    A child that is restarted reads the copy, and so is independent of the deployment's own folder.
 
     Raises:
         SettingsError: A file is not there, can't be read, or is not a regular one.

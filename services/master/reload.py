@@ -232,10 +232,7 @@ class Reloads:
 def fates(in_flight: int, lost: int, lost_meanwhile: int = 0) -> str:
     """Return the fates of frames in flight when a reload began, and of readings that came during it, in words.
 
-    Args:
-        in_flight: Frames in flight.
-        lost: Those of them that still waited for the boards at the end of the drain.
-        lost_meanwhile: Readings that came while boards were programmed and found the queue full.
+    `lost` frames still waited for the boards at the end of the drain; `lost_meanwhile` readings found the queue full.
     """
     frames = "1 frame was" if in_flight == 1 else f"{in_flight} frames were"
     text = f"{frames} in flight and finished before"

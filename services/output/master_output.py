@@ -52,12 +52,7 @@ def print_sentence(record: Published, in_force: InForce) -> None:
 
 
 def cell(deployment: Deployment, line: int) -> dict[str, float]:
-    """Return the values of a line of the result, by label.
-
-    Args:
-        deployment: The deployment of the result.
-        line: Index of the line; the last dimension is the fastest.
-    """
+    """Return the values of a line of the result, by label; the last dimension is the fastest."""
     values: dict[str, float] = {}
     for dimension in reversed(deployment.result_dimensions):
         line, index = divmod(line, dimension.size)

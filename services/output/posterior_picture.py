@@ -84,14 +84,9 @@ def in_colour(console: Console) -> bool:
 
 
 def picture(posterior: Posterior, axes: list[Axis], *, width: int, colour: bool, rows: int = ROWS) -> Text:
-    """Draw a posterior.
+    """Draw a posterior, coloured or of characters from " " to "@", `width` across and without four of `rows` lines for words.
 
-    Args:
-        posterior: The posterior; of three dimensions or more the two largest are drawn, the others summed out.
-        axes: Its axes, in its order.
-        width: Characters across.
-        colour: Whether cells are coloured; else they are characters from " " to "@".
-        rows: Lines at most, without four for words.
+    Of three dimensions or more the two largest are drawn, the others summed out.
     """
     width, rows = min(width, WIDTH), max(min(rows, ROWS), 2)
     if len(axes) == 1:

@@ -39,13 +39,7 @@ def serve_one(
 ) -> int:
     """Serve one board in this process until a signal, and return the signal's number.
 
-    Args:
-        endpoint: Endpoint of its registers.
-        index: The board's number.
-        misbehave: A fault, for tests.
-        directory: Folder of its status socket; None for no socket.
-        restarts: Number of its restarts so far.
-        on_ready: Called once both its sockets listen.
+    `directory` is the folder of its status socket, if it has one; `on_ready` is called once both its sockets listen.
     """
     stop = StopSignal()
     ended_by: list[int] = []

@@ -32,13 +32,8 @@ async def connect_all(
 ) -> dict[str, Ros]:
     """Connect to each of several servers once, and return the connections by URI.
 
-    Args:
-        stack: Closes the connections.
-        settings: The settings; their URI replaces all others.
-        uris: The servers.
-        by_uri: Filled with the connections as they are made, and returned.
-        on_state: Called when a connection changes its state.
-        options: Further options of `connect`.
+    The settings' URI replaces all others. `by_uri` is filled with the connections as they are made, and `options` are those
+    of `connect`.
 
     Raises:
         BridgeError: A server is not reachable, or is not a rosbridge server.

@@ -49,14 +49,7 @@ class DeployedBoards:
         *,
         reprogram: bool = False,
     ) -> None:
-        """Read the images.
-
-        Args:
-            settings: The settings.
-            deployment: The deployment.
-            endpoints: The boards' endpoints.
-            reprogram: Whether to program a board that holds another image, instead of refusing it.
-        """
+        """Read the images; with `reprogram`, a board that holds another one is programmed instead of refused."""
         self._settings = settings
         self.generations = Generations(deployment, _images_of, images=True)
         self._reprogram = reprogram

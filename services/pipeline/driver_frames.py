@@ -28,12 +28,7 @@ class BoardAwayError(BoardError):
 
 
 def driver_input(deployment: Deployment, frame: Frame, stop: str) -> FrameInput:
-    """Return a frame as the driver takes it.
-
-    Args:
-        deployment: The deployment in force.
-        frame: The master's record.
-        stop: When boards stop: `slices` or `own`.
+    """Return a frame as the driver takes it; `stop` says when boards stop: `slices` or `own`.
 
     Raises:
         FrameInputError: The frame's addresses do not fit the deployment.
@@ -70,11 +65,7 @@ def _one(address: int | list[int] | None) -> int | None:
 
 
 def machine_inputs(deployment: Deployment, addresses: Addresses) -> tuple[npt.NDArray[np.int64], PriorRow]:
-    """Return a frame's inputs where replicas or lines have readings of their own.
-
-    Args:
-        deployment: The deployment, which defines the shapes.
-        addresses: A row for each variable, in their order; None for one that is missing everywhere.
+    """Return a frame's inputs where replicas or lines have readings of their own: a row of addresses for each variable.
 
     Returns:
         The sensors' inputs, -1 for a missing one, and the row of the prior's table.

@@ -140,13 +140,9 @@ class FrameAssembler:
     def take(
         self, source: int, message: dict[str, Any], received_ns: int, received_tick: int
     ) -> list[Reading]:
-        """Take one message of one source, and return the readings that are complete now.
+        """Take one message of one source (its index), and return the readings that are complete now.
 
-        Args:
-            source: Index of the message's source in the deployment.
-            message: The ROS message.
-            received_ns: Unix time of its receipt.
-            received_tick: Monotonic time of its receipt, ns.
+        It was received at `received_ns`, Unix time, and `received_tick`, monotonic ns.
 
         Raises:
             VariableError: A variable is missing or unusable; the sentence names topic and variable.

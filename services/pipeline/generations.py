@@ -30,10 +30,8 @@ class Generations(Generic[Derived]):
     ) -> None:
         """Begin with a deployment.
 
-        Args:
-            deployment: The first one.
-            derive: Returns the service's data for a deployment; an error refuses the deployment.
-            images: Whether the service also reads the boards' images.
+        `derive` returns the service's data for a deployment; an error of it refuses the deployment. With `images` the boards'
+        images are read too.
         """
         self.number = 0
         self._derive = derive

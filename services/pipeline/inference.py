@@ -78,13 +78,7 @@ def report_of(
 ) -> FrameReport:
     """Return the report about a frame.
 
-    Args:
-        publish: The frame's result, and the times of its reading.
-        inference: The posterior of the result.
-        deployment: The deployment in force.
-        generation: Its number.
-        now: Unix time and monotonic time, ns.
-        previous_out_ns: Time that the sending of the previous result took.
+    `now` is the Unix time and the monotonic time, `previous_out_ns` how long the sending of the previous result took.
     """
     result = publish.result
     sent_ns, tick = now

@@ -124,9 +124,7 @@ class ResultTopics:
     async def publish(self, publish: Publish, *, look: bool) -> Published:
         """Publish a frame's report and then its posterior, if it has one, once the servers take them.
 
-        Args:
-            publish: The result and its frame's times.
-            look: Whether to wait until the result was seen on the wire, or until the settings' timeout.
+        With `look` it waits until the result was seen on the wire, or until the settings' timeout.
         """
         inference = Inference(publish.result)
         ready = [publication.ready() for publication in self._connected()]

@@ -74,13 +74,7 @@ def _too_long(number: int) -> InputLineError:
 
 
 def decoded(line: bytes, number: int, kind: Any, expected: str) -> Any:
-    """Return a line's JSON value.
-
-    Args:
-        line: The line.
-        number: Its number, from 1.
-        kind: The type of the value, for `msgspec`.
-        expected: The same for the user, behind "expected".
+    """Return a line's JSON value, of a type for `msgspec`; `expected` describes it to the user.
 
     Raises:
         InputLineError: It is not of this type; the sentence has its number.

@@ -38,11 +38,7 @@ def reading_from_line(line: bytes, number: int) -> LineReading:
 
 
 def compute_lines(boards: DeployedBoards, banks: int) -> int:
-    """Compute the readings that come on standard input.
-
-    Args:
-        boards: The boards, not open yet.
-        banks: Number of the boards' banks of generators, which frames take in turn.
+    """Compute the readings that come on standard input; frames take the boards' `banks` of generators in turn.
 
     Raises:
         InputLineError: A line is not a reading, or not one for this deployment.

@@ -45,11 +45,7 @@ def result_from_line(
 ) -> tuple[FrameResult, int | None] | list[float]:
     """Return the value of one line: a result of `pcie-app` with its reading's stamp, or an array of probabilities.
 
-    Args:
-        line: The line.
-        number: Its number, from 1.
-        count: Number of counts or probabilities in a result of this deployment.
-        replicas: Number of the deployment's replicas.
+    A result of this deployment has `count` counts or probabilities.
 
     Raises:
         InputLineError: It is neither.

@@ -184,12 +184,7 @@ def listening(endpoint: Endpoint, role: str, deployment: Deployment) -> MakeLink
 
 
 def outdated(deployment: Deployment, refused: AnyRecord) -> OutdatedError | None:
-    """Return why a service that refused a greeting has to be restarted; None where that would not help.
-
-    Args:
-        deployment: The service's deployment.
-        refused: The greeting.
-    """
+    """Return why a service that refused a greeting has to be restarted; None where that would not help."""
     if not isinstance(refused, Hello) or refused.deployment_hash == deployment.hash:
         return None
     try:

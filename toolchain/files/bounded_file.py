@@ -16,13 +16,8 @@ _PIECE: Final = 1 << 18
 def open_regular(path: Path, error: type[ToolchainError], most: int | None = None) -> BinaryIO:
     """Open a regular file for reading: a FIFO or a device could block for ever, or never end.
 
-    Args:
-        path: The file.
-        error: The type of the error that is raised.
-        most: The most bytes that the file may have; None for no bound.
-
     Raises:
-        error: The file is absent, can't be read, is not a regular file, or is larger.
+        error: The file is absent, can't be read, is not a regular file, or has more than `most` bytes.
     """
     try:
         number = os.open(path, os.O_RDONLY | os.O_NONBLOCK)  # without it, opening a FIFO waits for a writer

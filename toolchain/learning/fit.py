@@ -170,11 +170,8 @@ def mixture(
 ) -> tuple[float, float, list[float]]:
     """Fit one normal and, for each variable, the share of its readings that are uniform instead.
 
-    Args:
-        residuals: Of each variable, reading minus expectation.
-        widths: Each variable's range: an outlier lies anywhere in it.
-        bias: True to fit the normal's mean; else it is 0.
-        least_sigma: The least standard deviation.
+    `residuals` are readings minus expectations, and an outlier lies anywhere in its variable's width. Without `bias` the mean
+    is 0.
 
     Returns:
         The mean, the standard deviation and the shares.

@@ -51,15 +51,7 @@ def eliminate(terms: Iterable[Term], names: Iterable[str], sizes: Mapping[str, i
     """Return terms whose product is the given terms' product, summed over some names.
 
     Tables are scaled by their maxima on the way, so that long products don't underflow: the result is exact up to a
-    factor.
-
-    Args:
-        terms: The product.
-        names: The names to sum out.
-        sizes: The number of values of each name.
-
-    Raises:
-        ModelError: A table on the way would be larger than the limit.
+    factor. A ModelError for a table on the way that would be larger than the limit.
     """
     left = dict(enumerate(terms))
     fresh = count(len(left))

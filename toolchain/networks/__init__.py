@@ -27,11 +27,7 @@ def is_network(path: Path) -> bool:
 
 
 def read_network(path: Path, *, on_missing: Literal["error", "missing"] = "error") -> JointDistribution:
-    """Return the joint distribution of a network's file.
-
-    Args:
-        path: A file whose name ends in one of `SUFFIXES`.
-        on_missing: Whether readings of its variables may be missing.
+    """Return the joint distribution of a file whose name ends in one of `SUFFIXES`.
 
     Raises:
         NetworkFileError: The file is absent, too large, or not a network; names the file and the line.

@@ -21,11 +21,8 @@ class Scanner:
     def __init__(self, data: bytes, path: Path, *, signs: str = "{}()[]|;,", comments: str = "") -> None:
         """Scan a file's bytes.
 
-        Args:
-            data: The bytes.
-            path: The file's name in errors.
-            signs: Characters that stand for themselves; a word ends before one.
-            comments: A regular expression for the format's comments; for /* ... */ only the beginning.
+        `signs` stand for themselves, and a word ends before one. `comments` is a regular expression for the format's
+        comments; of /* ... */ only for the beginning.
         """
         self._path = path
         try:

@@ -54,11 +54,7 @@ class Mif:
 def mif_lines(width: int, depth: int, words: Iterable[int], comments: Iterable[str] = ()) -> Iterator[str]:
     """Yield a file in its canonical form, a line at a time: everything in hexadecimal, an entry a line.
 
-    Args:
-        width: Bits of a word.
-        depth: The number of words.
-        words: Every word, from address 0; 0 <= word < 2**width.
-        comments: Lines for the head; characters other than printable ASCII are escaped.
+    `words` are all words from address 0, and `comments` lines for the head, whose odd characters are escaped.
     """
     for comment in comments:
         yield f"-- {printable(comment)}\n"
@@ -86,15 +82,7 @@ def read_mif(path: Path) -> Mif:
 
 
 def parse_mif(text: str, name: str = "the MIF") -> Mif:
-    """Return a memory's contents from a file's text.
-
-    Args:
-        text: The text.
-        name: Its name in errors.
-
-    Raises:
-        MifError: The text is not a MIF; names the line and what was expected.
-    """
+    """Return a memory's contents from a text; a MifError names the line and what was expected."""
     return _Reader(text, name).read()
 
 

@@ -89,15 +89,9 @@ class Rosapi:
         return service.startswith(PREFIX) and service.removeprefix(PREFIX) in self._services
 
     def call(self, service: str, args: object) -> Values:
-        """Answer one call.
+        """Answer one call of a service for which `offers` returned true, and return the answer's `values`.
 
-        Args:
-            service: An absolute name for which `offers` returned true.
-            args: The client's arguments: an object, or a list in the order of the service's fields. A field
-                left out is the empty string, as in any ROS request.
-
-        Returns:
-            The answer's `values`.
+        `args` is an object, or a list in the order of the service's fields; a field left out is the empty string, as in ROS.
 
         Raises:
             RefusedError: The arguments are wrong, or a limit is reached.

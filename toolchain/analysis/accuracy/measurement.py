@@ -142,16 +142,9 @@ def measure(
 ) -> Accuracy:
     """Run a machine on readings and compare its posteriors with exact inference.
 
-    A replica counts to the bit what a machine by itself counts with the same bank, so one machine is run for all of them.
-
-    Args:
-        boards: The machine.
-        readings: The frames; those that are impossible in the model are left out.
-        model: The unquantised model, or None where only its codes are known.
-        banks: Sets of seeds to run each frame with; at most as many as the machine has.
-        replicas: Machines around the same generators: so many of the readings, one after the other, are one frame, which
-            ends with the last of them.
-        advance: Called after every reading.
+    A replica counts to the bit what a machine by itself counts with the same bank, so one machine is run for all of them:
+    so many of the readings, one after the other, are one frame, which ends with the last of them. Without a `model` only
+    the codes are known; readings that are impossible in it are left out. `advance` is called after every reading.
 
     Raises:
         BuildError: Fewer readings than replicas.

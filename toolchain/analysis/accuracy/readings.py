@@ -122,13 +122,6 @@ def readings_of_lines(
     The true line's cell reads the drawn value. The model does not define the others' readings; they are drawn from the mean
     of all lines. A machine with sensor_mode `threshold` gets their likelihoods, as codes.
 
-    Args:
-        drawn: As `sample_readings` draws them.
-        model: The model that they were drawn from.
-        machine: The machine, or one board's.
-        scale: The scaling before quantising.
-        seed: The same seed draws the same readings of the other lines.
-
     Raises:
         BuildError: The readings were not drawn, so that their true line is not known.
     """
@@ -212,14 +205,10 @@ def recorded_readings(
     frames: int,
     tolerance_s: float = 0.1,
 ) -> Readings:
-    """Return the readings of a recording, spread over its length.
+    """Return at most `frames` readings of a recording (CSV, MCAP or bag), spread over its length.
 
-    Args:
-        path: CSV, MCAP or bag.
-        variables: All known variables, those that are columns in their order.
-        given: NAME=COLUMN, the column of a variable's readings; `*` stands for the same in both. Default: its name.
-        frames: Number of rows, at most.
-        tolerance_s: In a bag, how far from a row another topic's message may be, seconds.
+    `given` are NAME=COLUMNs of variables whose column is not called like them, `*` for the same in both; in a bag another
+    topic's message may be `tolerance_s` from a row.
 
     Raises:
         ModelError: No such recording or column, or no row that the machine takes.

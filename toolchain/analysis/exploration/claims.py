@@ -183,15 +183,10 @@ class FaultyMachine:
         stream_rate: float = 0.0,
         number_rate: float = 0.0,
     ) -> tuple[NDArray[np.int64], int]:
-        """Run a frame and return the counts, int64[lines], and its cycles.
+        """Run a frame of codes, uint16[columns, lines], and return the counts, int64[lines], and its cycles.
 
-        Args:
-            codes: uint16[columns, lines], the codes from the tables.
-            bank: Set of seeds.
-            target_count: The count that stops it.
-            max_cycles: The cycle at which it stops anyway.
-            stream_rate: Probability that a cell's bit of a cycle is flipped.
-            number_rate: Probability that a bit of a random number, which a whole column compares with, is flipped.
+        A cell's bit of a cycle is flipped with probability `stream_rate`, and a bit of a random number, which a whole
+        column compares with, with `number_rate`.
         """
         ones = self._machine.parameters.ones_code
         width = self._machine.parameters.prob_bits
