@@ -14,15 +14,15 @@ library work;
 
 entity bm1 is
   generic (
-    BOARD         : natural  := 0;                      -- which of PARTITIONS this board is
-    MEMORY_FOLDER : string   := "bm_arch/Memory_MIFs/"; -- path of the MIFs, with a slash at its end
+    BOARD         : natural  := 0;                      -- index of this board in PARTITIONS
+    MEMORY_FOLDER : string   := "bm_arch/Memory_MIFs/"; -- path of the MIFs, with a trailing slash
     CLOCK_HZ      : positive := 100_000_000             -- frequency of the clock
   );
   port (
     -- system
     clk_i  : in    std_logic; -- clock
-    rstn_i : in    std_logic; -- reset of the board, low active, synchronous
-    irq_o  : out   std_logic; -- one clock: the machine has stopped
+    rstn_i : in    std_logic; -- reset of the board, active low, synchronous
+    irq_o  : out   std_logic; -- pulse: the machine has stopped
     -- AXI4-Lite
     axi_awvalid : in    std_logic; -- write address
     axi_awready : out   std_logic;

@@ -1,6 +1,6 @@
 -- ================================================================================================
 -- rosbayes: bm1_axi
--- AXI4-Lite slave: turns its channels into one access at a time.
+-- AXI4-Lite slave: converts its channels to one access at a time.
 -- MIT licence; datasheet: docs/hardware/bm1_axi.md
 -- ================================================================================================
 
@@ -34,37 +34,37 @@ entity bm1_axi is
     axi_rdata   : out   std_logic_vector(31 downto 0);
     axi_rresp   : out   std_logic_vector(1 downto 0);
     -- access
-    request_o : out   std_logic;                                   -- one clock: an access begins
-    write_o   : out   std_logic;                                   -- it writes; else it reads
+    request_o : out   std_logic;                                   -- pulse: an access begins
+    write_o   : out   std_logic;                                   -- 1: write, 0: read
     address_o : out   std_logic_vector(ADDRESS_BITS - 1 downto 0); -- in bytes
-    strobe_o  : out   std_logic_vector(3 downto 0);                -- bytes that are written
+    strobe_o  : out   std_logic_vector(3 downto 0);                -- byte enables of a write
     data_o    : out   std_logic_vector(31 downto 0);               -- data to write
-    respond_i : in    std_logic;                                   -- one clock: it has ended
-    refused_i : in    std_logic;                                   -- it was refused
-    data_i    : in    std_logic_vector(31 downto 0)                -- data read
+    respond_i : in    std_logic;                                   -- pulse: the access is complete
+    refused_i : in    std_logic;                                   -- the access was refused
+    data_i    : in    std_logic_vector(31 downto 0)                -- read data
   );
 end entity bm1_axi;
 
 architecture rtl of bm1_axi is
 
-  type state_t is (standing, busy_write, busy_read, answer_write, answer_read);
+  type state_t is (idle, busy_write, busy_read, answer_write, answer_read);
 
   constant OKAY   : std_logic_vector(1 downto 0) := "00";
   constant SLVERR : std_logic_vector(1 downto 0) := "10";
 
-  signal state      : state_t                       := standing;
+  signal state      : state_t                       := idle;
   signal answer     : std_logic_vector(1 downto 0)  := OKAY;
   signal data       : std_logic_vector(31 downto 0) := (others => '0');
   signal take_write : std_logic;
   signal take_read  : std_logic;
-  signal prefer     : std_logic                     := '0'; -- a read had to wait: it is next
+  signal prefer     : std_logic                     := '0'; -- a read had to wait: it has priority
 
 begin
 
-  take_write <= '1' when state = standing and rst_i = '0' and axi_awvalid = '1' and axi_wvalid = '1'
+  take_write <= '1' when state = idle and rst_i = '0' and axi_awvalid = '1' and axi_wvalid = '1'
                          and not (prefer = '1' and axi_arvalid = '1') else
                 '0';
-  take_read  <= '1' when state = standing and rst_i = '0' and axi_arvalid = '1' and take_write = '0' else
+  take_read  <= '1' when state = idle and rst_i = '0' and axi_arvalid = '1' and take_write = '0' else
                 '0';
 
   sequence_of_channels : process (clk_i) is
@@ -72,11 +72,11 @@ begin
 
     if rising_edge(clk_i) then
       if (rst_i = '1') then
-        state  <= standing;
+        state  <= idle;
         prefer <= '0';
       else
-        -- no case: GHDL's synthesis makes latches of one over an enumeration
-        if (state = standing) then
+        -- no case: GHDL's synthesis turns a case over an enumeration into latches
+        if (state = idle) then
           if (take_write = '1') then
             state  <= busy_write;
             prefer <= '1';
@@ -94,11 +94,11 @@ begin
           end if;
         elsif (state = answer_write) then
           if (axi_bready = '1') then
-            state <= standing;
+            state <= idle;
           end if;
         else
           if (axi_rready = '1') then
-            state <= standing;
+            state <= idle;
           end if;
         end if;
 

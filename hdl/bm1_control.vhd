@@ -13,7 +13,7 @@ library work;
 
 entity bm1_control is
   generic (
-    REPLICAS     : positive; -- machines around the same generators
+    REPLICAS     : positive; -- machines that share the generators
     COUNTER_BITS : positive; -- width of a counter
     RESET_BANK   : boolean   -- a frame restarts the generators
   );
@@ -26,31 +26,31 @@ entity bm1_control is
     resume_i : in    std_logic; -- run the frame's next slice
     reset_i  : in    std_logic; -- stop and clear
     -- settings
-    target_i     : in    std_logic_vector(COUNTER_BITS - 1 downto 0); -- taken by a start
-    max_cycles_i : in    std_logic_vector(63 downto 0);               -- taken by a start
-    run_until_i  : in    std_logic_vector(63 downto 0);               -- must stay while the machine runs; 0: none
-    halt_i       : in    std_logic_vector(REPLICAS - 1 downto 0);     -- taken by a resume
+    target_i     : in    std_logic_vector(COUNTER_BITS - 1 downto 0); -- latched by a start
+    max_cycles_i : in    std_logic_vector(63 downto 0);               -- latched by a start
+    run_until_i  : in    std_logic_vector(63 downto 0);               -- must be stable while the machine runs; 0: none
+    halt_i       : in    std_logic_vector(REPLICAS - 1 downto 0);     -- latched by a resume
     -- matrices
     overflow_i   : in    std_logic_vector(REPLICAS - 1 downto 0);     -- a counter is at the target
     impossible_i : in    std_logic_vector(REPLICAS - 1 downto 0);     -- every line has a code 0
-    load_o       : out   std_logic;                                   -- take the frame's codes
+    load_o       : out   std_logic;                                   -- latch the codes of the frame
     clear_o      : out   std_logic;                                   -- clear the counters
     enable_o     : out   std_logic_vector(REPLICAS - 1 downto 0);     -- run a cycle
     target_o     : out   std_logic_vector(COUNTER_BITS - 1 downto 0); -- target count of the frame
     -- generators
     seeds_ready_i  : in    std_logic; -- the seeds are loaded
     restart_o      : out   std_logic; -- load seeds
-    restart_bank_o : out   std_logic; -- of the chosen bank; else of bank 0
+    restart_bank_o : out   std_logic; -- 1: seeds of the selected bank, 0: of bank 0
     step_o         : out   std_logic; -- a cycle is run
     -- outcome
     running_o         : out   std_logic;                                   -- the machine runs
-    done_o            : out   std_logic;                                   -- it stops with this clock
-    has_run_o         : out   std_logic;                                   -- it has run since the last reset
+    done_o            : out   std_logic;                                   -- the machine stops in this clock
+    has_run_o         : out   std_logic;                                   -- the machine has run since the last reset
     cycles_o          : out   std_logic_vector(63 downto 0);               -- cycles of the frame
-    reason_o          : out   std_logic_vector(2 downto 0);                -- why it stands still
+    reason_o          : out   std_logic_vector(2 downto 0);                -- stop reason
     ready_o           : out   std_logic_vector(REPLICAS - 1 downto 0);     -- replicas that can be resumed
-    replica_reasons_o : out   std_logic_vector(3 * REPLICAS - 1 downto 0); -- why each one stands still
-    replica_cycles_o  : out   std_logic_vector(64 * REPLICAS - 1 downto 0) -- cycles of each one
+    replica_reasons_o : out   std_logic_vector(3 * REPLICAS - 1 downto 0); -- stop reason of each replica
+    replica_cycles_o  : out   std_logic_vector(64 * REPLICAS - 1 downto 0) -- cycles of each replica
   );
 end entity bm1_control;
 
@@ -62,7 +62,7 @@ architecture rtl of bm1_control is
 
   type cycles_t is array (0 to REPLICAS - 1) of unsigned(63 downto 0);
 
-  type state_t is (standing, loading, running);
+  type state_t is (idle, loading, running);
 
   constant REASON_NONE       : reason_t := std_logic_vector(to_unsigned(STOP_REASON_NONE, 3));
   constant REASON_OVERFLOW   : reason_t := std_logic_vector(to_unsigned(STOP_REASON_OVERFLOW, 3));
@@ -70,7 +70,7 @@ architecture rtl of bm1_control is
   constant REASON_SLICE      : reason_t := std_logic_vector(to_unsigned(STOP_REASON_SLICE, 3));
   constant REASON_IMPOSSIBLE : reason_t := std_logic_vector(to_unsigned(STOP_REASON_IMPOSSIBLE, 3));
 
-  signal state      : state_t                                     := standing;
+  signal state      : state_t                                     := idle;
   signal cycles     : unsigned(63 downto 0)                       := (others => '0');
   signal max_cycles : unsigned(63 downto 0)                       := (others => '0');
   signal target     : std_logic_vector(COUNTER_BITS - 1 downto 0) := (others => '0');
@@ -90,14 +90,14 @@ architecture rtl of bm1_control is
 
 begin
 
-  start  <= '1' when start_i = '1' and reset_i = '0' and rst_i = '0' and state = standing else
+  start  <= '1' when start_i = '1' and reset_i = '0' and rst_i = '0' and state = idle else
             '0';
-  resume <= '1' when resume_i = '1' and reset_i = '0' and rst_i = '0' and state = standing else
+  resume <= '1' when resume_i = '1' and reset_i = '0' and rst_i = '0' and state = idle else
             '0';
   loaded <= '1' when state = loading and seeds_ready_i = '1' else
             '0';
 
-  -- The limits are compared with what has been counted, so the clock that finds one reached runs no cycle.
+  -- The limits are compared with the cycles so far, so no cycle runs in the clock that detects the end.
   at_max   <= '1' when cycles = max_cycles else
               '0';
   at_slice <= '1' when cycles = unsigned(run_until_i) and unsigned(run_until_i) /= 0 else
@@ -170,12 +170,12 @@ begin
 
     if rising_edge(clk_i) then
       if (rst_i = '1' or reset_i = '1') then
-        state   <= standing;
+        state   <= idle;
         cycles  <= (others => '0');
         has_run <= '0';
       else
-        -- no case: GHDL's synthesis makes latches of one over an enumeration
-        if (state = standing) then
+        -- no case: GHDL's synthesis turns a case over an enumeration into latches
+        if (state = idle) then
           if (start = '1') then
             state      <= loading;
             cycles     <= (others => '0');
@@ -190,7 +190,7 @@ begin
           end if;
         else
           if (stopped = '1') then
-            state   <= standing;
+            state   <= idle;
             has_run <= '1';
           else
             cycles <= cycles + 1;
@@ -201,8 +201,8 @@ begin
 
   end process sequence_of_frame;
 
-  -- A frame of which no replica can count ends here too, without a cycle.
-  stopped <= '1' when state /= standing and state /= loading and (or enable) = '0' else
+  -- A frame in which no replica can count also ends here, without a cycle.
+  stopped <= '1' when state /= idle and state /= loading and (or enable) = '0' else
              '0';
 
   join_reasons : process (all) is
@@ -241,7 +241,7 @@ begin
       joint := REASON_SLICE;
     end if;
 
-    if (state /= standing) then
+    if (state /= idle) then
       joint := REASON_NONE;
     end if;
 
@@ -257,7 +257,7 @@ begin
                     '0';
   restart_bank_o <= start;
   step_o         <= or enable;
-  running_o      <= '0' when state = standing else
+  running_o      <= '0' when state = idle else
                     '1';
   done_o         <= stopped and not reset_i and not rst_i;
   has_run_o      <= has_run;

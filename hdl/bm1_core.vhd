@@ -15,22 +15,22 @@ entity bm1_core is
   generic (
     LINES         : positive;         -- lines of this board
     SENSORS       : natural;          -- sensor columns
-    REPLICAS      : positive;         -- machines around the same generators
-    MODE          : sensor_mode_t;    -- what the cells of a sensor column are given
-    ADDRESS_BITS  : natural_array_t;  -- of each sensor column, 1 to SENSORS
+    REPLICAS      : positive;         -- machines that share the generators
+    MODE          : sensor_mode_t;    -- input of the cells in a sensor column
+    ADDRESS_BITS  : natural_array_t;  -- address width of each sensor column, 1 to SENSORS
     PROB_BITS     : positive;         -- width of a code
     PRIOR_BITS    : natural;          -- width of the prior's address
     WRITTEN       : boolean;          -- the host writes the prior
     COUNTER_BITS  : positive;         -- width of a counter
     KIND          : rng_kind_t;       -- generators: LFSR or table
     STATE_BITS    : positive;         -- width of a generator's state
-    TAPS          : std_logic_vector; -- of an LFSR; STATE_BITS wide
-    RNG_SHARED    : boolean;          -- one generator a column; else one a cell
-    STEPS         : positive;         -- steps of a generator in a clock
+    TAPS          : std_logic_vector; -- feedback taps of an LFSR; STATE_BITS wide
+    RNG_SHARED    : boolean;          -- one generator per column; otherwise one per cell
+    STEPS         : positive;         -- steps of a generator per clock
     BANKS         : positive;         -- sets of seeds
     RESET_BANK    : boolean;          -- a frame restarts the generators
-    TABLE_LENGTH  : positive;         -- random numbers in the table, where one is played
-    MEMORY_FOLDER : string;           -- path of the MIFs, with a slash at its end
+    TABLE_LENGTH  : positive;         -- random numbers in the table, if one is used
+    MEMORY_FOLDER : string;           -- path of the MIFs, with a trailing slash
     BOARD         : natural           -- number of the board
   );
   port (
@@ -43,7 +43,7 @@ entity bm1_core is
     reset_i  : in    std_logic; -- stop and clear
     -- settings
     target_i     : in    std_logic_vector(COUNTER_BITS - 1 downto 0);    -- target count
-    max_cycles_i : in    std_logic_vector(63 downto 0);                  -- most cycles of a frame
+    max_cycles_i : in    std_logic_vector(63 downto 0);                  -- maximum cycles of a frame
     run_until_i  : in    std_logic_vector(63 downto 0);                  -- end of the slice
     bank_i       : in    std_logic_vector(bits_for(BANKS) - 1 downto 0); -- set of seeds
     halt_i       : in    std_logic_vector(REPLICAS - 1 downto 0);        -- replicas to halt
@@ -54,13 +54,13 @@ entity bm1_core is
       REPLICAS * SENSORS * inputs_per_column(MODE, LINES) * SLOT_BITS - 1 downto 0);   -- readings
     -- outcome
     running_o         : out   std_logic;                                                     -- the machine runs
-    done_o            : out   std_logic;                                                     -- it stops with this clock
-    has_run_o         : out   std_logic;                                                     -- it has run since the last reset
+    done_o            : out   std_logic;                                                     -- the machine stops in this clock
+    has_run_o         : out   std_logic;                                                     -- the machine has run since the last reset
     cycles_o          : out   std_logic_vector(63 downto 0);                                 -- cycles of the frame
-    reason_o          : out   std_logic_vector(2 downto 0);                                  -- why it stands still
+    reason_o          : out   std_logic_vector(2 downto 0);                                  -- stop reason
     ready_o           : out   std_logic_vector(REPLICAS - 1 downto 0);                       -- replicas that can be resumed
-    replica_reasons_o : out   std_logic_vector(3 * REPLICAS - 1 downto 0);                   -- why each one stands still
-    replica_cycles_o  : out   std_logic_vector(64 * REPLICAS - 1 downto 0);                  -- cycles of each one
+    replica_reasons_o : out   std_logic_vector(3 * REPLICAS - 1 downto 0);                   -- stop reason of each replica
+    replica_cycles_o  : out   std_logic_vector(64 * REPLICAS - 1 downto 0);                  -- cycles of each replica
     counts_o          : out   std_logic_vector(REPLICAS * LINES * COUNTER_BITS - 1 downto 0) -- counters
   );
 end entity bm1_core;
@@ -71,7 +71,7 @@ architecture rtl of bm1_core is
   constant GENERATORS : positive := COLUMNS * (LINES + to_natural(RNG_SHARED) * (1 - LINES));
   constant PER_INPUT  : natural  := SENSORS * inputs_per_column(MODE, LINES) * SLOT_BITS;
 
-  -- Return the path of a board's MIFs up to what distinguishes them.
+  -- Return the common start of the paths of a board's MIFs.
 
   function board_prefix return string is
   begin

@@ -1,6 +1,6 @@
 -- ================================================================================================
 -- rosbayes: bm1_counter
--- Counts the ones of a line's bitstream and says when the target count is reached.
+-- Counts the ones of a line's bitstream and reports when the target count is reached.
 -- MIT licence; datasheet: docs/hardware/bm1_counter.md
 -- ================================================================================================
 
@@ -14,11 +14,11 @@ entity bm1_counter is
   );
   port (
     clk_i    : in    std_logic;                                   -- clock
-    clear_i  : in    std_logic;                                   -- back to 0
+    clear_i  : in    std_logic;                                   -- clear the counter
     enable_i : in    std_logic;                                   -- a cycle is run
     bit_i    : in    std_logic;                                   -- bitstream of the line
     target_i : in    std_logic_vector(COUNTER_BITS - 1 downto 0); -- count at which the machine stops
-    count_o  : out   std_logic_vector(COUNTER_BITS - 1 downto 0); -- ones so far
+    count_o  : out   std_logic_vector(COUNTER_BITS - 1 downto 0); -- number of ones
     full_o   : out   std_logic                                    -- the target is reached
   );
 end entity bm1_counter;

@@ -14,16 +14,16 @@ library work;
 
 entity bm1_generators is
   generic (
-    GENERATORS   : positive;         -- how many: one a column, or one a cell
+    GENERATORS   : positive;         -- number of generators: one per column or per cell
     KIND         : rng_kind_t;       -- LFSR or table
     STATE_BITS   : positive;         -- width of a state
-    TAPS         : std_logic_vector; -- of an LFSR; STATE_BITS wide
-    STEPS        : positive;         -- steps in a clock
+    TAPS         : std_logic_vector; -- feedback taps of an LFSR; STATE_BITS wide
+    STEPS        : positive;         -- steps per clock
     BANKS        : positive;         -- sets of seeds
     PROB_BITS    : positive;         -- width of a number
     SEED_FILE    : string;           -- MIF of the seeds: bank by bank, generator by generator
-    TABLE_FILE   : string;           -- MIF of the random numbers, where a table is played
-    TABLE_LENGTH : positive          -- how many these are
+    TABLE_FILE   : string;           -- MIF of the random numbers, if a table is used
+    TABLE_LENGTH : positive          -- number of random numbers
   );
   port (
     clk_i     : in    std_logic;                                             -- clock
@@ -43,7 +43,7 @@ architecture rtl of bm1_generators is
   constant ADDRESS_BITS : positive := bits_for(SEEDS);
   constant INDEX_BITS   : positive := bits_for(GENERATORS + 1);
 
-  -- seeds(0) is what the memory shows, seeds(g + 1) the state of generator g
+  -- seeds(0) is the output of the memory, seeds(g + 1) the state of generator g
   signal chain     : std_logic_vector((GENERATORS + 1) * STATE_BITS - 1 downto 0);
   signal address   : unsigned(ADDRESS_BITS - 1 downto 0) := (others => '0');
   signal remaining : unsigned(INDEX_BITS - 1 downto 0)   := (others => '0');
@@ -53,7 +53,7 @@ architecture rtl of bm1_generators is
 
 begin
 
-  -- The seeds go in at generator 0 and are shifted on, so the last generator's is read first.
+  -- Seeds enter at generator 0 and are shifted on, so the seed of the last generator is read first.
   load_seeds : process (clk_i) is
 
     variable bank : natural range 0 to 2 ** bits_for(BANKS) - 1;
@@ -73,7 +73,7 @@ begin
         ready     <= '0';
       elsif (reading = '1') then
         remaining <= remaining - 1;
-        -- the last address may be 0: it must not wrap below the memory's first word
+        -- the last address may be 0: do not decrement it below 0
         if (remaining /= 1) then
           address <= address - 1;
         end if;

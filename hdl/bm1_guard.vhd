@@ -1,6 +1,6 @@
 -- ================================================================================================
 -- rosbayes: bm1_guard
--- Decides whether an access is allowed, and why not: address, state of the board, and value.
+-- Checks each access by address, state of the board and value, and gives the reason of a refusal.
 -- MIT licence; datasheet: docs/hardware/bm1_guard.md
 -- ================================================================================================
 
@@ -13,7 +13,7 @@ library work;
 
 entity bm1_guard is
   generic (
-    REPLICAS            : positive; -- machines around the same generators
+    REPLICAS            : positive; -- machines that share the generators
     COUNTER_BITS        : positive; -- width of a counter
     PRIOR_BITS          : natural;  -- width of the prior's address
     BANKS               : positive; -- sets of seeds
@@ -26,27 +26,27 @@ entity bm1_guard is
   );
   port (
     -- access
-    write_i   : in    std_logic;                                       -- it writes; else it reads
+    write_i   : in    std_logic;                                       -- 1: write, 0: read
     address_i : in    std_logic_vector(BAR_ADDRESS_BITS - 1 downto 0); -- in bytes
-    strobe_i  : in    std_logic_vector(3 downto 0);                    -- bytes that are written
+    strobe_i  : in    std_logic_vector(3 downto 0);                    -- byte enables of a write
     data_i    : in    std_logic_vector(31 downto 0);                   -- data to write
     -- state
     running_i    : in    std_logic;                               -- the machine runs
-    can_resume_i : in    std_logic;                               -- it stands at the end of a slice
+    can_resume_i : in    std_logic;                               -- the machine is at the end of a slice
     ready_i      : in    std_logic_vector(REPLICAS - 1 downto 0); -- replicas that can be resumed
     done_i       : in    std_logic_vector(31 downto 0);           -- number of the last start or resume that has stopped
     cycles_i     : in    std_logic_vector(63 downto 0);           -- cycles of the frame
     -- settings
     target_i     : in    std_logic_vector(31 downto 0);  -- target count
-    max_cycles_i : in    std_logic_vector(63 downto 0);  -- most cycles
+    max_cycles_i : in    std_logic_vector(63 downto 0);  -- maximum cycles
     run_until_i  : in    std_logic_vector(63 downto 0);  -- end of the slice
     bank_i       : in    std_logic_vector(31 downto 0);  -- set of seeds
     prior_i      : in    std_logic_vector(31 downto 0);  -- prior select of a single machine
     halt_i       : in    std_logic_vector(255 downto 0); -- replicas to halt
     bad_input_i  : in    std_logic;                      -- an input word is too large
     -- verdict
-    error_o : out   std_logic_vector(7 downto 0); -- why it is refused; 0: it is not
-    ring_o  : out   std_logic                     -- it is a doorbell that rings
+    error_o : out   std_logic_vector(7 downto 0); -- reason of a refusal; 0: none
+    ring_o  : out   std_logic                     -- the access is a valid doorbell
   );
 end entity bm1_guard;
 
@@ -54,7 +54,7 @@ architecture rtl of bm1_guard is
 
   type access_t is (absent, readable, writable);
 
-  -- Whether an address lies in the first words of a block.
+  -- Return whether an address is in the first words of a block.
 
   function is_in (
     address : unsigned;
@@ -117,7 +117,7 @@ begin
   is_resume <= '1' when write_i = '1' and unsigned(address_i) = RESUME_ADDRESS and unsigned(data_i) /= 0 else
                '0';
 
-  -- numbers go round from 2^32 - 1 to 1
+  -- numbers wrap from 2^32 - 1 to 1
   due <= to_unsigned(1, 32) when (and done_i) = '1' else
          unsigned(done_i) + 1;
 

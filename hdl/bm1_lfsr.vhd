@@ -1,6 +1,6 @@
 -- ================================================================================================
 -- rosbayes: bm1_lfsr
--- Random number generator: a Fibonacci LFSR that makes several steps in a clock.
+-- Random number generator: a Fibonacci LFSR with several steps per clock.
 -- MIT licence; datasheet: docs/hardware/bm1_lfsr.md
 -- ================================================================================================
 
@@ -10,12 +10,12 @@ library ieee;
 entity bm1_lfsr is
   generic (
     STATE_BITS : positive;         -- width of the register
-    TAPS       : std_logic_vector; -- mask of the bits whose parity comes in; STATE_BITS wide
-    STEPS      : positive          -- steps in a clock
+    TAPS       : std_logic_vector; -- mask of the bits whose parity is shifted in; STATE_BITS wide
+    STEPS      : positive          -- steps per clock
   );
   port (
     clk_i   : in    std_logic;                                 -- clock
-    shift_i : in    std_logic;                                 -- take the seed
+    shift_i : in    std_logic;                                 -- shift the seed in
     seed_i  : in    std_logic_vector(STATE_BITS - 1 downto 0); -- next seed of the chain
     step_i  : in    std_logic;                                 -- make the steps of a cycle
     state_o : out   std_logic_vector(STATE_BITS - 1 downto 0)  -- state, whose low bits are the number

@@ -15,19 +15,19 @@ entity bm1_matrix is
   generic (
     LINES         : positive;        -- lines of this board
     SENSORS       : natural;         -- sensor columns
-    MODE          : sensor_mode_t;   -- what the cells of a sensor column are given
-    ADDRESS_BITS  : natural_array_t; -- of each sensor column, 1 to SENSORS
+    MODE          : sensor_mode_t;   -- input of the cells in a sensor column
+    ADDRESS_BITS  : natural_array_t; -- address width of each sensor column, 1 to SENSORS
     PROB_BITS     : positive;        -- width of a code
     PRIOR_BITS    : natural;         -- width of the prior's address
     WRITTEN       : boolean;         -- the host writes the prior
     COUNTER_BITS  : positive;        -- width of a counter
-    RNG_SHARED    : boolean;         -- one random number a column; else one a cell
+    RNG_SHARED    : boolean;         -- one random number per column; otherwise one per cell
     MEMORY_PREFIX : string           -- path and board of the MIFs
   );
   port (
     clk_i : in    std_logic; -- clock
     -- control
-    load_i       : in    std_logic;                                   -- take the frame's codes
+    load_i       : in    std_logic;                                   -- latch the codes of the frame
     clear_i      : in    std_logic;                                   -- clear the counters
     enable_i     : in    std_logic;                                   -- run a cycle
     target_i     : in    std_logic_vector(COUNTER_BITS - 1 downto 0); -- target count
@@ -107,7 +107,7 @@ begin
     signal nevers     : std_logic_vector(COLUMNS - 1 downto 0);
     signal prior_code : std_logic_vector(PROB_BITS - 1 downto 0);
 
-    -- number of the generator that this line's first cell sees
+    -- number of the generator of this line's first cell
     constant FIRST : natural := l * COLUMNS * to_natural(not RNG_SHARED);
 
   begin

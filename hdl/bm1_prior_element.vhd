@@ -10,12 +10,12 @@ library ieee;
 entity bm1_prior_element is
   generic (
     PROB_BITS : positive; -- width of a code
-    WRITTEN   : boolean   -- the host writes the codes; else they come from the prior's table
+    WRITTEN   : boolean   -- the host writes the codes; otherwise they come from the prior's table
   );
   port (
     clk_i    : in    std_logic;                                -- clock
-    load_i   : in    std_logic;                                -- a frame starts: take the written code
-    code_i   : in    std_logic_vector(PROB_BITS - 1 downto 0); -- of the table, which holds it for the frame, or written
+    load_i   : in    std_logic;                                -- a frame starts: latch the written code
+    code_i   : in    std_logic_vector(PROB_BITS - 1 downto 0); -- from the table, which holds it for the frame, or written
     random_i : in    std_logic_vector(PROB_BITS - 1 downto 0); -- random number of column 0
     bit_o    : out   std_logic;                                -- bitstream of P(S)
     never_o  : out   std_logic                                 -- the bitstream is all zeros
@@ -29,7 +29,7 @@ architecture rtl of bm1_prior_element is
 begin
 
   written_code : if WRITTEN generate
-    -- The host may write the next prior between two slices of a frame: the frame keeps its own.
+    -- The host may write the next prior between two slices of a frame, so the frame needs a copy.
 
     hold_code : process (clk_i) is
     begin

@@ -1,6 +1,6 @@
 -- ================================================================================================
 -- rosbayes: bm1_readout
--- Selects what the host reads of the results: a counter, or a word of a replica's outcome.
+-- Selects the result that the host reads: a counter, or a word of a replica's outcome.
 -- MIT licence; datasheet: docs/hardware/bm1_readout.md
 -- ================================================================================================
 
@@ -12,16 +12,16 @@ entity bm1_readout is
   generic (
     RESULTS      : positive; -- counters of all replicas
     COUNTER_BITS : positive; -- width of a counter
-    REPLICAS     : positive  -- machines around the same generators
+    REPLICAS     : positive  -- machines that share the generators
   );
   port (
     clk_i     : in    std_logic;                                             -- clock
-    index_i   : in    std_logic_vector(11 downto 0);                         -- number of the word; OUTCOMES has 10 bits
+    index_i   : in    std_logic_vector(11 downto 0);                         -- index of the word; OUTCOMES uses 10 bits
     counts_i  : in    std_logic_vector(RESULTS * COUNTER_BITS - 1 downto 0); -- counters, the first lowest
     reasons_i : in    std_logic_vector(3 * REPLICAS - 1 downto 0);           -- stop reasons of the replicas
     cycles_i  : in    std_logic_vector(64 * REPLICAS - 1 downto 0);          -- cycles of the replicas
-    result_o  : out   std_logic_vector(31 downto 0);                         -- counter, a clock after its number
-    outcome_o : out   std_logic_vector(31 downto 0)                          -- word of OUTCOMES, a clock after its number
+    result_o  : out   std_logic_vector(31 downto 0);                         -- counter, one clock after its index
+    outcome_o : out   std_logic_vector(31 downto 0)                          -- word of OUTCOMES, one clock after its index
   );
 end entity bm1_readout;
 

@@ -1,6 +1,6 @@
 -- ================================================================================================
 -- rosbayes: bm1_registers
--- The board's register map: guards, stores and answers each access, and rings the machine.
+-- Register map of a board: checks, executes and answers each access, and starts the machine.
 -- MIT licence; datasheet: docs/hardware/bm1_registers.md
 -- ================================================================================================
 
@@ -17,16 +17,16 @@ entity bm1_registers is
   generic (
     LINES             : positive;                       -- lines of this board
     SENSORS           : natural;                        -- sensor columns
-    REPLICAS          : positive;                       -- machines around the same generators
-    MODE              : sensor_mode_t;                  -- what the cells of a sensor column are given
-    ADDRESS_BITS      : natural_array_t;                -- of each sensor column, 1 to SENSORS
+    REPLICAS          : positive;                       -- machines that share the generators
+    MODE              : sensor_mode_t;                  -- input of the cells in a sensor column
+    ADDRESS_BITS      : natural_array_t;                -- address width of each sensor column, 1 to SENSORS
     PROB_BITS         : positive;                       -- width of a code
     PRIOR_BITS        : natural;                        -- width of the prior's address
     WRITTEN           : boolean;                        -- the host writes the prior
     COUNTER_BITS      : positive;                       -- width of a counter
     KIND              : rng_kind_t;                     -- generators: LFSR or table
-    RNG_SHARED        : boolean;                        -- one generator a column; else one a cell
-    STEPS             : positive;                       -- steps of a generator in a clock
+    RNG_SHARED        : boolean;                        -- one generator per column; otherwise one per cell
+    STEPS             : positive;                       -- steps of a generator per clock
     BANKS             : positive;                       -- sets of seeds
     RESET_BANK        : boolean;                        -- a frame restarts the generators
     INTERFACE_INPUTS  : positive;                       -- words of SENSORS or INPUTS
@@ -36,29 +36,29 @@ entity bm1_registers is
     BOARD             : natural;                        -- number of this board
     BOARDS            : positive;                       -- number of boards
     IMAGE_HASH        : std_logic_vector(255 downto 0); -- identity of this board's image
-    MEMORY_FOLDER     : string;                         -- path of the MIFs, with a slash at its end
+    MEMORY_FOLDER     : string;                         -- path of the MIFs, with a trailing slash
     CLOCK_HZ          : positive                        -- frequency of the clock
   );
   port (
     -- system
     clk_i : in    std_logic; -- clock
     rst_i : in    std_logic; -- reset of the board
-    irq_o : out   std_logic; -- one clock: the machine has stopped
+    irq_o : out   std_logic; -- pulse: the machine has stopped
     -- access
-    request_i : in    std_logic;                                       -- one clock: an access begins
-    write_i   : in    std_logic;                                       -- it writes; else it reads
+    request_i : in    std_logic;                                       -- pulse: an access begins
+    write_i   : in    std_logic;                                       -- 1: write, 0: read
     address_i : in    std_logic_vector(BAR_ADDRESS_BITS - 1 downto 0); -- in bytes
-    strobe_i  : in    std_logic_vector(3 downto 0);                    -- bytes that are written
+    strobe_i  : in    std_logic_vector(3 downto 0);                    -- byte enables of a write
     data_i    : in    std_logic_vector(31 downto 0);                   -- data to write
-    respond_o : out   std_logic;                                       -- one clock: it has ended
-    refused_o : out   std_logic;                                       -- it was refused
-    data_o    : out   std_logic_vector(31 downto 0);                   -- data read
+    respond_o : out   std_logic;                                       -- pulse: the access is complete
+    refused_o : out   std_logic;                                       -- the access was refused
+    data_o    : out   std_logic_vector(31 downto 0);                   -- read data
     -- machine: commands and settings
     start_o       : out   std_logic;                                                   -- start a frame
     resume_o      : out   std_logic;                                                   -- run the frame's next slice
     reset_o       : out   std_logic;                                                   -- stop and clear
     target_o      : out   std_logic_vector(COUNTER_BITS - 1 downto 0);                 -- target count
-    max_cycles_o  : out   std_logic_vector(63 downto 0);                               -- most cycles of a frame
+    max_cycles_o  : out   std_logic_vector(63 downto 0);                               -- maximum cycles of a frame
     run_until_o   : out   std_logic_vector(63 downto 0);                               -- end of the slice
     bank_o        : out   std_logic_vector(bits_for(BANKS) - 1 downto 0);              -- set of seeds
     halt_o        : out   std_logic_vector(REPLICAS - 1 downto 0);                     -- replicas to halt
@@ -68,13 +68,13 @@ entity bm1_registers is
       REPLICAS * SENSORS * inputs_per_column(MODE, LINES) * SLOT_BITS - 1 downto 0);   -- readings
     -- machine: outcome
     running_i         : in    std_logic;                                                     -- the machine runs
-    done_i            : in    std_logic;                                                     -- it stops with this clock
-    has_run_i         : in    std_logic;                                                     -- it has run since the last reset
+    done_i            : in    std_logic;                                                     -- the machine stops in this clock
+    has_run_i         : in    std_logic;                                                     -- the machine has run since the last reset
     cycles_i          : in    std_logic_vector(63 downto 0);                                 -- cycles of the frame
-    reason_i          : in    std_logic_vector(2 downto 0);                                  -- why it stands still
+    reason_i          : in    std_logic_vector(2 downto 0);                                  -- stop reason
     ready_i           : in    std_logic_vector(REPLICAS - 1 downto 0);                       -- replicas that can be resumed
-    replica_reasons_i : in    std_logic_vector(3 * REPLICAS - 1 downto 0);                   -- why each one stands still
-    replica_cycles_i  : in    std_logic_vector(64 * REPLICAS - 1 downto 0);                  -- cycles of each one
+    replica_reasons_i : in    std_logic_vector(3 * REPLICAS - 1 downto 0);                   -- stop reason of each replica
+    replica_cycles_i  : in    std_logic_vector(64 * REPLICAS - 1 downto 0);                  -- cycles of each replica
     counts_i          : in    std_logic_vector(REPLICAS * LINES * COUNTER_BITS - 1 downto 0) -- counters
   );
 end entity bm1_registers;
@@ -101,7 +101,7 @@ architecture rtl of bm1_registers is
 
   end function word;
 
-  -- Return a SHA-256 as it is read: its first byte in the lowest byte of word 0.
+  -- Return a SHA-256 as register words: its first byte in the lowest byte of word 0.
 
   function read_order (
     hash : std_logic_vector(255 downto 0)
@@ -161,7 +161,7 @@ architecture rtl of bm1_registers is
 
   end function machine;
 
-  -- Return the widths of the input words, one at least.
+  -- Return the widths of the input words, at least one.
 
   function input_widths return natural_array_t is
   begin
@@ -227,7 +227,7 @@ architecture rtl of bm1_registers is
 
 begin
 
-  -- One access after the other: it is taken, judged, carried out, and (a read) answered a clock later.
+  -- Process one access at a time: accept, check and execute it, and answer a read one clock later.
   sequence_of_access : process (clk_i) is
   begin
 
@@ -236,7 +236,7 @@ begin
         state      <= waiting;
         error_code <= (others => '0');
       else
-        -- no case: GHDL's synthesis makes latches of one over an enumeration
+        -- no case: GHDL's synthesis turns a case over an enumeration into latches
         if (state = waiting) then
           if (request_i = '1') then
             state   <= checking;
@@ -317,7 +317,7 @@ begin
   refused_o     <= '1' when state = checking and allowed = '0' else
                    '0';
 
-  -- Which block it is: a guarded address needs no exact decoding.
+  -- Select the block. The guard has checked the address, so it needs no exact decoding.
   is_inputs   <= '1' when (PLAIN and unsigned(address(16 downto 8)) = SENSORS_ADDRESS / 256)
                           or (not PLAIN and address(16) = '1') else
                  '0';

@@ -13,7 +13,7 @@ entity bm1_stochastic_bitstream_generator is
     PROB_BITS : positive -- width of a code
   );
   port (
-    random_i : in    std_logic_vector(PROB_BITS - 1 downto 0); -- number that the generator shows
+    random_i : in    std_logic_vector(PROB_BITS - 1 downto 0); -- output of the generator
     code_i   : in    std_logic_vector(PROB_BITS - 1 downto 0); -- 0: never; all ones: always
     bit_o    : out   std_logic;                                -- one bit of the stream
     never_o  : out   std_logic                                 -- the code is 0

@@ -21,8 +21,8 @@ entity bm1_table is
   );
   port (
     clk_i     : in    std_logic;                                   -- clock
-    enable_i  : in    std_logic;                                   -- read; else the data stay
+    enable_i  : in    std_logic;                                   -- read; otherwise the output is kept
     address_i : in    std_logic_vector(ADDRESS_BITS - 1 downto 0); -- must be less than DEPTH
-    data_o    : out   std_logic_vector(DATA_BITS - 1 downto 0)     -- part of the word, a clock later
+    data_o    : out   std_logic_vector(DATA_BITS - 1 downto 0)     -- part of the word, one clock later
   );
 end entity bm1_table;

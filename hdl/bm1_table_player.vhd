@@ -1,6 +1,6 @@
 -- ================================================================================================
 -- rosbayes: bm1_table_player
--- Random number generator: plays a table of recorded random numbers in a ring.
+-- Random number generator: repeats a table of recorded random numbers.
 -- MIT licence; datasheet: docs/hardware/bm1_table_player.md
 -- ================================================================================================
 
@@ -13,19 +13,19 @@ library work;
 
 entity bm1_table_player is
   generic (
-    STATE_BITS : positive; -- width of the place in the table
+    STATE_BITS : positive; -- width of the index in the table
     PROB_BITS  : positive; -- width of a number
     TABLE_FILE : string;   -- MIF of the numbers
-    LENGTH     : positive; -- how many there are
-    STEPS      : positive  -- places in a clock
+    LENGTH     : positive; -- number of entries
+    STEPS      : positive  -- entries per clock
   );
   port (
     clk_i    : in    std_logic;                                 -- clock
-    shift_i  : in    std_logic;                                 -- take the seed
+    shift_i  : in    std_logic;                                 -- shift the seed in
     seed_i   : in    std_logic_vector(STATE_BITS - 1 downto 0); -- next seed of the chain
     step_i   : in    std_logic;                                 -- make the steps of a cycle
-    state_o  : out   std_logic_vector(STATE_BITS - 1 downto 0); -- place in the table
-    random_o : out   std_logic_vector(PROB_BITS - 1 downto 0)   -- number at that place
+    state_o  : out   std_logic_vector(STATE_BITS - 1 downto 0); -- index in the table
+    random_o : out   std_logic_vector(PROB_BITS - 1 downto 0)   -- entry at that index
   );
 end entity bm1_table_player;
 
@@ -72,7 +72,7 @@ begin
 
   end process hold_place;
 
-  -- The memory is read at the next place, so that its output always belongs to this one.
+  -- The memory is read at the next index, so its output always belongs to the current one.
   numbers : component bm1_table
     generic map (
       file_name    => TABLE_FILE,

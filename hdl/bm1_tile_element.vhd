@@ -1,6 +1,6 @@
 -- ================================================================================================
 -- rosbayes: bm1_tile_element
--- Cell of a sensor column: multiplies the line's bitstream by that of P(K | S) (thesis, figure 2.2).
+-- Cell of a sensor column: multiplies the bitstream of the line by P(K | S) (thesis, figure 2.2).
 -- MIT licence; datasheet: docs/hardware/bm1_tile_element.md
 -- ================================================================================================
 
@@ -14,7 +14,7 @@ library work;
 entity bm1_tile_element is
   generic (
     PROB_BITS    : positive;      -- width of a code
-    MODE         : sensor_mode_t; -- what the cell is given
+    MODE         : sensor_mode_t; -- input of the cell
     ADDRESS_BITS : positive;      -- of the table; SENSOR_CELL
     TABLE_FILE   : string;        -- MIF of the column; SENSOR_CELL
     LINES        : positive;      -- lines in the MIF's words; SENSOR_CELL
@@ -22,8 +22,8 @@ entity bm1_tile_element is
   );
   port (
     clk_i    : in    std_logic;                                -- clock
-    load_i   : in    std_logic;                                -- a frame starts: take the cell's input
-    given_i  : in    std_logic_vector(SLOT_BITS - 1 downto 0); -- code of the column's table, address, or code
+    load_i   : in    std_logic;                                -- a frame starts: latch the cell's input
+    given_i  : in    std_logic_vector(SLOT_BITS - 1 downto 0); -- by MODE: code from the column's table, address, or code
     random_i : in    std_logic_vector(PROB_BITS - 1 downto 0); -- random number of the column or cell
     bit_i    : in    std_logic;                                -- bitstream of the cells to the left
     never_i  : in    std_logic;                                -- one of their codes is 0
@@ -43,7 +43,7 @@ begin
   -- a chain of conditions: GHDL's synthesis does not know case generates
 
   source : if MODE = SENSOR_COLUMN generate
-    -- The tables of a column see the same address: they lie side by side in one memory outside.
+    -- The tables of a column have the same address: they share one memory in bm1_matrix.
     code <= given_i(PROB_BITS - 1 downto 0);
   elsif MODE = SENSOR_CELL generate
 

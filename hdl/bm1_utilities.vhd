@@ -15,7 +15,7 @@ package bm1_utilities is
   -- Bits of a slot in a vector of inputs: the widest address or code.
   constant SLOT_BITS : positive := 16;
 
-  -- Return the bits that hold 0 to COUNT - 1, at least one.
+  -- Return the number of bits for 0 to COUNT - 1, at least 1.
 
   function bits_for (
     count : positive
@@ -47,7 +47,7 @@ package bm1_utilities is
     highest : natural
   ) return string;
 
-  -- A memory (bm1_table.vhd), as a component: its architecture is bound by what is compiled, and a synthesis that
+  -- A memory (bm1_table.vhd), as a component: the compiled file provides its architecture, and a synthesis that
   -- counts logic leaves it out.
 
   component bm1_table is

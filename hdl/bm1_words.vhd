@@ -1,6 +1,6 @@
 -- ================================================================================================
 -- rosbayes: bm1_words
--- Memory of words that the host writes; the machine sees all of them at once, and whether one is too large.
+-- Memory of words from the host: outputs all used words in parallel, and whether one is too large.
 -- MIT licence; datasheet: docs/hardware/bm1_words.md
 -- ================================================================================================
 
@@ -14,24 +14,24 @@ library work;
 
 entity bm1_words is
   generic (
-    DEPTH         : positive;        -- words that can be written and read
-    USED          : natural;         -- words, from 0 on, that the machine sees; DEPTH at most
-    WIDTHS        : natural_array_t; -- bits of a word that the machine sees, column by column, 0 to SLOT_BITS
+    DEPTH         : positive;        -- number of words
+    USED          : natural;         -- words that the machine uses, from word 0 on; at most DEPTH
+    WIDTHS        : natural_array_t; -- used bits of a word, column by column, 0 to SLOT_BITS
     PER_COLUMN    : positive;        -- successive words of a column
-    INITIAL_FILE  : string;          -- MIF of what the words hold first; "": zeros
-    INITIAL_WORDS : positive;        -- words in it; they are repeated up to DEPTH
+    INITIAL_FILE  : string;          -- MIF of the initial words; "": zeros
+    INITIAL_WORDS : positive;        -- words in the MIF; repeated up to DEPTH
     INITIAL_BITS  : positive         -- width of these words
   );
   port (
     clk_i    : in    std_logic;                                       -- clock
     rst_i    : in    std_logic;                                       -- write the initial words
-    busy_o   : out   std_logic;                                       -- they are being written
+    busy_o   : out   std_logic;                                       -- the initial words are being written
     write_i  : in    std_logic;                                       -- write the word
-    index_i  : in    std_logic_vector(bits_for(DEPTH) - 1 downto 0);  -- number of the word
+    index_i  : in    std_logic_vector(bits_for(DEPTH) - 1 downto 0);  -- index of the word
     data_i   : in    std_logic_vector(31 downto 0);                   -- data to write
-    data_o   : out   std_logic_vector(31 downto 0);                   -- the word, a clock after its number
-    values_o : out   std_logic_vector(USED * SLOT_BITS - 1 downto 0); -- words as the machine sees them, word 0 lowest
-    bad_o    : out   std_logic                                        -- a word that is used is too large
+    data_o   : out   std_logic_vector(31 downto 0);                   -- the word, one clock after its index
+    values_o : out   std_logic_vector(USED * SLOT_BITS - 1 downto 0); -- used words, word 0 lowest
+    bad_o    : out   std_logic                                        -- a used word is too large
   );
 end entity bm1_words;
 
@@ -40,7 +40,7 @@ architecture rtl of bm1_words is
   constant INDEX_BITS           : positive := bits_for(DEPTH);
   constant INITIAL_ADDRESS_BITS : positive := bits_for(INITIAL_WORDS);
 
-  -- a power of two: the address of another block may stand at the index
+  -- a power of two: the index may be an address of another block
 
   type memory_t is array (0 to 2 ** INDEX_BITS - 1) of std_logic_vector(31 downto 0);
 
@@ -58,7 +58,7 @@ architecture rtl of bm1_words is
 
 begin
 
-  -- After a reset the initial words are written one by one, as if the host did it.
+  -- After a reset, write the initial words one by one, as the host would.
   count_initial_words : process (clk_i) is
   begin
 

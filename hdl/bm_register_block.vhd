@@ -1,6 +1,6 @@
 -- ================================================================================================
 -- rosbayes: bm_register_block
--- Registers of a board: stores what software writes and selects what it reads.
+-- Registers of a board: stores written values and selects read data.
 -- Generated from hdl/bm_registers.rdl by scripts/registers: change that file, not this one.
 -- MIT licence; datasheet: docs/hardware/bm_register_block.md
 -- ================================================================================================

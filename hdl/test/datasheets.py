@@ -108,7 +108,7 @@ def _ports(text: str) -> list[tuple[str, str, str, str]]:
 def generated_part(unit: Unit) -> str:
     """Return a page up to the theory of operation."""
     lines = [
-        f"<!-- Down to the theory of operation generated from hdl/{unit.name}.vhd by scripts/datasheets. -->",
+        f"<!-- Generated from hdl/{unit.name}.vhd by scripts/datasheets, except the theory. -->",
         f"# {unit.name}",
         "",
         unit.purpose,

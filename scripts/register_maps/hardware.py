@@ -212,7 +212,7 @@ def block_text(registers: tuple[Register, ...]) -> str:
         [
             _HEAD.format(
                 name="bm_register_block",
-                title="Registers of a board: stores what software writes and selects what it reads.",
+                title="Registers of a board: stores written values and selects read data.",
             ).rstrip(),
             "  use ieee.numeric_std.all;",
             "",
@@ -272,7 +272,7 @@ def _reset(register: Register) -> str:
 
 
 def _writes(registers: tuple[Register, ...]) -> list[str]:
-    """Return the process that stores what software writes.
+    """Return the process that stores written values.
 
     Every word is decided by itself: GHDL 2.0 writes a case without what holds otherwise into its Verilog, which makes latches.
     """

@@ -13,7 +13,7 @@ library work;
 
 entity core_under_proof is
   generic (
-    REPLICAS : positive := 1 -- machines around the same generators
+    REPLICAS : positive := 1 -- machines that share the generators
   );
   port (
     clk_i             : in    std_logic;
