@@ -200,11 +200,7 @@ class _Manifest(_Checked):
 
 
 def build_date() -> str:
-    """Return the current time, or `SOURCE_DATE_EPOCH` for reproducible builds, as ISO 8601 in UTC.
-
-    Raises:
-        ImageError: `SOURCE_DATE_EPOCH` is not a time.
-    """
+    """Return the current time, or `SOURCE_DATE_EPOCH`, as ISO 8601 in UTC; an ImageError if that is not a time."""
     epoch = os.environ.get("SOURCE_DATE_EPOCH")
     try:
         return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(None if epoch is None else int(epoch)))
@@ -225,21 +221,6 @@ def image_bytes(image: Image) -> bytes:
     manifest = _canonical(_manifest(image, sections).model_dump(mode="json"))
     header = _HEADER.pack(MAGIC, len(manifest), 0, hashlib.sha256(manifest).digest())
     return b"".join([header, manifest, *(array.tobytes() for _, array in sections)])
-
-
-def write_image(path: Path, image: Image) -> None:
-    """Write the image's programming file atomically.
-
-    Raises:
-        ImageError: The file cannot be written.
-    """
-    part = path.with_name(path.name + ".part")
-    try:
-        part.write_bytes(image_bytes(image))
-        part.replace(path)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        raise ImageError(f"{path} cannot be written: {error.strerror}") from error
 
 
 def read_image(path: Path) -> Image:

@@ -50,11 +50,7 @@ class FrameEncoder:
         self._missing = tuple((1 << bits) - 1 for bits in self._parameters.sensor_bits)
 
     def encode(self, frame: FrameInput) -> list[BoardWords]:
-        """Return the words for each board.
-
-        Raises:
-            FrameInputError: The frame does not fit the machine.
-        """
+        """Return the words for each board; a FrameInputError if the frame does not fit the machine."""
         settings, inputs, selects = self._words(frame)
         return [
             BoardWords(settings, own, selects, prior)

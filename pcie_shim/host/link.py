@@ -74,9 +74,6 @@ class Link(Protocol):
     def write_block(self, address: int, words: Octets) -> None:
         """Write little-endian words from `address` on and wait until the board has taken them."""
 
-    def wait_done(self, number: int, *, timeout: float) -> Done:
-        """Wait until the board has stopped after start or resume `number`; needs CONTROL.INTERRUPT_ENABLE."""
-
     def post(self, writes: Iterable[RegisterWrite]) -> None:
         """Write without waiting; a refusal is raised where the next answer is taken."""
 

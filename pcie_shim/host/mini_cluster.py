@@ -10,7 +10,6 @@ from __future__ import annotations
 import select
 import time
 from collections.abc import Sequence
-from types import TracebackType
 from typing import Final, NoReturn, Self
 
 import numpy as np
@@ -113,9 +112,7 @@ class MiniCluster:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     @property
@@ -180,16 +177,10 @@ class MiniCluster:
             raise
 
     def collect(self, seconds: float) -> FrameOutput | None:
-        """Take the boards' answers to the posted frame, and start its next slice where there is one.
+        """Take the boards' answers to the posted frame, and start its next slice where there is one; errors as `run`.
 
-        Args:
-            seconds: Longest wait if nothing has come yet; 0 polls.
-
-        Returns:
-            The frame's result, or None while boards still run: then `awaited` is the descriptor to poll.
-
-        Raises:
-            BoardError: As `run`.
+        It waits for `seconds` at most if nothing has come yet. It returns the frame's result, or None while boards still run:
+        then `awaited` is the descriptor to poll.
         """
         progress = self._progress
         if progress is None:

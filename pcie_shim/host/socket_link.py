@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import select
 import socket
 import struct
 import time
 from collections.abc import Iterable
 from contextlib import suppress
-from types import TracebackType
 from typing import Final, NoReturn, Self
 
 from pcie_shim import framing, register_map
@@ -28,7 +26,7 @@ from pcie_shim.errors import (
     StaleHandleError,
 )
 from pcie_shim.framing import Frame, Octets
-from pcie_shim.host.link import LONGEST_POLL_S, Done, Link, RegisterWrite
+from pcie_shim.host.link import Done, Link, RegisterWrite
 from pcie_shim.register_layout import ALL_ONES, DONE_BLOCK, WORD
 from pcie_shim.register_map import ErrorCode
 
@@ -70,10 +68,7 @@ class SocketLink(Link):
     def open(cls, endpoint: Endpoint, *, timeout: float, connect_timeout: float | None = None) -> Self:
         """Open a link to a board that has this protocol version and register map.
 
-        Args:
-            endpoint: The board's registers, or its programming port.
-            timeout: Seconds for each answer.
-            connect_timeout: Seconds for the board to listen and greet; None: `timeout`.
+        The board has `connect_timeout` seconds (None: `timeout`) to listen and greet, and `timeout` for each answer.
 
         Raises:
             UnreachableError: Nothing listens there.
@@ -101,9 +96,7 @@ class SocketLink(Link):
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     @property
@@ -124,13 +117,7 @@ class SocketLink(Link):
     # ---- registers ------------------------------------------------------------------------------------
 
     def read32(self, address: int) -> int:
-        """Read one register.
-
-        Raises:
-            DeviceGoneError: The ID register reads all ones.
-            AccessError: The board refused the address.
-            LinkError: The link broke; it is closed.
-        """
+        """Read one register; a DeviceGoneError where ID reads all ones."""
         (value,) = WORD.unpack(self.read_block(address, 1))
         if value == ALL_ONES and address == register_map.ID:
             self._give_up(
@@ -139,22 +126,11 @@ class SocketLink(Link):
         return int(value)
 
     def write32(self, address: int, value: int) -> None:
-        """Write one register and wait until the board has taken it.
-
-        Raises:
-            AccessError: The board refused the address or the value.
-            LinkError: The link broke; it is closed.
-        """
+        """Write one register and wait until the board has taken it."""
         self.write_block(address, WORD.pack(value))
 
     def read_block(self, address: int, count: int) -> bytes:
-        """Read `count` words from `address` on, as little-endian bytes.
-
-        Raises:
-            ShortReadError: Fewer or more words came; the link is closed.
-            AccessError: The board refused the address or the length.
-            LinkError: The link broke; it is closed.
-        """
+        """Read `count` words from `address` on, as little-endian bytes; a ShortReadError for fewer or more."""
         frame = self.request(framing.READ, 0, address, count)
         if frame.words != count:
             self._give_up(
@@ -166,44 +142,13 @@ class SocketLink(Link):
         return bytes(frame.payload)
 
     def write_block(self, address: int, words: Octets) -> None:
-        """Write little-endian words from `address` on and wait until the board has taken them.
-
-        Raises:
-            AccessError: The board refused the address, the length or a value.
-            LinkError: The link broke; it is closed.
-        """
+        """Write little-endian words from `address` on and wait until the board has taken them."""
         self.request(framing.WRITE, 0, address, len(words) // 4, words)
-
-    def wait_done(self, number: int, *, timeout: float) -> Done:
-        """Wait until the board has stopped after start or resume `number`; needs CONTROL.INTERRUPT_ENABLE.
-
-        Raises:
-            AccessError: The board refused the start, or a write posted before it.
-            LinkTimeoutError: It did not stop in time; the link is closed.
-            LinkError: The link broke; it is closed.
-        """
-        deadline = time.monotonic() + timeout
-        what = f"answer doorbell {number}"
-        while (done := self.take_done()) is None:
-            self._wait_readable(deadline, timeout, what)
-            self._receive_some()
-        if done.number != number:
-            self._give_up(
-                SequenceError(
-                    f"The board at {self.endpoint} answered doorbell {done.number} where {number} was due: "
-                    "the link is closed"
-                )
-            )
-        return done
 
     # ---- for a host that drives many boards -----------------------------------------------------------
 
     def post(self, writes: Iterable[RegisterWrite]) -> None:
-        """Send posted writes; a refusal is raised where the next answer or interrupt is taken.
-
-        Raises:
-            LinkError: The link broke; it is closed.
-        """
+        """Send posted writes; a refusal is raised where the next answer or interrupt is taken."""
         self._send(b"".join(self._posted(framing.WRITE, address, words) for address, words in writes))
 
     def post_part(self, offset: int, part: Octets) -> None:
@@ -222,22 +167,12 @@ class SocketLink(Link):
             self._broken_send(error)
 
     def receive_done(self) -> Done | None:
-        """Receive once, after a poll; return the board's answer if it is complete.
-
-        Raises:
-            AccessError: The board refused a posted write.
-            LinkError: The link broke; it is closed.
-        """
+        """Receive once, after a poll; return the board's answer if it is complete."""
         self._receive_some()
         return self.take_done()
 
     def take_done(self) -> Done | None:
-        """Return the board's answer if it has been received completely, else None.
-
-        Raises:
-            AccessError: The board refused a posted write.
-            LinkError: The link broke; it is closed.
-        """
+        """Return the board's answer if it has been received completely, else None."""
         if self._done is not None:
             done, self._done = self._done, None
             return done
@@ -253,14 +188,9 @@ class SocketLink(Link):
         return self._give_up(SequenceError("an answer came without a request"))
 
     def request(self, operation: int, flags: int, address: int, count: int, payload: Octets = b"") -> Frame:
-        """Send one request and wait for its answer; keep an interrupt that comes before it.
+        """Send one request and return the answer; keep an interrupt that comes before it.
 
-        Returns:
-            The reply; its payload is valid until the link receives again.
-
-        Raises:
-            AccessError: The board refused.
-            LinkError: The link broke; it is closed.
+        The answer's payload is valid until the link receives again.
         """
         self._sequence = sequence = (self._sequence + 1) & ALL_ONES
         self._send(framing.encode(operation, flags, sequence, address, count, payload))
@@ -309,14 +239,6 @@ class SocketLink(Link):
         if count == 0:
             self._give_up(self._gone("it closed the link"))
         self._decoder.received(count)
-
-    def _wait_readable(self, deadline: float, timeout: float, what: str) -> None:
-        poll = select.poll()
-        poll.register(self._socket, select.POLLIN)
-        while (remaining := deadline - time.monotonic()) > 0:
-            if poll.poll(min(remaining, LONGEST_POLL_S) * 1000):
-                return
-        self._give_up(self.late(timeout, what))
 
     def _interrupt(self, frame: Frame) -> Done:
         if frame.words < DONE_BLOCK.size // 4:

@@ -65,11 +65,6 @@ def mif_lines(width: int, depth: int, words: Iterable[int], comments: Iterable[s
     yield "END;\n"
 
 
-def mif_text(mif: Mif, comments: Iterable[str] = ()) -> str:
-    """Return a memory's file in its canonical form."""
-    return "".join(mif_lines(mif.width, len(mif.words), mif.words, comments))
-
-
 def printable(text: str) -> str:
     """Return a name as one line of printable ASCII, for a comment that every tool reads."""
     return text.encode("unicode_escape").decode("ascii")
@@ -97,10 +92,10 @@ class _Reader:
         self._next()
 
     def read(self) -> Mif:
-        width, depth, address_base, data_radix = self._header()
+        width, depth, address_radix, data_radix = self._header()
         words: list[int | None] = [None] * depth
         while not self._at("END"):
-            self._entry(words, width, address_base, data_radix)
+            self._entry(words, width, address_radix, data_radix)
         self._next()
         if self._kind:  # the semicolon after END is often left out at the end of a file
             self._expect(";")
@@ -108,7 +103,7 @@ class _Reader:
             self._refuse("the end of the file after END;")
         return Mif(width, tuple(word or 0 for word in words))
 
-    def _header(self) -> tuple[int, int, int, str]:
+    def _header(self) -> tuple[int, int, str, str]:
         sizes: dict[str, int] = {}
         radices = {"ADDRESS_RADIX": "HEX", "DATA_RADIX": "HEX"}
         seen: set[str] = set()
@@ -139,23 +134,23 @@ class _Reader:
         if not self._at("BEGIN"):
             self._refuse("BEGIN after CONTENT")
         self._next()
-        return sizes["WIDTH"], sizes["DEPTH"], _BASES[radices["ADDRESS_RADIX"]], radices["DATA_RADIX"]
+        return sizes["WIDTH"], sizes["DEPTH"], radices["ADDRESS_RADIX"], radices["DATA_RADIX"]
 
-    def _entry(self, words: list[int | None], width: int, address_base: int, data_radix: str) -> None:
+    def _entry(self, words: list[int | None], width: int, address_radix: str, data_radix: str) -> None:
         line = self._line
         first = last = None
         if self._word == "[":
             self._next()
-            first = self._address(address_base, len(words))
+            first = self._address(address_radix, len(words))
             if self._kind != "dots":
                 self._refuse("'..' between the ends of a range")
             self._next()
-            last = self._address(address_base, len(words))
+            last = self._address(address_radix, len(words))
             if last < first:
                 self._fail(f"the range ends at address {last}, before it begins at {first}")
             self._expect("]")
         else:
-            first = self._address(address_base, len(words))
+            first = self._address(address_radix, len(words))
         self._expect(":")
         values: list[int] = []
         while self._word != ";":
@@ -176,8 +171,7 @@ class _Reader:
             words[address] = values[place % len(values)]
         self._next()
 
-    def _address(self, base: int, depth: int) -> int:
-        radix = next(radix for radix, each in _BASES.items() if each == base)
+    def _address(self, radix: str, depth: int) -> int:
         address = self._number(radix, "an address or END;")
         if not 0 <= address < depth:
             self._fail(f"address {address} is outside the memory, whose last one is {depth - 1}")

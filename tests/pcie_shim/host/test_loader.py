@@ -16,7 +16,7 @@ from pcie_shim.errors import (
 from pcie_shim.host import loader
 from pcie_shim.host.loader import program
 from pcie_shim.host.socket_link import SocketLink
-from pcie_shim.programming_file import image_bytes, write_image
+from pcie_shim.programming_file import image_bytes
 from tests.pcie_shim.boards import BoardProcess, image, machine
 
 StartBoard = Callable[..., BoardProcess]
@@ -24,7 +24,7 @@ StartBoard = Callable[..., BoardProcess]
 
 def test_a_file_is_loaded_by_its_path(start_board: StartBoard, folder: Path) -> None:
     board = start_board()
-    write_image(folder / "board0.bm", image(machine(1)))
+    (folder / "board0.bm").write_bytes(image_bytes(image(machine(1))))
     assert program(board.endpoint, folder / "board0.bm") == image(machine(1)).image_hash
 
 

@@ -21,7 +21,7 @@ from toolchain.checks.finding import Check, Severity
 from toolchain.deployment import Scale
 from toolchain.models.conditional import normal, wrapped_normal
 from toolchain.models.model import Known, Model, PriorSelect, cell_centres, dimension, interval
-from toolchain.outputs.mif import Mif, mif_text
+from toolchain.outputs.mif import mif_lines
 
 
 def reading_of(name, **fields):
@@ -361,7 +361,7 @@ def test_a_deployment_says_what_its_model_said(tmp_path):
 
 def test_files_of_a_deployment(deployment):
     assert check_deployment(deployment) == []
-    (deployment / "bm_arch/Memory_MIFs/board0_prior.mif").write_text(mif_text(Mif(40, (1,))))
+    (deployment / "bm_arch/Memory_MIFs/board0_prior.mif").write_text("".join(mif_lines(40, 1, [1])))
     (deployment / "bm1.tcl").unlink()
     memories, project = check_deployment(deployment)
     assert (memories.check, memories.about) == (Check.FILES, "bm_arch/Memory_MIFs/board0_prior.mif")

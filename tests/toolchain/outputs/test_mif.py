@@ -7,9 +7,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from toolchain.errors import MifError
-from toolchain.outputs.mif import Mif, mif_text, parse_mif, read_mif
+from toolchain.outputs.mif import Mif, mif_lines, parse_mif, read_mif
 
 HEAD = "WIDTH=8; DEPTH=8; ADDRESS_RADIX=HEX; DATA_RADIX=HEX;\nCONTENT BEGIN\n"
+
+
+def mif_text(mif, comments=()) -> str:
+    return "".join(mif_lines(mif.width, len(mif.words), mif.words, comments))
 
 
 @st.composite
