@@ -3,27 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from pcie_shim.programming_file import Image, Partition, read_image
+from toolchain.building.machine import MACHINE_KEYS
 from toolchain.errors import DeploymentError
 
 if TYPE_CHECKING:
     from toolchain.deployment import Deployment
-
-_MACHINE_KEYS: Final = (
-    "prob_bits",
-    "prior_bits",
-    "prior_mode",
-    "counter_bits",
-    "rng",
-    "rng_banks",
-    "rng_reset",
-    "shared",
-    "steps_per_clock",
-    "sensor_mode",
-    "replicas",
-)
 
 
 def read_images(deployment: Deployment) -> list[Image]:
@@ -36,8 +23,8 @@ def check_agreement(deployment: Deployment, images: Sequence[Image]) -> None:
     machine = deployment.machine
     for index, (board, image) in enumerate(zip(deployment.boards, images, strict=True)):
         parameters = image.machine.parameters
-        found = {key: getattr(parameters, key) for key in _MACHINE_KEYS}
-        expected = {key: getattr(machine, key) for key in _MACHINE_KEYS}
+        found = {key: getattr(parameters, key) for key in MACHINE_KEYS}
+        expected = {key: getattr(machine, key) for key in MACHINE_KEYS}
         for variable, bits in zip(deployment.sensors, parameters.sensor_bits, strict=False):
             found[f"bits of {variable.name}"], expected[f"bits of {variable.name}"] = bits, variable.bits
         found |= {

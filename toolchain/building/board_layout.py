@@ -40,10 +40,7 @@ def board_layout(
 ) -> BoardLayout:
     """Return the layout of a machine's boards, before any table is computed.
 
-    Args:
-        parameters: The whole machine.
-        partitions: The number of boards.
-        interface: Inputs and results that were asked for; None for as many as are needed, at least the default.
+    Without an `interface`, its inputs and results are as many as are needed, at least the default.
 
     Raises:
         BuildError: More boards than lines, a machine that is larger than the interface, an interface that is larger than

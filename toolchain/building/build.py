@@ -44,13 +44,7 @@ class Built:
 def build_deployment(model: Model, directory: Path, options: BuildOptions, *, remark: str = "") -> Built:
     """Write a model's deployment: `deployment.toml`, an image per board, a report, and the hardware project.
 
-    The same model and options give the same bytes.
-
-    Args:
-        model: The model.
-        directory: The deployment's folder, which is created; a deployment in it is replaced.
-        options: Everything else.
-        remark: A sentence for the report about how the options were chosen.
+    The same model and options give the same bytes. A deployment in the folder is replaced; `remark` ends the report.
 
     Raises:
         BuildError: The options don't fit each other, the model or the register map, or the folder can't be written.

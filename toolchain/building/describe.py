@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from pydantic import ValidationError
 
 from machines.parameters import BM1Parameters, SensorMode
+from toolchain.building.machine import MACHINE_KEYS
 from toolchain.building.options import BuildOptions, refused_option
 from toolchain.deployment import Board, Deployment, MachineSection, Output, Variable
 from toolchain.deployment.deployment_hash import with_hash
@@ -38,21 +39,11 @@ def describe(
             machine=MachineSection(
                 lines=model.lines,
                 interface=layout.interface_text,
-                prob_bits=parameters.prob_bits,
                 scale=options.scaling,
-                prior_bits=parameters.prior_bits,
-                prior_mode=parameters.prior_mode,
-                counter_bits=parameters.counter_bits,
-                rng=parameters.rng,
-                rng_banks=parameters.rng_banks,
-                rng_reset=parameters.rng_reset,
-                shared=parameters.shared,
-                steps_per_clock=parameters.steps_per_clock,
                 target_count=target,
                 max_cycles=options.max_cycles,
                 stop=options.stop,
-                sensor_mode=parameters.sensor_mode,
-                replicas=parameters.replicas,
+                **{key: getattr(parameters, key) for key in MACHINE_KEYS},
             ),
             prior=options.written_prior,
             boards=tuple(

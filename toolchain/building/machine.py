@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from machines.bm1 import BM1Machine
 from machines.errors import ParameterError
 from machines.parameters import BM1Parameters, PriorMode, RngKind, SensorMode
+from toolchain.deployment import MachineSection
 from toolchain.errors import BuildError
 from toolchain.outputs.rng_table import random_table
 
@@ -17,6 +18,16 @@ if TYPE_CHECKING:
 
 _MOST_CODES: Final = 1 << 30
 """Of all columns together, 2 bytes each while they are computed."""
+
+MACHINE_KEYS: Final = tuple(
+    key for key in MachineSection.model_fields if key in BM1Parameters.__dataclass_fields__ and key != "lines"
+)
+"""The parameters that `[machine]` has under the same names; its lines are those of all boards."""
+
+
+def machine_options(source: BuildOptions | MachineSection) -> dict[str, Any]:
+    """Return the parameters of a machine that a build's options and `[machine]` have under the same names."""
+    return {key: getattr(source, key) for key in MACHINE_KEYS if key != "prior_bits"}
 
 
 def machine_parameters(model: Model, options: BuildOptions) -> BM1Parameters:
@@ -39,17 +50,8 @@ def machine_parameters(model: Model, options: BuildOptions) -> BM1Parameters:
         return BM1Parameters(
             lines=model.lines,
             sensor_bits=tuple(options.prob_bits if per_line_codes else known.bits for known in model.known),
-            prob_bits=options.prob_bits,
             prior_bits=0 if model.prior_select is None else model.prior_select.bits,
-            prior_mode=options.prior_mode,
-            counter_bits=options.counter_bits,
-            rng=options.rng,
-            shared=options.shared,
-            steps_per_clock=options.steps_per_clock,
-            rng_banks=options.rng_banks,
-            rng_reset=options.rng_reset,
-            sensor_mode=options.sensor_mode,
-            replicas=options.replicas,
+            **machine_options(options),
         )
     except ParameterError as reason:
         raise BuildError(str(reason)) from reason

@@ -12,6 +12,7 @@ from toolchain.building.agreement import check_agreement, read_images
 from toolchain.building.board_layout import board_layout
 from toolchain.building.build import assemble
 from toolchain.building.edits import DeploymentEdits, edited
+from toolchain.building.machine import machine_options
 from toolchain.building.options import BuildOptions
 from toolchain.building.report import REPORT_NAME, build_report, remark_of, with_remark
 from toolchain.deployment import FILE_NAME, Deployment, deployment_text, load_deployment
@@ -33,13 +34,8 @@ Changes = list[tuple[str, Change]]
 def regenerate_memories(directory: Path, model: Model | None = None, *, build_date: str = "") -> Changes:
     """Write `bm1_parameters.vhd` and the memories again, from the images, or with new tables from a model.
 
-    With a model, the images, the report and the hashes of `deployment.toml` follow, and the columns take the model's
-    order; sizes, widths and everything about topics stay as they are.
-
-    Args:
-        directory: The deployment's folder.
-        model: The changed model; None for the tables that the images hold.
-        build_date: The date in the images' manifests, with a model.
+    With a model, the images (with this date), the report and the hashes of `deployment.toml` follow, and the columns take
+    the model's order; sizes, widths and everything about topics stay as they are.
 
     Raises:
         BuildError: The model has become another machine, which needs a new build.
@@ -94,20 +90,11 @@ def _options(deployment: Deployment, image: Image) -> BuildOptions:
         partitions=partitions,
         interface=None if interface == without_flag.interface else interface,
         scale=machine.scale,
-        prob_bits=machine.prob_bits,
-        prior_mode=machine.prior_mode,
-        counter_bits=machine.counter_bits,
         target_count=machine.target_count,
         max_cycles=machine.max_cycles,
         stop=machine.stop,
-        rng=machine.rng,
         rng_table=image.machine.rng_table,
-        rng_banks=machine.rng_banks,
-        rng_reset=machine.rng_reset,
-        shared=machine.shared,
-        steps_per_clock=machine.steps_per_clock,
-        sensor_mode=machine.sensor_mode,
-        replicas=machine.replicas,
+        **machine_options(machine),
     )
 
 

@@ -7,7 +7,7 @@ the density at its middle, so that coarse bins stay exact.
 from __future__ import annotations
 
 import math
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -57,18 +57,14 @@ def normal(
     """
     shape = Normal(mean=mean, sigma=sigma, floor=floor, outliers=outliers)
     table = normal_table(name, shape, values=values, offset=offset, step=step)
-    return Known(
-        name=name,
-        table=table,
-        bits=bits,
-        offset=offset,
-        step=step,
-        on_range=on_range,
-        on_missing=on_missing,
-        path=path,
-        floor=floor,
-        normal=shape,
-    )
+    rule: dict[str, Any] = {
+        "bits": bits,
+        "offset": offset,
+        "step": step,
+        "on_missing": on_missing,
+        "path": path,
+    }
+    return Known(name=name, table=table, on_range=on_range, floor=floor, normal=shape, **rule)
 
 
 def wrapped_normal(
@@ -94,18 +90,14 @@ def wrapped_normal(
     """
     shape = Normal(mean=mean, sigma=sigma, floor=floor, outliers=outliers)
     table = wrapped_normal_table(name, shape, values=values, offset=offset, step=step)
-    return Known(
-        name=name,
-        table=table,
-        bits=bits,
-        offset=offset,
-        step=step,
-        period=values,
-        on_missing=on_missing,
-        path=path,
-        floor=floor,
-        normal=shape,
-    )
+    rule: dict[str, Any] = {
+        "bits": bits,
+        "offset": offset,
+        "step": step,
+        "on_missing": on_missing,
+        "path": path,
+    }
+    return Known(name=name, table=table, period=values, floor=floor, normal=shape, **rule)
 
 
 def normal_table(name: str, shape: Normal, *, values: int, offset: float, step: float) -> NDArray[np.float64]:
