@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from services.settings import LONGEST_S, SHORTEST_S
+
+
+def _seconds(meaning: str) -> Any:
+    return typer.Option(min=SHORTEST_S, max=LONGEST_S, help=meaning)
+
 
 Deployment = Annotated[
     Path | None,
@@ -15,84 +20,45 @@ Deployment = Annotated[
 ]
 Uri = Annotated[
     str | None,
-    typer.Option(
-        "--uri", help="rosbridge server, instead of the deployment's.", metavar="ws://HOST:PORT|robot:NAME"
-    ),
+    typer.Option(help="rosbridge server, instead of the deployment's.", metavar="ws://HOST:PORT|robot:NAME"),
 ]
 Listen = Annotated[
     str | None,
     typer.Option(
-        "--listen",
         help="Serve at this endpoint (a master; a board: its host) instead of standard input and output.",
         metavar="unix:PATH|tcp://HOST:PORT",
     ),
 ]
-RosVersion = Annotated[
-    str | None,
-    typer.Option("--ros-version", help="How stamps and types are written.", metavar="auto|1|2"),
-]
+RosVersion = Annotated[str | None, typer.Option(help="How stamps and types are written.", metavar="auto|1|2")]
 Queue = Annotated[
     str | None,
     typer.Option(
-        "--queue",
         help="What waits while a frame is computed: latest, or all (in order, 256 deep).",
         metavar="latest|all",
     ),
 ]
 Stop = Annotated[
     str | None,
-    typer.Option(
-        "--stop", help="When boards stop: slices (together) or own (each by itself).", metavar="slices|own"
-    ),
+    typer.Option(help="When boards stop: slices (together) or own (each by itself).", metavar="slices|own"),
 ]
 Boards = Annotated[
     str | None,
     typer.Option(
-        "--boards",
         help="Boards that already run, comma-separated, in the order of the partitions.",
         metavar="ENDPOINT,...",
     ),
 ]
-ConnectTimeout = Annotated[
-    float | None,
-    typer.Option(
-        "--connect-timeout", min=SHORTEST_S, max=LONGEST_S, help="Seconds to reach the rosbridge server (10)."
-    ),
-]
-FirstDataTimeout = Annotated[
-    float | None,
-    typer.Option(
-        "--first-data-timeout", min=SHORTEST_S, max=LONGEST_S, help="Seconds until the first reading (30)."
-    ),
-]
-PeerTimeout = Annotated[
-    float | None,
-    typer.Option(
-        "--peer-timeout",
-        min=SHORTEST_S,
-        max=LONGEST_S,
-        help="Seconds to reach a local process or a board (10).",
-    ),
-]
+ConnectTimeout = Annotated[float | None, _seconds("Seconds to reach the rosbridge server (10).")]
+FirstDataTimeout = Annotated[float | None, _seconds("Seconds until the first reading (30).")]
+PeerTimeout = Annotated[float | None, _seconds("Seconds to reach a local process or a board (10).")]
 BoardTimeout = Annotated[
-    float | None,
-    typer.Option(
-        "--board-timeout",
-        min=SHORTEST_S,
-        max=LONGEST_S,
-        help="Seconds a board may take beyond max_cycles at its speed (5).",
-    ),
+    float | None, _seconds("Seconds a board may take beyond max_cycles at its speed (5).")
 ]
-StopTimeout = Annotated[
-    float | None,
-    typer.Option("--stop-timeout", min=SHORTEST_S, max=LONGEST_S, help="Seconds a process has to end (5)."),
-]
+StopTimeout = Annotated[float | None, _seconds("Seconds a process has to end (5).")]
 LogLevel = Annotated[
     str | None,
     typer.Option(
-        "--log-level",
-        help="What is logged: info, warning, or debug (a line for every frame).",
-        metavar="info|warning|debug",
+        help="What is logged: info, warning, or debug (a line for every frame).", metavar="info|warning|debug"
     ),
 ]
 Count = Annotated[int | None, typer.Option("--count", "-n", min=1, help="End after this many.")]

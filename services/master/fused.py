@@ -9,8 +9,7 @@ import asyncio
 import threading
 from collections.abc import Callable, Coroutine
 from concurrent.futures import Future
-from types import TracebackType
-from typing import Any, Self, TypeVar, cast
+from typing import Any, TypeVar, cast
 
 from pcie_shim.errors import BoardError, PcieShimError
 from services.pipeline.deployed_boards import TICK, DeployedBoards
@@ -38,13 +37,7 @@ class FusedLink(Link):
     def __init__(self, to_master: TakeRecord) -> None:
         self._to_master: TakeRecord | None = to_master
 
-    async def __aenter__(self) -> Self:
-        """Do nothing: there is no socket."""
-        return self
-
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         """Pass on no more records."""
         self._to_master = None
 
@@ -53,21 +46,12 @@ class FusedLink(Link):
         """Whether the link is open."""
         return self._to_master is not None
 
-    @property
-    def backlog(self) -> int:
-        """Bytes that the master has not taken yet: none."""
-        return 0
-
     def send(self, record: Record) -> bool:
         """Pass a record to the master; return whether the link is open."""
         if self._to_master is None:
             return False
         self._to_master(cast("AnyRecord", record))
         return True
-
-    def keep(self, record: Record) -> None:
-        """Pass a record to the master; there are no later ones."""
-        self.send(record)
 
     def serve(self, deployment: Deployment) -> None:
         """Do nothing: there are no later masters to greet."""

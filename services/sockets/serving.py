@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import socket
 from collections.abc import Callable
-from types import TracebackType
 from typing import Any, Protocol, Self
 
 from pcie_shim.endpoint import Endpoint, listen, parse_endpoint, remove_listener
@@ -32,12 +31,14 @@ class Link(Protocol):
     @property
     def backlog(self) -> int:
         """Bytes that the master has not taken yet."""
+        return 0
 
     def send(self, record: Record) -> bool:
         """Send a record; return whether a master is there."""
 
     def keep(self, record: Record) -> None:
         """Send a record now and to every later master: a state that lasts, such as readiness."""
+        self.send(record)
 
     def notice(self, level: str, sentence: str) -> None:
         """Send a message for the user that does not end the run."""
@@ -48,10 +49,9 @@ class Link(Protocol):
 
     async def __aenter__(self) -> Self:
         """Start to serve."""
+        return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, kind: type[BaseException] | None, *_: object) -> None:
         """Stop."""
 
 
@@ -96,9 +96,7 @@ class MasterLink(Link):
             self._server = await loop.create_server(make, sock=listener)
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, kind: type[BaseException] | None, *_: object) -> None:
         """Stop listening, and remove the socket.
 
         Raises:
@@ -200,11 +198,7 @@ def outdated(deployment: Deployment, refused: AnyRecord) -> OutdatedError | None
 
 
 def endpoint_from(text: str, flag: str) -> Endpoint:
-    """Return the endpoint that a user gave.
-
-    Raises:
-        SettingsError: It is not an endpoint.
-    """
+    """Return the endpoint that a user gave, or raise a SettingsError."""
     try:
         return parse_endpoint(text)
     except PcieShimError as error:
