@@ -51,11 +51,7 @@ class Grid:
         return row * self.width + column
 
     def centre(self, line: int) -> tuple[float, float]:
-        """Return the centre (x, y) of a line's cell, in the map's units.
-
-        Raises:
-            IndexError: The line does not exist.
-        """
+        """Return the centre (x, y) of a line's cell, in the map's units; an IndexError if there is no such line."""
         if not 0 <= line < self.cells:
             raise IndexError(f"line {line} of a grid of {self.cells} cells")
         row, column = divmod(line, self.width)

@@ -72,11 +72,7 @@ class _PoseStamped(_Part):
 
 
 def read_truth(message: dict[str, Any], topic: str) -> Truth:
-    """Return a geometry_msgs/PoseStamped as a true position.
-
-    Raises:
-        BadResultError: The message has no stamp or no position.
-    """
+    """Return a geometry_msgs/PoseStamped as a true position; a BadResultError without a stamp or a position."""
     try:
         pose = _PoseStamped.model_validate(message)
     except ValidationError as error:

@@ -50,11 +50,7 @@ class Endpoint:
 
 
 def parse_endpoint(text: str) -> Endpoint:
-    """Parse an endpoint.
-
-    Raises:
-        EndpointError: The text is neither `unix:/path` nor `tcp://host:port`, or the path too long.
-    """
+    """Parse `unix:/path` or `tcp://host:port`; an EndpointError for anything else, or too long a path."""
     if text.startswith("unix:"):
         endpoint = Endpoint(path=text.removeprefix("unix:"))
         if not endpoint.path.startswith("/"):

@@ -178,11 +178,7 @@ def encode_greeting(greeting: Greeting) -> bytes:
 
 
 def decode_greeting(frame: Frame) -> Greeting:
-    """Decode the greeting in a frame.
-
-    Raises:
-        FramingError: The frame is not a greeting.
-    """
+    """Decode the greeting in a frame, or raise a FramingError."""
     if frame.operation != GREET or len(frame.payload) < _GREETING.size:
         raise FramingError("the link does not begin with a board's greeting")
     magic, version, bar_size, board, map_hash, image_hash, token = _GREETING.unpack_from(frame.payload)
@@ -206,11 +202,7 @@ def encode_error(sequence: int, address: int, code: int, detail: str) -> bytes:
 
 
 def decode_error(frame: Frame) -> tuple[int, str]:
-    """Return the code and the sentence of an ERROR frame.
-
-    Raises:
-        FramingError: It has no code.
-    """
+    """Return the code and the sentence of an ERROR frame; a FramingError if it has no code."""
     if frame.words < 1:
         raise FramingError("an ERROR without a code came")
     (code,) = _CRC.unpack_from(frame.payload)

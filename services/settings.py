@@ -142,11 +142,7 @@ def _expected(name: str, message: str) -> str:
 
 
 def _found(robot: str) -> str:
-    """Return the URI of a robot that announces its rosbridge server.
-
-    Raises:
-        BridgeError: No robot of that name does, or the network can't be asked.
-    """
+    """Return the URI of a robot that announces its rosbridge server, or raise a BridgeError."""
     from bridge.discovery import resolve
 
     # in a thread, because the caller may have a loop
@@ -155,11 +151,7 @@ def _found(robot: str) -> str:
 
 
 def endpoint_in(directory: Path, name: str) -> Endpoint:
-    """Return the endpoint of a named local socket in a directory.
-
-    Raises:
-        SettingsError: The path is too long for a unix socket.
-    """
+    """Return the endpoint of a named local socket in a directory; a SettingsError if the path is too long for one."""
     try:
         return parse_endpoint(f"unix:{directory.absolute() / name}.sock")
     except PcieShimError as error:

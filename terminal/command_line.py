@@ -101,11 +101,7 @@ def _naming(context: Any) -> Iterator[None]:
 
 
 def _check_value(context: Any, parameter: Any, typed: object) -> None:
-    """Refuse blank text and numbers that are not finite.
-
-    Raises:
-        RefusedValueError: The value is one of those.
-    """
+    """Refuse, with a RefusedValueError, blank text and numbers that are not finite."""
     for each in typed if isinstance(typed, list | tuple) else (typed,):
         if isinstance(each, str) and not each.strip():
             raise RefusedValueError(each, context, parameter)

@@ -92,11 +92,7 @@ def not_ours(path: str) -> NoHealthError:
 
 
 def is_ready(path: str, timeout: float) -> tuple[bool, str]:
-    """Return whether a process is ready, and why.
-
-    Raises:
-        NoHealthError: It gave no answer, or one that is not a status.
-    """
+    """Return whether a process is ready, and why; a NoHealthError without an answer, or for one that is not a status."""
     data = read_status(path, timeout)
     try:
         status = json.loads(data)
@@ -109,11 +105,7 @@ def is_ready(path: str, timeout: float) -> tuple[bool, str]:
 
 
 def _listen(path: str) -> socket.socket:
-    """Listen at a path, in place of a killed process.
-
-    Raises:
-        OSError: Another process listens there, or the system refuses.
-    """
+    """Listen at a path, in place of a killed process; an OSError if another one listens there, or the system refuses."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         probe.setblocking(False)  # a full backlog is a process that listens
         if probe.connect_ex(path) == errno.ECONNREFUSED:

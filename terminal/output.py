@@ -53,11 +53,7 @@ def _write(text: str) -> None:
 
 
 def put_json(value: Any) -> None:
-    """Print a line of JSON on standard output, free of terminal control characters.
-
-    Raises:
-        OSError: Standard output cannot be written.
-    """
+    """Print a line of JSON on standard output, free of terminal control characters."""
     line = orjson.dumps(value)
     if not line.isascii():  # orjson escapes only the control characters of ASCII
         text = line.decode()
@@ -86,11 +82,7 @@ def discard_output() -> None:
 
 
 def check_writable(folder: Path) -> None:
-    """Create a folder if necessary, and check before a long run that it can be written to.
-
-    Raises:
-        OutputError: It cannot, or it is not a folder.
-    """
+    """Create a folder if necessary, and check before a long run that it can be written to; an OutputError if not."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
@@ -102,11 +94,7 @@ def check_writable(folder: Path) -> None:
 
 
 def write_json(path: Path, values: Mapping[str, object]) -> None:
-    """Write one JSON object to a file.
-
-    Raises:
-        OutputError: The file cannot be written.
-    """
+    """Write one JSON object to a file, or raise an OutputError."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps(values, indent=1) + "\n")

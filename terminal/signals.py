@@ -51,11 +51,7 @@ def _report_dropped(dropped: sys.UnraisableHookArgs) -> None:
 
 
 def check_signals() -> None:
-    """Raise for a signal that has arrived, before the process waits for something.
-
-    Raises:
-        StoppedError: A signal arrived, and its exception was dropped.
-    """
+    """Raise a StoppedError for a signal whose exception was dropped, before the process waits for something."""
     if _received:
         raise stopped_by(_received[0])
 

@@ -81,11 +81,7 @@ def readings_message(
 def read_raw(
     message: Mapping[str, Any], *, array: bool
 ) -> tuple[tuple[float, ...], Mapping[str, Any] | None]:
-    """Return the six raw readings of a message in the order of `SENSOR_NAMES`, and its header if it has one.
-
-    Raises:
-        BadReadingError: A reading is missing, or is not a finite number.
-    """
+    """Return the six raw readings of a message, and its header if any; a BadReadingError if one is not a finite number."""
     if array:
         data = message.get("data")
         if not isinstance(data, list) or len(data) != len(SENSOR_NAMES):

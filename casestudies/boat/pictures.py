@@ -29,11 +29,7 @@ _EDGE: Final = 0.2
 
 
 def check_pictures_possible() -> None:
-    """Check before a long run that its pictures can be drawn.
-
-    Raises:
-        OutputError: matplotlib is not installed.
-    """
+    """Check before a long run that its pictures can be drawn; an OutputError without matplotlib."""
     if find_spec("matplotlib") is None:
         raise OutputError(
             "the pictures need matplotlib, which is not installed: run pip install matplotlib, "
@@ -128,11 +124,7 @@ def draw_shares(path: Path, shares: Sequence[StageShare], *, frames: int) -> Non
 
 
 def posterior_grid(posterior: Posterior) -> Grid:
-    """Return the map cut into the posterior's cells.
-
-    Raises:
-        OutputError: The posterior does not have two dimensions.
-    """
+    """Return the map cut into the posterior's cells; an OutputError if it does not have two dimensions."""
     if len(posterior.sizes) != 2:
         raise OutputError(
             f"the boat's posterior has two dimensions, y and x, but what arrived has "

@@ -61,11 +61,7 @@ class Line:
 
 
 def line_of(instance: "Instance") -> Line:
-    """Return the line for a frame.
-
-    Raises:
-        OutputError: Its posterior is not over a map.
-    """
+    """Return the line for a frame; an OutputError if its posterior is not over a map."""
     from casestudies.boat.geometry import map_grid
     from casestudies.boat.pictures import posterior_grid
 
@@ -167,11 +163,7 @@ class Viewer:
                         say(f"warning: frames on /bm/frame without their result: {listener.announced_only}")
 
     def draw(self, folder: Path) -> tuple[Path, ...]:
-        """Write the two pictures and return their paths.
-
-        Raises:
-            OutputError: matplotlib is missing, or the folder cannot be written to.
-        """
+        """Write the two pictures and return their paths; an OutputError if that is not possible."""
         from casestudies.boat.pictures import draw_positions, draw_shares, far_apart
         from casestudies.boat.shares import stage_shares
 
@@ -185,11 +177,7 @@ class Viewer:
         return tuple(written)
 
     def write_numbers(self, path: Path) -> None:
-        """Write the frames and the shares of time as one JSON object.
-
-        Raises:
-            OutputError: The file cannot be written.
-        """
+        """Write the frames and the shares of time as one JSON object; an OutputError if that is not possible."""
         from casestudies.boat.shares import stage_shares
 
         distances = [line.distance for line in self.lines if line.distance is not None]

@@ -125,11 +125,7 @@ def read_columns(path: Path, names: Sequence[str]) -> Iterator[tuple[str, tuple[
 
 
 def read_barcodes(folder: Path) -> dict[int, int]:
-    """Return the subject of each barcode from `Barcodes.dat`: 1 to 5 are robots, 6 to 20 landmarks.
-
-    Raises:
-        DataFileError: The file is missing, or a subject is unknown.
-    """
+    """Return each barcode's subject from `Barcodes.dat` (1 to 5: robots, 6 to 20: landmarks), or raise a DataFileError."""
     subjects: dict[int, int] = {}
     for where, (subject, barcode) in read_columns(folder / "Barcodes.dat", ("subject", "barcode")):
         if subject not in _SUBJECTS or barcode != int(barcode):
@@ -141,11 +137,7 @@ def read_barcodes(folder: Path) -> dict[int, int]:
 
 
 def read_positions(folder: Path) -> dict[int, tuple[float, float]]:
-    """Return the landmarks' positions in metres, from `Landmark_Groundtruth.dat`.
-
-    Raises:
-        DataFileError: The file is missing, or a line is not about a landmark.
-    """
+    """Return the landmarks' positions in metres, from `Landmark_Groundtruth.dat`, or raise a DataFileError."""
     path = folder / "Landmark_Groundtruth.dat"
     names = ("subject", "x (m)", "y (m)", "deviation of x", "deviation of y")
     positions = {}
@@ -159,11 +151,7 @@ def read_positions(folder: Path) -> dict[int, tuple[float, float]]:
 
 
 def read_track(folder: Path, robot: int) -> Track:
-    """Return a robot's track, from `RobotN_Groundtruth.dat`.
-
-    Raises:
-        DataFileError: The file is missing or empty, or its times do not rise.
-    """
+    """Return a robot's track, from `RobotN_Groundtruth.dat`; a DataFileError if its times do not rise."""
     path = folder / f"Robot{robot}_Groundtruth.dat"
     names = ("time (s)", "x (m)", "y (m)", "orientation (rad)")
     rows = np.array([values for _, values in read_columns(path, names)], dtype=np.float64).reshape(-1, 4)
@@ -175,11 +163,7 @@ def read_track(folder: Path, robot: int) -> Track:
 
 
 def read_measured(folder: Path, robot: int, subjects: dict[int, int]) -> tuple[list[Measured], int]:
-    """Return a robot's sightings of landmarks from `RobotN_Measurement.dat`, and the number of unknown barcodes.
-
-    Raises:
-        DataFileError: The file is missing.
-    """
+    """Return a robot's sightings of landmarks from `RobotN_Measurement.dat`, and the number of unknown barcodes."""
     path = folder / f"Robot{robot}_Measurement.dat"
     found, misread = [], 0
     for _, (time, barcode, away, bearing) in read_columns(
@@ -241,11 +225,7 @@ def _wrapped(angle: float) -> float:
 
 
 def write_landmarks(path: Path, positions: dict[int, tuple[float, float]]) -> None:
-    """Write `landmarks.csv`.
-
-    Raises:
-        OutputError: The file cannot be written.
-    """
+    """Write `landmarks.csv`, or raise an OutputError."""
     _write(
         path,
         ["landmark", "x_m", "y_m"],
@@ -254,11 +234,7 @@ def write_landmarks(path: Path, positions: dict[int, tuple[float, float]]) -> No
 
 
 def write_recording(path: Path, kept: Sequence[Window], landmarks: Sequence[int]) -> None:
-    """Write a file that `casestudies.mrclam.recording` reads.
-
-    Raises:
-        OutputError: The file cannot be written.
-    """
+    """Write a file that `casestudies.mrclam.recording` reads, or raise an OutputError."""
     heading = ["time_s", "ref_x_m", "ref_y_m", "ref_std_m", "heading_rad"]
     heading += [name for number in landmarks for name in (f"range_{number}_m", f"bearing_{number}_rad")]
     rows = []
@@ -286,11 +262,7 @@ def _write(path: Path, heading: Sequence[str], rows: Sequence[Sequence[str]]) ->
 
 
 def robots_in(folder: Path) -> list[int]:
-    """Return the robots that the folder has measurements of.
-
-    Raises:
-        DataFileError: There are none.
-    """
+    """Return the robots that the folder has measurements of; a DataFileError if there are none."""
     found = sorted(
         int(match[1])
         for path in folder.glob("Robot*_Measurement.dat")

@@ -53,11 +53,7 @@ class PlayedFrame:
     outcome: str
 
     def estimate(self) -> tuple[float, float] | None:
-        """Return the posterior's mean (x, y), in metres.
-
-        Raises:
-            BadResultError: The posterior is not over the area.
-        """
+        """Return the posterior's mean (x, y), in metres; a BadResultError if it is not over the area."""
         if self.posterior is None:
             return None
         if len(self.posterior.sizes) != 2:

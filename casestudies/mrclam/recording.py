@@ -54,11 +54,7 @@ class RecordedFrame:
 
 
 def read_recording(path: Path) -> tuple[RecordedFrame, ...]:
-    """Read a file like `ds1_robot3.csv`.
-
-    Raises:
-        DataFileError: The file cannot be read, is of another kind, or has a damaged line, which is named.
-    """
+    """Read a file like `ds1_robot3.csv`; a DataFileError names the line that is damaged."""
     try:
         with path.open(newline="", encoding="utf-8") as file:
             rows = csv.reader(file, strict=True)

@@ -57,11 +57,7 @@ class Misbehaviour:
 
     @classmethod
     def parse(cls, text: str) -> Self:
-        """Parse `KIND[:AFTER[:TIMES]]`.
-
-        Raises:
-            UnknownMisbehaviourError: There is no such kind, or AFTER or TIMES is not a number.
-        """
+        """Parse `KIND[:AFTER[:TIMES]]`, or raise an UnknownMisbehaviourError."""
         match = re.fullmatch(r"([a-z-]+)(?::(\d+))?(?::(\d+))?", text)
         if match is None or match[1] not in list(MisbehaviourKind):
             raise UnknownMisbehaviourError(

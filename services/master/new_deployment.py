@@ -71,11 +71,7 @@ def keep(deployment: Deployment, directory: Path, generation: int) -> Path:
 
 
 def _check_readable(source: Path) -> None:
-    """Check that a deployment's file can be copied.
-
-    Raises:
-        SettingsError: It can't be read, or is not a regular file of a size that a deployment has.
-    """
+    """Refuse, with a SettingsError, a file that can't be read, or is not a regular one of a deployment's size."""
     try:
         found = source.stat()
         if stat.S_ISREG(found.st_mode):  # opening a pipe would wait for a writer

@@ -199,11 +199,7 @@ class Peers:
     # --- starting and ending -------------------------------------------------------------------
 
     def prepare(self) -> None:
-        """Find out which peers run already, and how to start the others.
-
-        Raises:
-            SettingsError: The settings contradict each other.
-        """
+        """Find out which peers run already, and how to start the others; a SettingsError for settings that contradict."""
         settings, deployment = self._settings, self._in_force.deployment
         given = {
             "subscriber": settings.subscriber,

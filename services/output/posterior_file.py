@@ -31,22 +31,14 @@ class ResultFile(Protocol):
     """A file of posteriors."""
 
     def add(self, frame: FrameOutcome, axes: list[Axis]) -> None:
-        """Save one frame.
-
-        Raises:
-            SettingsError: The file cannot be written, or holds posteriors of another form.
-        """
+        """Save one frame; a SettingsError if the file cannot be written, or holds posteriors of another form."""
 
     def close(self) -> None:
         """Write everything to the file."""
 
 
 def open_result_file(path: Path) -> ResultFile:
-    """Open a file: `.jsonl` and `.csv` are appended to, `.npz` is overwritten.
-
-    Raises:
-        SettingsError: The name has another ending, or the file cannot be written.
-    """
+    """Open a file: `.jsonl` and `.csv` are appended to, `.npz` is overwritten; a SettingsError if it cannot be written."""
     kinds: dict[str, type[_JsonLines | _CsvLines | _Archive]] = {
         ".jsonl": _JsonLines,
         ".csv": _CsvLines,

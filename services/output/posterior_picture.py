@@ -56,11 +56,7 @@ class Axis:
 
 
 def axes_of(posterior: Posterior, deployment: Deployment | None) -> list[Axis]:
-    """Return the dimensions of a posterior that came over the wire.
-
-    Raises:
-        ValueError: They differ from the deployment's.
-    """
+    """Return the dimensions of a posterior that came over the wire; a ValueError if they are not the deployment's."""
     if deployment is None:
         return [Axis(label, size) for label, size in zip(posterior.labels, posterior.sizes, strict=True)]
     ours = [(dimension.label, dimension.size) for dimension in deployment.result_dimensions]

@@ -114,11 +114,7 @@ class BoardProcesses:
         self._ends: list[float] = []
 
     def run(self) -> NoReturn:
-        """Keep the boards running until a signal raises here.
-
-        Raises:
-            BoardFailedError: A board ended more often than restarts are allowed.
-        """
+        """Keep the boards running until a signal raises here, or a board ends too often (BoardFailedError)."""
         from machines.kernel import warm_up
 
         # the children share these pages: four imports of numba would take 1.6 s

@@ -59,11 +59,7 @@ class DeployedBoards:
         self._times_gone = [0] * len(self._endpoints)
 
     def open(self) -> str:
-        """Open all boards, programming blank ones, and return a sentence for the user.
-
-        Raises:
-            PcieShimError: A board is not reachable, holds another image, or misbehaves.
-        """
+        """Open all boards, programming blank ones, and return a sentence for the user, or raise a PcieShimError."""
         programmed: set[int] = set()
         while self._cluster is None:
             try:
@@ -128,11 +124,7 @@ class DeployedBoards:
             time.sleep(TICK / 4 if self.gone else 0)
 
     def _program(self, board: int, image: Image) -> None:
-        """Program a board that this process does not have open.
-
-        Raises:
-            BoardError: Programming failed.
-        """
+        """Program a board that this process does not have open, or raise a BoardError."""
         deadline = time.monotonic() + self._settings.peer_timeout
         while True:
             try:
@@ -168,11 +160,7 @@ class DeployedBoards:
         ]
 
     def run(self, frame: Frame) -> FrameOutput:
-        """Compute one frame.
-
-        Raises:
-            BoardError: A board failed; it is in `gone` until `recover` has reopened it.
-        """
+        """Compute one frame; a board that fails (a BoardError) is in `gone` until `recover` has reopened it."""
         cluster = self._whole_cluster()
         try:
             return cluster.run(self._input(frame))
@@ -181,19 +169,11 @@ class DeployedBoards:
             raise
 
     def post(self, frame: Frame) -> None:
-        """Start a frame without waiting for it: `collect` returns its result.
-
-        Raises:
-            BoardError: A board failed, or is still gone; call `find_gone` then.
-        """
+        """Start a frame, whose result `collect` returns; after a BoardError call `find_gone`."""
         self._whole_cluster().post(self._input(frame))
 
     def collect(self) -> FrameOutput | None:
-        """Return the posted frame's result, or None while boards still run.
-
-        Raises:
-            BoardError: A board failed, or exceeded its deadline; call `find_gone` then.
-        """
+        """Return the posted frame's result, or None while boards still run; after a BoardError call `find_gone`."""
         return self._whole_cluster().collect(0)
 
     @property

@@ -28,11 +28,7 @@ class BoardAwayError(BoardError):
 
 
 def driver_input(deployment: Deployment, frame: Frame, stop: str) -> FrameInput:
-    """Return a frame as the driver takes it; `stop` says when boards stop: `slices` or `own`.
-
-    Raises:
-        FrameInputError: The frame's addresses do not fit the deployment.
-    """
+    """Return a frame as the driver takes it; `stop` is `slices` or `own`. A FrameInputError if its addresses do not fit."""
     machine = deployment.machine
     prior = np.frombuffer(frame.prior_codes, "<u2") if frame.prior_codes else None
     addresses: tuple[int | None, ...] | npt.NDArray[np.int64]

@@ -47,11 +47,7 @@ class _SourceReader:
         )
 
     def read(self, message: dict[str, Any]) -> tuple[Addresses, bytes]:
-        """Return a message's addresses and prior codes.
-
-        Raises:
-            VariableError: A variable is missing or unusable.
-        """
+        """Return a message's addresses and prior codes; a VariableError if a variable is missing or unusable."""
         try:
             return [self._address(*each, message) for each in self._fields], self._prior_codes(message)
         except (BridgeError, ReadingError) as error:
@@ -221,11 +217,7 @@ class WaitingFrames(Generic[Item]):
         self.passed_over = 0
 
     def put(self, frame: Item) -> None:
-        """Add a frame.
-
-        Raises:
-            OverflowedQueueError: The queue is full; with `queue = latest` it never is.
-        """
+        """Add a frame; an OverflowedQueueError if the queue is full, as with `queue = latest` it never is."""
         if self._keep_all:
             if len(self._waiting) >= QUEUE_ALL_DEPTH:
                 raise OverflowedQueueError(

@@ -80,11 +80,7 @@ class Generations(Generic[Derived]):
         return Switched(record.generation)
 
     def get(self, number: int) -> tuple[Deployment, Derived]:
-        """Return the deployment with a number, and the data derived from it.
-
-        Raises:
-            NotPreparedError: There is none.
-        """
+        """Return the deployment with a number, and the data derived from it, or raise a NotPreparedError."""
         try:
             return self._held[number]
         except KeyError:

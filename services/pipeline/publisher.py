@@ -130,11 +130,7 @@ class Publisher:
         )
 
     async def run(self) -> int:
-        """Serve until a signal.
-
-        Raises:
-            BridgeError: A server is not reachable, or is not a rosbridge server.
-        """
+        """Serve until a signal; a BridgeError if a server is not reachable, or is not a rosbridge server."""
         async with self._link, status_served(self._run_directory, ROLE, self.status):
             try:
                 async with self._topics.opened(self._state_changed) as where:

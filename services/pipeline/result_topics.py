@@ -64,11 +64,7 @@ class ResultTopics:
 
     @contextlib.asynccontextmanager
     async def opened(self, on_state: OnState | None = None) -> AsyncIterator[str]:
-        """Connect and advertise, and yield a sentence that names topics and servers.
-
-        Raises:
-            BridgeError: A server is not reachable, or is not a rosbridge server.
-        """
+        """Connect and advertise, and yield a sentence that names topics and servers, or raise a BridgeError."""
         settings, deployment = self._settings, self._deployment
         by_uri = self.rosbridges
         async with contextlib.AsyncExitStack() as stack:

@@ -18,11 +18,7 @@ LINE_LIMIT = 1 << 24
 
 
 def require_pipe(command: str, values: str) -> None:
-    """Refuse to wait for lines that somebody would have to type.
-
-    Raises:
-        SettingsError: Standard input is a terminal.
-    """
+    """Refuse, with a SettingsError, to wait for lines that somebody would have to type."""
     if sys.stdin.isatty():
         raise SettingsError(
             f"{command} reads {values} from standard input, which is a terminal: pipe them in, or use --listen ({command} --help)"
@@ -30,11 +26,7 @@ def require_pipe(command: str, values: str) -> None:
 
 
 def blocking_lines() -> Iterator[tuple[int, bytes]]:
-    """Yield the lines of standard input with their numbers, without blank ones.
-
-    Raises:
-        InputLineError: A line is too long.
-    """
+    """Yield the lines of standard input with their numbers, without blank ones; an InputLineError for too long a line."""
     number = 0
     while line := sys.stdin.buffer.readline(LINE_LIMIT + 1):
         number += 1
@@ -74,11 +66,7 @@ def _too_long(number: int) -> InputLineError:
 
 
 def decoded(line: bytes, number: int, kind: Any, expected: str) -> Any:
-    """Return a line's JSON value, of a type for `msgspec`; `expected` describes it to the user.
-
-    Raises:
-        InputLineError: It is not of this type; the sentence has its number.
-    """
+    """Return a line's JSON value of a type for `msgspec`, or raise an InputLineError with its number and `expected`."""
     try:
         return msgspec.json.decode(line, type=kind)
     except (msgspec.MsgspecError, RecursionError) as error:

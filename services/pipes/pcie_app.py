@@ -26,11 +26,7 @@ class LineReading(msgspec.Struct):
 
 
 def reading_from_line(line: bytes, number: int) -> LineReading:
-    """Return the reading of one line of standard input.
-
-    Raises:
-        InputLineError: It is not a reading.
-    """
+    """Return the reading of one line of standard input, or raise an InputLineError."""
     reading: LineReading = decoded(
         line, number, LineReading, 'a reading such as {"addresses": [12, null, 7]}'
     )

@@ -55,11 +55,7 @@ def control_socket(directory: Path, name: str = "master") -> Path:
 
 
 def order_of(line: bytes) -> ReloadOrder:
-    """Return the order in a line.
-
-    Raises:
-        ControlError: The line is not an order.
-    """
+    """Return the order in a line, or raise a ControlError."""
     try:
         return msgspec.json.decode(line, type=ReloadOrder)
     except (msgspec.MsgspecError, RecursionError) as error:

@@ -28,11 +28,7 @@ _decoder: msgspec.msgpack.Decoder[AnyRecord] = msgspec.msgpack.Decoder(AnyRecord
 
 
 def encode_record(record: Record) -> bytes:
-    """Return the bytes of one framed record.
-
-    Raises:
-        LocalSocketError: The record is larger than MAX_RECORD.
-    """
+    """Return the bytes of one framed record; a LocalSocketError if it is larger than MAX_RECORD."""
     body = _encoder.encode(record)
     if len(body) > MAX_RECORD:
         raise LocalSocketError(
@@ -49,11 +45,7 @@ class RecordSplitter:
         self._pending = bytearray()
 
     def feed(self, data: bytes) -> list[AnyRecord]:
-        """Return the records that `data` completes, in order.
-
-        Raises:
-            LocalSocketError: A length is beyond MAX_RECORD, or bytes are not a record.
-        """
+        """Return the records that `data` completes, in order; a LocalSocketError if bytes are not a record."""
         pending = self._pending
         pending += data
         records: list[AnyRecord] = []
@@ -85,11 +77,7 @@ def own_hello(role: str, deployment_hash: str, generation: int = 0) -> Hello:
 
 
 def check_hello(record: AnyRecord, expected_role: str, deployment_hash: str, where: str) -> None:
-    """Check the greeting of a peer.
-
-    Raises:
-        OtherPeerError: The peer has another role, version or deployment.
-    """
+    """Refuse, with an OtherPeerError, a peer of another role, version or deployment."""
     if not isinstance(record, Hello):
         raise OtherPeerError(
             f"{where}: the peer did not greet (a {type(record).__name__} came first); is it a {expected_role}?"
@@ -169,11 +157,7 @@ class RecordProtocol(asyncio.Protocol):
 
 
 async def open_connection(endpoint: Endpoint, make: Callable[[], RecordProtocol]) -> RecordProtocol:
-    """Connect once.
-
-    Raises:
-        OSError: The socket's own.
-    """
+    """Connect once, or raise the socket's own OSError."""
     loop = asyncio.get_running_loop()
     if endpoint.path:
         _, protocol = await loop.create_unix_connection(make, endpoint.path)
@@ -204,11 +188,7 @@ class BlockingRecordSocket:
         return self._sock.fileno()
 
     def receive(self) -> list[AnyRecord] | None:
-        """Return the records received so far, possibly none; None when the peer has closed.
-
-        Raises:
-            LocalSocketError: The bytes are not records.
-        """
+        """Return the records received so far, possibly none; None when the peer has closed."""
         try:
             data = self._sock.recv(1 << 16)
         except (BlockingIOError, InterruptedError):

@@ -104,11 +104,7 @@ async def ask_stack(directory: Path) -> StackStatus:
 
 
 async def find_run() -> Path:
-    """Return the private directory of this user's only run that is alive.
-
-    Raises:
-        SettingsError: There is none, or more than one.
-    """
+    """Return the private directory of this user's only run that is alive; a SettingsError unless there is one."""
     found = run_directories()
     stacks = [await ask_stack(path) for path in found]
     alive = [path for path, stack in zip(found, stacks, strict=True) if stack.processes]

@@ -182,11 +182,7 @@ def _check(directory: Path | None) -> None:
 
 @contextlib.asynccontextmanager
 async def status_served(directory: Path | None, name: str, get_status: GetStatus) -> AsyncIterator[None]:
-    """Answer in the running loop while the context lasts; nothing happens without a directory.
-
-    Raises:
-        SettingsError: The directory is not a folder.
-    """
+    """Answer in the running loop while the context lasts; nothing happens without a directory, which must exist."""
     _check(directory)
     answerer = _Answerer(name, get_status)
     async with health_served(directory, name, answerer.answer, answerer.sample):
@@ -195,11 +191,7 @@ async def status_served(directory: Path | None, name: str, get_status: GetStatus
 
 @contextlib.contextmanager
 def status_thread(directory: Path | None, name: str, get_status: GetStatus) -> Iterator[None]:
-    """Answer from a thread while the context lasts, for a process with one blocking thread.
-
-    Raises:
-        SettingsError: The directory is not a folder.
-    """
+    """Answer from a thread while the context lasts, for a process with one blocking thread."""
     _check(directory)
     answerer = _Answerer(name, get_status)
     try:
@@ -210,11 +202,7 @@ def status_thread(directory: Path | None, name: str, get_status: GetStatus) -> I
 
 
 def read_process_status(path: str, timeout: float) -> ProcessStatus:
-    """Return the status of the process at a status socket.
-
-    Raises:
-        NoHealthError: It gave no answer, or one that is not a status of this version.
-    """
+    """Return the status of the process at a status socket, or raise a NoHealthError."""
     try:
         return msgspec.json.decode(read_status(path, timeout), type=ProcessStatus)
     except (msgspec.MsgspecError, RecursionError):

@@ -33,11 +33,7 @@ class PrivateDirectory:
     """
 
     def __init__(self) -> None:
-        """Make and lock a directory, after removing those that killed masters left.
-
-        Raises:
-            StackError: There is no place for it.
-        """
+        """Make and lock a directory, after removing those that killed masters left; a StackError if there is no place."""
         remove_orphans()
         while True:
             self.path = make_private_directory()
@@ -64,11 +60,7 @@ def _parent() -> Path:
 
 
 def make_private_directory() -> Path:
-    """Make a directory that only this user can enter (0700).
-
-    Raises:
-        StackError: There is no place for it.
-    """
+    """Make a directory that only this user can enter (0700); a StackError if there is no place for it."""
     try:
         return Path(tempfile.mkdtemp(prefix=DIRECTORY_PREFIX, dir=_parent()))
     except OSError as error:

@@ -80,12 +80,7 @@ class Fit:
 def with_fit(model: Model, path: Path | None) -> Model:
     """Return a model with what was learnt in the place of what was set by hand; the model itself without a path.
 
-    Args:
-        model: The model that the fit was made for, or one of another grid whose tables are normals.
-        path: A file that `toolchain fit` wrote, or None.
-
-    Raises:
-        ModelError: No such file, or one that was made for other variables.
+    The fit was made for the model, or for one of another grid whose tables are normals; a ModelError if not.
     """
     return model if path is None else apply_fit(model, read_fit(path), str(path))
 

@@ -121,11 +121,7 @@ class Definitions:
         return converted
 
     def serialise(self, type_name: str, message: dict[str, Any], max_size: int) -> bytes:
-        """Serialise a message as ROS 1's transport would, or as CDR with its header in ROS 2.
-
-        Raises:
-            RefusedError: The type is unknown or does not fit the message.
-        """
+        """Serialise a message as ROS 1's transport would, or as CDR with its header, or raise a RefusedError."""
         store, known = self._known(type_name)
         try:
             built = _Builder(store, max_size // _BYTES_A_VALUE).message(known, message, "")
@@ -135,11 +131,7 @@ class Definitions:
             raise RefusedError(f"a message does not fit its type {self.name(type_name)}: {error}") from None
 
     def full_text(self, type_name: str) -> str:
-        """Return a type's definition followed by those of its parts, as bag files have them.
-
-        Raises:
-            RefusedError: The type is unknown.
-        """
+        """Return a type's definition and those of its parts, as bag files have them; a RefusedError for an unknown one."""
         text = self._texts.get(type_name)
         if text is None:
             store, known = self._known(type_name)
@@ -148,11 +140,7 @@ class Definitions:
         return text
 
     def details(self, type_name: str) -> list[dict[str, Any]]:
-        """Return a type's fields and those of its parts, as `rosapi_msgs/TypeDef`.
-
-        Raises:
-            RefusedError: The type is unknown.
-        """
+        """Return a type's fields and those of its parts, as `rosapi_msgs/TypeDef`; a RefusedError for an unknown one."""
         store, known = self._known(type_name)
         found: dict[str, dict[str, Any]] = {}
         waiting = [known]

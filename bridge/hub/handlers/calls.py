@@ -43,15 +43,7 @@ class Calls:
         rosapi: Rosapi,
         answer_here: Callable[[Client, str], dict[str, Any] | None],
     ) -> None:
-        """Start without services.
-
-        Args:
-            graph: Stores the services.
-            limits: Bounds of the hub.
-            dispatcher: The way to clients.
-            rosapi: The hub's own services.
-            answer_here: Returns the values of other services that the hub answers for a client, or None.
-        """
+        """Start without services; `answer_here` returns the values of others that the hub answers for a client, or None."""
         self._graph = graph
         self._limits = limits
         self._dispatcher = dispatcher

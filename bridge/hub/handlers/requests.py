@@ -27,11 +27,7 @@ class Caller:
 
     @classmethod
     def of(cls, client: Client, operation: Operation, field: str) -> Self:
-        """Read the caller of an operation, which names a service or an action in `field`.
-
-        Raises:
-            RefusedError: The operation's name, id or fragment size is malformed.
-        """
+        """Read the caller of an operation, which names a service or an action in `field`, or raise a RefusedError."""
         return cls(
             client,
             operation_id(operation),
@@ -41,11 +37,7 @@ class Caller:
         )
 
     def answer(self, dispatcher: Dispatcher, payload: bytes) -> None:
-        """Send an answer as requested.
-
-        Raises:
-            RefusedError: It is too large.
-        """
+        """Send an answer as requested; a RefusedError if it is too large."""
         dispatcher.checked(payload, f"the answer of {self.name}")
         dispatcher.send(self.client, payload, fragment_size=self.fragment_size, png=self.png)
 
@@ -56,14 +48,7 @@ class Offers:
     def __init__(
         self, offers: dict[str, Offer], names_of: Callable[[Client], set[str]], limit: int, kind: str
     ) -> None:
-        """Manage a part of the graph.
-
-        Args:
-            offers: The graph's services or actions.
-            names_of: Returns the names that a client offers.
-            limit: Maximum of offers of one client.
-            kind: The name of what is offered, and of the operation's field.
-        """
+        """Manage services or actions of a graph, at most `limit` of a client; `kind` is also the field of operations."""
         self._offers = offers
         self._names_of = names_of
         self._limit = limit
