@@ -1,4 +1,4 @@
-"""Posteriors as ROS messages: written, read, paired with their frames' reports, and received."""
+"""Posteriors as ROS messages: writing, reading, pairing with the reports of their frames, and receiving."""
 
 from posteriors.errors import BadResultError, LabelError, NoResultError, PosteriorError
 from posteriors.frame_report import BoardReport, FrameReport, StageTimes

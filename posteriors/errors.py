@@ -1,10 +1,10 @@
-"""Errors of reading posteriors; like all errors of a connection they are `BridgeError`s with an exit code."""
+"""Errors in received posteriors; like all errors of a connection, they are `BridgeError`s with an exit code."""
 
 from bridge.errors import BridgeError, NoMessageError
 
 
 class PosteriorError(BridgeError):
-    """Root of the errors of `posteriors`."""
+    """Base class of the errors of `posteriors`."""
 
     exit_code = 2
 
@@ -20,4 +20,4 @@ class BadResultError(PosteriorError):
 
 
 class LabelError(PosteriorError):
-    """Raised when a posterior has no such variable or cell; the sentence lists those it has."""
+    """Raised when a posterior does not have a variable or cell; the sentence lists the existing ones."""

@@ -1,4 +1,4 @@
-"""`/bm/frame`: a report about each frame, written and read with the same keys."""
+"""`/bm/frame`: the report of each frame, written and read with the same keys."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
@@ -17,7 +17,7 @@ FRAME_TYPE: Final = "diagnostic_msgs/DiagnosticArray"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StageTimes:
-    """Where a frame's time went, each in microseconds (thesis figure 4.5); None where the stack did not report it."""
+    """Durations of the stages of a frame in microseconds, None if not reported (thesis figure 4.5)."""
 
     rosbridge_in: FiniteFloat | None = None
     local_hops: FiniteFloat | None = None
@@ -27,12 +27,12 @@ class StageTimes:
     reads: FiniteFloat | None = None
     boards_compute: FiniteFloat | None = None
     rosbridge_out: FiniteFloat | None = None
-    """Of the frame before: this one is not sent yet."""
+    """Of the previous frame, because this one has not been sent yet."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BoardReport:
-    """One board's outcome of a frame, with that of each machine if it has replicas."""
+    """The outcome of a frame on one board, and on each of its replicas."""
 
     name: str
     stopped: str
@@ -44,7 +44,7 @@ class BoardReport:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrameReport:
-    """A `/bm/frame` message; times called `_ns` are Unix times in nanoseconds."""
+    """A `/bm/frame` message; attributes that end in `_ns` are Unix times in nanoseconds."""
 
     stamp_ns: int
     """Time of the reading."""
@@ -65,7 +65,8 @@ class FrameReport:
     boards: tuple[BoardReport, ...] = ()
 
 
-# Keys of the message's values and their formats; a report's number has the key of its field, a stage's time `_us` behind it.
+# Keys of the message's values and their formats. The key of a number is the name of its field; that of a
+# stage has the suffix `_us`.
 _STAGES: Final = tuple(field.name for field in fields(StageTimes))
 _FRAME_KEYS: Final = {
     "number": "%d",
@@ -82,12 +83,12 @@ _REPLICA_KEYS: Final = {"replica_cycles": "%s", "replica_reasons": "%s"}
 
 
 def _template(level: str, name: str, keys: Mapping[str, str]) -> str:
-    """Return a DiagnosticStatus as JSON, in which `%` fills in the message, the hardware and the values."""
+    """Return a DiagnosticStatus as JSON, with `%` placeholders for the message, the hardware and the values."""
     pairs = ",".join(f'{{"key":"{key}","value":"{form}"}}' for key, form in keys.items())
     return f'{{"level":{level},"name":"rosbayes: {name}","message":%s,"hardware_id":%s,"values":[{pairs}]}}'
 
 
-# Every result is preceded by a report, so the text is formatted once and filled in for each frame.
+# Every result is preceded by a report, so the template is formatted once and only filled in for each frame.
 _FRAME: Final = _template("%d", "frame", _FRAME_KEYS)
 _BOARD: Final = _template("0", "board %d", _BOARD_KEYS)
 _BOARD_OF_REPLICAS: Final = _template("0", "board %d", _BOARD_KEYS | _REPLICA_KEYS)
@@ -96,7 +97,7 @@ _times: Final = attrgetter(*_STAGES)
 
 
 def write_frame_report(report: FrameReport, ros_version: Literal[1, 2]) -> dict[str, Any]:
-    """Return the diagnostic_msgs/DiagnosticArray of a report, none of whose numbers may be None."""
+    """Return a report, in which no number may be None, as a diagnostic_msgs/DiagnosticArray."""
     published = "true" if report.published else "false"
     statuses = [
         _FRAME
@@ -152,10 +153,10 @@ _REPORT: Final = TypeAdapter(FrameReport)
 
 
 def read_frame_report(message: dict[str, Any], heard_ns: int) -> FrameReport:
-    """Return the report of a diagnostic_msgs/DiagnosticArray; keys may be absent.
+    """Return the report in a diagnostic_msgs/DiagnosticArray; keys may be absent.
 
     Raises:
-        BadResultError: It has no stamp or no status, or one of its values is not a number.
+        BadResultError: The message has no stamp or no status, or one of its values is not a number.
     """
     array = validated(_ARRAY, message, FRAME_TOPIC, FRAME_TYPE)
     first, *others = array.status

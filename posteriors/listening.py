@@ -1,4 +1,4 @@
-"""A subscription to the posteriors of a running stack, each as a labelled array with its frame's report.
+"""Subscription to the posteriors of a running stack, each as a labelled array with the report of its frame.
 
 With asyncio:
 
@@ -10,7 +10,7 @@ and without:
 
     listen("ws://robot:9090", lambda posterior: print(posterior.best()))
 
-NumPy is imported with the first array that is used (docs/how-to/listening.md).
+NumPy is imported when the first array is used (docs/how-to/listening.md).
 """
 
 import asyncio
@@ -30,11 +30,11 @@ from posteriors.pairing import WAITING, FrameOutcome, Pairing
 from posteriors.posterior import MAX_RESULT, RESULTS_TOPIC, RESULTS_TYPE, Posterior, read_posterior
 
 QUEUE_SIZE: Final = 64
-"""Posteriors that wait for their reader, by default."""
+"""Default number of posteriors that wait for their reader."""
 FIRST_TIMEOUT: Final = 30.0
-"""Seconds until the first posterior, by default."""
+"""Default timeout for the first posterior, in seconds."""
 _DISORDER_NS: Final = 50_000_000
-"""Delay by which a server may deliver a report after the posterior that was published behind it."""
+"""Maximum delay of a report behind the posterior that was published after it, in nanoseconds."""
 _REPORT_TIMEOUT: Final = 1.0
 """Seconds that a posterior waits for its report."""
 
@@ -42,20 +42,22 @@ Result = TypeVar("Result")
 
 
 class _RunInLoop(Protocol):
-    """Runs a coroutine on a loop in another thread."""
+    """Function that runs a coroutine on a loop in another thread."""
 
     def __call__(self, work: Coroutine[Any, Any, Result]) -> Result:
         """Return the coroutine's result."""
 
 
 class Posteriors:
-    """The posteriors of one stack, read by one task with `async for posterior in ...`; `posteriors` makes it.
+    """The posteriors of one stack, created by `posteriors` and read by one task with `async for`.
 
-    A lost connection does not end the iteration: posteriors go on after the reconnection. Closing this or the client
-    ends it. If the reader is too slow, the oldest posteriors are dropped, and nothing else slows down.
+    A lost connection does not end the iteration: it continues after the reconnection. Closing this object or
+    the client ends it. If the reader is too slow, the oldest posteriors are dropped; the connection is not
+    affected.
 
     Attributes:
-        without_posterior: Frames passed over because they had no posterior, mostly for impossible readings.
+        without_posterior: Number of frames skipped because they had no posterior, usually due to impossible
+            readings.
     """
 
     def __init__(
@@ -112,15 +114,15 @@ class Posteriors:
             timeout: Seconds; None for no limit.
 
         Raises:
-            NoResultError: None came in time.
-            BadResultError: A message on the topic is not a posterior. The next call goes on behind it.
-            DisconnectedError: This or the client is closed.
-            ConcurrentReadError: Another task waits here.
+            NoResultError: None arrived in time.
+            BadResultError: A message on the topic is not a posterior; the next call continues after it.
+            DisconnectedError: This object or the client is closed.
+            ConcurrentReadError: Another task is waiting already.
         """
         return await self._within(timeout, self.__anext__)
 
     async def next_frame(self, timeout: float | None) -> FrameOutcome:  # noqa: ASYNC109  # as above
-        """Wait for one frame: its posterior, or the `FrameReport` of a frame without one, which gives the reason.
+        """Wait for one frame: return its posterior, or its `FrameReport` with the reason if it has none.
 
         Raises:
             NoResultError, BadResultError, DisconnectedError, ConcurrentReadError: As for `next`.
@@ -142,7 +144,7 @@ class Posteriors:
         raise self.no_result_error(timeout)
 
     def no_result_error(self, waited: float | None) -> NoResultError:
-        """Return the error for a time without a frame, in seconds, with the state of the connection."""
+        """Return the error for `waited` seconds without a frame, with the state of the connection."""
         ros = self._ros
         why = (
             "is the master running, and do readings reach it?"
@@ -151,7 +153,7 @@ class Posteriors:
         )
         limit = "" if waited is None else f" within {waited:g} s"
         return NoResultError(
-            f"nothing came on {self._frame_topic} and {self._topic} from {ros.uri}{limit}: {why}"
+            f"nothing arrived on {self._frame_topic} and {self._topic} from {ros.uri}{limit}: {why}"
         )
 
     async def _take(self) -> FrameOutcome:
@@ -160,7 +162,7 @@ class Posteriors:
                 raise StopAsyncIteration
             if self._waiter is not None:
                 raise ConcurrentReadError(
-                    f"another task waits for posteriors of {self._topic} already: give each reader its own subscription"
+                    f"another task is already waiting for posteriors of {self._topic}: give each reader its own subscription"
                 )
             self._waiter = asyncio.get_running_loop().create_future()
             try:
@@ -181,7 +183,7 @@ class Posteriors:
 
     @property
     def announced_only(self) -> int:
-        """Number of frames announced on `/bm/frame` whose posterior never came."""
+        """Number of frames announced on `/bm/frame` whose posterior never arrived."""
         return self._pairing.announced_only
 
     @property
@@ -192,7 +194,7 @@ class Posteriors:
     # Closing
 
     async def close(self) -> None:
-        """Unsubscribe. May be called again."""
+        """Unsubscribe. Further calls have no effect."""
         for subscription in self._subscriptions:
             await subscription.close()
         await asyncio.gather(*self._pumps, return_exceptions=True)
@@ -206,7 +208,7 @@ class Posteriors:
     # Arrival
 
     async def _pump(self, subscription: Subscription, take: Callable[[Message], list[FrameOutcome]]) -> None:
-        """Hand the messages of one topic to the pairing, until it is closed."""
+        """Pass the messages of one topic to the pairing, until the subscription is closed."""
         async for message in subscription:
             try:
                 self._put(take(message))
@@ -239,7 +241,7 @@ class Posteriors:
             self._waiter.set_result(None)
 
     def _flush(self) -> None:
-        """Hand out the posteriors whose reports did not come in time."""
+        """Deliver the posteriors whose reports did not arrive in time."""
         self._put(self._pairing.flush())
 
 
@@ -259,16 +261,17 @@ def posteriors(
         topic: Topic of the posteriors (`toolchain build --output`).
         frame_topic: Topic of their frames' reports.
         deployment: The model's name, to ignore frames of other stacks on the same server.
-        queue_size: Number of posteriors that wait for their reader; beyond it, the oldest is dropped and counted.
-        compression: `cbor` transfers large posteriors faster, from servers that support it.
+        queue_size: Maximum number of posteriors that wait for their reader; then the oldest is dropped and
+            counted.
+        compression: `cbor` transfers large posteriors faster if the server supports it.
 
     Returns:
         The posteriors from now on; `async with` closes them before the client is closed.
 
     Raises:
         NameFormError: A topic's name is malformed.
-        TypeConflictError: This client subscribes to one of them already, with another type.
-        OptionError: The queue has no room.
+        TypeConflictError: This client already subscribes to one of the topics, with another type.
+        OptionError: `queue_size` is less than 1.
         DisconnectedError: The client is closed.
     """
     return Posteriors(
@@ -293,28 +296,29 @@ def listen(
     deployment: str | None = None,
     queue_size: int = QUEUE_SIZE,
 ) -> int:
-    """Call a function with each posterior, in this thread; no asyncio needed.
+    """Call a function with each posterior, in this thread, without asyncio.
 
-    The connection lives in a thread of its own, so a slow function loses the oldest posteriors of its queue and
-    nothing else; a lost connection is restored. Ctrl-C is a normal end.
+    The connection runs in its own thread, so a slow function only loses the oldest posteriors in its queue. A
+    lost connection is restored. Ctrl-C ends the loop normally.
 
     Args:
-        server: A rosbridge server's URI, or `connect(...)` with further options (a token, a proxy), not opened yet.
-        function: Called with each `Posterior`. Its exceptions end the loop and are raised here; returning False ends
-            the loop too.
+        server: The URI of a rosbridge server, or an unopened `connect(...)` with further options (a token, a
+            proxy).
+        function: Called with each `Posterior`. Its exceptions end the loop and propagate; returning False
+            also ends the loop.
         count: Number of posteriors after which to return; None for no limit.
-        first_timeout: Seconds until the first; None for no limit.
-        timeout: Seconds between two; None for no limit.
-        topic: As in `posteriors`, like all that follows.
-        frame_topic: As there.
-        deployment: As there.
-        queue_size: As there.
+        first_timeout: Seconds until the first posterior; None for no limit.
+        timeout: Seconds between two posteriors; None for no limit.
+        topic: As in `posteriors`.
+        frame_topic: As in `posteriors`.
+        deployment: As in `posteriors`.
+        queue_size: As in `posteriors`.
 
     Returns:
-        The number of posteriors that the function got.
+        The number of posteriors passed to the function.
 
     Raises:
-        NoResultError: None came in time.
+        NoResultError: None arrived in time.
         BadResultError: A message on the topic is not a posterior.
         BridgeError: The server is not reachable, or is not a rosbridge server.
     """
@@ -342,7 +346,7 @@ def listen(
 
 @contextlib.contextmanager
 def _loop_in_a_thread() -> Iterator[_RunInLoop]:
-    """Run an event loop in a thread of its own until the block is left."""
+    """Run an event loop in its own thread within the context."""
     started: Future[tuple[asyncio.AbstractEventLoop, asyncio.Event]] = Future()
 
     async def until_stopped() -> None:
@@ -356,7 +360,7 @@ def _loop_in_a_thread() -> Iterator[_RunInLoop]:
         except BaseException as error:
             if started.done():
                 raise
-            started.set_exception(error)  # else the caller would wait for a loop that never starts
+            started.set_exception(error)  # otherwise the caller would wait for a loop that never starts
 
     thread = threading.Thread(target=thread_main, name="posteriors", daemon=True)
     thread.start()

@@ -1,4 +1,4 @@
-"""ROS messages of the result topics as pydantic models: what both topics share."""
+"""Common base of the pydantic models for ROS messages of the result topics."""
 
 from typing import Any, TypeVar
 
@@ -10,16 +10,17 @@ Model = TypeVar("Model")
 
 
 class Part(BaseModel):
-    """A part of a ROS message; fields that are not named here are ignored."""
+    """A part of a ROS message; undeclared fields are ignored."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 
 
 def validated(adapter: TypeAdapter[Model], value: object, topic: str, type_name: str) -> Model:
-    """Return a message, or a part of it, as its model.
+    """Return a message, or a part of it, converted to its model.
 
     Raises:
-        BadResultError: It does not fit; the sentence names the topic, the type, and the first place that is wrong.
+        BadResultError: The message is invalid; the sentence names the topic, the type, and the path of the
+            first error.
     """
     try:
         return adapter.validate_python(value)

@@ -1,6 +1,6 @@
-"""Which posterior belongs to which frame.
+"""Pairing of posteriors with the reports of their frames.
 
-`/BMresults` carries no stamp; the `/bm/frame` that is sent just before it does, and it is the stamp of the reading.
+`/BMresults` has no stamp; the `/bm/frame` sent just before it contains the stamp of the reading.
 """
 
 from collections import deque
@@ -11,22 +11,22 @@ from posteriors.frame_report import FrameReport
 from posteriors.posterior import Posterior
 
 FrameOutcome = Posterior | FrameReport
-"""A frame's posterior, or the report of a frame that has none."""
+"""The posterior of a frame, or the report of a frame without one."""
 
 WAITING: Final = 256
-"""Reports, and posteriors, that wait for their counterparts at most."""
+"""Maximum number of reports, and of posteriors, that wait for their counterparts."""
 
 
 class Pairing:
-    """Matches posteriors with the reports of their frames, in whatever order the two topics arrive.
+    """Pairing of posteriors with reports, for any order of arrival between the two topics.
 
-    Each topic's own messages arrive in order, so the next posterior goes to the next report of a published frame.
-    `heard_ns` shows when one of the two was lost: a posterior goes to no report that arrived more than `disorder_ns`
-    after it, nor to one that arrived as long before it if the next one did not. Servers keep the order of a topic, but
-    not all keep the order between topics.
+    Servers preserve the order within a topic, but not all preserve the order between topics. So the next
+    posterior belongs to the next report of a published frame, unless the times of arrival (`heard_ns`) show
+    that one of the two was lost: a posterior never belongs to a report that arrived more than `disorder_ns`
+    after it, nor to one that arrived more than `disorder_ns` before it if the next report did not.
 
     Attributes:
-        announced_only: Reports whose posterior never came.
+        announced_only: Number of reports whose posterior never arrived.
     """
 
     def __init__(self, *, disorder_ns: int = 0) -> None:
@@ -37,19 +37,19 @@ class Pairing:
 
     @property
     def waits(self) -> bool:
-        """Whether a posterior waits for its report."""
+        """Whether a posterior is waiting for its report."""
         return bool(self._posteriors)
 
     def add_report(self, report: FrameReport) -> list[FrameOutcome]:
-        """Take a `/bm/frame` and return the frames that are complete now."""
+        """Add a `/bm/frame` and return the frames that are now complete."""
         self._reports.append(report)
-        if len(self._reports) > WAITING:  # nobody publishes posteriors on the subscribed topic
+        if len(self._reports) > WAITING:  # no posteriors arrive on the subscribed topic
             self._reports.popleft()
             self.announced_only += 1
         return self._match()
 
     def add_posterior(self, posterior: Posterior) -> list[FrameOutcome]:
-        """Take a `/BMresults` and return the frames that are complete now."""
+        """Add a `/BMresults` and return the frames that are now complete."""
         self._posteriors.append(posterior)
         ready = self._match()
         if len(self._posteriors) > WAITING:
@@ -57,7 +57,7 @@ class Pairing:
         return ready
 
     def flush(self) -> list[FrameOutcome]:
-        """Return the posteriors that still wait: their reports are lost."""
+        """Return the posteriors that are still waiting: their reports are lost."""
         ended: list[FrameOutcome] = list(self._posteriors)
         self._posteriors.clear()
         return ended
@@ -81,7 +81,7 @@ class Pairing:
         return ready
 
     def _belongs_to_a_later(self, posterior: Posterior) -> bool:
-        """Whether a posterior came too late to be the first report's, and not too early to be the next one's."""
+        """Return whether a posterior is too late for the first report, and not too early for the next."""
         first, second = self._reports[0], self._reports[1]
         return (
             first.heard_ns + self._disorder_ns < posterior.heard_ns

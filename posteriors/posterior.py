@@ -1,4 +1,4 @@
-"""`/BMresults`: posteriors as arrays with labels, written and read."""
+"""`/BMresults`: posteriors as labelled arrays, and their conversion from and to messages."""
 
 import difflib
 import math
@@ -22,27 +22,31 @@ if TYPE_CHECKING:
 RESULTS_TOPIC: Final = "/BMresults"
 RESULTS_TYPE: Final = "std_msgs/Float64MultiArray"
 MAX_RESULT: Final = 1 << 23
-"""Largest posterior as JSON, in bytes: 64 boards of 4096 lines, 26 bytes a number, and room for the rest."""
+"""Size of the largest posterior as JSON in bytes: 64 boards of 4096 lines, 26 bytes per number, and the rest
+of the message.
+"""
 REPLICA: Final = "replica"
 """Label of the first dimension of the posteriors of several replicas."""
 
 _MAX_DIMENSIONS: Final = 32
-"""NumPy's own limit."""
+"""Limit of NumPy."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Posterior:
-    """A posterior: a probability for each cell of the searched variables' grid, with its frame's data."""
+    """A posterior: a probability for each cell of the searched variables' grid, with the data of its frame."""
 
     probabilities: tuple[float, ...]
-    """Row-major over the labelled dimensions, the first slowest; they sum to 1. If the first label is `replica`, there are
-    as many posteriors, one after the other; each sums to 1, or to 0 if no line of the replica counted."""
+    """Row-major over the labelled dimensions, the first slowest; they sum to 1. If the first label is
+    `replica`, these are several posteriors in sequence; each sums to 1, or to 0 if all counts of the replica
+    are 0.
+    """
     labels: tuple[str, ...]
-    """The searched variables' names, in the order of the dimensions."""
+    """Names of the searched variables, in the order of the dimensions."""
     sizes: tuple[int, ...]
-    """The number of values of each."""
+    """Number of values of each dimension."""
     heard_ns: int
-    """Arrival here, Unix time in nanoseconds."""
+    """Time of arrival, Unix time in nanoseconds."""
     report: FrameReport | None = None
     """Its `/bm/frame`; None if that was lost."""
 
@@ -57,14 +61,14 @@ class Posterior:
 
     @property
     def replicas(self) -> int:
-        """Number of posteriors: one for each of the deployment's replicas, or 1."""
+        """Number of posteriors: the number of replicas of the deployment."""
         return self.sizes[0] if self.labels[0] == REPLICA else 1
 
     def replica(self, at: int) -> "Posterior":
-        """Return one replica's posterior, without the dimension of replicas.
+        """Return the posterior of one replica, without the dimension `replica`.
 
         Raises:
-            LabelError: There is no such replica, or it has no posterior because no line of it counted.
+            LabelError: The replica does not exist, or has no posterior because all its counts are 0.
         """
         if not 0 <= at < self.replicas:
             raise LabelError(f"there is no replica {at}: expected 0 to {self.replicas - 1}")
@@ -73,34 +77,34 @@ class Posterior:
         each = len(self.probabilities) // self.replicas
         own = self.probabilities[at * each : (at + 1) * each]
         if not any(own):
-            raise LabelError(f"replica {at} has no posterior in this frame: no line of it counted")
+            raise LabelError(f"replica {at} has no posterior in this frame: all its counts are 0")
         return replace(self, probabilities=own, labels=self.labels[1:], sizes=self.sizes[1:])
 
     @property
     def number(self) -> int | None:
-        """The frame's number, rising from 1 per master; None if it is not known."""
+        """Number of the frame, from 1 for each master; None if unknown."""
         return self.report.number if self.report else None
 
     @property
     def stamp_ns(self) -> int | None:
-        """Time of the reading, Unix time in nanoseconds; None if it is not known."""
+        """Time of the reading, Unix time in nanoseconds; None if unknown."""
         return self.report.stamp_ns if self.report else None
 
     @property
     def cycles(self) -> int | None:
-        """Most cycles that any board ran; None if it is not known."""
+        """Largest number of cycles of a board; None if unknown."""
         return self.report.cycles if self.report else None
 
     @property
     def stages(self) -> StageTimes:
-        """Where the frame's time went, in microseconds."""
+        """Durations of the stages of the frame, in microseconds."""
         return self.report.stages if self.report else StageTimes()
 
     @property
     def latency_us(self) -> float | None:
         """Microseconds from the receipt of the reading by the subscriber to the arrival here.
 
-        None if it is not known, or if the clocks of the two computers disagree.
+        None if unknown, or if the clocks of the two computers disagree.
         """
         return self._since(self.report.received_ns if self.report else None)
 
@@ -118,7 +122,7 @@ class Posterior:
         return max(self.probabilities)
 
     def best(self) -> dict[str, int]:
-        """Return the most probable cell as an index from 0 for each label; the first of equal ones."""
+        """Return the most probable cell as an index from 0 for each label; if several are equal, the first."""
         line = self.probabilities.index(self.probability)
         indices: list[int] = []
         for size in reversed(self.sizes):
@@ -129,8 +133,8 @@ class Posterior:
     def mean(self) -> dict[str, float]:
         """Return the mean index of each label, from 0.
 
-        `deployment.toml` maps an index to its value by `offset + index * step`, which is linear, so the mean index
-        maps to the mean value. The mean of a periodic variable (a heading) has no meaning.
+        The value of an index is `offset + index * step` (`deployment.toml`), which is linear, so the mean
+        index corresponds to the mean value. The mean of a periodic variable (a heading) is not meaningful.
         """
         means: dict[str, float] = {}
         for label, size in zip(self.labels, self.sizes, strict=True):
@@ -139,20 +143,20 @@ class Posterior:
         return means
 
     def marginal(self, *labels: str) -> "NDArray[np.float64]":
-        """Return the posterior of some of the searched variables, with the others summed out.
+        """Return the marginal posterior of some of the searched variables.
 
         Args:
-            labels: The variables, each once.
+            labels: The variables, without repetition.
 
         Returns:
             A float64 array with one dimension for each label, in the order given.
 
         Raises:
-            LabelError: No such variable is searched; the sentence has the nearest right name.
+            LabelError: A variable is not searched; the sentence suggests the nearest name.
         """
         kept = [self._dimension(label) for label in labels]
         if len(set(kept)) != len(kept):
-            raise LabelError(f"marginal() takes each label once, but got {', '.join(labels)}")
+            raise LabelError(f"marginal() expects each label once, but got {', '.join(labels)}")
         others = tuple(at for at in range(len(self.sizes)) if at not in kept)
         in_order = sorted(kept)
         summed: NDArray[np.float64] = self.values.sum(axis=others)
@@ -162,7 +166,7 @@ class Posterior:
         """Return the probability of one cell: `posterior.at(y=3, x=4)`, or a mapping such as `best` returns.
 
         Raises:
-            LabelError: A label is unknown or missing, or an index is outside of the grid.
+            LabelError: A label is unknown or missing, or an index is outside the grid.
         """
         wanted = dict(indices or {}) | by_label
         for label in wanted:
@@ -187,7 +191,7 @@ class Posterior:
 def posterior_layout(deployment: "Deployment") -> dict[str, Any]:
     """Return the `layout` of a deployment's posteriors: dimensions with labels, row-major strides.
 
-    With replicas, they are the first dimension, labelled `replica`.
+    With several replicas, the first dimension is labelled `replica`.
     """
     dimensions = []
     stride = deployment.machine.results
@@ -216,10 +220,10 @@ _ARRAY: Final = TypeAdapter(_Float64MultiArray)
 
 
 def read_posterior(message: dict[str, Any], heard_ns: int, topic: str = RESULTS_TOPIC) -> Posterior:
-    """Return the posterior of a std_msgs/Float64MultiArray; without a layout its only label is `cell`.
+    """Return the posterior in a std_msgs/Float64MultiArray; without a layout, its only label is `cell`.
 
     Raises:
-        BadResultError: A value is not a probability, or the layout does not describe the data.
+        BadResultError: A value is not a probability, or the layout does not match the data.
     """
     array = validated(_ARRAY, message, topic, RESULTS_TYPE)
     values = array.data[array.layout.data_offset :]
@@ -232,7 +236,7 @@ def read_posterior(message: dict[str, Any], heard_ns: int, topic: str = RESULTS_
             f"{' x '.join(map(str, sizes))}: another program publishes there"
         )
     if len(set(labels)) != len(labels):
-        raise BadResultError(f"a message on {topic} has two dimensions of one name among {', '.join(labels)}")
+        raise BadResultError(f"a message on {topic} has two dimensions of the same name: {', '.join(labels)}")
     if not 0 < sum(values) < math.inf:
-        raise BadResultError(f"a message on {topic} has no probability in any of its {len(values)} values")
+        raise BadResultError(f"the values in a message on {topic} do not have a positive, finite sum")
     return Posterior(probabilities=values, labels=labels, sizes=sizes, heard_ns=heard_ns)

@@ -1,1 +1,1 @@
-"""The parts that all command lines share: start, flags, logs, errors and exit codes, end."""
+"""Code shared by all commands: command lines, logs, errors, exit codes, signals, health checks."""

@@ -1,4 +1,4 @@
-"""The command line that all commands share: its flags, its start and its end."""
+"""The base of all command lines: common flags, start-up and exit."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from terminal.usage import RefusedValueError, metavar
 
 
 class CommandLine(typer.Typer):
-    """A command, or several: each failure is one sentence on standard error and an exit code."""
+    """A command, or a group of commands, whose failures are one sentence on standard error and an exit code."""
 
     def __init__(self, **settings: Any) -> None:
         """Take the settings of `typer.Typer`, and add those that all commands share."""
@@ -49,7 +49,7 @@ class CommandLine(typer.Typer):
 
 
 class _WithEnd:
-    """Behaviour that commands and groups share: `--help` without a placeholder, and an end that typer does not choose."""
+    """Behaviour of commands and groups: `--help` without a placeholder, and our own exit codes."""
 
     def get_help_option(self, ctx: Any) -> Any:
         option = super().get_help_option(ctx)  # type: ignore[misc]  # of typer's class
@@ -65,7 +65,7 @@ class _WithEnd:
 
 
 class _Command(_WithEnd, TyperCommand):
-    """A command that names the values of its flags in `--help` and refuses blank or non-finite ones."""
+    """A command that names the values of its flags in `--help`, and refuses blank and non-finite values."""
 
     def __init__(self, *args: Any, **settings: Any) -> None:
         super().__init__(*args, **settings)
@@ -82,7 +82,7 @@ class _Command(_WithEnd, TyperCommand):
 
 
 class _Group(_WithEnd, TyperGroup):
-    """Several commands, one of which is named first."""
+    """A group of commands."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         with _naming(ctx):
@@ -91,7 +91,7 @@ class _Group(_WithEnd, TyperGroup):
 
 @contextmanager
 def _naming(context: Any) -> Iterator[None]:
-    """Add the subcommand to a mistake on its command line where typer leaves it out."""
+    """Add the name of the subcommand to a usage error if typer omits it."""
     try:
         yield
     except typer.TyperException as error:
@@ -101,7 +101,7 @@ def _naming(context: Any) -> Iterator[None]:
 
 
 def _check_value(context: Any, parameter: Any, typed: object) -> None:
-    """Refuse, with a RefusedValueError, blank text and numbers that are not finite."""
+    """Raise a RefusedValueError for blank text and numbers that are not finite."""
     for each in typed if isinstance(typed, list | tuple) else (typed,):
         if isinstance(each, str) and not each.strip():
             raise RefusedValueError(each, context, parameter)

@@ -1,4 +1,4 @@
-"""Reports of a lost connection and of its return, for the person at the terminal."""
+"""Messages for the user about lost and restored connections."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from terminal.output import say
 
 
 def report_connection(uri: str) -> Callable[[str, str], None]:
-    """Return a callback for a client's `on_state` that reports each loss of the connection once, and its return."""
-    # the client logs warnings of the same losses
+    """Return a callback for a client's `on_state` that reports each lost and restored connection once."""
+    # the client itself logs a warning at each loss
     log_libraries(logging.ERROR, "%(name)s: %(message)s")
     lost = False
 

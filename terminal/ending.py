@@ -1,4 +1,4 @@
-"""The end of a command: every error becomes one sentence and an exit code."""
+"""Exit of a command: conversion of every error to one sentence and an exit code."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from terminal.signals import check_signals, ignore_signals
 from terminal.usage import usage_sentence
 
 PARENT_VARIABLE: Final = "ROSBAYES_PARENT"
-"""Environment variable that a process sets for its children; they end with it, and without comment."""
+"""Environment variable that a process sets for its children, which exit with it and report nothing."""
 
 _NO_SPACE: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO})
 _TOO_MANY_FILES: Final = frozenset({errno.EMFILE, errno.ENFILE})
@@ -26,7 +26,8 @@ _TOO_MANY_FILES: Final = frozenset({errno.EMFILE, errno.ENFILE})
 def outcome(command: Callable[[], object]) -> int:
     """Run a command, report its failure on standard error, and return its exit code.
 
-    Only an exception that does not belong to the project (a bug) shows a traceback. Signals are ignored from then on.
+    Only a bug, that is, an exception not raised by the project, shows a traceback. Signals are ignored
+    afterwards.
     """
     try:
         code = command()
@@ -45,7 +46,7 @@ def report(error: BaseException) -> int:
     if isinstance(error, SystemExit):
         return error.code if isinstance(error.code, int) else ExitCode.DONE
     if isinstance(error, typer.TyperException):
-        if type(error).__name__ != "NoArgsIsHelpError":  # the help is already on the screen
+        if type(error).__name__ != "NoArgsIsHelpError":  # typer has already printed the help
             say(f"error: {usage_sentence(error)}")
         return ExitCode.USAGE
     if isinstance(error, ReaderGoneError | BrokenPipeError):
@@ -69,7 +70,7 @@ def report(error: BaseException) -> int:
 
 
 def _system_sentence(error: OSError) -> str | None:
-    """Return the sentence for a limit of the system or a file that it refuses; None if the error is a bug."""
+    """Return the sentence for a limit of the system or an unwritable output; None if the error is a bug."""
     if error.filename is not None:
         return f"{error.filename}: {error.strerror}"
     if error.errno in _NO_SPACE:

@@ -1,4 +1,4 @@
-"""Exit codes, and how an error gets one."""
+"""Exit codes of commands and of errors."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ class ExitCode(IntEnum):
 class StoppedError(BaseException):
     """A signal asked the process to end.
 
-    Like KeyboardInterrupt it is not an `Exception`: it is raised wherever the main thread stands, inside a library too,
-    and code that catches `Exception` must not swallow it.
+    Like KeyboardInterrupt, it is not an `Exception`: it can be raised anywhere in the main thread, even
+        inside a library, and code that catches `Exception` must not swallow it.
     """
 
     def __init__(self, exit_code: int, sentence: str) -> None:
@@ -33,7 +33,7 @@ class StoppedError(BaseException):
 
 
 class ReaderGoneError(Exception):
-    """The program that reads standard output has closed it, as `| head` does; not a failure."""
+    """The reader of standard output has closed it, as `| head` does; this is not a failure."""
 
     exit_code = ExitCode.DONE
 
@@ -45,6 +45,6 @@ class OutputError(Exception):
 
 
 def exit_code_of(error: BaseException) -> int:
-    """Return the exit code that an error of any package carries; `BUG` for all others."""
+    """Return the exit code of an error, or `BUG` if it has none."""
     code = getattr(error, "exit_code", ExitCode.BUG)
     return int(code) if isinstance(code, int) else int(ExitCode.BUG)

@@ -1,8 +1,9 @@
-"""Health of a process: whether it is ready, and why, shown on its status socket.
+"""Health of a process, reported on its status socket: whether it is ready, and the reason.
 
-A process listens on `NAME.status.sock` in the run directory, a socket of its user alone (0600). Each connection gets one
-JSON object, which has at least `ready` and `why`, and is closed; nothing is read from it. This module imports the standard
-library alone, and asyncio only to serve: a health check runs every few seconds.
+A process listens on `NAME.status.sock` in the run directory, accessible only to its user (mode 0600). Each
+connection receives one JSON object with at least `ready` and `why`, and is closed; nothing is read from it.
+Because a health check runs every few seconds, this module imports only the standard library, and asyncio only
+in a server.
 """
 
 from __future__ import annotations
@@ -24,14 +25,14 @@ if TYPE_CHECKING:
 
 SUFFIX = ".status.sock"
 ANSWER_LIMIT = 1 << 20
-"""Bytes of the longest answer that is read."""
+"""Maximum size of an answer in bytes."""
 
 _SAMPLE_EVERY = 1.0
 _SEND_TIMEOUT = 0.5
 
 
 class Silence(StrEnum):
-    """Reason why a status socket gave no answer."""
+    """The reason why a status socket did not answer."""
 
     NO_SOCKET = "no socket"
     NO_LISTENER = "no listener"
@@ -40,7 +41,7 @@ class Silence(StrEnum):
 
 
 class NoHealthError(Exception):
-    """A status socket gave no answer; the text says why."""
+    """A status socket did not answer; the text gives the reason."""
 
     def __init__(self, reason: Silence, sentence: str) -> None:
         """Take the reason, and a sentence whose subject is the process."""
@@ -57,10 +58,10 @@ def status_socket(directory: str | os.PathLike[str], name: str) -> str:
 
 
 def read_status(path: str, timeout: float) -> bytes:
-    """Return what the process at a status socket answers, within `timeout` seconds.
+    """Return the answer of the process at a status socket, within `timeout` seconds.
 
     Raises:
-        NoHealthError: It gave no answer, or one of more than `ANSWER_LIMIT` bytes.
+        NoHealthError: There was no answer, or it exceeded `ANSWER_LIMIT` bytes.
     """
     deadline = time.monotonic() + timeout
     data = bytearray()
@@ -77,22 +78,22 @@ def read_status(path: str, timeout: float) -> bytes:
     except TimeoutError:
         raise NoHealthError(Silence.TIMEOUT, f"does not answer at {path} within {timeout:g} s") from None
     except ConnectionRefusedError:
-        sentence = f"was killed and has not been restarted yet: nobody listens at {path}"
+        sentence = f"was killed and has not been restarted yet: nothing listens at {path}"
         raise NoHealthError(Silence.NO_LISTENER, sentence) from None
     except OSError as error:
-        sentence = f"is not running, or shows no status at {path} ({error.strerror or error})"
+        sentence = f"is not running, or does not report its status at {path} ({error.strerror or error})"
         raise NoHealthError(Silence.NO_SOCKET, sentence) from None
     raise not_ours(path)
 
 
 def not_ours(path: str) -> NoHealthError:
     """Return the error for an answer that is not a status."""
-    sentence = f"is not a process of rosbayes of this version, by the answer at {path}"
+    sentence = f"is not a rosbayes process of this version, according to its answer at {path}"
     return NoHealthError(Silence.NOT_OURS, sentence)
 
 
 def is_ready(path: str, timeout: float) -> tuple[bool, str]:
-    """Return whether a process is ready, and why; a NoHealthError without an answer, or for one that is not a status."""
+    """Return whether a process is ready, and the reason, or raise a NoHealthError without a valid answer."""
     data = read_status(path, timeout)
     try:
         status = json.loads(data)
@@ -107,12 +108,12 @@ def is_ready(path: str, timeout: float) -> tuple[bool, str]:
 def _listen(path: str) -> socket.socket:
     """Listen at a path, in place of a killed process; an OSError if another one listens there, or the system refuses."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
-        probe.setblocking(False)  # a full backlog is a process that listens
+        probe.setblocking(False)  # a full backlog means that a process is listening
         if probe.connect_ex(path) == errno.ECONNREFUSED:
             os.unlink(path)  # noqa: PTH108 - see above
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
-        # Linux gives the socket's file the mode of the socket: at no time can another user connect
+        # Linux creates the file with the mode of the socket, so another user can never connect
         os.fchmod(listener.fileno(), 0o600)
         listener.bind(path)
         listener.listen()
@@ -124,7 +125,7 @@ def _listen(path: str) -> socket.socket:
 
 @contextlib.contextmanager
 def _listening(directory: str | os.PathLike[str] | None, name: str) -> Iterator[socket.socket | None]:
-    """Listen while the context lasts; give None without a directory, and after a warning where the socket can't be had."""
+    """Listen within the context; yield None without a directory, or after a warning without a socket."""
     listener = None
     path = "" if directory is None else status_socket(os.path.abspath(directory), name)  # noqa: PTH100 - see above
     if path:
@@ -151,9 +152,10 @@ async def health_served(
     answer: Callable[[], bytes],
     sample: Callable[[], None] | None = None,
 ) -> AsyncIterator[None]:
-    """Answer in the running loop while the context lasts, so that an answer shows that the loop turns.
+    """Answer in the running event loop within the context, so an answer proves that the loop is not blocked.
 
-    `answer` gives the JSON object, and `sample` is called once a second. Without a directory nothing is served.
+    `answer` returns the JSON object, and `sample` is called once per second. Without a directory nothing is
+    served.
     """
     import asyncio
 
@@ -187,7 +189,7 @@ def health_thread(
     answer: Callable[[], bytes],
     sample: Callable[[], None],
 ) -> Iterator[None]:
-    """Answer from a thread while the context lasts, for a process with one blocking thread.
+    """Answer from a thread within the context, for a process whose main thread blocks.
 
     The arguments are those of `health_served`; `answer` and `sample` run in the thread.
     """
@@ -199,7 +201,7 @@ def health_thread(
         thread = threading.Thread(
             target=_answer_all, args=(listener, answer, sample, over), name="status", daemon=True
         )
-        # a signal must find the main thread: a blocking call there would not return otherwise
+        # signals must go to the main thread: a blocking call there would not return otherwise
         mask = signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())
         try:
             thread.start()

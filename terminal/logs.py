@@ -1,4 +1,4 @@
-"""Logs: one line format for every process, on standard error."""
+"""Logging to standard error, in one line format for every process."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from terminal.output import SurvivingStream
 
 
 class _OneLine(logging.Formatter):
-    """One line for each record, since a library may quote a stranger; the lines of a traceback stay apart."""
+    """Formatter with one line per record: a library may quote untrusted text. Tracebacks keep their lines."""
 
     def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802 - the name in logging
         return one_line(super().formatMessage(record))
@@ -25,24 +25,24 @@ class _OneLine(logging.Formatter):
 
 
 def escape_last_resort() -> None:
-    """Escape warnings of libraries where no logging is configured: some quote a server."""
+    """Escape warnings of libraries if logging is not configured, because some quote a server."""
     if logging.lastResort is not None:
         logging.lastResort.setFormatter(_OneLine())
 
 
 def log_libraries(level: int, form: str) -> None:
-    """Write what libraries log from a level on to standard error, a line for each record in the form of `logging`."""
+    """Write log records of libraries from a level on to standard error, one line each."""
     handler = logging.StreamHandler()
     handler.setFormatter(_OneLine(form))
     logging.basicConfig(level=level, handlers=[handler])
 
 
 def get_logger(role: str, level: str = "info") -> FilteringBoundLogger:
-    """Return the logger of a process; every line names the process, and the frame if there is one.
+    """Return the logger of a process; its lines contain its name, and the number of the frame if any.
 
-    The first call in a process decides on the lowest level that is written: debug, info or warning.
+    The first call in a process sets the minimum level: debug, info or warning.
     """
-    # our own records cover what the libraries warn of; only their errors are new
+    # our own records cover the warnings of libraries; only their errors are new
     log_libraries(logging.ERROR, "%(name)s: %(message)s")
     if not structlog.is_configured():
         _configure(level)
@@ -66,7 +66,7 @@ def _configure(level: str) -> None:
 def _one_line(_: Any, level: str, event: structlog.typing.EventDict) -> str:
     """Format `12:00:00.123 master: warning: frame=7 the event cycles=512`, without the level if it is info.
 
-    The frame comes before the sentence, so that a space follows it: `grep 'frame=7 '` does not find frame 70.
+    The frame precedes the sentence and is followed by a space, so `grep 'frame=7 '` does not find frame 70.
     """
     time, process, sentence = str(event.pop("timestamp"))[:12], event.pop("process"), event.pop("event")
     event.pop("level", None)
@@ -77,6 +77,6 @@ def _one_line(_: Any, level: str, event: structlog.typing.EventDict) -> str:
 
 
 def _value(value: Any) -> str:
-    """Return a value as logfmt writes it: quoted if it contains spaces."""
+    """Return a value in logfmt: quoted if it contains spaces."""
     text = str(value)
     return json.dumps(text) if not text or set(text) & set(' ="') else text

@@ -1,4 +1,4 @@
-"""Text made safe for a terminal: control characters and line ends are shown escaped.
+"""Text that is safe for a terminal, with control characters and line ends escaped.
 
 A path, a topic name or a server's answer may contain line ends and terminal control sequences.
 """
@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import Final
 
 _LONGEST: Final = 80
-"""Characters of a value that are shown."""
+"""Maximum number of characters shown of a value."""
 
 
 def one_line(text: str) -> str:

@@ -18,13 +18,13 @@ from terminal.one_line import lines_of, one_line
 
 
 class SurvivingStream:
-    """Standard error that may disappear: a closed terminal must not end a robot's run."""
+    """Standard error that may disappear, because a closed terminal must not end a robot's run."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
 
     def write(self, text: str) -> int:
-        """Write a text if the stream still takes it."""
+        """Write a text if the stream still accepts it."""
         try:
             return self._stream.write(text)
         except (OSError, ValueError):
@@ -63,7 +63,7 @@ def put_json(value: Any) -> None:
 
 
 def open_standard_streams() -> None:
-    """Open /dev/null in place of a standard stream that is closed (`>&-`), lest an event loop take its number."""
+    """Open /dev/null for closed standard streams (`>&-`), so that an event loop cannot get their numbers."""
     for number, (name, mode) in enumerate((("stdin", "r"), ("stdout", "w"), ("stderr", "w"))):
         try:
             os.fstat(number)

@@ -1,4 +1,4 @@
-"""Signals that end a process: an exception for blocking code, cancellation for a coroutine."""
+"""Signals that end a process, as an exception in blocking code and as cancellation of a coroutine."""
 
 from __future__ import annotations
 
@@ -30,8 +30,9 @@ def stopped_by(number: int) -> StoppedError:
 def raise_on_signals() -> None:
     """Make SIGINT, SIGTERM and SIGHUP raise `StoppedError` in the main thread.
 
-    A second signal is ignored, since cleaning up is bounded. Python drops an exception that is raised while the thread
-    runs a callback from C code, forks, or runs a finaliser, so code that blocks calls `check_signals` first.
+    A second signal is ignored, because the duration of the clean-up is bounded. Python drops an exception
+    that is raised while the thread runs a callback from C code, forks, or runs a finaliser, so code calls
+    `check_signals` before it blocks.
     """
     sys.unraisablehook = _report_dropped
     for number in _ENDS:
@@ -45,13 +46,13 @@ def _stop(number: int, _frame: object) -> None:
 
 
 def _report_dropped(dropped: sys.UnraisableHookArgs) -> None:
-    """Report an exception that Python drops, unless it is a signal's, which is not lost."""
+    """Report an exception that Python drops, except those of signals, which `check_signals` raises again."""
     if not isinstance(dropped.exc_value, StoppedError):
         sys.__unraisablehook__(dropped)
 
 
 def check_signals() -> None:
-    """Raise a StoppedError for a signal whose exception was dropped, before the process waits for something."""
+    """Raise a StoppedError for a signal whose exception was dropped; call this before blocking."""
     if _received:
         raise stopped_by(_received[0])
 
@@ -100,6 +101,6 @@ def run_async(main: Coroutine[Any, Any, int | None]) -> int:
     try:
         with contextlib.closing(main), asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
             return runner.run(guarded())
-    finally:  # closing the loop has installed the system's own handlers
+    finally:  # closing the loop has restored the default handlers
         for number, handler in handlers.items():
             signal.signal(number, handler)

@@ -1,4 +1,4 @@
-"""Mistakes on a command line, each as one sentence: where, what was expected, and where to read more."""
+"""Sentences for usage errors: the place, the expected value, and where to read more."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ _TYPES: Final = {int: "NUMBER", float: "NUMBER", str: "TEXT"}
 
 
 class RefusedValueError(typer.BadParameter):
-    """A value that no flag takes: blank text, or a number that is not finite."""
+    """A value that no flag accepts: blank text, or a number that is not finite."""
 
     def __init__(self, value: str, context: typer.Context, parameter: Parameter) -> None:
-        """Keep the value as it was typed, and where."""
+        """Store the value as typed, and its place."""
         super().__init__("expected a text that is not blank", context, parameter)
         self.value = value
 
 
 def choices(parameter: Parameter) -> list[str]:
-    """Return the values that a parameter is restricted to, or an empty list."""
+    """Return the permitted values of a parameter, or an empty list if there is no restriction."""
     return [str(getattr(each, "value", each)) for each in parameter.type_descriptor.choices or ()]
 
 
 def is_number(parameter: Parameter) -> bool:
-    """Return whether a parameter takes numbers."""
+    """Return whether the values of a parameter are numbers."""
     return parameter.type_descriptor.annotation in {int, float}
 
 
@@ -49,7 +49,7 @@ def metavar(parameter: Parameter) -> str | None:
 
 
 def usage_sentence(error: typer.TyperException) -> str:
-    """Return one sentence for a mistake on a command line."""
+    """Return one sentence for a usage error."""
     context = getattr(error, "ctx", None)
     command = Path(sys.argv[0]).name if context is None else context.command_path
     return one_line(f"{_without_stop(_mistake(error, command))}; {command} --help says more")
@@ -76,7 +76,7 @@ def _mistake(error: typer.TyperException, command: str) -> str:
     if isinstance(error, typer.BadParameter):
         return f"{error.param_hint or command}: {error.message}"
     if kind == "BadOptionUsage":
-        needs_value = "requires" in error.message  # the library's one sign of which of the two it is
+        needs_value = "requires" in error.message  # the library distinguishes the two cases only by this text
         return f"{shown(option)} {'needs a' if needs_value else 'takes no'} value"
     return f"{command}: {one_line(error.message[:1].lower() + error.message[1:])}"
 
@@ -95,7 +95,7 @@ def _meaning(parameter: Parameter) -> str:
 
 
 def _value(error: typer.BadParameter) -> str:
-    """Return the value that was typed, if the check that refused it kept it."""
+    """Return the value as typed, if the refusing check stored it."""
     if isinstance(error, RefusedValueError):
         return f" {shown(error.value)}"
     details = getattr(error.__cause__, "errors", None)
