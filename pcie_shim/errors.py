@@ -17,6 +17,12 @@ class EndpointError(PcieShimError):
     exit_code = 2
 
 
+class CredentialsError(PcieShimError):
+    """A key or certificate that cannot be used."""
+
+    exit_code = 2
+
+
 class ImageError(PcieShimError):
     """A programming file that cannot be made or used: a model too large for the interface, a wrong partition."""
 
@@ -71,6 +77,12 @@ class ShortReadError(FramingError):
 
 class DeviceGoneError(LinkError):
     """The ID register reads all ones: no device answers behind the link."""
+
+
+class KeyRefusedError(LinkError):
+    """A board and a host that do not have the same key, or a certificate that is not trusted."""
+
+    exit_code = 2
 
 
 class GreetingMismatchError(LinkError):

@@ -29,6 +29,8 @@ ERROR: Final = 5
 """Board to host: the request of this sequence number was refused (`encode_error`)."""
 PROGRAM: Final = 6
 """Loader to the programming port: a part of a programming file; `address` is its offset in bytes."""
+AUTHENTICATE: Final = 7
+"""Board to host, before GREET: a challenge; the host's request has its nonce and its proof, the reply the board's proof."""
 
 REPLY: Final = 1
 """Flag: the answer to the request of the same sequence number."""
@@ -50,7 +52,7 @@ _HEADER: Final = struct.Struct("<HBBIIII")
 HEADER_BYTES: Final = _HEADER.size
 _MAX_FRAME: Final = HEADER_BYTES + 4 * MAX_PAYLOAD_WORDS
 _WITHOUT_PAYLOAD: Final = frozenset({(READ, 0), (WRITE, REPLY), (PROGRAM, REPLY)})
-_OPERATIONS: Final = (GREET, READ, WRITE, IRQ, ERROR, PROGRAM)
+_OPERATIONS: Final = (GREET, READ, WRITE, IRQ, ERROR, PROGRAM, AUTHENTICATE)
 
 
 class Frame(NamedTuple):

@@ -41,6 +41,11 @@ class Settings(BaseSettings):
     boards: Annotated[tuple[str, ...], NoDecode] = Field(
         default=(), description="endpoints of boards that already run, comma-separated"
     )
+    key_file: Path | None = Field(default=None, description="file with the key that boards over TCP share")
+    board_ca: Path | None = Field(
+        default=None,
+        description="certificates (PEM) that sign those of boards over TLS; the system's without it",
+    )
     subscriber: str = Field(default="", description="endpoint of a subscriber that already runs")
     publisher: str = Field(default="", description="endpoint of a publisher that already runs")
     pcie_app: str = Field(default="", description="endpoint of a pcie-app that already runs")
@@ -67,7 +72,9 @@ class Settings(BaseSettings):
         default="info", description="what is logged; debug has a line for every frame"
     )
 
-    @field_validator("deployment", "run_directory", "control_directory", mode="before")
+    @field_validator(
+        "deployment", "key_file", "board_ca", "run_directory", "control_directory", mode="before"
+    )
     @classmethod
     def _no_directory(cls, value: object) -> object:
         return value or None  # an empty variable means none, not the current folder

@@ -26,8 +26,10 @@ SUBPROTOCOL: Final = Subprotocol("rosbridge")
 _BEARER: Final = "bearer."
 _TOKEN: Final = re.compile(r"[A-Za-z0-9._~-]{16,1024}")
 """Characters that both a header and a subprotocol accept."""
-LOCAL_ORIGIN: Final = re.compile(r"https?://(localhost|127\.\d+\.\d+\.\d+|\[::1\])(:\d+)?")
+_LOCAL: Final = r"(localhost|127\.\d+\.\d+\.\d+|\[::1\])(:\d+)?"
+LOCAL_ORIGIN: Final = re.compile(f"https?://{_LOCAL}")
 """Web pages of this machine; pages from elsewhere could control a robot through their visitor's browser."""
+_LOCAL_HOST: Final = re.compile(_LOCAL)
 _MAX_TOKENS: Final = 1000
 
 
@@ -37,8 +39,8 @@ class AccessPolicy:
 
     Attributes:
         tokens: A client must present one of them; without tokens every client may connect.
-        origins: Web pages (`https://robot.example`) that may connect, besides those of this machine.
-            Programs other than browsers send no origin and may always connect.
+        origins: Web pages (`https://robot.example`) that may connect, besides those of this machine; `null` stands for
+            pages opened from a file. Programs other than browsers send no origin and may always connect.
         tls: The hub's certificate and key; without it nothing is encrypted.
     """
 
@@ -64,8 +66,14 @@ class AccessPolicy:
         """Return the origins for the WebSocket handshake; None stands for programs, which send none."""
         return [None, LOCAL_ORIGIN, *map(Origin, self.origins)]
 
-    def refusal(self, request: Request) -> HTTPStatus | None:
-        """Return the status that refuses a request, or None to admit it."""
+    def refusal(self, request: Request, *, loopback: bool) -> HTTPStatus | None:
+        """Return the status that refuses a request, or None to admit it.
+
+        On a loopback address, the request must be for this machine or the host of an allowed page: a web page that reaches
+        the hub under another name has had its name resolved to this machine (DNS rebinding).
+        """
+        if loopback and not self._is_for_this_machine(request):
+            return HTTPStatus.FORBIDDEN
         if not self.tokens:
             return None
         matches = False
@@ -73,6 +81,11 @@ class AccessPolicy:
             for token in self.tokens:  # all of them, even after a match: the time must reveal nothing
                 matches |= hmac.compare_digest(candidate.encode("utf-8", "replace"), token.encode())
         return None if matches else HTTPStatus.UNAUTHORIZED
+
+    def _is_for_this_machine(self, request: Request) -> bool:
+        hosts = request.headers.get_all("Host")
+        known = {origin.partition("://")[2] for origin in self.origins}
+        return len(hosts) == 1 and (_LOCAL_HOST.fullmatch(hosts[0]) is not None or hosts[0] in known)
 
 
 def _presented(request: Request) -> list[str]:

@@ -20,7 +20,7 @@ from websockets.frames import CloseCode
 from websockets.http11 import Request, Response
 from websockets.server import ServerProtocol
 
-from bridge.hub.access import AccessPolicy, choose_subprotocol
+from bridge.hub.access import AccessPolicy, choose_subprotocol, is_loopback
 from bridge.hub.broker import Broker
 from bridge.hub.delivery.definitions import RosVersion
 from bridge.hub.delivery.outbox import Outbox
@@ -85,7 +85,7 @@ async def serve_hub(
             f"the hub cannot listen on {host} port {port}: a port is a number from 0 to {_LAST_PORT}"
         )
     access = access or AccessPolicy()
-    hub = _Hub(limits or HubLimits(), access, ros_version)
+    hub = _Hub(limits or HubLimits(), access, ros_version, loopback=is_loopback(host))
     _retain_memory()
     loop = asyncio.get_running_loop()
     try:
@@ -130,8 +130,11 @@ def _retain_memory() -> None:
 class _Hub:
     """The broker, its connections and its timers."""
 
-    def __init__(self, limits: HubLimits, access: AccessPolicy, ros_version: RosVersion) -> None:
+    def __init__(
+        self, limits: HubLimits, access: AccessPolicy, ros_version: RosVersion, *, loopback: bool
+    ) -> None:
         self.limits = limits
+        self.loopback = loopback
         self.broker = Broker(limits, ros_version=ros_version)
         self.access = access
         self.connections: set[_Connection] = set()
@@ -304,8 +307,10 @@ class _Connection(WebSocketTransport):
         protocol, request = self._server_protocol, cast("Request", event)
         response = protocol.accept(request)
         if response.status_code == HTTPStatus.SWITCHING_PROTOCOLS:
-            refusal = self._hub.access.refusal(request)
-            if refusal is not None:
+            refusal = self._hub.access.refusal(request, loopback=self._hub.loopback)
+            if refusal is HTTPStatus.FORBIDDEN:
+                response = protocol.reject(refusal, "The hub is known by another name.\n")
+            elif refusal is not None:
                 response = protocol.reject(refusal, "The hub expects a token.\n")
                 response.headers["WWW-Authenticate"] = "Bearer"
             elif self._hub.broker.full:

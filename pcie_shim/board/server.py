@@ -8,6 +8,7 @@ that breaks the protocol gets an ERROR and loses its link.
 from __future__ import annotations
 
 import hashlib
+import hmac
 import logging
 import os
 import select
@@ -19,7 +20,7 @@ from contextlib import suppress
 from functools import partial
 from typing import Final
 
-from pcie_shim import framing, register_map
+from pcie_shim import credentials, framing, register_map
 from pcie_shim.board.emulated_board import EmulatedBoard, RefusedError
 from pcie_shim.board.misbehaviour import Misbehaviour, MisbehaviourKind
 from pcie_shim.endpoint import Endpoint, listen, no_delay, parse_endpoint, remove_listener
@@ -28,6 +29,7 @@ from pcie_shim.framing import Frame, ProgramBegin
 from pcie_shim.programming_file import MAX_IMAGE_BYTES
 from pcie_shim.register_layout import ALL_ONES
 from pcie_shim.register_map import ErrorCode
+from pcie_shim.tunnel import tunnel_to_host
 
 _LOG: Final = logging.getLogger(__name__)
 
@@ -38,10 +40,11 @@ KEEPALIVE_S: Final = 5
 PROGRAMMING_SILENCE_S: Final = 10.0
 """Seconds without a frame of a loader, after which another may program the board."""
 
-MAX_SILENT_HOSTS: Final = 16
-"""Most connections without a request, which do not hold the board; a further one ends the oldest."""
+MAX_SILENT: Final = 16
+"""Most connections to a port without a request, which do not hold the board; a further one ends the oldest."""
 
 _HELD: Final = "another host has it; one host drives a board at a time"
+_PROGRAMMED: Final = "another loader is programming it"
 _READABLE: Final = select.EPOLLIN | select.EPOLLHUP | select.EPOLLERR
 
 
@@ -104,7 +107,7 @@ def serve_board(
         remove_listener(where, registers)
         raise
     try:
-        server = _Server(registers, programming, index, stop, misbehave)
+        server = _Server(where, registers, programming, index, stop, misbehave)
         if on_ready is not None:
             on_ready(server.board)
         server.run()
@@ -114,9 +117,9 @@ def serve_board(
 
 
 class _Connection:
-    """A host's or a loader's connection: a socket with frames."""
+    """A host's or a loader's connection: a socket with frames, which begins with the board's challenge or greeting."""
 
-    def __init__(self, connection: socket.socket) -> None:
+    def __init__(self, connection: socket.socket, endpoint: Endpoint, greeting: bytes) -> None:
         no_delay(connection)
         if connection.family != socket.AF_UNIX:
             # a host whose machine or cable failed must not hold the board for ever
@@ -124,6 +127,7 @@ class _Connection:
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, KEEPALIVE_S)
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, KEEPALIVE_S)
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT, 3)
+        connection = _tunnelled(connection, endpoint)
         # reads never block, since epoll comes first; writes may take SEND_S
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, struct.pack("@ll", int(SEND_S), 0))
         self.socket = connection
@@ -131,6 +135,16 @@ class _Connection:
         self.sequence = 0
         self.open = True
         self.stalled = False
+        self._key = endpoint.credentials.key if endpoint.host else b""
+        self._greeting = greeting
+        self._nonce = b""
+        if self._key:
+            self._nonce = credentials.nonce()
+            self.send(
+                framing.encode(framing.AUTHENTICATE, 0, 0, 0, credentials.NONCE_BYTES // 4, self._nonce)
+            )
+        else:
+            self.send(greeting)
 
     def receive(self) -> bool:
         """Receive once; return False if nothing came or the connection is closed, which clears `open`."""
@@ -155,7 +169,7 @@ class _Connection:
                 _, _, sequence, address, _, _ = frame
                 self.sequence = due = (self.sequence + 1) & ALL_ONES
                 if sequence == due:
-                    handle(frame)
+                    (self._authenticate if self._nonce else handle)(frame)
                     continue
                 problem = f"request {sequence} came where {due} was due"
             except FramingError as error:
@@ -165,6 +179,20 @@ class _Connection:
                 continue
             self.send(framing.encode_error(sequence, address, ErrorCode.BAD_FRAME, problem))
             self.open = False
+
+    def _authenticate(self, frame: Frame) -> None:
+        """Check the peer's proof, and answer with the board's and the greeting."""
+        answer = bytes(frame.payload)
+        nonce, proof = answer[: credentials.NONCE_BYTES], answer[credentials.NONCE_BYTES :]
+        expected = credentials.host_proof(self._key, self._nonce, nonce)
+        if frame.operation != framing.AUTHENTICATE or not hmac.compare_digest(proof, expected):
+            raise FramingError("the proof that this host has the board's key is missing or wrong")
+        own = credentials.board_proof(self._key, self._nonce, nonce)
+        self._nonce = b""
+        reply = framing.encode(
+            framing.AUTHENTICATE, framing.REPLY, frame.sequence, 0, credentials.PROOF_BYTES // 4, own
+        )
+        self.send(reply + self._greeting)
 
     def send(self, data: bytes) -> None:
         """Send all bytes; a connection that accepts none for SEND_S is closed."""
@@ -177,18 +205,20 @@ class _Connection:
 class _Host(_Connection):
     """A link to a host, which holds the board from its first request on."""
 
-    def __init__(self, connection: socket.socket, programmed: int) -> None:
-        super().__init__(connection)
-        self.token = os.urandom(8)
+    def __init__(
+        self, connection: socket.socket, endpoint: Endpoint, greeting: bytes, token: bytes, programmed: int
+    ) -> None:
+        super().__init__(connection, endpoint, greeting)
+        self.token = token
         self.programmed = programmed
         self.interrupts = 0
 
 
 class _Loader(_Connection):
-    """The programming port's connection, with the received part of the programming file."""
+    """A connection to the programming port, which programs the board from its first request on."""
 
-    def __init__(self, connection: socket.socket) -> None:
-        super().__init__(connection)
+    def __init__(self, connection: socket.socket, endpoint: Endpoint, greeting: bytes) -> None:
+        super().__init__(connection, endpoint, greeting)
         self.begin: ProgramBegin | None = None
         self.content = bytearray()
         self.last_frame = time.monotonic()
@@ -199,12 +229,14 @@ class _Server:
 
     def __init__(
         self,
+        endpoint: Endpoint,
         registers: socket.socket,
         programming: socket.socket,
         index: int,
         stop: StopSignal,
         misbehave: Misbehaviour | None,
     ) -> None:
+        self._endpoint = endpoint
         self._registers = registers
         self._programming = programming
         self._index = index
@@ -216,6 +248,7 @@ class _Server:
         self._host: _Host | None = None
         self._silent_hosts: dict[int, _Host] = {}
         self._loader: _Loader | None = None
+        self._silent_loaders: dict[int, _Loader] = {}
         self._epoll = select.epoll()
         for descriptor in (stop.fileno(), registers.fileno(), programming.fileno()):
             self._epoll.register(descriptor, _READABLE)
@@ -240,7 +273,9 @@ class _Server:
             for host in [*self._silent_hosts.values(), self._host]:
                 if host is not None:
                     self._drop_host(host)
-            self._drop_loader()
+            for loader in [*self._silent_loaders.values(), self._loader]:
+                if loader is not None:
+                    self._drop_loader(loader)
             epoll.close()
 
     def _serve(self, descriptor: int) -> None:
@@ -249,6 +284,8 @@ class _Server:
             self._serve_host(self._silent_hosts[descriptor])
         elif host is not None and descriptor == host.socket.fileno():
             self._serve_host(host)
+        elif descriptor in self._silent_loaders:
+            self._serve_loader(self._silent_loaders[descriptor])
         elif loader is not None and descriptor == loader.socket.fileno():
             self._serve_loader(loader)
         elif descriptor == self._registers.fileno():
@@ -264,13 +301,14 @@ class _Server:
         except OSError:
             return  # the peer has disconnected already
         if self._is_held():
-            _refuse(connection, _HELD)
+            _refuse(connection, self._endpoint, _HELD)
             return
-        if len(self._silent_hosts) == MAX_SILENT_HOSTS:
+        if len(self._silent_hosts) == MAX_SILENT:
             self._drop_host(next(iter(self._silent_hosts.values())))
-        host = self._silent_hosts[connection.fileno()] = _Host(connection, self.board.programmed)
-        self._epoll.register(connection.fileno(), _READABLE)
-        host.send(self._greeting(host.token))
+        token = os.urandom(8)
+        host = _Host(connection, self._endpoint, self._greeting(token), token, self.board.programmed)
+        self._silent_hosts[host.socket.fileno()] = host
+        self._epoll.register(host.socket.fileno(), _READABLE)
 
     def _is_held(self) -> bool:
         """Return whether a host holds the board; the last frames of one that has just left are handled first."""
@@ -405,35 +443,38 @@ class _Server:
         except OSError:
             return
         if self._is_being_programmed():
-            _refuse(connection, "another loader is programming it")
+            _refuse(connection, self._endpoint, _PROGRAMMED)
             return
-        self._loader = loader = _Loader(connection)
-        self._epoll.register(connection.fileno(), _READABLE)
-        loader.send(self._greeting(framing.NO_TOKEN))
+        if len(self._silent_loaders) == MAX_SILENT:
+            self._drop_loader(next(iter(self._silent_loaders.values())))
+        loader = _Loader(connection, self._endpoint, self._greeting(framing.NO_TOKEN))
+        self._silent_loaders[loader.socket.fileno()] = loader
+        self._epoll.register(loader.socket.fileno(), _READABLE)
 
     def _is_being_programmed(self) -> bool:
-        """Return whether a loader is connected; the last frames of one that has just left are handled first."""
+        """Return whether a loader programs the board; the last frames of one that has just left are handled first."""
         loader = self._loader
         if loader is None:
             return False
         while loader.open and loader.receive():
-            loader.answer(self._program)
+            loader.answer(partial(self._program, loader))
         if not loader.open:
-            self._drop_loader()
+            self._drop_loader(loader)
         return self._loader is not None
 
     def _serve_loader(self, loader: _Loader) -> None:
         loader.last_frame = time.monotonic()
         loader.receive()
-        loader.answer(self._program)
+        loader.answer(partial(self._program, loader))
         if not loader.open:
-            self._drop_loader()
+            self._drop_loader(loader)
 
-    def _program(self, frame: Frame) -> None:
-        """Handle a frame of the loader."""
-        loader = self._loader
-        if loader is None:
-            return
+    def _program(self, loader: _Loader, frame: Frame) -> None:
+        """Handle a frame of a loader, which is the only one from its first request on."""
+        if loader is not self._loader:
+            if self._loader is not None:
+                raise RefusedError(ErrorCode.HELD, _PROGRAMMED)
+            self._loader = self._silent_loaders.pop(loader.socket.fileno())
         operation, flags, sequence, address, count, payload = frame
         if operation == framing.READ:
             words = self.board.read(address, count)
@@ -476,17 +517,26 @@ class _Server:
         _LOG.info("board %d: programmed with image %s", self._index, self.board.image_hash)
 
     def _drop_silent_loader(self) -> None:
-        if self._loader is not None and time.monotonic() - self._loader.last_frame > PROGRAMMING_SILENCE_S:
-            self._drop_loader()
+        loader = self._loader
+        if loader is not None and time.monotonic() - loader.last_frame > PROGRAMMING_SILENCE_S:
+            self._drop_loader(loader)
 
-    def _drop_loader(self) -> None:
-        loader, self._loader = self._loader, None
-        if loader is not None:
-            self._epoll.unregister(loader.socket.fileno())
-            loader.socket.close()
+    def _drop_loader(self, loader: _Loader) -> None:
+        if loader is self._loader:
+            self._loader = None
+        else:
+            del self._silent_loaders[loader.socket.fileno()]
+        self._epoll.unregister(loader.socket.fileno())
+        loader.socket.close()
 
 
-def _refuse(connection: socket.socket, detail: str) -> None:
+def _tunnelled(connection: socket.socket, endpoint: Endpoint) -> socket.socket:
+    tls = endpoint.credentials.tls
+    return connection if tls is None or not endpoint.host else tunnel_to_host(connection, tls)
+
+
+def _refuse(connection: socket.socket, endpoint: Endpoint, detail: str) -> None:
+    connection = _tunnelled(connection, endpoint)
     with suppress(OSError):
         connection.sendall(framing.encode_error(0, 0, ErrorCode.HELD, detail))
     connection.close()

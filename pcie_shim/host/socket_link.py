@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hmac
 import socket
 import struct
 import time
@@ -9,7 +10,7 @@ from collections.abc import Iterable
 from contextlib import suppress
 from typing import Final, NoReturn, Self
 
-from pcie_shim import framing, register_map
+from pcie_shim import credentials, framing, register_map
 from pcie_shim.endpoint import Endpoint, connect
 from pcie_shim.errors import (
     AccessError,
@@ -18,6 +19,7 @@ from pcie_shim.errors import (
     FramingError,
     GreetingMismatchError,
     HeldError,
+    KeyRefusedError,
     LinkClosedError,
     LinkError,
     LinkTimeoutError,
@@ -30,6 +32,9 @@ from pcie_shim.host.link import Done, Link, RegisterWrite
 from pcie_shim.register_layout import ALL_ONES, DONE_BLOCK, WORD
 from pcie_shim.register_map import ErrorCode
 
+_TLS_ENDS_S: Final = 1.0
+"""Seconds that the end of this host's previous link may need to pass both ends of a TLS connection."""
+_RETRY_S: Final = 0.02
 _CLOSING_CODES: Final = (ErrorCode.STALE, ErrorCode.HELD, ErrorCode.BAD_FRAME)
 
 
@@ -57,12 +62,45 @@ class SocketLink(Link):
             self._limit(connect_timeout)
             frame = self._receive(deadline, connect_timeout, "greet")
             self._limit(timeout)
+            if endpoint.host:
+                frame = self._authenticate(frame, deadline, connect_timeout)
             if frame.operation == framing.ERROR:
                 self._refused(frame)
             self.greeting = framing.decode_greeting(frame)
             self.token = self.greeting.token
         except LinkError as error:
             self._give_up(error)
+
+    def _authenticate(self, frame: Frame, deadline: float, connect_timeout: float) -> Frame:
+        """Prove to the board that this host has the key, check the board's proof, and return the greeting's frame.
+
+        Raises:
+            KeyRefusedError: One of the two has no key, or another one.
+        """
+        key = self.endpoint.credentials.key
+        if frame.operation != framing.AUTHENTICATE:
+            if key and frame.operation == framing.GREET:
+                raise KeyRefusedError(
+                    f"The board at {self.endpoint} does not ask for the key: start it with the same --key-file, or unset the host's"
+                )
+            return frame
+        if not key:
+            raise KeyRefusedError(
+                f"The board at {self.endpoint} expects a key: give the file with --key-file or BM_KEY_FILE"
+            )
+        board_nonce, host_nonce = bytes(frame.payload), credentials.nonce()
+        proof = credentials.host_proof(key, board_nonce, host_nonce)
+        payload = host_nonce + proof
+        try:
+            reply = self.request(framing.AUTHENTICATE, 0, 0, len(payload) // 4, payload)
+        except (AccessError, LinkClosedError):
+            reply = None
+        expected = credentials.board_proof(key, board_nonce, host_nonce)
+        if reply is None or not hmac.compare_digest(bytes(reply.payload), expected):
+            raise KeyRefusedError(
+                f"The board at {self.endpoint} has another key: give both sides the same file"
+            )
+        return self._receive(deadline, connect_timeout, "greet")
 
     @classmethod
     def open(cls, endpoint: Endpoint, *, timeout: float, connect_timeout: float | None = None) -> Self:
@@ -73,12 +111,11 @@ class SocketLink(Link):
         Raises:
             UnreachableError: Nothing listens there.
             HeldError: Another host holds the board.
+            KeyRefusedError: Host and board do not have the same key, or the certificate is not trusted.
             GreetingMismatchError: It has another protocol version, register map or BAR size.
             LinkError: It does not greet, or is not a board.
         """
-        link = cls(
-            endpoint, timeout=timeout, connect_timeout=timeout if connect_timeout is None else connect_timeout
-        )
+        link = cls._opened(endpoint, timeout, timeout if connect_timeout is None else connect_timeout)
         greeting = link.greeting
         for what, theirs, ours in (
             ("protocol version", greeting.protocol_version, framing.PROTOCOL_VERSION),
@@ -92,6 +129,17 @@ class SocketLink(Link):
                     "use a board and a host of the same version"
                 )
         return link
+
+    @classmethod
+    def _opened(cls, endpoint: Endpoint, timeout: float, connect_timeout: float) -> Self:
+        deadline = time.monotonic() + (_TLS_ENDS_S if endpoint.tls else 0.0)
+        while True:
+            try:
+                return cls(endpoint, timeout=timeout, connect_timeout=connect_timeout)
+            except HeldError:
+                if time.monotonic() >= deadline:
+                    raise
+                time.sleep(_RETRY_S)
 
     def __enter__(self) -> Self:
         return self

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import os
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from pcie_shim.board.misbehaviour import Misbehaviour
+from pcie_shim.credentials import Credentials, board_tls, read_key
+from pcie_shim.endpoint import Endpoint
 from services.commands import flags as options
 from services.errors import SettingsError
 from services.pipeline.board_processes import BoardProcesses, serve_one
@@ -40,13 +43,23 @@ def board(
     restarts: Annotated[
         int, typer.Option(min=0, help="Restarts of boards within 60 s before it gives up.")
     ] = RESTARTS,
+    key_file: options.KeyFile = None,
+    tls_cert: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Its certificate (PEM); then it serves tls:// instead of tcp://."),
+    ] = None,
+    tls_key: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="The certificate's private key (PEM).")
+    ] = None,
+    insecure: options.Insecure = False,
     misbehave: Annotated[
         str, typer.Option(help="For tests: one of the misbehaviours listed in docs/reference/boards.md.")
     ] = "",
 ) -> int:
     """Emulate boards of the mini-cluster."""
     end_with_parent()
-    run_directory = load_settings().run_directory
+    settings = load_settings(key_file=key_file)
+    run_directory = settings.run_directory
     if (listen is None) == (boards is None):
         raise SettingsError(
             "give either --listen ENDPOINT for one board, or --boards N --directory DIR for several"
@@ -56,14 +69,22 @@ def board(
             raise SettingsError("--misbehave belongs to a single board: start it with --listen ENDPOINT")
         if directory is None:
             raise SettingsError("--boards needs --directory DIR, a folder for the boards' sockets")
-        if not directory.is_dir():
-            raise SettingsError(f"--directory {directory} is not a folder; name one for the boards' sockets")
+        try:
+            directory.mkdir(mode=0o700, exist_ok=True)
+        except OSError as error:
+            raise SettingsError(
+                f"--directory {directory} is not a folder and can't be made ({error.strerror}); name one for the boards' sockets"
+            ) from None
+        if directory.stat().st_mode & 0o077:
+            raise SettingsError(
+                f"--directory {directory} can be entered by other users, who could replace the boards' sockets: run chmod 700 {directory}"
+            )
         BoardProcesses(directory, boards, restarts, run_directory).run()
     from machines.kernel import warm_up
 
     warm_up()
     check_signals()
-    endpoint = endpoint_from(listen or "", "--listen")
+    endpoint = _endpoint(listen or "", settings.key_file, tls_cert, tls_key, insecure=insecure)
 
     def on_ready() -> None:
         if PARENT_VARIABLE not in os.environ:  # a master watches its boards itself
@@ -74,6 +95,29 @@ def board(
     if ended_by:
         raise stopped_by(ended_by)
     return 0
+
+
+def _endpoint(
+    listen: str, key_file: Path | None, certificate: Path | None, key: Path | None, *, insecure: bool
+) -> Endpoint:
+    """Return where the board listens, with its credentials."""
+    endpoint = endpoint_from(listen, "--listen")
+    if not endpoint.host:
+        return endpoint
+    if (certificate is None) != (key is None) or (endpoint.tls and certificate is None):
+        raise SettingsError(
+            "TLS needs both the certificate and its key: give --tls-cert FILE and --tls-key FILE"
+        )
+    if key_file is None and not endpoint.is_loopback and not insecure:
+        raise SettingsError(
+            f"--listen {listen} lets everybody on that network use this board; give --key-file FILE with a key that its "
+            "hosts have too, or --insecure if that is meant"
+        )
+    credentials = Credentials(
+        key=read_key(key_file) if key_file is not None else b"",
+        tls=board_tls(certificate, key) if certificate is not None and key is not None else None,
+    )
+    return replace(endpoint, tls=credentials.tls is not None, credentials=credentials)
 
 
 def main() -> None:

@@ -29,6 +29,18 @@ Listen = Annotated[
         metavar="unix:PATH|tcp://HOST:PORT",
     ),
 ]
+Insecure = Annotated[
+    bool,
+    typer.Option(help="Say that an address which others reach, without protection, is meant."),
+]
+KeyFile = Annotated[
+    Path | None,
+    typer.Option(help="Key shared by boards over TCP and their hosts.", metavar="FILE"),
+]
+BoardCa = Annotated[
+    Path | None,
+    typer.Option(help="Certificates that sign those of boards over TLS (the system's).", metavar="FILE"),
+]
 RosVersion = Annotated[str | None, typer.Option(help="How stamps and types are written.", metavar="auto|1|2")]
 Queue = Annotated[
     str | None,

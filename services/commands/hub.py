@@ -43,7 +43,7 @@ def hub(
         list[str] | None,
         typer.Option(
             metavar="ORIGIN",
-            help="Web page that may connect, such as https://robot.example, besides this machine's; repeatable.",
+            help="Web page that may connect, such as https://robot.example, besides this machine's ('null': pages opened from a file); repeatable.",
         ),
     ] = None,
     message_bytes: Annotated[
@@ -95,7 +95,7 @@ def _access_policy(
             "TLS needs both the certificate and its key: give --tls-cert FILE and --tls-key FILE"
         )
     for page in origins:
-        if not page.startswith(("http://", "https://")) or page.count("/") != 2:
+        if page != "null" and (not page.startswith(("http://", "https://")) or page.count("/") != 2):
             raise SettingsError(
                 f"--origin {shown(page)} is not a web page's origin: expected for example https://robot.example:8000"
             )

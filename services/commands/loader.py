@@ -10,7 +10,7 @@ import typer
 from pcie_shim.host.loader import program
 from services.commands import flags as options
 from services.settings import load_settings
-from services.sockets.serving import endpoint_from
+from services.sockets.serving import board_endpoint
 from services.supervision.parent import end_with_parent
 from terminal.command_line import CommandLine
 from terminal.output import say
@@ -27,10 +27,12 @@ def loader(
     image: Annotated[Path, typer.Argument(help="Programming file (boards/*.bm of a deployment).")],
     endpoint: Annotated[str, typer.Argument(help="The board's endpoint.", metavar="ENDPOINT")],
     peer_timeout: options.PeerTimeout = None,
+    key_file: options.KeyFile = None,
+    board_ca: options.BoardCa = None,
 ) -> int:
     """Program a board with an image that `toolchain build` wrote."""
     end_with_parent()
-    settings = load_settings(peer_timeout=peer_timeout)
-    image_hash = program(endpoint_from(endpoint, "ENDPOINT"), image, timeout=settings.peer_timeout)
+    settings = load_settings(peer_timeout=peer_timeout, key_file=key_file, board_ca=board_ca)
+    image_hash = program(board_endpoint(endpoint, "ENDPOINT", settings), image, timeout=settings.peer_timeout)
     say(f"{endpoint} holds image {image_hash[:16]} now")
     return 0

@@ -55,6 +55,8 @@ def master(
     peer_timeout: options.PeerTimeout = None,
     board_timeout: options.BoardTimeout = None,
     stop_timeout: options.StopTimeout = None,
+    key_file: options.KeyFile = None,
+    board_ca: options.BoardCa = None,
     fused: Annotated[
         bool | None,
         typer.Option(
@@ -92,6 +94,8 @@ def master(
         peer_timeout=peer_timeout,
         board_timeout=board_timeout,
         stop_timeout=stop_timeout,
+        key_file=key_file,
+        board_ca=board_ca,
         fused=fused,
         log_level=log_level,
         **connected,

@@ -12,7 +12,7 @@ from services.pipeline.pcie_app import ROLE, PcieApp
 from services.pipes.lines import require_pipe
 from services.pipes.pcie_app import compute_lines
 from services.settings import load_settings
-from services.sockets.serving import board_endpoints, deployment_for, endpoint_from
+from services.sockets.serving import board_endpoints, deployment_for, own_endpoint
 from services.sockets.status import status_thread
 from services.supervision.parent import end_with_parent
 from terminal.command_line import CommandLine
@@ -40,6 +40,9 @@ def pcie_app(
             help="Program boards that hold another image, instead of refusing them.",
         ),
     ] = False,
+    key_file: options.KeyFile = None,
+    board_ca: options.BoardCa = None,
+    insecure: options.Insecure = False,
     log_level: options.LogLevel = None,
 ) -> int:
     """Drive the boards of a mini-cluster."""
@@ -50,12 +53,14 @@ def pcie_app(
         stop=stop,
         peer_timeout=peer_timeout,
         board_timeout=board_timeout,
+        key_file=key_file,
+        board_ca=board_ca,
         log_level=log_level,
     )
     loaded = deployment_for(settings, images=True)
     deployed = DeployedBoards(settings, loaded, board_endpoints(settings, loaded), reprogram=reprogram)
     if listen is not None:
-        pcie = PcieApp(deployed, endpoint_from(listen, "--listen"), settings.log_level)
+        pcie = PcieApp(deployed, own_endpoint(listen, insecure=insecure), settings.log_level)
         with status_thread(settings.run_directory, ROLE, pcie.status):
             return pcie.serve()
     require_pipe(ROLE, "readings")

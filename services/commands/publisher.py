@@ -12,7 +12,7 @@ from services.pipeline.result_topics import ROLE
 from services.pipes.lines import require_pipe
 from services.pipes.publisher import publish_lines
 from services.settings import load_settings
-from services.sockets.serving import deployment_for, endpoint_from, listening
+from services.sockets.serving import deployment_for, listening, own_endpoint
 from services.supervision.parent import end_with_parent
 from terminal.command_line import CommandLine
 from terminal.signals import run_async
@@ -35,6 +35,7 @@ def publisher(
     seen_timeout: Annotated[
         float | None, typer.Option(help="Seconds until a result is seen on the wire (2).")
     ] = None,
+    insecure: options.Insecure = False,
     log_level: options.LogLevel = None,
 ) -> int:
     """Publish posteriors over rosbridge."""
@@ -49,7 +50,7 @@ def publisher(
     )
     loaded = deployment_for(settings)
     if listen is not None:
-        link = listening(endpoint_from(listen, "--listen"), ROLE, loaded)
+        link = listening(own_endpoint(listen, insecure=insecure), ROLE, loaded)
         return run_async(Publisher(settings, loaded, link).run())
     require_pipe(ROLE, "results")
     return run_async(publish_lines(settings, loaded))

@@ -12,7 +12,7 @@ from services.errors import SettingsError
 from services.pipeline.subscriber import ROLE, Subscriber
 from services.pipes.subscriber import print_addresses, print_variables
 from services.settings import load_settings
-from services.sockets.serving import deployment_for, endpoint_from, listening
+from services.sockets.serving import deployment_for, listening, own_endpoint
 from services.supervision.parent import end_with_parent
 from terminal.command_line import CommandLine
 from terminal.output import say
@@ -43,6 +43,7 @@ def subscriber(
     ros_version: options.RosVersion = None,
     connect_timeout: options.ConnectTimeout = None,
     first_data_timeout: options.FirstDataTimeout = None,
+    insecure: options.Insecure = False,
     log_level: options.LogLevel = None,
 ) -> int:
     """Take variables out of a ROS topic over rosbridge."""
@@ -63,7 +64,7 @@ def subscriber(
         )
     if listen is not None:
         loaded = deployment_for(settings)
-        link = listening(endpoint_from(listen, "--listen"), ROLE, loaded)
+        link = listening(own_endpoint(listen, insecure=insecure), ROLE, loaded)
         return run_async(Subscriber(settings, loaded, link).run())
     if settings.deployment is not None:
         loaded = deployment_for(settings)

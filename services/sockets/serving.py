@@ -5,8 +5,10 @@ from __future__ import annotations
 import asyncio
 import socket
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, Protocol, Self
 
+from pcie_shim.credentials import Credentials, host_tls, read_key
 from pcie_shim.endpoint import Endpoint, listen, parse_endpoint, remove_listener
 from pcie_shim.errors import PcieShimError
 from services.errors import OtherPeerError, OutdatedError, SettingsError
@@ -239,4 +241,36 @@ def board_endpoints(settings: Settings, deployment: Deployment) -> list[Endpoint
             "the deployment names no endpoints of boards; give --boards ENDPOINT,... (start some with: board --boards 4 --directory DIR)"
         )
     where = "--boards" if settings.boards else f"{deployment.path}, [[board]] endpoint"
-    return [endpoint_from(text, where) for text in texts]
+    return [board_endpoint(text, where, settings) for text in texts]
+
+
+def board_endpoint(text: str, where: str, settings: Settings) -> Endpoint:
+    """Return the endpoint of a board, with the credentials of the settings if it is on TCP.
+
+    Raises:
+        SettingsError: It is not an endpoint.
+        CredentialsError: The key or the certificates cannot be used.
+    """
+    endpoint = endpoint_from(text, where)
+    if not endpoint.host:
+        return endpoint
+    credentials = Credentials(
+        key=read_key(settings.key_file) if settings.key_file is not None else b"",
+        tls=host_tls(settings.board_ca) if settings.board_ca is not None else None,
+    )
+    return replace(endpoint, credentials=credentials)
+
+
+def own_endpoint(text: str, *, insecure: bool) -> Endpoint:
+    """Return the endpoint at which a service serves its master.
+
+    Raises:
+        SettingsError: It is not an endpoint, or others on the network could reach it.
+    """
+    endpoint = endpoint_from(text, "--listen")
+    if endpoint.host and not insecure and not endpoint.is_loopback:
+        raise SettingsError(
+            f"--listen {text} lets everybody on that network order frames and read results; "
+            "use unix:PATH or a loopback address, or give --insecure if that is meant"
+        )
+    return endpoint

@@ -169,7 +169,7 @@ def test_boards_are_those_of_the_deployment():
     default = filled(SERVICES["pcie-app"]["environment"]["BM_BOARDS"])
     assert default == ",".join(f"tcp://{board}:7000" for board in BOARDS)
     for index, board in enumerate(BOARDS):
-        assert SERVICES[board]["command"] == f"board --listen tcp://0.0.0.0:7000 --index {index}"
+        assert SERVICES[board]["command"] == f"board --listen tcp://0.0.0.0:7000 --insecure --index {index}"
 
 
 def test_another_deployment_is_mounted_where_it_is_looked_for():

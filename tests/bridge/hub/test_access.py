@@ -1,5 +1,6 @@
 """Who may come in: tokens, TLS, and what is said to who may not."""
 
+import asyncio
 import ssl
 import subprocess
 from pathlib import Path
@@ -70,6 +71,34 @@ async def test_a_browsers_token_is_not_sent_back(tokens: tuple[str, ...], offere
         assert socket.response is not None
         assert TOKEN not in str(socket.response.headers)
         await Client(socket).sync()
+
+
+@pytest.mark.parametrize(
+    ("host", "origin", "status"),
+    [
+        ("localhost:9090", None, 101),
+        ("127.0.0.1", "http://localhost:8000", 101),
+        ("[::1]:9090", None, 101),
+        ("robot.example:8000", "https://robot.example:8000", 101),
+        ("localhost", "null", 101),
+        ("attacker.example:9090", None, 403),
+        ("attacker.example", "http://attacker.example", 403),
+        ("localhost.attacker.example", None, 403),
+        ("localhost", "http://attacker.example", 403),
+    ],
+)
+async def test_a_page_needs_a_known_origin_and_this_machines_name(
+    host: str, origin: str | None, status: int
+) -> None:
+    access = AccessPolicy(origins=("https://robot.example:8000", "null"))
+    async with running_hub(access=access) as port:
+        reader, writer = await asyncio.open_connection("127.0.0.1", port)
+        lines = ["GET / HTTP/1.1", f"Host: {host}", "Connection: Upgrade", "Upgrade: websocket"]
+        lines += ["Sec-WebSocket-Version: 13", "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ=="]
+        lines += [f"Origin: {origin}"] if origin else []
+        writer.write("\r\n".join([*lines, "", ""]).encode())
+        assert int((await reader.readline()).split()[1]) == status
+        writer.close()
 
 
 async def test_tokens_are_in_no_log_and_no_answer(caplog: pytest.LogCaptureFixture) -> None:

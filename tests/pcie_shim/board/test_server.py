@@ -184,7 +184,7 @@ def test_a_second_host_is_refused_and_the_first_goes_on(start_board: StartBoard)
 
 def test_silent_connections_are_bounded_and_keep_nobody_out(start_board: StartBoard) -> None:
     board = start_board()
-    silent = [open_link(board) for _ in range(board_module.MAX_SILENT_HOSTS + 1)]
+    silent = [open_link(board) for _ in range(board_module.MAX_SILENT + 1)]
     with pytest.raises(LinkClosedError):
         silent[0].read32(rm.ID)
     with open_link(board) as link:
@@ -211,7 +211,7 @@ def test_a_host_that_vanishes_leaves_the_board_well(start_board: StartBoard) -> 
 def test_a_host_that_has_just_left_does_not_hold_the_board(folder: Path) -> None:
     endpoint, port = (parse_endpoint(f"unix:{folder}/{name}.sock") for name in ("registers", "programming"))
     stop = board_module.StopSignal()
-    server = board_module._Server(listen(endpoint), listen(port), 0, stop, None)
+    server = board_module._Server(endpoint, listen(endpoint), listen(port), 0, stop, None)
     for where, accept in ((endpoint, server._accept_host), (port, server._accept_loader)):
         first = connect(where, timeout=PATIENCE)
         accept()
@@ -223,14 +223,13 @@ def test_a_host_that_has_just_left_does_not_hold_the_board(folder: Path) -> None
             decoder = framing.FrameDecoder()
             decoder.received(second.recv_into(decoder.room()))
             assert decoder.next_frame().operation == framing.GREET
-    server._drop_loader()
     stop.close()
 
 
 def test_a_host_whose_machine_is_gone_does_not_hold_the_board_for_ever() -> None:
     endpoint = parse_endpoint(tcp_endpoint())
     with listen(endpoint) as server, connect(endpoint, timeout=PATIENCE):
-        connection = board_module._Connection(server.accept()[0]).socket
+        connection = board_module._Connection(server.accept()[0], endpoint, b"").socket
         assert connection.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE)
         assert connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE) == board_module.KEEPALIVE_S
         assert connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
@@ -384,6 +383,7 @@ def test_a_running_board_is_not_programmed_even_by_its_host(start_board: StartBo
 def test_one_loader_at_a_time(start_board: StartBoard) -> None:
     board = start_board()
     first = SocketLink.open(parse_endpoint(board.endpoint).programming, timeout=PATIENCE)
+    first.read32(rm.ID)
     with pytest.raises(HeldError):
         program(board.endpoint, image(MACHINE))
     first.close()
@@ -397,6 +397,7 @@ def test_a_loader_that_says_nothing_loses_its_turn(
     monkeypatch.setattr(board_module, "PROGRAMMING_SILENCE_S", 3.0)
     board = start_board()
     silent = SocketLink.open(parse_endpoint(board.endpoint).programming, timeout=PATIENCE)
+    silent.read32(rm.ID)
     with pytest.raises(LinkClosedError):
         wait_done(silent, 1)
     program(board.endpoint, image(MACHINE))

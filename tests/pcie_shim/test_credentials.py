@@ -1,0 +1,149 @@
+"""Boards over TCP: a shared key, TLS, and connections that do neither."""
+
+import socket
+import subprocess
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from pcie_shim import framing
+from pcie_shim import register_map as rm
+from pcie_shim.credentials import Credentials, board_tls, host_tls, read_key
+from pcie_shim.endpoint import Endpoint, parse_endpoint
+from pcie_shim.errors import CredentialsError, KeyRefusedError, LinkClosedError, LinkError
+from pcie_shim.host.loader import program
+from pcie_shim.host.socket_link import SocketLink
+from tests.pcie_shim.boards import image, machine, tcp_endpoint
+
+KEY = Credentials(key=b"sixteen-letters-at-least")
+OTHER = Credentials(key=b"sixteen-letters-and-others")
+PATIENCE = 60.0
+
+
+@pytest.fixture(scope="module")
+def certificate(tmp_path_factory):
+    """A certificate for 127.0.0.1 and its key."""
+    folder = tmp_path_factory.mktemp("tls")
+    files = folder / "cert.pem", folder / "key.pem"
+    command = "openssl req -x509 -newkey rsa:2048 -nodes -days 1 -subj /CN=board -addext subjectAltName=IP:127.0.0.1"
+    subprocess.run(
+        [*command.split(), "-out", files[0], "-keyout", files[1]],
+        check=True,
+        capture_output=True,
+        timeout=240,
+    )
+    return files
+
+
+def with_credentials(text: str, credentials: Credentials) -> Endpoint:
+    return replace(parse_endpoint(text), credentials=credentials)
+
+
+def identity(endpoint: Endpoint) -> int:
+    with SocketLink.open(endpoint, timeout=PATIENCE) as link:
+        return link.read32(rm.ID)
+
+
+def test_a_host_with_the_key_uses_and_programs_the_board(start_board):
+    endpoint = with_credentials(tcp_endpoint(), KEY)
+    start_board(endpoint)
+    expected = image(machine(1))
+    assert program(endpoint, expected, timeout=PATIENCE) == expected.image_hash
+    with SocketLink.open(endpoint, timeout=PATIENCE) as link:
+        assert link.read32(rm.ID) == rm.ID_VALUE
+        assert link.greeting.image_hash == expected.image_hash
+
+
+@pytest.mark.parametrize(("board", "host"), [(KEY, OTHER), (KEY, Credentials()), (Credentials(), KEY)])
+def test_without_the_same_key_there_is_no_link(start_board, board, host):
+    text = tcp_endpoint()
+    start_board(with_credentials(text, board))
+    with pytest.raises(KeyRefusedError):
+        identity(with_credentials(text, host))
+    with pytest.raises(KeyRefusedError):
+        program(with_credentials(text, host), image(machine(1)), timeout=PATIENCE)
+    assert identity(with_credentials(text, board)) == rm.ID_VALUE
+
+
+def test_a_proof_does_not_fit_another_challenge(start_board):
+    """A recorded answer is worth nothing, and a request without a proof ends the connection."""
+    endpoint = with_credentials(tcp_endpoint(), KEY)
+    start_board(endpoint)
+    answers = []
+
+    class Recording(SocketLink):
+        def request(self, operation, flags, address, count, payload=b""):
+            answers.append(framing.encode(operation, flags, 1, address, count, payload))
+            return super().request(operation, flags, address, count, payload)
+
+    with Recording.open(endpoint, timeout=PATIENCE):
+        pass
+    for data in (answers[0], framing.encode(framing.READ, 0, 1, rm.ID, 1)):
+        for port in (endpoint.port, endpoint.programming.port):
+            with socket.create_connection((endpoint.host, port), timeout=PATIENCE) as connection:
+                connection.sendall(data)
+                received = bytearray()
+                while piece := connection.recv(4096):
+                    received += piece
+            assert bytes(answers[0][20:]) not in received
+            assert received[3] in {framing.AUTHENTICATE, 0}
+            assert b"ROSBAYES" not in received  # the greeting
+
+
+def test_a_link_over_tls(start_board, certificate):
+    endpoint = with_credentials(tcp_endpoint().replace("tcp", "tls"), KEY)
+    start_board(replace(endpoint, credentials=replace(KEY, tls=board_tls(*certificate))))
+    host = replace(endpoint, credentials=replace(KEY, tls=host_tls(certificate[0])))
+    expected = image(machine(1, lines=600))
+    assert program(host, expected, timeout=PATIENCE) == expected.image_hash
+    for _ in range(20):  # more than the board keeps of silent ones
+        assert identity(host) == rm.ID_VALUE
+    with pytest.raises(KeyRefusedError):
+        identity(endpoint)  # the system does not trust this certificate
+    with pytest.raises(LinkError):
+        SocketLink.open(replace(host, tls=False), timeout=2)
+
+
+def test_a_silent_loader_keeps_nobody_from_programming(start_board):
+    board = start_board(tcp_endpoint())
+    endpoint = parse_endpoint(board.endpoint)
+    silent = [SocketLink.open(endpoint.programming, timeout=PATIENCE) for _ in range(20)]
+    expected = image(machine(1))
+    assert program(endpoint, expected, timeout=PATIENCE) == expected.image_hash
+    with pytest.raises(LinkClosedError):
+        silent[0].read32(rm.ID)
+    for each in silent:
+        each.close()
+
+
+@pytest.mark.parametrize("content", [b"", b"short", b"has spaces in it, sixteen", b"x" * 2000, None])
+def test_a_file_that_is_not_a_key(tmp_path: Path, content):
+    path = tmp_path / "key"
+    if content is not None:
+        path.write_bytes(content)
+        path.chmod(0o600)
+    with pytest.raises(CredentialsError, match=str(path)):
+        read_key(path)
+
+
+def test_a_key_is_private(tmp_path: Path):
+    path = tmp_path / "key"
+    path.write_bytes(KEY.key + b"\n")
+    path.chmod(0o640)
+    with pytest.raises(CredentialsError, match="chmod"):
+        read_key(path)
+    path.chmod(0o600)
+    assert read_key(path) == KEY.key
+    assert "letters" not in repr(with_credentials("tcp://localhost:7", KEY))
+
+
+def test_files_that_are_not_certificates(tmp_path: Path, certificate):
+    nothing = tmp_path / "nothing"
+    for make in (
+        lambda: board_tls(nothing, nothing),
+        lambda: board_tls(*[certificate[1]] * 2),
+        lambda: host_tls(nothing),
+    ):
+        with pytest.raises(CredentialsError):
+            make()
