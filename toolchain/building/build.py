@@ -13,8 +13,7 @@ from pathlib import Path
 
 from pcie_shim.programming_file import Image
 from toolchain.building.board_layout import board_layout
-from toolchain.building.describe import describe
-from toolchain.building.images import board_images
+from toolchain.building.images import board_images, describe
 from toolchain.building.machine import machine_parameters, whole_machine
 from toolchain.building.options import BuildOptions, check_options
 from toolchain.building.quantise import Quantised, quantise

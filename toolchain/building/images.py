@@ -1,19 +1,23 @@
-"""The images of a model's boards: what each board is programmed with."""
+"""The images of the boards that a model is built for, and the deployment that names them."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+
+from pydantic import ValidationError
 
 from machines.bm1 import BM1Machine
-from machines.parameters import SensorMode
+from machines.parameters import BM1Parameters, SensorMode
 from pcie_shim.programming_file import Image, Partition, tool_version
+from toolchain.building.board_layout import BoardLayout
+from toolchain.building.machine import MACHINE_KEYS
+from toolchain.building.options import BuildOptions, refused_option
 from toolchain.building.partition import split
-
-if TYPE_CHECKING:
-    from toolchain.building.board_layout import BoardLayout
-    from toolchain.models.model import Model
+from toolchain.deployment import Board, Deployment, MachineSection, Output, Variable
+from toolchain.deployment.deployment_hash import with_hash
+from toolchain.models.model import Model
 
 
 def model_hash(model: Model, machine: BM1Machine) -> str:
@@ -52,4 +56,67 @@ def board_images(
             tool_version=tool_version(),
         )
         for board, (part, block) in enumerate(zip(split(machine, count), layout.blocks, strict=True))
+    )
+
+
+def describe(
+    model: Model,
+    parameters: BM1Parameters,
+    layout: BoardLayout,
+    images: Sequence[Image],
+    options: BuildOptions,
+) -> Deployment:
+    """Return the deployment of these images, with its hash; a BuildError if an option does not fit the machine."""
+    target = parameters.target_count_max if options.target_count is None else options.target_count
+    try:
+        deployment = Deployment(
+            name=model.name,
+            queue=options.queue,
+            tolerance_s=options.tolerance_s,
+            sources=options.all_sources,
+            variables=_variables(model, options),
+            searched=model.searched,
+            machine=MachineSection(
+                lines=model.lines,
+                interface=layout.interface_text,
+                scale=options.scaling,
+                target_count=target,
+                max_cycles=options.max_cycles,
+                stop=options.stop,
+                **{key: getattr(parameters, key) for key in MACHINE_KEYS},
+            ),
+            prior=options.written_prior,
+            boards=tuple(
+                Board(
+                    image=f"boards/board{index}.bm",
+                    image_hash=image.image_hash,
+                    line_offset=block.offset,
+                    lines=block.lines,
+                )
+                for index, (image, block) in enumerate(zip(images, layout.blocks, strict=True))
+            ),
+            outputs=(Output(topic=options.output),),
+        )
+    except ValidationError as reason:
+        raise refused_option(reason) from None
+    return with_hash(deployment)
+
+
+def _variables(model: Model, options: BuildOptions) -> tuple[Variable, ...]:
+    """Return the known variables; where cells are given codes, a sensor's values are the codes."""
+    variables = model.variables if options.sources is None else options.sources.place(model.variables)
+    if options.sensor_mode is not SensorMode.THRESHOLD:
+        return tuple(variables)
+    return tuple(
+        Variable(
+            name=variable.name,
+            source=variable.source,
+            path=variable.path,
+            bits=options.prob_bits,
+            values=2**options.prob_bits - 1,
+            on_missing=variable.on_missing,
+        )
+        if variable.kind == "sensor"
+        else variable
+        for variable in variables
     )

@@ -1,12 +1,16 @@
 """Flags that several subcommands share, as dataclasses that a command takes whole (thesis 3.4)."""
 
-from dataclasses import dataclass
+import functools
+import inspect
+from collections.abc import Callable
+from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
-from typing import Annotated, TypeAlias
+from typing import Annotated, Any, TypeAlias, get_type_hints
 
 import typer
 
 from machines.parameters import PriorMode, RngKind, RngReset, SensorMode
+from terminal.command_line import CommandLine
 from toolchain.building.options import OnMissing
 from toolchain.deployment import Scale, Stop
 
@@ -164,3 +168,45 @@ class ReadingFlags:
     reading: ReadingColumns = None
     seed: Annotated[int, typer.Option(help="Of the readings that are drawn.", min=0)] = 1
     device: Annotated[str, typer.Option(help="What the boards have: proce-v-d8.")] = "proce-v-d8"
+
+
+def add_commands(app: CommandLine, *commands: Callable[..., None]) -> None:
+    """Add functions to a command line, each under its own name."""
+    for command in commands:
+        app.command()(expand_flags(command))
+
+
+def expand_flags(command: Callable[..., None]) -> Callable[..., None]:
+    """Give a command one parameter for each field of the dataclasses that it takes.
+
+    Typer reads a command's flags from its signature, so the signature is what is expanded. Every field of such a
+    dataclass has a default.
+    """
+    parameters: list[inspect.Parameter] = []
+    groups: dict[str, type[Any]] = {}
+    for parameter in inspect.signature(command, eval_str=True).parameters.values():
+        kind = parameter.annotation
+        if not is_dataclass(kind):
+            parameters.append(parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY))
+            continue
+        groups[parameter.name] = kind  # type: ignore[assignment]  # the class, not an instance of it
+        hints = get_type_hints(kind, include_extras=True)
+        parameters += [
+            inspect.Parameter(
+                field.name,
+                inspect.Parameter.KEYWORD_ONLY,
+                default=field.default,
+                annotation=hints[field.name],
+            )
+            for field in fields(kind)
+        ]
+
+    @functools.wraps(command)
+    def run(**values: Any) -> None:
+        for name, kind in groups.items():
+            values[name] = kind(**{field.name: values.pop(field.name) for field in fields(kind)})
+        command(**values)
+
+    run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]  # inspect.signature() reads it
+    run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    return run

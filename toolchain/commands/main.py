@@ -8,9 +8,9 @@ from toolchain.commands.build import build
 from toolchain.commands.check import check
 from toolchain.commands.explore import explore
 from toolchain.commands.fit import fit
+from toolchain.commands.flags import add_commands
 from toolchain.commands.inspect import inspect
 from toolchain.commands.new import new
-from toolchain.commands.registration import add_commands
 
 app = CommandLine(no_args_is_help=True)
 app.add_typer(regenerate.app, name="regenerate")

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Annotated, TypeAlias
 import typer
 
 from terminal.command_line import CommandLine
-from toolchain.commands.flags import ModelFlags, TargetCount
-from toolchain.commands.registration import add_commands
+from toolchain.commands.flags import ModelFlags, TargetCount, add_commands
 from toolchain.deployment import FILE_NAME, Queue, Stop
 
 if TYPE_CHECKING:
@@ -108,8 +107,7 @@ def deployment(
     For example `toolchain regenerate deployment build/boat --order D2,D1,D3,B1,B2,B3` where the first two readings were
     mixed up. No image, memory or board is touched. Flags that are left out change nothing.
     """
-    from toolchain.building.edits import DeploymentEdits
-    from toolchain.building.regenerate import regenerate_deployment
+    from toolchain.building.regenerate import DeploymentEdits, regenerate_deployment
     from toolchain.flag_values import key_values, names_in
 
     edits = DeploymentEdits(

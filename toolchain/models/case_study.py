@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import importlib.util
 import inspect
 import sys
@@ -15,6 +14,7 @@ from types import ModuleType, UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from toolchain.errors import ModelError, ToolchainError
+from toolchain.files.toml_file import nearest_name
 from toolchain.models.joint import Question
 from toolchain.models.model import Model
 
@@ -148,9 +148,7 @@ def _arguments(path: Path, function: Callable[..., object], settings: Mapping[st
 def _unknown(key: str, known: list[str]) -> str:
     if not known:
         return f"the model has no parameters, so --set {key} means nothing"
-    close = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
-    nearest = f"did you mean '{close[0]}'?" if close else f"expected one of {', '.join(known)}"
-    return f"the model has no parameter '{key}'; {nearest}"
+    return f"the model has no parameter '{key}'; {nearest_name(key, known)}"
 
 
 def _value(key: str, text: str, wanted: Any) -> object:

@@ -18,8 +18,7 @@ from services.sockets.records import Hello, NotReloaded, Prepare, Prepared, Swit
 from services.supervision.parent import DIRECTORY_VARIABLE
 from services.supervision.private_directory import PrivateDirectory
 from terminal.errors import ExitCode, StoppedError
-from toolchain.building.edits import DeploymentEdits
-from toolchain.building.regenerate import regenerate_deployment
+from toolchain.building.regenerate import DeploymentEdits, regenerate_deployment
 from toolchain.deployment import load_deployment
 
 

@@ -11,8 +11,7 @@ from services.sockets import serving
 from services.sockets.local_socket import RecordProtocol, open_connection, own_hello
 from services.sockets.records import Hello, Notice, Trouble
 from services.sockets.serving import MasterLink, outdated
-from toolchain.building.edits import DeploymentEdits
-from toolchain.building.regenerate import regenerate_deployment
+from toolchain.building.regenerate import DeploymentEdits, regenerate_deployment
 from toolchain.deployment import load_deployment
 
 PATIENCE = 120

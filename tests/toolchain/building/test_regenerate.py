@@ -5,7 +5,7 @@ import shutil
 import pytest
 
 from tests.toolchain.running import TARGET, contents, toolchain
-from toolchain.building.edits import DeploymentEdits, edited
+from toolchain.building.regenerate import DeploymentEdits, edited
 from toolchain.deployment import load_deployment
 from toolchain.errors import DamagedDeploymentError
 

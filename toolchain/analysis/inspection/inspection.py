@@ -26,6 +26,7 @@ from toolchain.analysis.accuracy.readings import (
 from toolchain.analysis.resources.energy import Energy, energy
 from toolchain.analysis.resources.estimate import Estimate, Pcie, estimate
 from toolchain.analysis.resources.table_memories import Tables
+from toolchain.building.agreement import read_images
 from toolchain.building.quantise import ColumnLoss, quantise
 from toolchain.building.report import REPORT_NAME
 from toolchain.deployment import Deployment, Scale
@@ -156,12 +157,9 @@ def inspect_deployment(
 def machines_of(deployment: Deployment) -> tuple[BM1Machine, ...]:
     """Return the boards' machines from a deployment's programming files."""
     from pcie_shim.errors import PcieShimError
-    from pcie_shim.programming_file import read_image
 
     try:
-        return tuple(
-            read_image(deployment.image_path(board)).machine for board in range(len(deployment.boards))
-        )
+        return tuple(image.machine for image in read_images(deployment))
     except PcieShimError as reason:
         raise DeploymentError(str(reason)) from reason
 
