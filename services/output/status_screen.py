@@ -64,13 +64,10 @@ def _verdict(stack: StackStatus) -> Iterator[RenderableType]:
 
 
 def _processes(stack: StackStatus) -> Table:
-    from rich.table import Table
     from rich.text import Text
 
     restarts = {peer.name: peer.restarts for process in stack.processes for peer in process.peers}
-    table = Table(box=None, pad_edge=False)
-    table.add_column("process")
-    table.add_column("ready")
+    table = _table("process", "ready")
     for heading in ("pid", "up", "restarts", "received", "completed", "per s"):
         table.add_column(heading, justify="right", no_wrap=True)
     table.add_column("last frame", no_wrap=True)
@@ -93,12 +90,9 @@ def _processes(stack: StackStatus) -> Table:
 
 
 def _connections(stack: StackStatus) -> Table:
-    from rich.table import Table
     from rich.text import Text
 
-    table = Table(box=None, pad_edge=False)
-    for heading in ("rosbridge of", "server", "state", "reconnections"):
-        table.add_column(heading)
+    table = _table("rosbridge of", "server", "state", "reconnections")
     for process in stack.processes:
         for connection in process.connections:
             table.add_row(
@@ -111,12 +105,9 @@ def _connections(stack: StackStatus) -> Table:
 
 
 def _boards(boards: list[BoardStatus]) -> Table:
-    from rich.table import Table
     from rich.text import Text
 
-    table = Table(box=None, pad_edge=False)
-    for heading in ("board", "state", "image", "restarts", "last cycles", "endpoint"):
-        table.add_column(heading)
+    table = _table("board", "state", "image", "restarts", "last cycles", "endpoint")
     for board in boards:
         table.add_row(
             str(board.index),
@@ -126,6 +117,15 @@ def _boards(boards: list[BoardStatus]) -> Table:
             "" if board.last_cycles is None else str(board.last_cycles),
             Text(plain(board.endpoint)),
         )
+    return table
+
+
+def _table(*headings: str) -> Table:
+    from rich.table import Table
+
+    table = Table(box=None, pad_edge=False)
+    for heading in headings:
+        table.add_column(heading)
     return table
 
 

@@ -19,6 +19,7 @@ from bridge.names import absolute, ros2_type, same_type
 
 _CANCEL_ALL: Final = "/_action/cancel_goal"
 """ROS 2's service that cancels all goals of an action, as roslibjs calls it."""
+_RESULT: Final = ("action_result", "action")
 
 
 @dataclass(eq=False, slots=True)
@@ -133,7 +134,7 @@ class Actions:
             raise RefusedError(f"the feedback of {goal.action} must be a JSON object")
         if not goal.wants_feedback:
             return
-        payload = _operation("action_feedback", goal.caller, values=values)
+        payload = goal.caller.operation("action_feedback", "action", values=values)
         self._dispatcher.checked(payload, f"the feedback of {goal.action}")
         self._dispatcher.offer(goal.caller.client, goal.feedback, payload, now)
 
@@ -152,9 +153,7 @@ class Actions:
         elif not isinstance(values, dict | None):
             self._fail(goal.caller, f"{goal.action} ended with values that are not a JSON object")
         else:
-            payload = _operation(
-                "action_result", goal.caller, values=values or {}, status=status, result=True
-            )
+            payload = goal.caller.operation(*_RESULT, values=values or {}, status=status, result=True)
             try:
                 goal.caller.answer(self._dispatcher, payload)
             except RefusedError as error:
@@ -179,12 +178,5 @@ class Actions:
     def _fail(self, caller: Caller, reason: str, status: int = GoalStatus.ABORTED) -> None:
         # A character can take six bytes as JSON, and a failure must always get through.
         reason = reason[: self._limits.message_bytes // 8]
-        payload = _operation("action_result", caller, values=reason, status=status, result=False)
+        payload = caller.operation(*_RESULT, values=reason, status=status, result=False)
         self._dispatcher.send(caller.client, payload)
-
-
-def _operation(op: str, caller: Caller, **fields: object) -> bytes:
-    operation: dict[str, object] = {"op": op, "action": caller.name, **fields}
-    if caller.id is not None:
-        operation["id"] = caller.id
-    return orjson.dumps(operation)

@@ -21,6 +21,7 @@ from bridge.names import absolute
 
 _ANSWERED: Final = 64
 """Deadlines of answered calls to keep in the queue, beyond as many as there are calls."""
+_RESPONSE: Final = ("service_response", "service")
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,16 +162,10 @@ class Calls:
         return call
 
     def _answer(self, caller: Caller, values: dict[str, Any]) -> None:
-        caller.answer(self._dispatcher, _response(caller, values, result=True))
+        caller.answer(self._dispatcher, caller.operation(*_RESPONSE, values=values, result=True))
 
     def _fail(self, caller: Caller, reason: str) -> None:
         # A character can take six bytes as JSON, and a failure must always get through.
         reason = reason[: self._limits.message_bytes // 8]
-        self._dispatcher.send(caller.client, _response(caller, reason, result=False))
-
-
-def _response(caller: Caller, values: object, *, result: bool) -> bytes:
-    answer = {"op": "service_response", "service": caller.name, "values": values, "result": result}
-    if caller.id is not None:
-        answer["id"] = caller.id
-    return orjson.dumps(answer)
+        payload = caller.operation(*_RESPONSE, values=reason, result=False)
+        self._dispatcher.send(caller.client, payload)

@@ -5,6 +5,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Self
 
+import orjson
+
 from bridge.hub.delivery.dispatcher import Dispatcher, fragment_size_of
 from bridge.hub.delivery.encodings import Compression, compression_of
 from bridge.hub.errors import RefusedError
@@ -35,6 +37,11 @@ class Caller:
             fragment_size_of(number(operation, "fragment_size")),
             compression_of(operation.get("compression")) is Compression.PNG,
         )
+
+    def operation(self, op: str, kind: str, **fields: object) -> bytes:
+        """Return an operation for this client about the `kind` that it named."""
+        identity = {} if self.id is None else {"id": self.id}
+        return orjson.dumps({"op": op, kind: self.name, **fields, **identity})
 
     def answer(self, dispatcher: Dispatcher, payload: bytes) -> None:
         """Send an answer as requested; a RefusedError if it is too large."""

@@ -187,21 +187,21 @@ class Rosapi:
             "services": _of_type((self._own_types() | services).items(), type_name, self.service_type_name)
         }
 
-    def _service_node(self, name: str) -> Values:
+    def _server(self, name: str) -> tuple[str, str]:
+        """Return the node that serves a service and its host, or empty text."""
         service = self._graph.services.get(absolute(name))
         if service:
-            return {"node": service.client.node}
-        return {"node": NODE if self.offers(absolute(name)) else ""}
+            return service.client.node, service.client.address
+        return (NODE, "localhost") if self.offers(absolute(name)) else ("", "")
+
+    def _service_node(self, name: str) -> Values:
+        return {"node": self._server(name)[0]}
 
     def _service_host(self, name: str) -> Values:
-        service = self._graph.services.get(absolute(name))
-        if service:
-            return {"host": service.client.address}
-        return {"host": "localhost" if self.offers(absolute(name)) else ""}
+        return {"host": self._server(name)[1]}
 
     def _service_providers(self, type_name: str) -> Values:
-        names = self._services_for_type(type_name)["services"]
-        nodes = [self._service_node(name)["node"] for name in names]
+        nodes = [self._server(name)[0] for name in self._services_for_type(type_name)["services"]]
         return {"providers": list(dict.fromkeys(nodes))}
 
     def _action_servers(self) -> Values:
