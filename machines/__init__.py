@@ -1,6 +1,6 @@
-"""Bayesian machines, emulated to the bit: pure computing, no sockets, no files.
+"""Bayesian machines, emulated bit for bit, without sockets and files.
 
-Start at `machines.posterior` (one call, for a notebook) or `machines.kernel` (a board's machine).
-`machines.bm1` defines a machine, `machines.reference` runs it cycle by cycle, and `machines.fast` does the
-same quickly. Only `machines.fast` loads numba.
+Start at `machines.posterior` (one call, for a notebook) or `machines.kernel` (the machine of a board).
+`machines.bm1` defines a machine, `machines.reference` runs it cycle by cycle, and `machines.fast` gets the
+same results faster. Only `machines.fast` imports numba.
 """

@@ -1,4 +1,4 @@
-"""A BM1 as data: its tables, the registers that start a frame, the reasons for which it stops."""
+"""The data of a BM1: its tables, the inputs of a frame, and its stop reasons."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
@@ -16,18 +16,18 @@ _Scalar = TypeVar("_Scalar", bound=np.generic)
 
 @dataclass(frozen=True, eq=False, slots=True)
 class BM1Machine:
-    """A machine that can run: parameters and the codes of every cell. Arrays are kept as read-only copies.
+    """A complete machine: parameters and the codes of every cell. Arrays are stored as read-only copies.
 
     Attributes:
         parameters: Sizes, widths and generators.
-        prior: uint16[2**prior_bits, lines], the prior's codes; its row 0 is also a written prior's
-            until the host writes one.
-        tables: One uint16[2**sensor_bits, lines] per sensor column; the top row is all-ones codes (a
-            missing reading). None of them where `sensor_mode` is `threshold`.
-        rng_table: uint32[length], the numbers that all columns play where `rng` is `table`; else None.
+        prior: uint16[2**prior_bits, lines], the codes of the prior; for a written prior, row 0 applies until
+            the host writes one.
+        tables: One uint16[2**sensor_bits, lines] per sensor column; the top row has all-ones codes (a missing
+            reading). Empty if `sensor_mode` is `threshold`.
+        rng_table: uint32[length], the random numbers for all columns if `rng` is `table`; otherwise None.
 
     Raises:
-        ParameterError: The arrays are not those of such a machine.
+        ParameterError: The arrays do not match the parameters.
     """
 
     parameters: BM1Parameters
@@ -36,12 +36,11 @@ class BM1Machine:
     rng_table: npt.NDArray[np.uint32] | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
-        """Check shapes and codes, and keep read-only copies."""
+        """Check shapes and codes, and store read-only copies."""
         parameters = self.parameters
         if not parameters.has_tables and self.tables:
             raise ParameterError(
-                f"There are {len(self.tables)} sensor tables; sensor_mode = threshold takes none, since its cells are "
-                "given codes."
+                f"There are {len(self.tables)} sensor tables; with sensor_mode = threshold there must be none."
             )
         if parameters.has_tables and len(self.tables) != parameters.sensors:
             raise ParameterError(
@@ -79,19 +78,19 @@ class BM1Machine:
         )
 
     def __hash__(self) -> int:
-        """Hash the parameters: equal machines have equal ones."""
+        """Hash the parameters, which are equal for equal machines."""
         return hash(self.parameters)
 
 
 SHORTEST_SLICE: Final = 256
-"""Earliest end of the first slice, in cycles; each later slice ends at twice the cycle of the one before."""
+"""Minimum end of the first slice, in cycles; each later slice ends at twice the cycle of the previous one."""
 
 
 def first_slice(target_count: int) -> int:
-    """Return the cycle at which a frame's first slice ends: the first 256 * 2^k that is at least twice the target.
+    """Return the end of a frame's first slice: the smallest 256 * 2^k that is at least twice the target.
 
-    No counter reaches the target in fewer cycles than the target, and a line that counts in every other cycle takes
-    twice as many: an earlier end would cost every board a doorbell and an answer for nothing.
+    A line needs at least as many cycles as the target, and twice as many if it counts in every other cycle.
+    An earlier end would cost every board a doorbell and an answer in vain.
     """
     end = SHORTEST_SLICE
     while end < 2 * target_count:
@@ -100,18 +99,18 @@ def first_slice(target_count: int) -> int:
 
 
 class StopReason(IntEnum):
-    """Why a machine stopped. The numbers are those of the status register."""
+    """The reason why a machine stopped. The numbers are those of the status register."""
 
     NONE = 0
-    """It has not run since the reset."""
+    """The machine has not run since the reset."""
     OVERFLOW = 1
     """A counter reached the target count."""
     MAX_CYCLES = 2
-    """It ran the frame's last cycle without an overflow."""
+    """The frame's last cycle was run without an overflow."""
     SLICE = 3
-    """It ran the slice's last cycle (`run_until`); the frame can go on."""
+    """The slice's last cycle (`run_until`) was run; the frame can continue."""
     IMPOSSIBLE = 4
-    """No line can count for these addresses (each has a code 0), so it did not run."""
+    """No line can count for these addresses (each has a code 0), so the machine did not run."""
 
 
 _JOINT_ORDER: Final = (StopReason.OVERFLOW, StopReason.MAX_CYCLES, StopReason.IMPOSSIBLE)
@@ -119,10 +118,10 @@ _SLICE: Final = StopReason.SLICE
 
 
 def joint_reason(reasons: Sequence[StopReason], halted: Collection[int] = ()) -> StopReason:
-    """Return why several replicas stopped, as one reason.
+    """Return one stop reason for several replicas.
 
-    It is `SLICE` while a replica that is not halted can go on; else the first of `OVERFLOW`, `MAX_CYCLES` and
-    `IMPOSSIBLE` that a replica has.
+    It is `SLICE` while a replica that is not halted can continue; otherwise the first of `OVERFLOW`,
+    `MAX_CYCLES` and `IMPOSSIBLE` that applies to a replica.
     """
     if _SLICE in reasons and any(
         reason is _SLICE and replica not in halted for replica, reason in enumerate(reasons)
@@ -140,12 +139,12 @@ class Start:
 
     Attributes:
         addresses: One address per sensor column, columns 1..N; a missing reading is the column's top address.
-            Where cells have inputs of their own, or there are several replicas: an array of integers of the
-            shape `parameters.input_shape`, addresses or (`threshold`) codes; all lines of a missing reading have
-            the top value.
-        prior_address: Row of the prior's table; with replicas one row for all, or a tuple of one each.
-        prior_codes: uint16[lines], a written prior (`prior_mode` = `written` only); with replicas the same for all,
-            or uint16[replicas, lines]. None leaves the table's row.
+            With inputs per cell or several replicas: an array of integers of shape `parameters.input_shape`,
+            addresses or (`threshold`) codes; all lines of a missing reading have the top value.
+        prior_address: Row of the prior's table; with replicas one row for all, or a tuple with one row for
+            each.
+        prior_codes: uint16[lines], a written prior (only with `prior_mode` = `written`); with replicas the
+            same for all, or uint16[replicas, lines]. None selects the row of the table.
         target_count: The count at which a line stops the machine, 1 to 2**counter_bits - 1.
         max_cycles: The frame's last cycle, 1 or more.
         bank: Set of seeds from which the generators restart (`rng_reset` = `bank`); free generators ignore it.
@@ -162,10 +161,10 @@ class Start:
 
 
 def addressed_codes(machine: BM1Machine, start: Start) -> npt.NDArray[np.uint16]:
-    """Return the codes that a valid start's inputs select.
+    """Return the codes selected by the inputs of a valid start.
 
     Returns:
-        uint16[columns, lines], row 0 the prior's; with replicas uint16[replicas, columns, lines].
+        uint16[columns, lines], with the prior in row 0; with replicas uint16[replicas, columns, lines].
     """
     parameters = machine.parameters
     codes = np.empty((parameters.replicas, parameters.columns, parameters.lines), dtype=np.uint16)
@@ -189,7 +188,7 @@ def addressed_codes(machine: BM1Machine, start: Start) -> npt.NDArray[np.uint16]
 
 
 def missing_inputs(parameters: BM1Parameters) -> tuple[int, ...] | npt.NDArray[np.int64]:
-    """Return the inputs of a frame whose readings are all missing, as `Start.addresses` takes them."""
+    """Return the inputs of a frame in which all readings are missing, in the form of `Start.addresses`."""
     tops = tuple((1 << bits) - 1 for bits in parameters.sensor_bits)
     shape = parameters.input_shape
     if shape == (parameters.sensors,):
@@ -203,7 +202,7 @@ def missing_inputs(parameters: BM1Parameters) -> tuple[int, ...] | npt.NDArray[n
 def checked_codes(
     name: str, given: npt.NDArray[np.uint16], shape: tuple[int, ...], parameters: BM1Parameters
 ) -> npt.NDArray[np.uint16]:
-    """Return `given` as a read-only uint16 array, if it has this shape and only codes of `prob_bits` bits."""
+    """Return `given` as a read-only uint16 array, after checking its shape and its codes."""
     array = np.asarray(given)
     if array.shape != shape:
         raise ParameterError(f"{name} has the shape {array.shape}; it must be {shape}.")
@@ -220,11 +219,11 @@ def checked_codes(
 def _rng_table(
     given: npt.NDArray[np.uint32] | None, parameters: BM1Parameters
 ) -> npt.NDArray[np.uint32] | None:
-    """Return `given` as a read-only uint32 array, if there is one exactly where the generator plays a table."""
+    """Return `given` as a read-only uint32 array; it must exist if and only if the generator uses a table."""
     if parameters.rng is not RngKind.TABLE:
         if given is not None:
             raise ParameterError(
-                f"There is a table of random numbers, but rng = {parameters.rng} plays none."
+                f"There is a table of random numbers, but rng = {parameters.rng} does not use one."
             )
         return None
     if given is None:
@@ -242,7 +241,7 @@ def _rng_table(
 
 
 def _frozen(array: npt.NDArray[_Scalar]) -> npt.NDArray[_Scalar]:
-    """Return the array C-contiguous and read-only: a copy, unless its owner has already frozen it."""
+    """Return a C-contiguous read-only array: a copy, unless the array already is one."""
     if array.flags.c_contiguous and array.flags.owndata and not array.flags.writeable:
         return array
     copy = array.copy(order="C")

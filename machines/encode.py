@@ -1,4 +1,4 @@
-"""Conversion of probabilities to the codes of a cell, and back."""
+"""Conversion between probabilities and codes."""
 
 import numpy as np
 import numpy.typing as npt
@@ -8,9 +8,9 @@ from machines.parameters import PROB_BITS_MAX
 
 
 def encode_probability(p: npt.ArrayLike, prob_bits: int) -> npt.NDArray[np.uint16]:
-    """Return the code of the nearest probability that a cell can make; ties go up.
+    """Return the code of the nearest probability that a cell can represent; ties are rounded up.
 
-    A cell of W bits makes k / 2**W for 0 <= k <= 2**W - 2, and 1 with the all-ones code.
+    A cell of W bits represents k / 2**W for 0 <= k <= 2**W - 2, and 1 with the all-ones code.
 
     Args:
         p: Probabilities from 0 to 1, of any shape.
@@ -27,16 +27,16 @@ def encode_probability(p: npt.ArrayLike, prob_bits: int) -> npt.NDArray[np.uint1
     if not ((probabilities >= 0) & (probabilities <= 1)).all():
         raise ParameterError("A probability to encode is not a number from 0 to 1.")
     ones = (1 << prob_bits) - 1
-    scaled = probabilities * (1 << prob_bits)  # exact: a power of two
+    scaled = probabilities * (1 << prob_bits)  # exact, because the factor is a power of two
     below = np.floor(scaled)
-    # `floor(x + 0.5)` would send the float just below one half up; the remainder is exact.
+    # `floor(x + 0.5)` would round the float just below one half up; the remainder is exact.
     nearest = np.minimum(below + (scaled - below >= 0.5), ones - 1)
     # The step from (2**W - 2) / 2**W to 1 is twice as wide: its middle is (2**W - 1) / 2**W.
     return np.where(scaled >= ones, ones, nearest).astype(np.uint16)
 
 
 def decode_code(codes: npt.ArrayLike, prob_bits: int) -> npt.NDArray[np.float64]:
-    """Return the probability that a cell with this code makes: code / 2**W, and 1 for the all-ones code; float64.
+    """Return the probability of a code as float64: code / 2**W, and 1 for the all-ones code.
 
     Raises:
         ParameterError: A code has more bits, or `prob_bits` is not 1 to 16.

@@ -1,10 +1,10 @@
-"""The errors of this package; the text of each is one sentence for the user."""
+"""Errors of this package; the text of each is one sentence for the user."""
 
 from typing import ClassVar
 
 
 class MachineError(Exception):
-    """Root of this package's errors."""
+    """Base class of this package's errors."""
 
     exit_code: ClassVar[int] = 2
 
@@ -18,6 +18,6 @@ class StartError(MachineError):
 
 
 class NoPosteriorError(MachineError):
-    """Readings for which no line counts, so that there is nothing to normalise."""
+    """Readings for which all counts are 0, so they cannot be normalised."""
 
     exit_code: ClassVar[int] = 4

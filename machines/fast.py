@@ -1,13 +1,13 @@
-"""The fast BM1 for shared LFSRs: 64 cycles to a word, and the same results as the reference, to the bit.
+"""The fast BM1 for shared LFSRs: 64 cycles per word, with the same results as the reference, bit for bit.
 
-A cell's bits of 64 cycles are one word, which depends only on its column's generator and on its code, so that
-cells of a column with the same code share it, in all replicas. A line is the AND of its words, and it counts their
-ones. Lines with a code 0 can't count and are left out. Cycles are run in blocks of 512. If a block takes a counter
-to the target, the exact cycle is looked up in the words of the lines concerned, and the block is counted again, up
-to there. Each replica is run to its own end, one after the other.
+The bits of a cell in 64 cycles are one word, which depends only on the generator of its column and on its
+code, so all cells of a column with the same code share it, in all replicas. A line ANDs the words of its
+cells and counts the ones. Lines with a code 0 cannot count and are omitted. Cycles are run in blocks of 512.
+If a counter reaches the target in a block, the exact cycle is found in the words of those lines, and the
+block is counted again up to that cycle. Replicas are run one after the other, each to its own end.
 
-Where frames restart from a bank, the words of a frame's first cycles are constants of the machine: a frame keeps
-the words that it made, and later frames from that bank use them.
+If frames restart from a bank, the words of a frame's first cycles are constants of the machine: they are
+cached for later frames with the same bank.
 """
 
 from typing import Final
@@ -37,24 +37,24 @@ from machines.parameters import BM1Parameters, PriorMode, RngKind, RngReset
 from machines.rng import LFSR, LFSRNumbers, Words, jump_tables
 
 KEPT_BYTES: Final = 64 * 2**20
-"""Most memory for kept words, in bytes for each machine; untouched memory is not allocated."""
+"""Maximum size of the cache of a machine, in bytes; the system allocates only the used part."""
 
 KEPT_CYCLES: Final = 2**17
-"""Cycle from which on no words are kept."""
+"""Number of cycles after which words are no longer cached."""
 
 PREPARED_CYCLES: Final = 2**14
-"""Number of a frame's first cycles whose words `prepare` makes."""
+"""Number of a frame's first cycles whose words `prepare` computes."""
 
 
 class FastBM1(BM1Kernel):
-    """A machine with shared LFSRs that runs many cycles at a time (thesis 2.1.2 and 4.4).
+    """A kernel for shared LFSRs that runs many cycles at a time (thesis 2.1.2 and 4.4).
 
     Args:
         machine: The machine to run.
-        kept_bytes: Most memory for kept words; 0 keeps none.
+        kept_bytes: Maximum size of the cache; 0 for no cache.
 
     Raises:
-        MachineError: The machine's generators are not LFSRs, or are not shared.
+        MachineError: The generators of the machine are not LFSRs, or are not shared.
     """
 
     def __init__(self, machine: BM1Machine, *, kept_bytes: int = KEPT_BYTES) -> None:
@@ -62,8 +62,8 @@ class FastBM1(BM1Kernel):
         parameters = machine.parameters
         if not parameters.shared or parameters.rng.lfsr_bits is None:
             raise MachineError(
-                f"The fast kernel runs shared LFSRs only; this machine has rng = {parameters.rng}, "
-                f"shared = {str(parameters.shared).lower()}: use the reference."
+                f"The fast kernel supports only shared LFSRs; this machine has rng = {parameters.rng}, "
+                f"shared = {str(parameters.shared).lower()}; use the reference kernel."
             )
         self._period = LFSR(parameters.rng).period
         self._random_numbers = LFSRNumbers(parameters)
@@ -74,10 +74,10 @@ class FastBM1(BM1Kernel):
         )
         occurring = _occurring_codes(machine)
         rows = int(occurring.sum())
-        # the states of free generators are not a bank's, and hardly ever come again
+        # free generators do not start from a bank, and their states hardly ever recur
         banks = parameters.rng_banks if parameters.rng_reset is RngReset.BANK else 0
         self._kept_blocks = _blocks_in(kept_bytes, rows * banks) if banks else 0
-        # Where a bank's words cannot be kept from frame to frame, several replicas still share the frame's.
+        # Even without a cache between frames, several replicas share the words of a frame.
         self._of_frame = self._kept_blocks == 0
         if self._of_frame:
             cells = parameters.replicas * parameters.lines * parameters.columns
@@ -87,30 +87,30 @@ class FastBM1(BM1Kernel):
         else:
             self._store = store_of_codes(occurring, banks * self._kept_blocks)
         self._frame = make_frame(parameters, len(self._store.row_code))
-        self._frames = 1  # a row that was never used has 0
+        self._frames = 1  # 0 for a row that was never used
         self._rows = 0
         self._first_slot = 0
         self.reset()
 
     @property
     def counts(self) -> npt.NDArray[np.uint32]:
-        """The counters, a copy: uint32[lines], with several replicas uint32[replicas, lines]."""
+        """A copy of the counters: uint32[lines], with several replicas uint32[replicas, lines]."""
         return self._frame.counts.reshape(self._machine.parameters.count_shape).copy()
 
     @property
     def rng_state(self) -> npt.NDArray[np.uint64]:
-        """uint64[columns]: the generators' states, a copy."""
+        """A copy of the generators' states: uint64[columns]."""
         states = np.empty_like(self._frame.starts)
         jump(self._generators.jumps, self._frame.starts, self.cycles % self._period, states)
         return states
 
     @property
     def kept_cycles(self) -> int:
-        """Number of a frame's first cycles, in every bank, whose words are kept for later frames."""
+        """Number of a frame's first cycles, in every bank, whose words are cached."""
         return 0 if self._of_frame else self._kept_blocks * BLOCK_CYCLES
 
     def prepare(self) -> None:
-        """Make the words of every bank's first `PREPARED_CYCLES` cycles that are kept: a tenth of a second at most."""
+        """Fill the cache for the first `PREPARED_CYCLES` cycles of every bank, in at most 0.1 s."""
         blocks = min(self.kept_cycles, PREPARED_CYCLES) // BLOCK_CYCLES
         for bank in range(self._machine.parameters.rng_banks if blocks else 0):
             self._restart(bank)
@@ -130,7 +130,8 @@ class FastBM1(BM1Kernel):
             self._frame.starts[:] = self.rng_state
         self._free_rows()
         codes = addressed_codes(self._machine, start)
-        # One call for all: passing a machine's arrays costs as much as a block of its cycles.
+        # One call for all replicas, because passing a machine's arrays costs as much as a block of its
+        # cycles.
         self._rows = begin(
             codes.reshape(-1, parameters.columns, parameters.lines),
             parameters.ones_code,
@@ -176,7 +177,7 @@ class FastBM1(BM1Kernel):
                 self._reasons[replica] = StopReason.SLICE
 
     def _free_rows(self) -> None:
-        """Take back the rows that the last frame assigned, and their words; the rows of banks stay."""
+        """Free the rows assigned by the last frame, and their words; the rows of the cache remain."""
         if not self._rows:
             return
         assigned = self._store.row_column[: self._rows], self._store.row_code[: self._rows]
@@ -186,7 +187,7 @@ class FastBM1(BM1Kernel):
         self._rows = 0
 
     def _restart(self, bank: int) -> None:
-        """Set the generators to the start of a bank."""
+        """Restart the generators from a bank."""
         starts = self._bank_starts.get(bank)
         if starts is None:
             starts = self._bank_starts[bank] = self._random_numbers.restart(bank)
@@ -199,7 +200,7 @@ class FastBM1(BM1Kernel):
 
 
 def warm_up() -> None:
-    """Compile everything, or load it from the cache: some 5 s the first time, then 0.2 s."""
+    """Compile the kernel, or load it from the cache: about 5 s the first time, then 0.2 s."""
     parameters = BM1Parameters(lines=1, sensor_bits=(), rng=RngKind.LFSR16)
     kernel = FastBM1(BM1Machine(parameters, np.full((1, 1), 128, dtype=np.uint16), ()))
     kernel.start(Start(addresses=(), target_count=2, max_cycles=2, run_until=1))
@@ -209,7 +210,7 @@ def warm_up() -> None:
 
 
 def _occurring_codes(machine: BM1Machine) -> npt.NDArray[np.bool_]:
-    """bool[columns, 2**prob_bits]: the codes that a frame may address, but for 0 and all-ones, which need no words."""
+    """Return the codes that a frame may use, except 0 and all-ones, as bool[columns, 2**prob_bits]."""
     parameters = machine.parameters
     occurring = np.zeros((parameters.columns, 1 << parameters.prob_bits), dtype=np.bool_)
     if parameters.prior_mode is PriorMode.WRITTEN:
@@ -223,6 +224,6 @@ def _occurring_codes(machine: BM1Machine) -> npt.NDArray[np.bool_]:
 
 
 def _blocks_in(kept_bytes: int, rows: int) -> int:
-    """Return the number of blocks of this many rows that fit into a memory."""
+    """Return the number of blocks of this many rows that fit into the memory."""
     block_bytes = max(rows, 1) * (BLOCK_WORDS * WORD_BITS // 8 + 1)
     return min(kept_bytes // block_bytes, KEPT_CYCLES // BLOCK_CYCLES)

@@ -1,4 +1,4 @@
-"""The fast kernel's machine code, which makes and counts the words of a block of cycles, and the arrays it works on.
+"""Machine code of the fast kernel, which computes and counts the words of a block, and its arrays.
 
 Both are in one file because numba recompiles when this file changes, but not when an imported one does.
 """
@@ -21,8 +21,8 @@ WORD_BITS: Final = 64
 BLOCK_WORDS: Final = 8  # one register of AVX-512, two of AVX2, four of NEON
 BLOCK_CYCLES: Final = WORD_BITS * BLOCK_WORDS
 NO_ROW: Final = -1
-LIVE, USED, CYCLES, OVERFLOWED = range(4)  # in a replica's outcome
-# a literal 0 has a type of its own: numba would compile `_select` twice
+LIVE, USED, CYCLES, OVERFLOWED = range(4)  # columns of a replica's outcome
+# a literal 0 has its own type: numba would compile `_select` twice
 _NO_ROWS: Final = cast("int", np.int64(0))
 
 cgutils: Any = untyped_cgutils
@@ -30,52 +30,52 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
 def _jit(function: _Function) -> _Function:
-    """Compile a function, and cache it on disk where there is a writable place."""
+    """Compile a function, and cache it on disk if there is a writable folder."""
     try:
         return cast("_Function", njit(cache=True, nogil=True)(function))
-    except RuntimeError:  # no writable place: every process compiles
+    except RuntimeError:  # no writable folder: every process compiles
         return cast("_Function", njit(nogil=True)(function))
 
 
 class Generators(NamedTuple):
-    """The steps of all columns' LFSRs, as linear maps of a state."""
+    """Steps of the LFSRs of all columns, as linear maps of a state."""
 
-    jumps: Words  # [bits, bits / 8, 256]: 2**i clocks on
-    bits: Words  # [prob_bits, bits / 4, 16, BLOCK_WORDS]: the next block of each bit shown
+    jumps: Words  # [bits, bits / 8, 256]: the state 2**i clocks later
+    bits: Words  # [prob_bits, bits / 4, 16, BLOCK_WORDS]: the next block of each output bit
 
 
 class _Store(NamedTuple):
-    """The words, by slot (a block of cycles of a bank; the last one is scratch) and row (a column's code)."""
+    """Words by slot (a block of cycles of a bank; the last one is scratch) and row (a code of a column)."""
 
     words: Words  # [slots, rows * BLOCK_WORDS]
-    filled: npt.NDArray[np.uint8]  # [slots, rows]: whether those words are there to stay
+    filled: npt.NDArray[np.uint8]  # [slots, rows]: whether these words are cached
     row_column: npt.NDArray[np.int64]  # [rows]
     row_code: npt.NDArray[np.int64]  # [rows]
-    row_of_code: npt.NDArray[np.int32]  # [columns, 2**prob_bits]; NO_ROW where a code has none
+    row_of_code: npt.NDArray[np.int32]  # [columns, 2**prob_bits]; NO_ROW for a code without a row
     row_frame: npt.NDArray[np.int64]  # [rows]: the last frame that used the row
 
 
 class _Frame(NamedTuple):
-    """A frame of all replicas. Arrays by line hold the lines that can count, without gaps."""
+    """A frame of all replicas. Arrays by line contain the lines that can count, without gaps."""
 
-    lines: npt.NDArray[np.int64]  # [replicas, lines]: the line's number in the machine
-    places: npt.NDArray[np.uint32]  # [replicas, lines, columns]: where in a slot the words to AND begin
-    widths: npt.NDArray[np.int64]  # [replicas, lines]: how many words to AND
+    lines: npt.NDArray[np.int64]  # [replicas, lines]: number of the line in the machine
+    places: npt.NDArray[np.uint32]  # [replicas, lines, columns]: start of the words to AND in a slot
+    widths: npt.NDArray[np.int64]  # [replicas, lines]: number of words to AND
     sums: npt.NDArray[np.int64]  # [replicas, lines]: the counters
-    added: npt.NDArray[np.int64]  # [lines]: a block's ones
-    used: npt.NDArray[np.int64]  # [replicas, rows]: the rows that the replica uses, once each
+    added: npt.NDArray[np.int64]  # [lines]: ones in a block
+    used: npt.NDArray[np.int64]  # [replicas, rows]: rows used by the replica, each once
     starts: Words  # [columns]: states before the frame's first cycle
     states: Words  # [columns]: working space
     inverted: Words  # [columns, prob_bits, BLOCK_WORDS]: working space
-    mask: Words  # [BLOCK_WORDS]: the cycles of a block that are run
+    mask: Words  # [BLOCK_WORDS]: mask of the cycles of a block to run
     counts: npt.NDArray[
         np.uint32
-    ]  # [replicas, all lines of the machine]: the counters, in the machine's order
+    ]  # [replicas, all lines of the machine]: the counters, in the order of the machine
     outcome: npt.NDArray[np.int64]  # [replicas, 4]: live lines, rows used, cycles, whether one overflowed
 
 
 def store_of_codes(occurring: npt.NDArray[np.bool_], slots: int) -> _Store:
-    """Allocate words for all codes that may occur, none of them filled."""
+    """Allocate words for all codes that may occur, without filling them."""
     row_of_code = np.full(occurring.shape, NO_ROW, dtype=np.int32)
     row_column, row_code = np.nonzero(occurring)
     row_of_code[occurring] = np.arange(len(row_code), dtype=np.int32)
@@ -83,7 +83,7 @@ def store_of_codes(occurring: npt.NDArray[np.bool_], slots: int) -> _Store:
 
 
 def store_of_frame(occurring: npt.NDArray[np.bool_], cells: int, slots: int) -> _Store:
-    """Allocate words for the codes that a frame of so many cells uses; each frame assigns the rows."""
+    """Allocate words for the codes of a frame of `cells` cells; each frame assigns the rows."""
     none = np.zeros(min(int(occurring.sum()), cells), dtype=np.int64)
     return _store(np.full(occurring.shape, NO_ROW, dtype=np.int32), none, none, slots)
 
@@ -94,7 +94,7 @@ def _store(
     row_code: npt.NDArray[np.int64],
     slots: int,
 ) -> _Store:
-    """Allocate words in so many slots, and one for scratch."""
+    """Allocate words in `slots` slots and a scratch slot."""
     rows = len(row_code)
     return _Store(
         words=_aligned((slots + 1, rows * BLOCK_WORDS)),
@@ -107,7 +107,7 @@ def _store(
 
 
 def _aligned(shape: tuple[int, int]) -> Words:
-    """Allocate uninitialised words that begin at a cache line, so that no block straddles two."""
+    """Allocate uninitialised words aligned to a cache line, so that no block straddles two."""
     count = shape[0] * shape[1]
     line = 64 // np.dtype(np.uint64).itemsize
     words = np.empty(count + line, dtype=np.uint64)
@@ -136,10 +136,10 @@ def make_frame(parameters: BM1Parameters, rows: int) -> _Frame:
 
 @cache
 def bit_tables(kind: RngKind, steps_per_clock: int, prob_bits: int) -> Words:
-    """Return the map from a state to a block of each bit shown: uint64[prob_bits, bits / 4, 16, BLOCK_WORDS].
+    """Return the map from state to output bits of a block: uint64[prob_bits, bits / 4, 16, BLOCK_WORDS].
 
-    Unlike `machines.rng.map_tables` it has a table per 4 bits of the state, so that all of them stay in the
-    processor's nearest caches.
+    Unlike `machines.rng.map_tables`, it has a table per 4 bits of the state, so that all tables fit into the
+    processor's first caches.
     """
     clock = jump_tables(kind, steps_per_clock)[0]
     bits = LFSR(kind).bits
@@ -157,9 +157,9 @@ def bit_tables(kind: RngKind, steps_per_clock: int, prob_bits: int) -> Words:
     return tables
 
 
-# Everything below is machine code. Types are the same for every machine (contiguous arrays, int64 and uint64), so
-# it is compiled once and cached on disk. A uint64 and an int64 in one operation would make a float: words meet
-# only uint64 constants, and counts are int64 throughout.
+# Everything below is compiled. Types are the same for every machine (contiguous arrays, int64 and uint64), so
+# it is compiled once and cached on disk. An operation on a uint64 and an int64 would give a float: words are
+# combined only with uint64 constants, and counts are int64 throughout.
 
 _0: Final = np.uint64(0)
 _1: Final = np.uint64(1)
@@ -180,24 +180,24 @@ def _constant_block(word: int) -> ir.Constant:
 
 
 def _block_pointer(builder: Any, data: Any, place: Any) -> Any:
-    """Return the address of the block of words that begins at a place of an array."""
+    """Return the address of the block of words that begins at an index of an array."""
     return builder.bitcast(builder.gep(data, [place]), _BLOCK.as_pointer())
 
 
 def _load_block(builder: Any, data: Any, place: Any) -> Any:
     block = builder.load(_block_pointer(builder, data, place))
-    block.align = WORD_BITS // 8  # arrays promise no more
+    block.align = WORD_BITS // 8  # arrays guarantee no more
     return block
 
 
 def _call_on_block(builder: Any, name: str, result: Any, block: Any) -> Any:
-    """Call one of LLVM's own functions with a block of words."""
+    """Call an LLVM intrinsic with a block of words."""
     function = cgutils.get_or_insert_function(builder.module, ir.FunctionType(result, [_BLOCK]), name)
     return builder.call(function, [block])
 
 
 def _count_code(_context: Any, words: Any, places: Any, _line: Any, _width: Any, mask: Any) -> Any:
-    """Count a line's ones in a block: those of the AND of its rows and the mask."""
+    """Count the ones of a line in a block: those in the AND of its rows and the mask."""
 
     def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         data, where, masks = (
@@ -219,7 +219,7 @@ _count = cast("Callable[[Words, npt.NDArray[np.uint32], int, int, Words], int]",
 
 
 def _fill_code(_context: Any, _code: Any, inverted: Any, words: Any, _place: Any) -> Any:
-    """Make a block of words of a code in a column: shown number < code, from the low bit up."""
+    """Compute a block of words for a code in a column: random number < code, from the low bit up."""
 
     def make(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         shown, into = (context.make_array(signature.args[i])(context, builder, arguments[i]) for i in (1, 2))
@@ -228,7 +228,7 @@ def _fill_code(_context: Any, _code: Any, inverted: Any, words: Any, _place: Any
             first = builder.mul(loop.index, ir.Constant(_I64, BLOCK_WORDS))
             zeros = _load_block(builder, shown.data, first)
             bit = builder.trunc(builder.lshr(arguments[0], loop.index), ir.IntType(1))
-            # A 0 is less than the code's 1, and a 1 is more than the code's 0, whatever the lower bits are.
+            # If this bit differs between number and code, it decides regardless of the lower bits.
             before = builder.load(less)
             builder.store(builder.select(bit, builder.or_(before, zeros), builder.and_(before, zeros)), less)
         store = builder.store(builder.load(less), _block_pointer(builder, into.data, arguments[3]))
@@ -242,7 +242,7 @@ _fill = cast("Callable[[int, Words, Words, int], None]", intrinsic(_fill_code))
 
 
 def _popcount_code(_context: Any, _word: Any) -> Any:
-    """Count a word's ones."""
+    """Count the ones in a word."""
 
     def code(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
         return builder.ctpop(arguments[0])
@@ -285,9 +285,10 @@ def _select(
     new_rows: bool,
     rows: int,
 ) -> int:
-    """Find a replica's lines that can count and the rows that each ANDs, and put their counters to 0.
+    """Find the lines of a replica that can count and the rows that each ANDs, and clear their counters.
 
-    With `new_rows`, a code that has no row gets the next one, from `rows` on. Returns the number of assigned rows.
+    With `new_rows`, a code without a row gets the next one, from `rows` on. Returns the number of assigned
+    rows.
     """
     columns, lines = codes.shape
     numbers, places, widths = frame.lines[replica], frame.places[replica], frame.widths[replica]
@@ -332,7 +333,7 @@ def _select(
 
 @_jit
 def _show(generators: Generators, frame: _Frame, clocks: int) -> None:
-    """Make the inverted words of all bits that the generators show in the block that begins after so many clocks."""
+    """Compute the inverted words of all output bits in the block that begins after `clocks` clocks."""
     jump(generators.jumps, frame.starts, clocks, frame.states)
     for column in range(frame.inverted.shape[0]):
         for bit in range(frame.inverted.shape[1]):
@@ -350,7 +351,7 @@ def _show(generators: Generators, frame: _Frame, clocks: int) -> None:
 def fill_blocks(
     generators: Generators, store: _Store, frame: _Frame, first_slot: int, blocks: int, period: int
 ) -> None:
-    """Make the words of all codes for a bank's first blocks, from the states in `frame.starts`."""
+    """Compute the words of all codes for the first blocks of a bank, from the states in `frame.starts`."""
     for block in range(blocks):
         words = store.words[first_slot + block]
         filled = store.filled[first_slot + block]
@@ -363,13 +364,13 @@ def fill_blocks(
 
 @_jit
 def _mask(first: int, end: int, mask: Words) -> None:
-    """Mark a block's cycles `first` to `end` - 1."""
+    """Set the mask to cycles `first` to `end` - 1 of a block."""
     for word in range(BLOCK_WORDS):
         start = word * WORD_BITS
         low = min(max(first - start, 0), WORD_BITS)
         high = min(max(end - start, 0), WORD_BITS)
         ones = _0
-        if low < high:  # a shift by 64 would not shift
+        if low < high:  # a shift by 64 would have no effect
             ones = (_ALL >> np.uint64(WORD_BITS - (high - low))) << np.uint64(low)
         mask[word] = ones
 
@@ -378,7 +379,7 @@ def _mask(first: int, end: int, mask: Words) -> None:
 def _cycle_of(
     words: Words, places: npt.NDArray[np.uint32], width: int, mask: Words, line: int, nth: int
 ) -> int:
-    """Return the block's cycle in which a line makes its `nth` one (from 1) under the mask, which must exist."""
+    """Return the cycle in a block of the `nth` one (from 1) of a line under the mask; it must exist."""
     word = 0
     while True:
         made = mask[word]
@@ -435,7 +436,7 @@ def _run(
             added[i] = ones
             overflow |= sums[i] + ones >= target_count
         if overflow:
-            # The first line to reach the target stops all of them, after that cycle.
+            # The first line that reaches the target stops all lines after that cycle.
             for i in range(live):
                 missing = target_count - sums[i]
                 if added[i] >= missing:
@@ -468,10 +469,10 @@ def begin(
     period: int,
     new_rows: bool,
 ) -> int:
-    """Select every replica's lines and run its first cycles; `frame.outcome` has the result.
+    """Select the lines of every replica and run its first slice; the result is in `frame.outcome`.
 
-    Returns the number of assigned rows. All rows are assigned before the first block is run: a slot has the words of
-    one and the same row from the first replica to the last. A replica in which no line can count runs no cycle.
+    Returns the number of assigned rows. All rows are assigned before the first block is run, so that rows
+    mean the same in all replicas. A replica in which no line can count runs no cycle.
     """
     rows = _NO_ROWS
     for replica in range(codes.shape[0]):
@@ -495,6 +496,6 @@ def resume(
     kept_blocks: int,
     period: int,
 ) -> None:
-    """Run the replicas that go on, each from where it stands."""
+    """Continue the remaining replicas."""
     for replica in going:
         _run(generators, store, frame, replica, limit, target_count, first_slot, kept_blocks, period)

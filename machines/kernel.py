@@ -1,4 +1,4 @@
-"""The kernels of a BM1: what they have in common, the checks of their arguments, and the choice of one."""
+"""The common base of the kernels of a BM1, the checks of their arguments, and their selection."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Collection
@@ -12,14 +12,14 @@ from machines.errors import ParameterError, StartError
 from machines.parameters import CYCLES_MAX, BM1Parameters, PriorMode, SensorMode
 
 FAST_CODES_MAX: Final = 2**24
-"""Most different codes, of all columns together, for the fast kernel: it has a table of them."""
+"""Maximum number of different codes, over all columns, for the fast kernel, which has a table of them."""
 
 
 class BM1Kernel(ABC):
-    """A running machine of `replicas` replicas, which share its generators (thesis 2.1.2 and 4.4).
+    """A running machine with `replicas` replicas, which share its generators (thesis 2.1.2 and 4.4).
 
-    Each replica counts and stops by itself; the generators step until the last one has stopped. Counts, cycles,
-    reasons and states are the same to the bit in every kernel.
+    Each replica counts and stops by itself; the generators step until the last one has stopped. Counts,
+    cycles, reasons and states are the same in every kernel, bit for bit.
     """
 
     def __init__(self, machine: BM1Machine) -> None:
@@ -37,12 +37,12 @@ class BM1Kernel(ABC):
 
     @property
     def cycles(self) -> int:
-        """Cycles of this frame: those of the replica that ran longest, which the generators stepped."""
+        """Cycles of this frame: those of the generators and of the longest-running replica."""
         return max(self._cycles)
 
     @property
     def reason(self) -> StopReason:
-        """Why the machine stopped: the `joint_reason` of its replicas."""
+        """The reason why the machine stopped: the `joint_reason` of its replicas."""
         return joint_reason(self._reasons, self._halted)
 
     @property
@@ -52,38 +52,37 @@ class BM1Kernel(ABC):
 
     @property
     def replica_reasons(self) -> tuple[StopReason, ...]:
-        """Why each replica stopped."""
+        """The reason why each replica stopped."""
         return tuple(self._reasons)
 
     @property
     @abstractmethod
     def counts(self) -> npt.NDArray[np.uint32]:
-        """The counters, a copy: uint32[lines], with several replicas uint32[replicas, lines]."""
+        """A copy of the counters: uint32[lines], with several replicas uint32[replicas, lines]."""
 
     @property
     @abstractmethod
     def rng_state(self) -> npt.NDArray[np.uint64]:
-        """The generators' states, a copy: uint64[columns], or uint64[lines, columns] if unshared."""
+        """A copy of the generators' states: uint64[columns], or uint64[lines, columns] if unshared."""
 
     def reset(self) -> None:
-        """Set counters and cycles to 0, reasons to `NONE`, and the generators to the start of bank 0."""
+        """Set counters and cycles to 0 and reasons to `NONE`, and restart the generators from bank 0."""
         self._reset()
         self._cycles = [0] * len(self._cycles)
         self._reasons = [StopReason.NONE] * len(self._reasons)
         self._halted = set()
 
     def prepare(self) -> None:
-        """Do beforehand what would slow the first frames, and reset the machine; no result changes."""
+        """Do in advance the work that would slow down the first frames, and reset the machine."""
         self.reset()
 
     def start(self, start: Start) -> StopReason:
         """Run a new frame to its end, or to the end of its first slice.
 
-        Counters start at 0; generators restart from the start's bank (`rng_reset` = `bank`) or go on
-        (`free`).
+        Counters start at 0; generators restart from the start's bank (`rng_reset` = `bank`) or continue (`free`).
 
         Raises:
-            StartError: The start does not fit the machine, which is unchanged.
+            StartError: The start does not fit the machine; nothing has changed.
         """
         check_start(self._machine.parameters, start)
         self._target_count = int(start.target_count)
@@ -96,11 +95,11 @@ class BM1Kernel(ABC):
         """Run the next slice of the same frame, to cycle `run_until` at most; 0 for no further slices.
 
         Args:
-            run_until: Where the slice ends.
-            halted: Numbers of replicas that do not go on, for the rest of the frame: they keep the reason `SLICE`.
+            run_until: Cycle at which the slice ends.
+            halted: Numbers of replicas that do not continue in this frame: they keep the reason `SLICE`.
 
         Raises:
-            StartError: There is no frame that can go on, or `run_until` is not a later cycle; nothing has changed.
+            StartError: No frame can be continued, or `run_until` is not a later cycle; nothing has changed.
         """
         halts = self._halted | set(halted)
         self._check_resume(run_until, halted, halts)
@@ -115,7 +114,7 @@ class BM1Kernel(ABC):
 
     @abstractmethod
     def _reset(self) -> None:
-        """Set the counters to 0 and the generators to the start of bank 0."""
+        """Set the counters to 0 and restart the generators from bank 0."""
 
     @abstractmethod
     def _start(self, start: Start) -> None:
@@ -129,7 +128,7 @@ class BM1Kernel(ABC):
         replicas = len(self._reasons)
         if not all(0 <= replica < replicas for replica in halted):
             raise StartError(
-                f"Replicas {', '.join(map(str, sorted(halted)))} cannot be halted; this machine's are 0 to {replicas - 1}."
+                f"Replicas {', '.join(map(str, sorted(halted)))} cannot be halted; this machine has replicas 0 to {replicas - 1}."
             )
         reason = joint_reason(self._reasons, halts)
         if reason is not StopReason.SLICE:
@@ -147,7 +146,7 @@ def make_kernel(machine: BM1Machine) -> BM1Kernel:
     parameters = machine.parameters
     codes = parameters.columns << parameters.prob_bits
     if parameters.shared and parameters.rng.lfsr_bits is not None and codes <= FAST_CODES_MAX:
-        # only a process that runs such machines loads numba
+        # only a process that runs such machines imports numba
         from machines.fast import FastBM1
 
         return FastBM1(machine)
@@ -157,7 +156,7 @@ def make_kernel(machine: BM1Machine) -> BM1Kernel:
 
 
 def warm_up() -> None:
-    """Load (the first time: compile) the fast kernel, so that no frame waits for it; a fork has it loaded too."""
+    """Load the fast kernel (the first time, compile it) before the first frame; forked processes share it."""
     from machines import fast
 
     fast.warm_up()
@@ -167,15 +166,15 @@ def check_start(parameters: BM1Parameters, start: Start) -> None:
     """Refuse a start that does not fit the machine.
 
     Raises:
-        StartError: Names the part and its range.
+        StartError: A value does not fit; the sentence names it and its range.
     """
     if not _are_plain_addresses(parameters, start.addresses):
         _check_inputs(parameters, start.addresses)
     if isinstance(start.prior_address, tuple):
         if parameters.replicas == 1 or len(start.prior_address) != parameters.replicas:
             raise StartError(
-                f"There are {len(start.prior_address)} prior addresses; this machine takes one, or with several "
-                f"replicas one each: it has {parameters.replicas}."
+                f"There are {len(start.prior_address)} prior addresses; this machine needs one for all or "
+                f"one for each of its replicas, of which it has {parameters.replicas}."
             )
         for replica, address in enumerate(start.prior_address):
             _check(f"prior_address of replica {replica}", address, 0, parameters.prior_addresses - 1)
@@ -199,7 +198,7 @@ def check_start(parameters: BM1Parameters, start: Start) -> None:
 
 
 def _are_plain_addresses(parameters: BM1Parameters, given: object) -> bool:
-    """Return whether these are one integer per column, all in range: a quick check for almost every frame."""
+    """Return whether these are one integer per column, all in range: a fast path for most frames."""
     if type(given) is not tuple or parameters.input_shape != (len(given),):
         return False
     # a generator expression would slow every frame
@@ -210,7 +209,7 @@ def _are_plain_addresses(parameters: BM1Parameters, given: object) -> bool:
 
 
 def _check_inputs(parameters: BM1Parameters, given: object) -> None:
-    """Refuse inputs that do not have the machine's shape, and values that its columns do not have."""
+    """Refuse inputs of another shape than the machine's, and values outside the range of their column."""
     inputs, shape = np.asarray(given), parameters.input_shape
     if inputs.size == 0 and not parameters.sensors:
         return

@@ -7,29 +7,29 @@ from typing import Final
 from machines.errors import ParameterError
 
 PROB_BITS_MAX: Final = 16
-"""Widest code, in bits: tables hold uint16."""
+"""Maximum width of a code in bits, because tables contain uint16."""
 
 ADDRESS_BITS_MAX: Final = 16
-"""Widest address of a sensor or prior table, in bits: 65,536 rows of one code per line."""
+"""Maximum width of an address of a sensor or prior table in bits: 65,536 rows of one code per line."""
 
 COUNTER_BITS_MAX: Final = 32
-"""Widest counter, in bits: a result register holds 32."""
+"""Maximum width of a counter in bits: that of a result register."""
 
 STEPS_PER_CLOCK_MAX: Final = 256
-"""Most steps of a generator in a clock: hardware unrolls them, and the reference takes them one by one."""
+"""Maximum number of steps per clock: hardware unrolls them, and the reference makes them one by one."""
 
 RNG_BANKS_MAX: Final = 65536
-"""Most sets of seeds."""
+"""Maximum number of seed sets."""
 
 REPLICAS_MAX: Final = 256
-"""Most machines on a board: the register map has room for the outcomes of that many."""
+"""Maximum number of machines on a board, which is the room for outcomes in the register map."""
 
 CYCLES_MAX: Final = 2**63 - 1
-"""Highest `max_cycles` and `run_until`: 64-bit registers whose values must fit a signed number."""
+"""Maximum of `max_cycles` and `run_until`: 64-bit registers whose values must fit into a signed number."""
 
 
 class RngKind(StrEnum):
-    """The kinds of random number generator; `machines.rng` implements them."""
+    """Kinds of random number generators; `machines.rng` implements them."""
 
     LFSR8 = "lfsr8"
     LFSR16 = "lfsr16"
@@ -48,21 +48,21 @@ _LFSR_BITS: Final = {RngKind.LFSR8: 8, RngKind.LFSR16: 16, RngKind.LFSR24: 24, R
 
 
 class RngReset(StrEnum):
-    """Where a new frame's random numbers start: at the frame's bank, or where the last frame left them (`free`)."""
+    """Start of a frame's random numbers: at the bank of the frame, or where the last frame ended (`free`)."""
 
     BANK = "bank"
     FREE = "free"
 
 
 class PriorMode(StrEnum):
-    """Where the prior's codes come from: a table with an address, or one code a line that the host writes."""
+    """Source of the prior's codes: a table with an address, or one code per line that the host writes."""
 
     TABLE = "table"
     WRITTEN = "written"
 
 
 class SensorMode(StrEnum):
-    """The inputs of a sensor column (thesis 4.4): one address, an address for each cell, or each cell's code."""
+    """Inputs of a sensor column (thesis 4.4): one address, an address for each cell, or a code for each cell."""
 
     COLUMN = "column"
     CELL = "cell"
@@ -71,32 +71,32 @@ class SensorMode(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BM1Parameters:
-    """Parameters of a BM1: a matrix of `lines` lines and `sensors` + 1 columns, column 0 being the prior.
+    """Parameters of a BM1: a matrix of `lines` lines and `sensors` + 1 columns; column 0 is the prior.
 
     Attributes:
         lines: Lines of the matrix, one per value of the searched variable (M in the thesis).
-        sensor_bits: Address bits of each sensor column's table, columns 1..N. The top address of each
-            column stands for a missing reading, so a column of b bits serves 2**b - 1 values.
+        sensor_bits: Address bits of each sensor column's table, columns 1..N. The top address of each column
+            means a missing reading, so a column of b bits supports 2**b - 1 values.
         prob_bits: Bits of a code (W), 1 to 16.
-        prior_bits: Address bits of the prior's table; 0 is a table of a single row.
-        prior_mode: `table`, or `written`: the host writes the codes with the start; until then the table's
-            single row is used.
+        prior_bits: Address bits of the prior's table; 0 for a table with a single row.
+        prior_mode: `table`, or `written`: the host writes the codes with the start; until then, the single
+            row of the table applies.
         counter_bits: Bits of a line's counter, 1 to 32.
-        rng: Kind of random number generator. An LFSR must be wider than a code, or its low bits would
-            never all be 0 and code 1 would never count.
-        shared: One generator per column, shared by all its lines; else one per cell.
-        steps_per_clock: Steps of a generator between two cycles. 0 is replaced by the default: for an LFSR the
-            smallest power of two that is not below `prob_bits`, so that every cycle sees fresh bits; 1 for
-            `table` and `ideal`, whose every step is fresh.
-        rng_banks: Number of sets of seeds, of which a start selects one.
+        rng: Kind of random number generators. An LFSR must be wider than a code; otherwise its low bits would
+            never all be 0, and code 1 would never make a one.
+        shared: One generator per column, shared by all its lines; otherwise one per cell.
+        steps_per_clock: Steps of a generator per cycle. 0 is replaced by the default: for an LFSR the
+            smallest power of two that is at least `prob_bits`, so that every cycle uses fresh bits; 1 for
+            `table` and `ideal`.
+        rng_banks: Number of seed sets; a start selects one.
         rng_reset: Whether a start restarts the generators.
         ideal_seed: Seed of the `ideal` generator, 64 bits.
-        sensor_mode: `column`: one address serves a whole sensor column; `cell`: every cell has its own;
-            `threshold`: every cell is given its code, there are no tables, and `sensor_bits` are `prob_bits`.
+        sensor_mode: `column`: one address per sensor column; `cell`: one address per cell; `threshold`: one
+            code per cell, without tables, and `sensor_bits` equal to `prob_bits`.
         replicas: Machines that share the generators, each with its own inputs, counters, stop and cycles.
 
     Raises:
-        ParameterError: No such machine can be built.
+        ParameterError: A machine with these parameters cannot be built.
     """
 
     lines: int
@@ -147,10 +147,7 @@ class BM1Parameters:
                         f"prob_bits = {self.prob_bits}, since a cell's input is its code."
                     )
         if self.prior_mode is PriorMode.WRITTEN and self.prior_bits != 0:
-            raise ParameterError(
-                f"prior_bits is {self.prior_bits}; with prior_mode = written it must be 0, since a written prior "
-                "has no address."
-            )
+            raise ParameterError(f"prior_bits is {self.prior_bits}; with prior_mode = written it must be 0.")
         width = self.rng.lfsr_bits
         if width is not None and width <= self.prob_bits:
             raise ParameterError(
@@ -168,23 +165,23 @@ class BM1Parameters:
 
     @property
     def columns(self) -> int:
-        """Number of columns that make bits: the prior and the sensors (N + 1)."""
+        """Number of columns, including the prior (N + 1)."""
         return len(self.sensor_bits) + 1
 
     @property
     def has_tables(self) -> bool:
-        """Whether sensor columns hold tables; in `threshold` mode their inputs are codes."""
+        """Whether sensor columns have tables; in `threshold` mode their inputs are codes."""
         return self.sensor_mode is not SensorMode.THRESHOLD
 
     @property
     def input_shape(self) -> tuple[int, ...]:
-        """Shape of a frame's sensor inputs: [sensors] or, per cell, [sensors, lines]; several replicas come first."""
+        """Shape of a frame's inputs: [sensors], or [sensors, lines] per cell; with [replicas, ...] in front."""
         shape = (self.sensors,) if self.sensor_mode is SensorMode.COLUMN else (self.sensors, self.lines)
         return shape if self.replicas == 1 else (self.replicas, *shape)
 
     @property
     def count_shape(self) -> tuple[int, ...]:
-        """Shape of a frame's counts: [lines], or [replicas, lines] of several replicas."""
+        """Shape of a frame's counts: [lines], or [replicas, lines] with several replicas."""
         return (self.lines,) if self.replicas == 1 else (self.replicas, self.lines)
 
     @property
@@ -194,24 +191,22 @@ class BM1Parameters:
 
     @property
     def ones_code(self) -> int:
-        """The all-ones code, which is always 1."""
+        """The all-ones code, which always makes a one."""
         return (1 << self.prob_bits) - 1
 
     @property
     def target_count_max(self) -> int:
-        """Highest target count that a counter can reach."""
+        """Maximum target count."""
         return (1 << self.counter_bits) - 1
 
     def missing_address(self, column: int) -> int:
         """Return the address of a missing reading in sensor column `column` (1..N): the top one.
 
         Raises:
-            ParameterError: There is no such sensor column.
+            ParameterError: The column is not a sensor column.
         """
         if not 1 <= column <= self.sensors:
-            raise ParameterError(
-                f"There is no sensor column {column}: this machine's are 1 to {self.sensors}."
-            )
+            raise ParameterError(f"There is no sensor column {column}: this machine has 1 to {self.sensors}.")
         return (1 << self.sensor_bits[column - 1]) - 1
 
 

@@ -16,9 +16,9 @@ def joint_posterior(
 ) -> npt.NDArray[np.float64] | None:
     """Return the posterior over the lines of all boards, normalised jointly (thesis equation 2.3).
 
-    A line's probability is proportional to its count over its board's cycles; a board that ran no cycle (no line
-    of it can count) has the weight 0. Boards' counts can't be normalised board by board, since each board stopped at
-    its own cycle.
+    The probability of a line is proportional to its count divided by the cycles of its board; a board without
+    cycles (no line of it can count) has the weight 0. Counts must not be normalised for each board
+    separately, because each board stopped at its own cycle.
 
     Args:
         counts: One uint32[lines] per board, in the order of the model's lines.
@@ -28,7 +28,7 @@ def joint_posterior(
         float64[all lines] with the sum 1, or None if every count is 0.
 
     Raises:
-        MachineError: There are not as many cycles as boards, or a board has counts and ran no cycle.
+        MachineError: The numbers of counts and of cycles differ, or a board has counts without cycles.
     """
     if len(counts) != len(cycles):
         raise MachineError(f"There are counts of {len(counts)} boards and cycles of {len(cycles)}.")
@@ -40,10 +40,10 @@ def joint_posterior(
 def posterior_of_lines(
     counts: npt.NDArray[np.uint32], lines: Sequence[int], cycles: Sequence[int]
 ) -> npt.NDArray[np.float64] | None:
-    """Return `joint_posterior` of counts that are concatenated already: uint32[all lines], board after board.
+    """Return the `joint_posterior` of concatenated counts: uint32[all lines], board after board.
 
     Raises:
-        MachineError: A board has counts and ran no cycle.
+        MachineError: A board has counts without cycles.
     """
     if min(cycles) <= 0:
         end = 0
@@ -58,7 +58,7 @@ def posterior_of_lines(
 
 
 Reading: TypeAlias = int | Sequence[int] | npt.NDArray[np.integer] | None
-"""One sensor column's reading: an address, an address or code per line (`sensor_mode`), or None for a missing one."""
+"""Reading of a sensor column: an address, an address or code per line (`sensor_mode`), or None if missing."""
 
 
 def posterior(
@@ -75,29 +75,29 @@ def posterior(
 
     Args:
         machine: The machine to run.
-        readings: One address per sensor column, columns 1..N; None for a missing reading. Where cells have inputs
-            of their own (`sensor_mode`), a column's reading is a row of one address, or one code, per line. Several
-            replicas take one such set each; without a missing reading that may be one array of integers of the
-            shape `machine.parameters.input_shape`.
-        prior_address: Row of the prior's table; with replicas one for all, or a tuple of one each.
-        prior_codes: uint16[lines], a written prior, where the machine takes one; with replicas the same for all, or
-            uint16[replicas, lines].
+        readings: One address per sensor column, columns 1..N; None for a missing reading. With inputs per
+            cell (`sensor_mode`), the reading of a column is a row with one address, or one code, per line.
+            With several replicas, a list of one such set for each; if no reading is missing, this may be one
+            array of integers of shape `machine.parameters.input_shape`.
+        prior_address: Row of the prior's table; with replicas one for all, or a tuple with one for each.
+        prior_codes: uint16[lines], a written prior, if the machine uses one; with replicas the same for all,
+            or uint16[replicas, lines].
         target_count: The count at which the best line stops the machine.
-        max_cycles: Most cycles.
+        max_cycles: Maximum number of cycles.
         bank: Set of seeds; each gives another draw of the same distribution.
 
     Returns:
-        float64[lines] with the sum 1. With several replicas float64[replicas, lines]; the row of a replica without
-        a posterior is 0.
+        float64[lines] with the sum 1. With several replicas float64[replicas, lines]; the row of a replica
+        without a posterior is 0.
 
     Raises:
-        NoPosteriorError: No line (of any replica) can count for these readings, or none did before `max_cycles`.
+        NoPosteriorError: All counts (of all replicas) are 0 for these readings.
         StartError: A reading or another argument does not fit the machine.
     """
     from machines.kernel import make_kernel
 
     if not isinstance(readings, Sized):
-        raise StartError(f"Readings are a list, one for each sensor column; {readings!r} is not.")
+        raise StartError(f"Readings must be a list with one for each sensor column, not {readings!r}.")
     parameters = machine.parameters
     sets = [readings] if parameters.replicas == 1 else readings
     if len(sets) != parameters.replicas:
@@ -122,9 +122,9 @@ def posterior(
     ]
     if all(joint is None for joint in joints):
         cause = (
-            "every line has a code 0 among these readings' codes"
+            "these readings select a code 0 on every line"
             if kernel.reason is StopReason.IMPOSSIBLE
-            else f"no line counted in {kernel.cycles} cycles"
+            else f"all counts are 0 after {kernel.cycles} cycles"
         )
         raise NoPosteriorError(f"There is no posterior: {cause}.")
     rows = [np.zeros(parameters.lines) if joint is None else joint for joint in joints]
@@ -155,10 +155,10 @@ def _inputs(parameters: BM1Parameters, readings: Sequence[Reading]) -> npt.NDArr
                 f"The reading of column {column} has the shape {row.shape} and holds {row.dtype}; "
                 f"this machine takes {wanted}, or None."
             )
-        # as a code the top value is 1 for certain, like any other probability
+        # as a code, the top value is an ordinary probability: certainty
         if parameters.has_tables and (row == missing).any():
             raise StartError(
-                f"The reading of column {column} is {missing}, the address of a missing reading: give None for that."
+                f"The reading of column {column} is {missing}, the address of a missing reading: use None instead."
             )
         inputs[column - 1] = row
     return inputs

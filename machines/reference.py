@@ -1,4 +1,4 @@
-"""The reference BM1: one cycle at a time, as the thesis describes it; every other kernel is checked against it."""
+"""The reference BM1, which runs one cycle at a time as in the thesis; other kernels are tested against it."""
 
 import numpy as np
 import numpy.typing as npt
@@ -10,9 +10,9 @@ from machines.rng import random_numbers
 
 
 class ReferenceBM1(BM1Kernel):
-    """A machine of any kind that runs cycle by cycle (thesis 2.1.2, figure 2.4).
+    """A kernel for any machine that runs cycle by cycle (thesis 2.1.2, figure 2.4).
 
-    In every cycle all replicas see the same random numbers. Each compares these with its own codes, counts by itself
+    In every cycle, all replicas use the same random numbers. Each compares them with its own codes, counts
     and stops by itself; the generators step until the last one has stopped.
     """
 
@@ -26,12 +26,12 @@ class ReferenceBM1(BM1Kernel):
 
     @property
     def counts(self) -> npt.NDArray[np.uint32]:
-        """The counters, a copy: uint32[lines], with several replicas uint32[replicas, lines]."""
+        """A copy of the counters: uint32[lines], with several replicas uint32[replicas, lines]."""
         return self._counts.reshape(self._machine.parameters.count_shape).copy()
 
     @property
     def rng_state(self) -> npt.NDArray[np.uint64]:
-        """The generators' states, a copy: uint64[columns], or uint64[lines, columns] if unshared."""
+        """A copy of the generators' states: uint64[columns], or uint64[lines, columns] if unshared."""
         return self._states.copy()
 
     def _reset(self) -> None:
@@ -54,7 +54,7 @@ class ReferenceBM1(BM1Kernel):
         self._resume(going, int(start.run_until))
 
     def _resume(self, going: list[int], run_until: int) -> None:
-        """Cycle until every replica has overflowed, or has run the frame's or the slice's last cycle."""
+        """Run until every replica has overflowed, or has reached the last cycle of the frame or slice."""
         running = going
         while running:
             self._cycle(running)
@@ -69,7 +69,7 @@ class ReferenceBM1(BM1Kernel):
             running = going
 
     def _cycle(self, running: list[int]) -> None:
-        """Make every cell's bit, AND and count every line of the running replicas, and step every generator."""
+        """Compute the bits of all cells, count the lines of the running replicas, and step all generators."""
         ones = self._machine.parameters.ones_code
         random = self._random_numbers.show(self._states)
         bits = (random < self._codes) | (self._codes == ones)

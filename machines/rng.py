@@ -1,8 +1,9 @@
-"""The random number generators of a machine: seeds, steps, and the numbers shown to the cells.
+"""The random number generators of a machine: seeds, steps and outputs.
 
-There is one generator in each column, or in each cell where they are not shared. They are numbered: column c
-is number c, a cell is number line * columns + column, and bank b begins at b times their count. A generator's
-state is one uint64, and a cell compares its code with the low `prob_bits` bits of the number that the state shows.
+There is one generator for each column, or for each cell if they are not shared. The number of a generator is
+its column, or line * columns + column for a cell; the numbers of bank b begin at b times the number of
+generators. The state of a generator is one uint64, and a cell compares its code with the low `prob_bits` bits
+of the output.
 """
 
 from dataclasses import dataclass
@@ -18,10 +19,10 @@ from machines.parameters import BM1Parameters, RngKind
 Words: TypeAlias = npt.NDArray[np.uint64]
 
 GOLDEN: Final = 0x9E3779B97F4A7C15
-"""2**64 over the golden ratio, rounded to an odd number: any number of its multiples are spread evenly."""
+"""2**64 divided by the golden ratio, rounded to an odd number: its multiples are evenly spread."""
 
 BASE_STATE: Final = 0x2545F4914F6CDD1D
-"""Its low bits are the state from which every LFSR's seeds are reached."""
+"""Its low bits are the state from which the seeds of every LFSR are computed."""
 
 POLYNOMIALS: Final = {
     RngKind.LFSR8: (8, 6, 5, 4),
@@ -29,17 +30,17 @@ POLYNOMIALS: Final = {
     RngKind.LFSR24: (24, 23, 22, 17),
     RngKind.LFSR32: (32, 22, 2, 1),
 }
-"""Exponents of each LFSR's maximal polynomial, except for the 1, in descending order."""
+"""Exponents of each LFSR's maximal-length polynomial, except 0, in descending order."""
 
 
 class RandomNumbers(Protocol):
-    """All generators of a machine at once: arrays hold one element per generator."""
+    """All generators of a machine: arrays have one element per generator."""
 
     def restart(self, bank: int) -> Words:
         """Return the states at the start of a bank: uint64[columns], or uint64[lines, columns] if unshared."""
 
     def show(self, states: Words) -> Words:
-        """Return the numbers that the states show to the cells, `prob_bits` bits each."""
+        """Return the outputs for these states, `prob_bits` bits each."""
 
     def clock(self, states: Words) -> Words:
         """Return the states after one clock, which is `steps_per_clock` steps."""
@@ -79,12 +80,12 @@ class LFSR:
 
     @property
     def period(self) -> int:
-        """Steps after which a state repeats."""
+        """Number of steps after which a state repeats."""
         return (1 << self.bits) - 1
 
     @property
     def taps(self) -> int:
-        """Mask of the state's bits whose parity is shifted in."""
+        """Mask of the state bits whose parity is shifted in."""
         return sum(1 << (exponent - 1) for exponent in POLYNOMIALS[self.kind])
 
     def step(self, states: Words) -> Words:
@@ -93,7 +94,7 @@ class LFSR:
         return ((states << np.uint64(1)) & np.uint64(self.period)) | parity
 
     def jump(self, states: Words, steps: Words) -> Words:
-        """Return each state after its number of steps, at the cost of a few look-ups."""
+        """Return each state after its number of steps, in a few look-ups."""
         steps = steps % np.uint64(self.period)
         for bit, tables in enumerate(jump_tables(self.kind, 1)):
             taken = (steps >> np.uint64(bit)) & np.uint64(1) == 1
@@ -101,7 +102,7 @@ class LFSR:
         return states
 
     def seeds(self, numbers: Words) -> Words:
-        """Return the first states of the generators with these numbers.
+        """Return the initial states of the generators with these numbers.
 
         Their distances from a base state are scattered, not evenly spaced: evenly spaced phases of 3, 5
         or 17 columns XOR to 0, because these divide 2**32 - 1, and the AND of such columns is wrong at any length.
@@ -113,7 +114,7 @@ class LFSR:
 
 @dataclass(frozen=True, slots=True)
 class LFSRNumbers:
-    """LFSRs, which show the low bits of their states."""
+    """LFSRs, which output the low bits of their states."""
 
     parameters: BM1Parameters
 
@@ -126,7 +127,7 @@ class LFSRNumbers:
         return states & np.uint64(self.parameters.ones_code)
 
     def clock(self, states: Words) -> Words:
-        """Take `steps_per_clock` steps, one by one."""
+        """Make `steps_per_clock` steps, one by one."""
         lfsr = LFSR(self.parameters.rng)
         for _ in range(self.parameters.steps_per_clock):
             states = lfsr.step(states)
@@ -135,20 +136,20 @@ class LFSRNumbers:
 
 @dataclass(frozen=True, slots=True)
 class TableNumbers:
-    """Generators that all play one recorded table in a ring; a state is an index.
+    """Generators that all repeat one recorded table; a state is an index.
 
-    Generator n of `count` starts at floor(n * length / count), and bank b goes b / banks of the way to the
-    next one's start.
+    Generator n of `count` starts at floor(n * length / count), and bank b adds b / banks of the distance to
+    the start of the next generator.
     """
 
     parameters: BM1Parameters
     table: npt.NDArray[np.uint32]
 
     def restart(self, bank: int) -> Words:
-        """Return the first indices."""
+        """Return the initial indices."""
         numbers = generator_numbers(self.parameters, 0)
         banks = self.parameters.rng_banks
-        # Python's integers: the products may exceed 64 bits
+        # Python integers, because the products may exceed 64 bits
         starts = [(n * banks + bank) * len(self.table) // (numbers.size * banks) for n in range(numbers.size)]
         return np.array(starts, dtype=np.uint64).reshape(numbers.shape)
 
@@ -163,16 +164,16 @@ class TableNumbers:
 
 @dataclass(frozen=True, slots=True)
 class IdealNumbers:
-    """Generators for comparison, as good as random: splitmix64 of seed, generator and cycle.
+    """Nearly ideal generators for comparison: splitmix64 of seed, generator and cycle.
 
-    The state of generator n starts at mix(mix(`ideal_seed`) + (n + 1) * GOLDEN), a step adds GOLDEN, and a
-    state shows mix(state), all modulo 2**64.
+    The state of generator n starts at mix(mix(`ideal_seed`) + (n + 1) * GOLDEN), a step adds GOLDEN, and the
+    output is mix(state), all modulo 2**64.
     """
 
     parameters: BM1Parameters
 
     def restart(self, bank: int) -> Words:
-        """Return the first states."""
+        """Return the initial states."""
         seed = mix(np.array([self.parameters.ideal_seed], dtype=np.uint64))
         numbers = generator_numbers(self.parameters, bank)
         return mix(seed + (numbers + np.uint64(1)) * np.uint64(GOLDEN))
@@ -182,7 +183,7 @@ class IdealNumbers:
         return mix(states) & np.uint64(self.parameters.ones_code)
 
     def clock(self, states: Words) -> Words:
-        """Take `steps_per_clock` steps in one addition."""
+        """Make `steps_per_clock` steps in one addition."""
         return states + np.uint64(self.parameters.steps_per_clock * GOLDEN % 2**64)
 
 
@@ -193,12 +194,12 @@ def mix(words: Words) -> Words:
     return words ^ (words >> np.uint64(31))
 
 
-# An LFSR's step is linear over GF(2), and so is any number of steps. A linear map of a state is held as one
-# table of 256 words per byte of the state: the image is the XOR of one word from each.
+# A step of an LFSR is linear over GF(2), and so is any number of steps. A linear map of a state is stored as
+# one table of 256 words per byte of the state: the image is the XOR of one word from each table.
 
 
 def map_tables(images: Words) -> Words:
-    """Return the tables of the linear map that takes state bit j to `images[j]`: uint64[bits / 8, 256]."""
+    """Return the tables of the linear map from state bit j to `images[j]`: uint64[bits / 8, 256]."""
     tables = np.zeros((len(images) // 8, 256), dtype=np.uint64)
     for j, image in enumerate(images):
         table, half = tables[j // 8], 1 << (j % 8)
