@@ -1,1 +1,1 @@
-"""The way to the boards: registers, link, emulated board, driver, programming files (thesis 2.3, 3.2)."""
+"""Boards: registers, link, emulated board, driver, programming files (thesis 2.3, 3.2)."""

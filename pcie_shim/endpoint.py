@@ -19,7 +19,7 @@ from pcie_shim.errors import EndpointError, KeyRefusedError, LinkTimeoutError, U
 from pcie_shim.tunnel import tunnel_to_board
 
 UNIX_PATH_BYTES: Final = 107
-"""Longest path of a unix socket on Linux."""
+"""Maximum length in bytes of the path of a Unix socket on Linux."""
 
 _RETRY_S: Final = 0.02
 
@@ -60,7 +60,7 @@ class Endpoint:
 
     @property
     def programming(self) -> Endpoint:
-        """The board's programming port: `board0.program.sock` beside `board0.sock`, or the next TCP port."""
+        """The programming port: `board0.program.sock` next to `board0.sock`, or the next TCP port."""
         if self.path:
             path = Path(self.path)
             return Endpoint(path=str(path.with_name(f"{path.stem}.program{path.suffix}")))
@@ -72,7 +72,7 @@ def parse_endpoint(text: str) -> Endpoint:
     if text.startswith("unix:"):
         endpoint = Endpoint(path=text.removeprefix("unix:"))
         if not endpoint.path.startswith("/"):
-            raise EndpointError(f"The endpoint '{text}' has a relative path: unix: takes an absolute one")
+            raise EndpointError(f"The endpoint '{text}' has a relative path: unix: needs an absolute one")
         longest = len(os.fsencode(endpoint.programming.path))
         if longest > UNIX_PATH_BYTES:
             raise EndpointError(
@@ -83,9 +83,7 @@ def parse_endpoint(text: str) -> Endpoint:
     try:
         parts = urlsplit(text)
         host, port = parts.hostname, parts.port
-        (host or "").encode(
-            "idna"
-        )  # as the resolver does, which would fail with a UnicodeError (a ValueError)
+        (host or "").encode("idna")  # like the resolver, which would fail with a UnicodeError (a ValueError)
     except ValueError:
         host, port = None, None
     if text.startswith(("tcp://", "tls://")) and host and port and port < 65535 and text.count("/") == 2:
@@ -107,7 +105,7 @@ def listen(endpoint: Endpoint) -> socket.socket:
             family = socket.AF_INET6 if ":" in endpoint.host else socket.AF_INET
             return socket.create_server((endpoint.host, endpoint.port), family=family)
         server = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        # Linux gives the file the socket's mode, so that another user can never connect
+        # Linux creates the file with the mode of the socket, so another user can never connect
         os.fchmod(server.fileno(), 0o600)
         try:
             server.bind(endpoint.path)
@@ -132,7 +130,7 @@ def _is_served(path: str) -> bool:
         except ConnectionRefusedError:
             return False
         except BlockingIOError:
-            pass  # its backlog is full: a blocking connect would wait
+            pass  # the backlog is full: a blocking connect would wait
         return True
 
 

@@ -1,4 +1,4 @@
-"""Errors between the host and its boards; the text of each is one sentence for the user."""
+"""Errors of boards and of the link; the text of each is one sentence for the user."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import ClassVar
 
 
 class PcieShimError(Exception):
-    """Root of this package's errors."""
+    """Base class of this package's errors."""
 
     exit_code: ClassVar[int] = 5
 
@@ -24,7 +24,7 @@ class CredentialsError(PcieShimError):
 
 
 class ImageError(PcieShimError):
-    """A programming file that cannot be made or used: a model too large for the interface, a wrong partition."""
+    """A programming file that cannot be created or used, such as a model too large for the interface."""
 
     exit_code = 2
 
@@ -44,7 +44,7 @@ class FrameInputError(PcieShimError):
 
 
 class LinkError(PcieShimError):
-    """A link to a board that is unusable."""
+    """An unusable link to a board."""
 
 
 class UnreachableError(LinkError):
@@ -60,11 +60,11 @@ class LinkTimeoutError(LinkError):
 
 
 class FramingError(LinkError):
-    """Bytes that are not a frame: another program listens there, or the stream is broken."""
+    """Bytes that are not a frame: another program is listening there, or the stream is damaged."""
 
 
 class CrcError(FramingError):
-    """A frame's CRC-32 is not that of its header and payload."""
+    """A frame with a CRC-32 that does not match its header and payload."""
 
 
 class SequenceError(FramingError):
@@ -72,7 +72,7 @@ class SequenceError(FramingError):
 
 
 class ShortReadError(FramingError):
-    """A read was answered with fewer or more words than were asked for."""
+    """A read was answered with fewer or more words than requested."""
 
 
 class DeviceGoneError(LinkError):
@@ -92,7 +92,7 @@ class GreetingMismatchError(LinkError):
 
 
 class AccessError(LinkError):
-    """An access that the board refused.
+    """An access that was refused by the board.
 
     Attributes:
         code: The board's error code, a `register_map.ErrorCode` (or an unknown number).
@@ -110,11 +110,11 @@ class HeldError(AccessError):
 
 
 class StaleHandleError(AccessError):
-    """A handle that is stale because the board was programmed after it was opened."""
+    """A handle of a board that was programmed after it was opened."""
 
 
 class BoardError(PcieShimError):
-    """A board of the mini-cluster that failed a frame or cannot be opened.
+    """A board of the mini-cluster on which a frame failed, or that cannot be opened.
 
     Attributes:
         board: The board's number in the mini-cluster, from 0.
@@ -126,7 +126,7 @@ class BoardError(PcieShimError):
 
 
 class BoardUnreachableError(BoardError):
-    """Nothing listens at the board's endpoint, or it does not greet."""
+    """Nothing listens at the board's endpoint, or the greeting is missing."""
 
 
 class BoardHeldError(BoardError):
@@ -148,11 +148,11 @@ class BoardGoneError(BoardError):
 
 
 class BoardLinkError(BoardError):
-    """The board broke the protocol: a short read, a wrong CRC, a wrong sequence number."""
+    """The board violated the protocol: a short read, a wrong CRC, a wrong sequence number."""
 
 
 class BoardRefusedError(BoardError):
-    """The board answered ERROR to an access of the driver."""
+    """The board answered an access of the driver with ERROR."""
 
 
 class BoardStaleError(BoardError):

@@ -1,8 +1,8 @@
-"""Frames of the link, without sockets: bytes to frames and back (docs/reference/boards.md has the wire format).
+"""Frames of the link, without sockets: encoding and decoding (docs/reference/boards.md has the wire format).
 
-A frame is a header of 20 bytes (operation, flags, sequence, address, count, CRC-32) and 32-bit words,
-all little-endian: thesis 2.3, where the data link layer adds sequence numbers and CRCs to requests
-to read and write. `FrameDecoder` keeps one buffer for the life of a link.
+A frame is a header of 20 bytes (operation, flags, sequence, address, count, CRC-32) and 32-bit words, all
+little-endian. It corresponds to the data link layer of thesis 2.3, which adds sequence numbers and CRCs to
+read and write requests. `FrameDecoder` uses one buffer as long as the link is open.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ from pcie_shim.errors import CrcError, FramingError
 
 Octets: TypeAlias = bytes | bytearray | memoryview
 
-# Plain integers: an enumeration's members cost a look-up and a conversion in every frame.
+# Plain integers, because members of an enumeration cost a look-up and a conversion in every frame.
 GREET: Final = 1
-"""Board to host, first frame of a link: the `Greeting`."""
+"""Board to host, the first frame of a link: the `Greeting`."""
 READ: Final = 2
-"""Host to board: `count` words from `address` on; the reply carries them."""
+"""Host to board: read `count` words from `address` on; the reply contains them."""
 WRITE: Final = 3
-"""Host to board: the payload goes to `address` and on; acknowledged, unless posted."""
+"""Host to board: write the payload from `address` on; acknowledged, unless posted."""
 IRQ: Final = 4
-"""Board to host: the machine has stopped; the payload is the block from DONE on and the results."""
+"""Board to host: the machine has stopped; the payload is the block from DONE on, and the results."""
 ERROR: Final = 5
 """Board to host: the request of this sequence number was refused (`encode_error`)."""
 PROGRAM: Final = 6
@@ -35,15 +35,15 @@ AUTHENTICATE: Final = 7
 REPLY: Final = 1
 """Flag: the answer to the request of the same sequence number."""
 POSTED: Final = 2
-"""Flag: no acknowledgement; a refusal is still answered by ERROR."""
+"""Flag: no acknowledgement; a refusal is still answered with ERROR."""
 BEGIN: Final = 4
 """Flag of PROGRAM: the payload announces the file (`ProgramBegin`)."""
 END: Final = 8
-"""Flag of PROGRAM: the file is complete; the reply comes when the board has loaded it."""
+"""Flag of PROGRAM: the file is complete; the reply follows when the board has loaded it."""
 
 PROTOCOL_VERSION: Final = 1
 MAX_PAYLOAD_WORDS: Final = 8192
-"""Longest payload: the map's longest block, INPUTS."""
+"""Maximum payload in words: the length of INPUTS, the longest block of the map."""
 
 _MAGIC: Final = 0x4D42
 _HEAD: Final = struct.Struct("<HBBIII")
@@ -61,10 +61,10 @@ class Frame(NamedTuple):
     Attributes:
         operation: One of this module's operations.
         flags: Sum of this module's flags.
-        sequence: A request's number, from 1 up, modulo 2^32; the same in what answers it.
+        sequence: Number of the request, from 1, modulo 2^32; an answer has the number of its request.
         address: Offset in the register map, in bytes.
-        words: Words of payload, or, in a READ request, asked for.
-        payload: The words, as bytes in the decoder's buffer: valid until the next bytes are received.
+        words: Number of words in the payload, or requested words in a READ request.
+        payload: The words as bytes in the buffer of the decoder, valid until the next bytes are received.
     """
 
     operation: int
@@ -78,16 +78,16 @@ class Frame(NamedTuple):
 def encode(
     operation: int, flags: int, sequence: int, address: int, count: int, payload: Octets = b""
 ) -> bytes:
-    """Return a frame's bytes; `payload` has `count` words, or none."""
+    """Return the bytes of a frame; `payload` has `count` words, or is empty."""
     head = _HEAD.pack(_MAGIC, operation, flags, sequence, address, count)
     return b"".join((head, _CRC.pack(crc32(payload, crc32(head))), payload))
 
 
 class FrameDecoder:
-    """Turns a stream of bytes into frames.
+    """Decoder of a stream of bytes into frames.
 
-    Receive into `room`, report the number of bytes to `received`, then take frames from `next_frame` until it
-    returns None. After an error the decoder is unusable.
+    Receive into `room`, pass the number of bytes to `received`, then call `next_frame` until it returns None.
+    After an error the decoder is unusable.
     """
 
     def __init__(self) -> None:
@@ -97,7 +97,7 @@ class FrameDecoder:
 
     @property
     def inside_frame(self) -> bool:
-        """Whether the buffer holds an incomplete frame."""
+        """Whether the buffer contains an incomplete frame."""
         return self._end > self._start
 
     def room(self) -> memoryview:
@@ -115,7 +115,7 @@ class FrameDecoder:
         self._end += count
 
     def next_frame(self) -> Frame | None:
-        """Return the next complete frame, or None until more bytes come.
+        """Return the next complete frame, or None if more bytes are needed.
 
         Raises:
             FramingError: The bytes are not a frame.
@@ -128,7 +128,7 @@ class FrameDecoder:
         if magic != _MAGIC or operation not in _OPERATIONS or flags > 15:
             raise FramingError("the bytes received are not a frame of the link")
         if count > MAX_PAYLOAD_WORDS:
-            raise FramingError(f"a frame has {count} words; {MAX_PAYLOAD_WORDS} are the most")
+            raise FramingError(f"a frame has {count} words; the maximum is {MAX_PAYLOAD_WORDS}")
         payload_start = start + HEADER_BYTES
         end = payload_start if (operation, flags & REPLY) in _WITHOUT_PAYLOAD else payload_start + 4 * count
         if self._end < end:
@@ -146,15 +146,15 @@ _LINK_MAGIC: Final = b"ROSBAYES"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Greeting:
-    """A board's introduction when a link opens.
+    """The identity of a board, sent when a link opens.
 
     Attributes:
         protocol_version: Version of the wire format.
         bar_size: Size of the register map, in bytes.
-        board: The board's number, as it was started.
+        board: Number of the board, given at its start.
         map_hash: SHA-256 (hex) of the register map's definition.
         image_hash: SHA-256 (hex) of the loaded image; all zeros on a blank board.
-        token: Proves to the programming port that its sender holds this link.
+        token: Token that proves to the programming port that its sender holds this link.
     """
 
     protocol_version: int

@@ -1,11 +1,11 @@
-"""Programming files, which the toolchain builds from a model and the loader writes to a board (thesis 3.4).
+"""Programming files, which the toolchain builds from a model and the loader sends to a board (thesis 3.4).
 
-A file is a fixed header, a manifest (readable JSON: `head -c 4000 board0.bm`) and the machine's tables, one
-section each. The header has the manifest's SHA-256 and the manifest that of every section, so that an error
-names the damaged part. The same image and build date always give the same bytes.
+A file is a fixed header, a manifest (readable JSON: `head -c 4000 board0.bm`) and the tables of the machine,
+one section each. The header contains the SHA-256 of the manifest, and the manifest that of every section, so
+that an error names the damaged part. The same image and build date always give the same bytes.
 
-`image_hash` identifies the computation: parameters, tables, partition, interface, model and register map; not
-the date or the version of the tools.
+`image_hash` identifies the computation: parameters, tables, partition, interface, model and register map, but
+not the date or the version of the tools.
 """
 
 from __future__ import annotations
@@ -34,20 +34,20 @@ from pcie_shim import register_map
 from pcie_shim.errors import DamagedImageError, ImageError, ImageMismatchError
 
 MAGIC: Final = b"BMIMAGE\x01"
-"""First bytes of a programming file; the last of them is the format's version."""
+"""First bytes of a programming file; the last one is the version of the format."""
 
 MAX_IMAGE_BYTES: Final = 1 << 30
-"""Largest programming file that is read or received."""
+"""Maximum size of a programming file in bytes."""
 
 _HEADER: Final = struct.Struct("<8sII32s")  # magic, length of the manifest, zero, SHA-256 of the manifest
 
 
 @dataclass(frozen=True)
 class Partition:
-    """Which lines of the model a board holds.
+    """The lines of the model on one board.
 
     Attributes:
-        index: This part's number, from 0.
+        index: Number of this part, from 0.
         count: Number of parts (boards).
         line_offset: First line of this part in the whole model.
         total_lines: Lines of the whole model.
@@ -61,11 +61,11 @@ class Partition:
 
 @dataclass(frozen=True, eq=False)
 class Image:
-    """The contents of one board's programming file.
+    """The content of the programming file of one board.
 
     Attributes:
-        machine: The board's lines of the machine.
-        partition: Their place in the model.
+        machine: The machine with the lines of the board.
+        partition: Position of the lines in the model.
         interface_sensors: Input words of the interface (thesis 3.2: 20).
         interface_results: Result words of the interface (thesis 3.2: 1200).
         model_hash: SHA-256 (hex) of the model; the same for all boards of a deployment.
@@ -73,8 +73,8 @@ class Image:
         tool_version: Version of the toolchain.
 
     Raises:
-        ImageError: The machine is larger than the interface, or the interface than the register map, or
-            the partition does not hold these lines.
+        ImageError: The machine is larger than the interface, or the interface than the register map, or the
+            partition does not match the lines.
     """
 
     machine: BM1Machine
@@ -86,7 +86,7 @@ class Image:
     tool_version: str
 
     def __post_init__(self) -> None:
-        """Refuse an image that no board can hold."""
+        """Check that a board can hold the image."""
         parameters, part = self.machine.parameters, self.partition
         lines, words = parameters.lines, interface_room(parameters)
         inputs, results = interface_words(parameters)
@@ -115,33 +115,33 @@ class Image:
 
     @property
     def map_hash(self) -> str:
-        """SHA-256 (hex) of the image's register map, which is this software's."""
+        """SHA-256 (hex) of the register map of this software, for which the image is built."""
         return register_map.MAP_SHA256
 
     @cached_property
     def image_hash(self) -> str:
-        """SHA-256 (hex) of the board's computation, independent of the build's date."""
+        """SHA-256 (hex) of the computation of the board, independent of the build date."""
         return _manifest(self, _sections(self.machine)).image_hash
 
 
 def interface_words(parameters: BM1Parameters) -> tuple[int, int]:
-    """Return the input words and result words of a board with this machine, those of all replicas."""
+    """Return the numbers of input words and result words of a board with this machine and all its replicas."""
     return math.prod(parameters.input_shape), math.prod(parameters.count_shape)
 
 
 def interface_room(parameters: BM1Parameters) -> tuple[int, int]:
-    """Return the input words and result words for which the register map has room, with such inputs."""
+    """Return the maximum numbers of input words and result words in the register map, for such inputs."""
     inputs = register_map.SENSORS_WORDS if is_plain(parameters) else register_map.INPUTS_WORDS
     return inputs, register_map.RESULTS_WORDS
 
 
 def is_plain(parameters: BM1Parameters) -> bool:
-    """Return whether one replica has one input per column: then its inputs are in SENSORS, else in INPUTS."""
+    """Return whether a single machine has one input per column, in SENSORS; otherwise inputs are in INPUTS."""
     return parameters.replicas == 1 and parameters.sensor_mode is SensorMode.COLUMN
 
 
 def _sizes(parameters: BM1Parameters) -> str:
-    """Describe a machine's size for an error's sentence."""
+    """Return the size of a machine as text for an error."""
     if is_plain(parameters):
         return f"{parameters.sensors} sensors and {parameters.lines} lines"
     inputs, results = interface_words(parameters)
@@ -216,7 +216,7 @@ def tool_version() -> str:
 
 
 def image_bytes(image: Image) -> bytes:
-    """Return the bytes of the image's programming file, which are always the same for the same image."""
+    """Return the bytes of the programming file, which are always the same for the same image."""
     sections = _sections(image.machine)
     manifest = _canonical(_manifest(image, sections).model_dump(mode="json"))
     header = _HEADER.pack(MAGIC, len(manifest), 0, hashlib.sha256(manifest).digest())
@@ -229,20 +229,20 @@ def read_image(path: Path) -> Image:
     Raises:
         ImageError: The file cannot be read.
         DamagedImageError: A hash is wrong.
-        ImageMismatchError: It is for another register map or format.
+        ImageMismatchError: The file is for another register map or format.
     """
     return image_from_bytes(read_bytes(path), str(path))
 
 
 def read_bytes(path: Path) -> bytes:
-    """Read the bytes of a file for `image_from_bytes`, no more than it accepts.
+    """Read the bytes of a file for `image_from_bytes`, up to the maximum that it accepts.
 
     Raises:
         ImageError: The file cannot be read.
     """
     try:
         with path.open("rb") as file:
-            # one byte more than allowed, which marks a file that is too large
+            # one byte more than allowed, to detect a file that is too large
             return file.read(MAX_IMAGE_BYTES + 1)
     except OSError as error:
         raise ImageError(f"{path} cannot be read: {error.strerror}") from error
@@ -253,7 +253,7 @@ def image_from_bytes(content: bytes, name: str = "the image") -> Image:
 
     Raises:
         DamagedImageError: A hash is wrong.
-        ImageMismatchError: It is for another register map or format.
+        ImageMismatchError: The file is for another register map or format.
     """
     manifest, data_start = _read_manifest(content, name)
     if manifest.identity.map_hash != register_map.MAP_SHA256:
@@ -283,7 +283,7 @@ def image_from_bytes(content: bytes, name: str = "the image") -> Image:
             tool_version=manifest.tool_version,
         )
     except MachineError as error:
-        raise ImageMismatchError(f"{name} holds a machine that cannot be built: {error}") from error
+        raise ImageMismatchError(f"{name} contains a machine that cannot be built: {error}") from error
 
 
 def _read_manifest(content: bytes, name: str) -> tuple[_Manifest, int]:
@@ -312,12 +312,12 @@ def _read_manifest(content: bytes, name: str) -> tuple[_Manifest, int]:
 
 
 def _read_sections(content: bytes, name: str, manifest: _Manifest, start: int) -> dict[str, npt.NDArray[Any]]:
-    """Return the tables by their names; the parameters say which there must be, before anything is allocated."""
+    """Return the tables by name; the parameters define the expected sections before anything is allocated."""
     sections: dict[str, npt.NDArray[Any]] = {}
     due = _due_sections(manifest.identity.parameters)
     for section in manifest.identity.sections:
         name_due, dtype, shape = next(due, ("no further section", "", ()))
-        # -1: the only length that the parameters leave open
+        # -1: the only length that the parameters do not define
         fits = len(shape) == len(section.shape) and all(
             size in {-1, given} for size, given in zip(shape, section.shape, strict=True)
         )
@@ -335,12 +335,12 @@ def _read_sections(content: bytes, name: str, manifest: _Manifest, start: int) -
     if (missing := next(due, None)) is not None:
         raise ImageMismatchError(f"{name} has no section '{missing[0]}', which its parameters need")
     if start != len(content):
-        raise DamagedImageError(f"{name} is damaged: {len(content) - start} bytes follow its last section")
+        raise DamagedImageError(f"{name} is damaged: {len(content) - start} bytes follow the last section")
     return sections
 
 
 def _due_sections(parameters: BM1Parameters) -> Iterator[tuple[str, str, tuple[int, ...]]]:
-    """Yield the name, type and shape of each section that a machine with these parameters has."""
+    """Yield the name, type and shape of each expected section."""
     yield "prior", "<u2", (parameters.prior_addresses, parameters.lines)
     if parameters.has_tables:
         for column, bits in enumerate(parameters.sensor_bits, start=1):
@@ -389,7 +389,7 @@ def _manifest(image: Image, sections: list[tuple[str, npt.NDArray[Any]]]) -> _Ma
 
 
 def _sections(machine: BM1Machine) -> list[tuple[str, npt.NDArray[Any]]]:
-    """Return the tables in the file's order and types (one per MIF of the thesis's hardware project)."""
+    """Return the tables in the order and types of the file (one per MIF of the thesis's hardware project)."""
     sections: list[tuple[str, npt.NDArray[Any]]] = [("prior", machine.prior.astype("<u2", copy=False))]
     for column, table in enumerate(machine.tables, start=1):
         sections.append((f"column {column}", table.astype("<u2", copy=False)))

@@ -1,6 +1,6 @@
-"""TLS for links over TCP: a tunnel between the network's socket and one of a pair, for which all code stays the same.
+"""TLS for links over TCP: a tunnel between the network socket and a local socket pair.
 
-One thread with an event loop carries the bytes of all tunnels of a process. Links without TLS do not pass through here.
+One thread with an event loop forwards the bytes of all tunnels of a process. Links without TLS do not use it.
 """
 
 from __future__ import annotations

@@ -1,1 +1,1 @@
-"""The board side of the link: the emulated board and the server that puts it behind a socket."""
+"""The board side of the link: the emulated board, and the server that makes it accessible over a socket."""

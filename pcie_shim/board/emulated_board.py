@@ -1,8 +1,8 @@
-"""The emulated FPGA board, without sockets: a register file with a Bayesian machine behind it.
+"""The emulated FPGA board, without sockets: a register file and a Bayesian machine.
 
-The whole map is one array of bytes, so that a read is a slice; only registers with side effects need code. The
-machine runs in chunks of some 50 ms (`EmulatedBoard.step`), between which the server can read a reset; chunks
-do not change results, since a machine that stops at a cycle and is resumed gives the same bits.
+The whole map is one array of bytes, so a read is a slice, and only registers with side effects need code. The
+machine runs in chunks of about 50 ms (`EmulatedBoard.step`), between which the server can receive a reset.
+Chunks do not change results, because a machine that is stopped and resumed gives the same bits.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ from pcie_shim.register_layout import (
 from pcie_shim.register_map import BoardState, ErrorCode, MachineKind, RngKind, SensorMode
 
 CHUNK_S: Final = 0.05
-"""Seconds that the machine runs before the board reads from its host again."""
+"""Duration of a chunk in seconds, after which the board reads from its host again."""
 
 _NO_ACCESS, _READ, _READ_WRITE = 0, 1, 3
 _SETTINGS: Final = struct.Struct(f"{SETTINGS.format}Q")  # and RUN_UNTIL
-_SHORTEST_CHUNK: Final = 64  # cycles, however slow the machine
+_SHORTEST_CHUNK: Final = 64  # cycles, even if the machine is slow
 _ALIGNMENT: Final = 4096  # chunks end between the blocks of a fast kernel
 
 
@@ -46,7 +46,7 @@ class RefusedError(PcieShimError):
     """The board refuses an access.
 
     Attributes:
-        code: Why, for the host.
+        code: The error code for the host.
     """
 
     def __init__(self, code: ErrorCode, detail: str) -> None:
@@ -55,13 +55,13 @@ class RefusedError(PcieShimError):
 
 
 class EmulatedBoard:
-    """A board: blank until an image is loaded, then a BM1 behind registers (docs/reference/registers.md).
+    """A board: blank until an image is loaded, then a BM1 with registers (docs/reference/registers.md).
 
     Attributes:
         programmed: Number of images loaded so far.
         done: The number of the last start or resume that has stopped (register DONE).
-        running: Whether the machine runs and `step` must be called.
-        stuck: Set by misbehaviour: a machine that is started now runs for ever without a cycle.
+        running: Whether the machine is running and `step` must be called.
+        stuck: Set by misbehaviour: a machine that is started now runs forever without a cycle.
     """
 
     def __init__(self, make: Callable[[BM1Machine], BM1Kernel] = make_kernel) -> None:
@@ -97,7 +97,7 @@ class EmulatedBoard:
 
     @property
     def interrupt_enabled(self) -> bool:
-        """Whether the host wants an interrupt when the machine stops."""
+        """Whether the host has enabled interrupts."""
         return bool(self._memory[rm.CONTROL] & rm.CONTROL_INTERRUPT_ENABLE_MASK)
 
     def _power_up(self) -> None:
@@ -117,16 +117,16 @@ class EmulatedBoard:
             self._allow(window.start, len(window) // 4, _NO_ACCESS)
 
     def load(self, content: bytes) -> None:
-        """Program the board with the bytes of a programming file, as the loader sends them.
+        """Program the board with the bytes of a programming file.
 
-        This prepares the machine, which takes a tenth of a second, runs it for a few milliseconds, to measure its
-        speed, and resets it.
+        This prepares the machine (about 0.1 s), runs it for a few milliseconds to measure its speed, and
+        resets it.
 
         Raises:
-            RefusedError: The machine runs, or the image is damaged or for another map.
+            RefusedError: The machine is running, or the image is damaged or for another map.
         """
         if self.running:
-            raise RefusedError(ErrorCode.BUSY, "the machine runs; reset it before programming")
+            raise RefusedError(ErrorCode.BUSY, "the machine is running; reset it before programming")
         try:
             image = image_from_bytes(content, "the image")
             kernel = self._make(image.machine)
@@ -143,7 +143,7 @@ class EmulatedBoard:
         self.reset()
 
     def _describe(self, image: Image) -> None:
-        """Set the capability registers, and allow access to the words that the image implements."""
+        """Set the capability registers, and permit access to the words that the image implements."""
         parameters, part = image.machine.parameters, image.partition
         written = parameters.prior_mode is PriorMode.WRITTEN
         self._view[rm.IMAGE_HASH : rm.IMAGE_HASH + 32] = bytes.fromhex(image.image_hash)
@@ -178,7 +178,7 @@ class EmulatedBoard:
             | image.interface_results << rm.CAP_INTERFACE_RESULTS_SHIFT,
         )
         self._put(rm.CAP_STEPS, parameters.steps_per_clock)
-        # a machine with inputs per cell can have more sensors than the register has room for
+        # a machine with inputs per cell can have more sensors than fit into the register
         widths = bytes(parameters.sensor_bits[: 4 * rm.CAP_SENSOR_BITS_WORDS])
         self._view[rm.CAP_SENSOR_BITS : rm.CAP_SENSOR_BITS + len(widths)] = widths
         self._sensors = struct.Struct(f"<{parameters.sensors}I")
@@ -204,7 +204,7 @@ class EmulatedBoard:
         """Return `count` words from `address` on, little-endian.
 
         Raises:
-            RefusedError: Some of them are not in the map or not implemented.
+            RefusedError: One of them is not in the map, or not implemented.
         """
         end = address + 4 * count
         outside = end > rm.BAR_SIZE or self._access.find(_NO_ACCESS, address >> 2, end >> 2) >= 0
@@ -212,7 +212,7 @@ class EmulatedBoard:
             self._refuse_access(address, count, "read")
         words = bytes(self._view[address:end])
         if address in _LONG_LOW:
-            # a host that reads 64 bits in two accesses must see one value: the low word latches the high one
+            # a host may read 64 bits in two accesses: reading the low word latches the high one
             self._latched[address + 4] = bytes(self._view[address + 4 : address + 8])
         elif address in self._latched:
             return self._latched.pop(address) + words[4:]
@@ -231,13 +231,13 @@ class EmulatedBoard:
         if address & 3 or not count or self._access.count(_READ_WRITE, first, first + count) != count:
             self._refuse_access(address, count, "written")
         if self.running and not (address == rm.CONTROL and count == 1 and words[0] & rm.CONTROL_RESET_MASK):
-            self._refuse(ErrorCode.BUSY, "the machine runs; only a reset may be written")
+            self._refuse(ErrorCode.BUSY, "the machine is running; only a reset may be written")
         if end <= rm.START or address > rm.RESUME:
             self._view[address:end] = words
             if address <= rm.CONTROL:
                 self._take_control(address, words)
             return
-        # The doorbells are the last of their burst: they act on the words before them.
+        # Doorbells take effect after all other words of a burst.
         plain = max(rm.START - address, 0)
         self._view[address : address + plain] = words[:plain]
         if address == rm.CONTROL:
@@ -268,7 +268,7 @@ class EmulatedBoard:
             self._refuse(ErrorCode.OUTSIDE, f"nothing can be {verb} at {address:#06x}")
         if len(words) < count or _NO_ACCESS in words:
             self._refuse(
-                ErrorCode.TOO_LONG, f"{count} words from {address:#06x} on run past the end of the block"
+                ErrorCode.TOO_LONG, f"{count} words from {address:#06x} on extend beyond the end of the block"
             )
         read_only = address + 4 * words.index(_READ)
         self._refuse(ErrorCode.READ_ONLY, f"the register at {read_only:#06x} cannot be written")
@@ -282,7 +282,7 @@ class EmulatedBoard:
     # ---- the machine ----------------------------------------------------------------------------------
 
     def reset(self) -> None:
-        """Stop, clear counters and cycles, and restart the RNGs from bank 0; DONE and all settings stay."""
+        """Stop, clear counters and cycles, and restart the RNGs from bank 0; DONE and all settings remain."""
         self.running = False
         self._error = ErrorCode.NONE
         self._compute_ns = 0
@@ -307,13 +307,13 @@ class EmulatedBoard:
             self._refuse(ErrorCode.BLANK, "the board is blank; program it first")
         due = next_doorbell(self.done)
         if self.running or number != due:
-            self._refuse(ErrorCode.DOORBELL, f"number {number} was written, {due} is due")
+            self._refuse(ErrorCode.DOORBELL, f"number {number} was written, {due} was expected")
         target, max_cycles, bank, prior_address, run_until = _SETTINGS.unpack_from(
             self._memory, rm.TARGET_COUNT
         )
         if run_until > CYCLES_MAX:
             self._refuse(
-                ErrorCode.BAD_VALUE, f"a slice cannot end at cycle {run_until}: {CYCLES_MAX} is the last"
+                ErrorCode.BAD_VALUE, f"a slice cannot end at cycle {run_until}: the maximum is {CYCLES_MAX}"
             )
         if doorbell == rm.RESUME:
             if kernel.reason is not StopReason.SLICE:
@@ -363,7 +363,7 @@ class EmulatedBoard:
         return tuple(np.frombuffer(self._memory, "<u4", len(self._outcomes), rm.PRIOR_SELECTS).tolist())
 
     def _halted(self) -> Collection[int]:
-        """Return the replicas that a resume leaves where they are."""
+        """Return the replicas that a resume does not continue."""
         if not len(self._outcomes):
             return ()
         mask = int.from_bytes(self._view[rm.HALT : rm.HALT + 4 * rm.HALT_WORDS], "little")
@@ -376,13 +376,13 @@ class EmulatedBoard:
         words = np.frombuffer(self._memory, "<u4", math.prod(shape), rm.PRIOR_CODES).reshape(shape)
         if int(words.max()) > parameters.ones_code:
             self._refuse(
-                ErrorCode.BAD_VALUE, f"a prior code is {words.max()}; the highest is {parameters.ones_code}"
+                ErrorCode.BAD_VALUE, f"a prior code is {words.max()}; the maximum is {parameters.ones_code}"
             )
         codes: npt.NDArray[np.uint16] = words.astype(np.uint16)
         return codes
 
     def step(self) -> None:
-        """Run the machine for one more chunk, after which `running` tells whether it has to go on."""
+        """Run the machine for one more chunk; then `running` tells whether it must continue."""
         kernel = self._kernel
         if kernel is not None and self.running:
             self._run(kernel, None, self._chunk_end(kernel.cycles))
@@ -398,7 +398,8 @@ class EmulatedBoard:
         elapsed = time.perf_counter_ns() - began
         self._compute_ns += elapsed
         cycles = kernel.cycles
-        # Frames differ in speed (lines that cannot count cost nothing), and so does the core's other load.
+        # The speed varies with the frame (lines that cannot count take no time) and with the load of the
+        # core.
         if elapsed < CHUNK_S * 0.5e9:
             self._chunk *= 2
         elif elapsed > CHUNK_S * 1.5e9:
@@ -415,7 +416,7 @@ class EmulatedBoard:
             self._publish(BoardState.DONE, reason, cycles)
 
     def _chunk_end(self, cycles: int) -> int:
-        """Return the cycle at which the next chunk ends: the slice's end, if that is nearer; 0 for no end."""
+        """Return the end of the next chunk, or of the slice if that is nearer, in cycles; 0 for none."""
         end = cycles + self._chunk
         if end - cycles > _ALIGNMENT:
             end -= end % _ALIGNMENT
@@ -423,7 +424,7 @@ class EmulatedBoard:
         return run_until if end >= self._max_cycles or end >= run_until > 0 else end
 
     def _publish(self, state: BoardState, reason: StopReason, cycles: int) -> None:
-        """Write the outcome to the registers that the host reads."""
+        """Write the outcome to the registers."""
         status = (
             state << rm.STATUS_STATE_SHIFT
             | reason << rm.STATUS_STOP_REASON_SHIFT
@@ -432,7 +433,7 @@ class EmulatedBoard:
         DONE_BLOCK.pack_into(self._memory, rm.DONE, self.done, status, cycles, self._compute_ns)
 
     def interrupt_words(self) -> bytes:
-        """Return an interrupt's payload: DONE to COMPUTE_NS, one count per line, and several replicas' outcomes."""
+        """Return the payload of an interrupt: DONE to COMPUTE_NS, one count per line, replicas' outcomes."""
         words = self._view[rm.DONE : rm.DONE + DONE_BLOCK.size].tobytes() + self._results.tobytes()
         return words if self._is_plain else words + self._outcomes.tobytes()
 
@@ -458,9 +459,9 @@ _DATA: Final = (
 
 
 def _measure_speed(kernel: BM1Kernel) -> float:
-    """Return machine cycles per second with all readings missing, when every line counts: the slowest case.
+    """Return the cycles per second in the slowest case: with all readings missing, all lines count.
 
-    It measures the thread's own time, so that the core's other load does not make a board look slow for ever.
+    It measures CPU time of the thread, so that other load does not permanently make the board look slow.
     """
     parameters = kernel.machine.parameters
     start = Start(
@@ -469,7 +470,7 @@ def _measure_speed(kernel: BM1Kernel) -> float:
         max_cycles=CYCLES_MAX,
         run_until=1,
     )
-    kernel.start(start)  # a kernel's first start takes longer
+    kernel.start(start)  # the first start of a kernel takes longer
     began = time.thread_time_ns()
     reason = kernel.start(start)
     while reason is StopReason.SLICE and kernel.cycles < _ALIGNMENT:

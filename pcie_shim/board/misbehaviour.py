@@ -1,4 +1,4 @@
-"""The faults that an emulated board makes on request, to test how a host handles them."""
+"""Deliberate faults of an emulated board, for tests of hosts."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from pcie_shim.errors import PcieShimError
 
 
 class UnknownMisbehaviourError(PcieShimError):
-    """A text that does not name a misbehaviour."""
+    """A text that is not a misbehaviour."""
 
     exit_code = 2
 
 
 class MisbehaviourKind(StrEnum):
-    """The fault that the board makes."""
+    """The kind of fault."""
 
     DROP = "drop"
     """The board does not send an answer or interrupt."""
@@ -34,7 +34,7 @@ class MisbehaviourKind(StrEnum):
     ALL_ONES = "all-ones"
     """Every register reads all ones, as if the device were gone."""
     WRONG_MAP = "wrong-map"
-    """The board greets with another register map."""
+    """The greeting contains another register map."""
     NEVER_DONE = "never-done"
     """The machine starts and never stops."""
     DONE_TWICE = "done-twice"
@@ -47,7 +47,7 @@ class Misbehaviour:
 
     Attributes:
         kind: The fault.
-        after: Starts and resumes before the first fault; 0: from the opening of the link on.
+        after: Number of starts and resumes before the first fault; 0: from the opening of the link on.
         times: Number of faults; 0: no limit.
     """
 

@@ -1,8 +1,8 @@
-"""The server of an emulated board: one thread, which serves the registers to one host at a time, and a loader.
+"""The server of an emulated board: one thread that serves the registers to one host at a time, and a loader.
 
-The loop polls its sockets between two chunks of the machine, so that a reset, a second host or the end of the
-process never waits longer than a chunk takes. When a host disconnects, the board is idle for the next one; a host
-that breaks the protocol gets an ERROR and loses its link.
+The loop polls its sockets between two chunks of the machine, so a reset, a second host or the end of the
+process never waits longer than one chunk. When a host disconnects, the board is free for the next one. A host
+that violates the protocol gets an ERROR, and its link is closed.
 """
 
 from __future__ import annotations
@@ -34,28 +34,30 @@ from pcie_shim.tunnel import tunnel_to_host
 _LOG: Final = logging.getLogger(__name__)
 
 SEND_S: Final = 5.0
-"""Seconds that a host may leave the board's frames unread, before it loses its link."""
+"""Seconds after which the link of a host that does not read the board's frames is closed."""
 KEEPALIVE_S: Final = 5
-"""Interval of TCP keep-alive probes to a silent host; three unanswered ones end the link."""
+"""Interval of TCP keep-alive probes in seconds; three unanswered ones close the link.
+"""
 PROGRAMMING_SILENCE_S: Final = 10.0
-"""Seconds without a frame of a loader, after which another may program the board."""
+"""Seconds without a frame of the loader after which another loader may program the board."""
 
 MAX_SILENT: Final = 16
-"""Most connections to a port without a request, which do not hold the board; a further one ends the oldest."""
+"""Maximum number of connections without a request per port; a new one replaces the oldest.
+"""
 
-_HELD: Final = "another host has it; one host drives a board at a time"
+_HELD: Final = "another host holds it; only one host can drive a board at a time"
 _PROGRAMMED: Final = "another loader is programming it"
 _READABLE: Final = select.EPOLLIN | select.EPOLLHUP | select.EPOLLERR
 
 
 class StopSignal:
-    """Ends `serve_board`, from a signal handler or another thread; create it after a fork, not before."""
+    """Stop request for `serve_board`, from a signal handler or a thread; create it after a fork."""
 
     def __init__(self) -> None:
         self._read, self._write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
 
     def set(self) -> None:
-        """Request the end; may be called in a signal handler, and more than once."""
+        """Request the end; may be called in a signal handler and repeatedly."""
         with suppress(OSError):
             os.write(self._write, b"x")
 
@@ -78,27 +80,27 @@ def serve_board(
     pin: bool = True,
     on_ready: Callable[[EmulatedBoard], None] | None = None,
 ) -> None:
-    """Serve one emulated board, blank at first, until `stop` is set; then remove the sockets' files.
+    """Serve one emulated board, initially blank, until `stop` is set; then remove the socket files.
 
     Args:
-        endpoint: Where to serve the registers; the programming port is beside it (`Endpoint.programming`).
-        index: The board's number, for its greeting.
+        endpoint: Endpoint of the registers; `Endpoint.programming` is the programming port.
+        index: Number of the board, for the greeting.
         stop: Ends the loop.
-        misbehave: The fault that the board makes, for tests of hosts.
-        pin: Keep this thread on one of its allowed cores, number `index` modulo their number. Boards compute for
-            tenths of a millisecond, in which Linux does not spread the threads that one host has woken over the
-            cores: unpinned, the boards of a mini-cluster compute one after the other. The thread also gets the
-            policy SCHED_BATCH, with which it does not preempt others when it wakes.
-        on_ready: Called with the board once both sockets listen.
+        misbehave: The fault of the board, for tests of hosts.
+        pin: Pin this thread to one of its allowed cores, number `index` modulo their number. Boards compute
+            for tenths of a millisecond, too short for Linux to distribute the threads woken by one host over
+            the cores: without pinning, the boards of a mini-cluster would compute one after the other. The
+            thread also gets the policy SCHED_BATCH, so that it does not preempt others when it wakes.
+        on_ready: Called with the board when both sockets are listening.
 
     Raises:
-        EndpointError: The endpoint is wrong or taken.
+        EndpointError: The endpoint is invalid or in use.
     """
     where = parse_endpoint(endpoint) if isinstance(endpoint, str) else endpoint
     if pin:
         cores = sorted(os.sched_getaffinity(0))
         os.sched_setaffinity(0, {cores[index % len(cores)]})
-        # a board that wakes must not preempt the host, which still has other boards to start
+        # a board that wakes must not preempt the host, which has other boards to start
         os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
     registers = listen(where)
     try:
@@ -122,13 +124,13 @@ class _Connection:
     def __init__(self, connection: socket.socket, endpoint: Endpoint, greeting: bytes) -> None:
         no_delay(connection)
         if connection.family != socket.AF_UNIX:
-            # a host whose machine or cable failed must not hold the board for ever
+            # a host whose machine or cable failed must not hold the board forever
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, KEEPALIVE_S)
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, KEEPALIVE_S)
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT, 3)
         connection = _tunnelled(connection, endpoint)
-        # reads never block, since epoll comes first; writes may take SEND_S
+        # reads never block, because epoll precedes them; writes may take SEND_S
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, struct.pack("@ll", int(SEND_S), 0))
         self.socket = connection
         self.decoder = framing.FrameDecoder()
@@ -147,7 +149,7 @@ class _Connection:
             self.send(greeting)
 
     def receive(self) -> bool:
-        """Receive once; return False if nothing came or the connection is closed, which clears `open`."""
+        """Receive once; return False if nothing arrived or the connection is closed, which clears `open`."""
         try:
             count = self.socket.recv_into(self.decoder.room(), 0, socket.MSG_DONTWAIT)
         except BlockingIOError:
@@ -171,7 +173,7 @@ class _Connection:
                 if sequence == due:
                     (self._authenticate if self._nonce else handle)(frame)
                     continue
-                problem = f"request {sequence} came where {due} was due"
+                problem = f"request {sequence} arrived instead of {due}"
             except FramingError as error:
                 problem = str(error)
             except RefusedError as error:
@@ -311,7 +313,7 @@ class _Server:
         self._epoll.register(host.socket.fileno(), _READABLE)
 
     def _is_held(self) -> bool:
-        """Return whether a host holds the board; the last frames of one that has just left are handled first."""
+        """Return whether a host holds the board, after handling the last frames of one that has disconnected."""
         host = self._host
         if host is None:
             return False
@@ -325,7 +327,7 @@ class _Server:
 
     def _serve_host(self, host: _Host) -> None:
         if host.stalled:
-            # misbehaving: the host's frames are not read, but it may disconnect
+            # misbehaving: do not read the host's frames, but notice when it disconnects
             host.open = not _has_left(host.socket)
             time.sleep(0.01)
         else:
@@ -350,7 +352,7 @@ class _Server:
         )
 
     def _access(self, host: _Host, frame: Frame) -> None:
-        """Handle a frame of a host, which takes the board if it is free."""
+        """Handle a frame of a host, which then holds the board if it is free."""
         operation, flags, sequence, address, count, payload = frame
         board = self.board
         if host is not self._host:
@@ -375,7 +377,7 @@ class _Server:
                 self._starts += 1
                 self._interrupt_if_done()
         else:
-            raise FramingError(f"the register port does not take operation {operation}")
+            raise FramingError(f"the register port does not support operation {operation}")
 
     def _interrupt_if_done(self) -> None:
         board, host = self.board, self._host
@@ -388,7 +390,7 @@ class _Server:
         if host is self._host:
             self._host = None
             self.board.release()
-            _LOG.info("board %d: its host has gone", self._index)
+            _LOG.info("board %d: its host has disconnected", self._index)
         else:
             del self._silent_hosts[host.socket.fileno()]
         self._epoll.unregister(host.socket.fileno())
@@ -397,7 +399,7 @@ class _Server:
     # ---- misbehaving ----------------------------------------------------------------------------------
 
     def _wrong(self, kind: MisbehaviourKind, *, ahead: int = 0) -> bool:
-        """Return whether to make this fault now, with `ahead` more starts than counted so far; counts the fault."""
+        """Return whether this fault occurs now, with `ahead` more starts than counted so far, and count it."""
         wanted = self._misbehaviour
         if wanted is None or wanted.kind is not kind:
             return False
@@ -452,7 +454,7 @@ class _Server:
         self._epoll.register(loader.socket.fileno(), _READABLE)
 
     def _is_being_programmed(self) -> bool:
-        """Return whether a loader programs the board; the last frames of one that has just left are handled first."""
+        """Return whether a loader programs the board, after handling the last frames of a disconnected one."""
         loader = self._loader
         if loader is None:
             return False
@@ -470,7 +472,7 @@ class _Server:
             self._drop_loader(loader)
 
     def _program(self, loader: _Loader, frame: Frame) -> None:
-        """Handle a frame of a loader, which is the only one from its first request on."""
+        """Handle a frame of a loader, which excludes other loaders from its first request on."""
         if loader is not self._loader:
             if self._loader is not None:
                 raise RefusedError(ErrorCode.HELD, _PROGRAMMED)
@@ -481,20 +483,20 @@ class _Server:
             loader.send(framing.encode(framing.READ, framing.REPLY, sequence, address, count, words))
             return
         if operation != framing.PROGRAM:
-            raise FramingError(f"the programming port does not take operation {operation}")
+            raise FramingError(f"the programming port does not support operation {operation}")
         if flags & framing.BEGIN:
             begin = framing.ProgramBegin.decode(payload)
             if begin.size > MAX_IMAGE_BYTES:
                 raise RefusedError(
-                    ErrorCode.BAD_IMAGE, f"it has {begin.size} bytes, {MAX_IMAGE_BYTES} are the most"
+                    ErrorCode.BAD_IMAGE, f"it has {begin.size} bytes, the maximum is {MAX_IMAGE_BYTES}"
                 )
             self._check_not_held(begin)
             loader.begin = begin
             loader.content.clear()
         elif loader.begin is None or address != len(loader.content):
-            raise FramingError(f"a part for offset {address} came out of order")
+            raise FramingError(f"a part for offset {address} arrived out of order")
         elif len(loader.content) < loader.begin.size:
-            # the file's last word may be padded with zeros
+            # the last word of the file may be padded with zeros
             loader.content += payload[: loader.begin.size - len(loader.content)]
         if flags & framing.END:
             self._load(loader)
@@ -503,7 +505,9 @@ class _Server:
 
     def _check_not_held(self, begin: ProgramBegin) -> None:
         if self._is_held() and self._host is not None and begin.token != self._host.token:
-            raise RefusedError(ErrorCode.HELD, "a host has it; end that host, or program through it")
+            raise RefusedError(
+                ErrorCode.HELD, "a host holds it; stop that host, or use it to program the board"
+            )
 
     def _load(self, loader: _Loader) -> None:
         assert loader.begin is not None  # noqa: S101 - BEGIN comes first
@@ -512,7 +516,7 @@ class _Server:
         loader.content.clear()
         self._check_not_held(begin)
         if len(content) != begin.size or hashlib.sha256(content).digest() != begin.sha256:
-            raise RefusedError(ErrorCode.BAD_IMAGE, "the bytes that came are not those that were announced")
+            raise RefusedError(ErrorCode.BAD_IMAGE, "the received bytes differ from the announced ones")
         self.board.load(content)
         _LOG.info("board %d: programmed with image %s", self._index, self.board.image_hash)
 

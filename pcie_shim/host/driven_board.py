@@ -49,9 +49,9 @@ from pcie_shim.register_map import BoardState
 if TYPE_CHECKING:
     from pcie_shim.host.frame_encoder import BoardWords
 
-_ASSUMED_SPEED: Final = 1e4  # cycles per second of a board that does not say its own
+_ASSUMED_SPEED: Final = 1e4  # cycles per second of a board that does not report its speed
 _START: Final = struct.Struct("<QI")  # RUN_UNTIL, START
-_RESUME: Final = struct.Struct("<QII")  # RUN_UNTIL, START (0 rings nothing), RESUME
+_RESUME: Final = struct.Struct("<QII")  # RUN_UNTIL, START (0: no effect), RESUME
 _BANK_AT: Final = rm.BANK - rm.TARGET_COUNT
 _REASONS: Final = frozenset(StopReason) - {StopReason.NONE}
 _PRIOR_AT: Final = rm.PRIOR_SELECT - rm.TARGET_COUNT
@@ -74,7 +74,7 @@ class DrivenBoard:
             self.replicas * REPLICA_OUTCOME.itemsize if self.replicas > 1 else 0
         )
         self.link: Link | None = None
-        self.broken = "it was not opened"
+        self.broken = "it has not been opened"
         self.speed = _ASSUMED_SPEED
         self._forget()
 
@@ -95,7 +95,7 @@ class DrivenBoard:
         """Open the board as `MiniCluster.open` does; each step of programming may take `programming_timeout`.
 
         Raises:
-            PcieShimError: The link's errors, and the image's.
+            PcieShimError: An error of the link or of the image.
         """
         self.close("it is being opened")
         self._forget()
@@ -117,7 +117,7 @@ class DrivenBoard:
         self.readable.register(link.fileno(), select.POLLIN)
 
     def _identified(self, timeout: float, connect_timeout: float) -> Link:
-        """Return a link to a board whose identity and register map are checked."""
+        """Return a link to the board, after checking its identity and register map."""
         link = SocketLink.open(self.endpoint, timeout=timeout, connect_timeout=connect_timeout)
         try:
             self._check_identity(link)
@@ -153,7 +153,7 @@ class DrivenBoard:
             )
 
     def _check_capabilities(self, link: Link) -> None:
-        """Check that the registers which the host uses exist, whatever the image hash is."""
+        """Check that the registers used by the host exist, independently of the image hash."""
         parameters = self.image.machine.parameters
         words = struct.iter_unpack("<I", link.read_block(_CAPABILITIES.start, len(_CAPABILITIES)))
         capabilities = dict(zip(_CAPABILITIES, (word for (word,) in words), strict=True))
@@ -180,7 +180,7 @@ class DrivenBoard:
             )
 
     def close(self, reason: str) -> None:
-        """End the link; the board stops computing."""
+        """Close the link; the board stops computing."""
         if self.link is not None:
             self.link.close(reason)
             self.link = None
@@ -192,7 +192,7 @@ class DrivenBoard:
     def start(self, words: BoardWords, end: int) -> None:
         """Post a new frame: the sensors, the settings that changed, and the doorbell (figure 3.3)."""
         assert self.link is not None  # noqa: S101 - MiniCluster.run has checked
-        self.waiting = True  # from here on an interrupted frame must interrupt the board
+        self.waiting = True  # from here on, abandoning the frame must interrupt the board
         settings, sensors, selects, prior = words
         writes: list[RegisterWrite] = [(self.inputs_at, sensors)] if sensors else []
         if selects != self.selects:
@@ -201,7 +201,7 @@ class DrivenBoard:
         if prior is not None and (self.prior is None or not np.array_equal(prior, self.prior)):
             writes.append((rm.PRIOR_CODES, prior.astype("<u4").tobytes()))
             self.prior = prior.copy()
-        # Settings, slice and doorbell lie side by side: one burst from the first one that changed.
+        # Settings, slice and doorbell are adjacent: write one burst from the first changed setting on.
         known = self.settings
         if settings == known:
             at = len(settings)
@@ -243,7 +243,7 @@ class DrivenBoard:
         return is_done
 
     def _take(self, done: Done) -> None:
-        """Check the board's answer, and keep it."""
+        """Check the answer of the board, and store it."""
         if not self.waiting or done.number != self.number:
             raise SequenceError(
                 f"The board at {self.endpoint} answered doorbell {done.number} where {self.number} was due once"
@@ -267,11 +267,11 @@ class DrivenBoard:
 
     @property
     def reason(self) -> int:
-        """Why the machine stopped last."""
+        """The last stop reason of the machine."""
         return 0 if self.done is None else self.done.reason
 
     def result(self) -> BoardResult:
-        """Return the frame's result; the counts are copied out of the link's buffer."""
+        """Return the result of the frame; the counts are copied from the buffer of the link."""
         assert self.done is not None  # noqa: S101 - every board is done
         if self.replicas > 1:
             reasons = tuple(StopReason(reason) for reason in self.outcomes["reason"].tolist())
@@ -303,6 +303,6 @@ _BOARD_ERRORS: Final[tuple[tuple[tuple[type[PcieShimError], ...], type[BoardErro
 
 
 def board_error(board: DrivenBoard, error: PcieShimError) -> BoardError:
-    """Return the error of a board of the mini-cluster for an error of its link or image."""
+    """Return the error of a board for an error of its link or image."""
     kind = next(kind for causes, kind in _BOARD_ERRORS if isinstance(error, causes))
     return kind(f"Board {board.index}: {error}", board=board.index)

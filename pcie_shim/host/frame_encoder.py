@@ -1,4 +1,4 @@
-"""Register words of a frame, which the host writes to each board to start it."""
+"""Register words that the host writes to each board to start a frame."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ _Scalar = TypeVar("_Scalar", bound=np.generic)
 
 
 class BoardWords(NamedTuple):
-    """One board's register words for a frame.
+    """Register words of a frame for one board.
 
     Attributes:
         settings: `register_layout.SETTINGS`.
         inputs: The words of SENSORS or INPUTS; empty without sensors.
-        selects: The words of PRIOR_SELECTS; empty where PRIOR_SELECT is used.
-        prior: The codes of PRIOR_CODES; None where the prior is a table.
+        selects: The words of PRIOR_SELECTS; empty if PRIOR_SELECT is used.
+        prior: The codes of PRIOR_CODES; None if the prior is a table.
     """
 
     settings: bytes
@@ -38,7 +38,7 @@ class BoardWords(NamedTuple):
 
 
 class FrameEncoder:
-    """Checks frames against the machine that the boards hold together, and encodes them for each board."""
+    """Encoder of frames for each board, which checks them against the whole machine."""
 
     def __init__(self, images: Sequence[Image]) -> None:
         self._images = tuple(images)
@@ -58,7 +58,7 @@ class FrameEncoder:
         ]
 
     def _words(self, frame: FrameInput) -> tuple[bytes, list[bytes], bytes]:
-        """Return the settings, each board's inputs, and the replicas' prior selects."""
+        """Return the settings, the inputs of each board, and the prior selects of the replicas."""
         parameters = self._parameters
         prior_address, selects = (
             (frame.prior_address, b"")
@@ -94,7 +94,7 @@ class FrameEncoder:
         return settings, [self._sensor_words.pack(*words)] * len(self._images), selects
 
     def _prior_selects(self, frame: FrameInput) -> tuple[int, bytes]:
-        """Return the prior's address (of several the one most out of range) and the words of PRIOR_SELECTS."""
+        """Return the prior's address (of several, the one most out of range) and the words of PRIOR_SELECTS."""
         given = frame.prior_address
         if isinstance(given, tuple):
             if self._replicas == 1 or len(given) != self._replicas:
@@ -111,7 +111,7 @@ class FrameEncoder:
         return worst, np.array(given, dtype="<u4").tobytes() if fits else b""
 
     def _input_words(self, inputs: npt.NDArray[np.integer]) -> list[bytes]:
-        """Return each board's words of INPUTS: where cells have inputs, those of its lines."""
+        """Return the words of INPUTS for each board: with inputs per cell, those of its lines."""
         parameters = self._parameters
         per_cell = parameters.sensor_mode is not SensorMode.COLUMN
         replicas, sensors, lines = self._replicas, parameters.sensors, self._total_lines
@@ -147,11 +147,13 @@ class FrameEncoder:
         return [own.tobytes() for own in self._by_board(words)]
 
     def _priors(self, frame: FrameInput) -> list[npt.NDArray[np.uint16] | None]:
-        """Return each board's part of the written prior; None where the prior is a table."""
+        """Return the part of the written prior for each board, or None if the prior is a table."""
         codes = frame.prior_codes
         if self._parameters.prior_mode is not PriorMode.WRITTEN:
             if codes is not None:
-                raise FrameInputError("The frame has a prior to write, but the machine's prior is a table")
+                raise FrameInputError(
+                    "The frame has a written prior, but the prior of the machine is a table"
+                )
             return [None] * len(self._images)
         if codes is None:
             return [np.tile(image.machine.prior[0], self._replicas) for image in self._images]

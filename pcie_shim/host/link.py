@@ -1,4 +1,4 @@
-"""The interface of a link to one board: its registers, and its answer when the machine has stopped."""
+"""Interface of a link to one board: its registers, and its answer when the machine has stopped."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ if TYPE_CHECKING:
     from pcie_shim.framing import Octets
 
 LONGEST_POLL_S: Final = 3600.0
-"""Longest single wait: poll takes milliseconds in 31 bits."""
+"""Maximum duration of a single wait in seconds, because poll expects milliseconds in 31 bits."""
 
 RegisterWrite: TypeAlias = "tuple[int, Octets]"
-"""An address of the register map, in bytes, and the little-endian words to write from there on."""
+"""An address of the register map in bytes, and the little-endian words to write from that address on."""
 
 
 class Done(NamedTuple):
-    """A board's answer when its machine has stopped.
+    """The answer of a board when its machine has stopped.
 
     Attributes:
         number: The number of the start or resume that has stopped.
         status: The STATUS register.
         cycles: Cycles run in this frame.
-        compute_ns: Time the machine took since that start or resume, in nanoseconds.
-        results: One 32-bit count per line, replica after replica, and then the OUTCOMES of several replicas; as
-            bytes, valid until the link receives again.
+        compute_ns: Computing time since that start or resume, in nanoseconds.
+        results: One 32-bit count per line, replica after replica, followed by OUTCOMES if there are replicas;
+            as bytes, valid until the link receives again.
     """
 
     number: int
@@ -49,45 +49,45 @@ class Done(NamedTuple):
 
 
 class Link(Protocol):
-    """One open link to a board over any medium; it closes itself once its data cannot be trusted.
+    """An open link to a board over any medium; it closes itself when its data cannot be trusted.
 
-    A host with one board reads, writes and waits. A host with many boards posts to each of them, polls
-    their descriptors and takes what has come. Every method raises `LinkError`: `AccessError` where the
-    board refused (the link stays open), any other one where the link broke (it is closed).
+    A host with one board reads, writes and waits. A host with many boards posts to each of them, polls their
+    descriptors and receives what has arrived. Every method raises `LinkError`: `AccessError` if the board
+    refused the access (the link stays open), and any other error if the link is broken (it is closed).
     """
 
     endpoint: Endpoint
-    """Where the board listens."""
+    """Endpoint of the board."""
 
     token: bytes
-    """Proof, for the board's programming port, that its owner holds this link."""
+    """Token that proves to the programming port that its owner holds this link."""
 
     def read32(self, address: int) -> int:
         """Read one register."""
 
     def write32(self, address: int, value: int) -> None:
-        """Write one register and wait until the board has taken it."""
+        """Write one register and wait for the acknowledgement."""
 
     def read_block(self, address: int, count: int) -> bytes:
         """Read `count` words from `address` on, as little-endian bytes."""
 
     def write_block(self, address: int, words: Octets) -> None:
-        """Write little-endian words from `address` on and wait until the board has taken them."""
+        """Write little-endian words from `address` on and wait for the acknowledgement."""
 
     def post(self, writes: Iterable[RegisterWrite]) -> None:
-        """Write without waiting; a refusal is raised where the next answer is taken."""
+        """Write without waiting; a refusal is raised when the next answer is received."""
 
     def receive_done(self) -> Done | None:
         """Receive once, after a poll of `fileno()`; return the board's answer if it is complete."""
 
     def take_done(self) -> Done | None:
-        """Return the board's answer if it has been received completely already."""
+        """Return the board's answer if it has already been received completely."""
 
     def fileno(self) -> int:
-        """Return a descriptor that is readable when something has come."""
+        """Return a descriptor that is readable when data has arrived."""
 
     def late(self, timeout: float, what: str) -> LinkTimeoutError:
         """Return the error that the board did not `what` within `timeout` seconds."""
 
     def close(self, reason: str = "it was closed") -> None:
-        """End the link; later calls raise `LinkClosedError` with this reason."""
+        """Close the link; later calls raise `LinkClosedError` with this reason."""

@@ -1,4 +1,4 @@
-"""The loader, which programs boards over their own port without a restart of the host (thesis 3.4: SofLoader)."""
+"""The loader, which programs a board through its programming port (thesis 3.4: SofLoader)."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ def program(
     The file and the board's register map are checked before the board is changed.
 
     Args:
-        endpoint: The endpoint of the board's registers; the programming port is beside it.
+        endpoint: Endpoint of the board's registers, from which the programming port follows.
         image: An image, the path of a programming file, or its bytes.
-        timeout: Seconds for each step: connecting, taking the file, making the machine.
+        timeout: Seconds for each step: connecting, transferring the file, loading the machine.
         token: The token of this host's link to the board, if it has one.
 
     Returns:
@@ -39,8 +39,8 @@ def program(
     Raises:
         ImageError: The file is missing, damaged, or for another register map.
         GreetingMismatchError: The board has another register map.
-        HeldError: A host holds the board, or another loader programs it.
-        LinkError: The board cannot be reached, or the link broke.
+        HeldError: A host holds the board, or another loader is programming it.
+        LinkError: The board is unreachable, or the link is broken.
     """
     where = parse_endpoint(endpoint) if isinstance(endpoint, str) else endpoint
     content, expected = _content(image)
@@ -63,7 +63,7 @@ def program(
 
 
 def _content(image: Image | Path | bytes) -> tuple[bytes, str]:
-    """Return the programming file's bytes and the image hash that the board must show."""
+    """Return the bytes of the programming file, and the expected image hash."""
     if isinstance(image, Image):
         return image_bytes(image), image.image_hash
     if isinstance(image, bytes):
@@ -78,6 +78,4 @@ def _request(link: SocketLink, flag: int, offset: int, payload: bytes) -> None:
     except AccessError as error:
         if error.code != ErrorCode.BAD_IMAGE:
             raise
-        raise ImageMismatchError(
-            f"The board at {link.endpoint} does not take the image: {error.detail}"
-        ) from error
+        raise ImageMismatchError(f"The board at {link.endpoint} refuses the image: {error.detail}") from error

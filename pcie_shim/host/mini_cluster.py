@@ -1,8 +1,7 @@
 """The mini-cluster: all boards of a model, driven by one blocking thread (thesis 3.2, figure 3.3).
 
-A frame's sensors and its start are posted to every board before the first is waited for; then results are taken
-as the boards stop. Boards that hold parts of one model stop together (`slices`) or each by itself (`own`, as in
-the thesis).
+The sensors and the start of a frame are posted to every board before waiting for the first one; then results
+are received as the boards stop. Boards stop together (`slices`) or independently (`own`, as in the thesis).
 """
 
 from __future__ import annotations
@@ -32,15 +31,15 @@ from pcie_shim.host.link import LONGEST_POLL_S
 from pcie_shim.programming_file import Image
 
 SLACK_S: Final = 5.0
-"""Seconds that a board may take beyond the time of its cycles at its measured speed."""
+"""Seconds that a board may take beyond the time for its cycles at its measured speed."""
 FIRST_WAIT_S: Final = 0.01
-"""Longest wait in which only the board that was started last is polled."""
+"""Maximum wait in seconds in which only the board that was started last is polled."""
 PROGRAMMING_S: Final = 30.0
-"""Shortest timeout of each step of programming a blank board, in seconds."""
+"""Minimum timeout of each step of programming a blank board, in seconds."""
 
 
 class _Progress:
-    """The progress of the posted frame."""
+    """Progress of the posted frame."""
 
     def __init__(self, max_cycles: int, end: int, boards: Sequence[DrivenBoard]) -> None:
         self.max_cycles = max_cycles
@@ -48,7 +47,7 @@ class _Progress:
         self.end = end  # last cycle of the slice; 0: the frame's
         self.running = boards
         self.halted: frozenset[int] = frozenset()
-        self.left = 0  # boards of the slice that still run
+        self.left = 0  # boards that are still running this slice
         self.cycles = 0
         self.limit = 0.0
         self.deadline = 0.0
@@ -61,7 +60,7 @@ class MiniCluster:
     """All boards of a deployment, in the order of their partition; used by one thread."""
 
     def __init__(self, boards: Sequence[DrivenBoard], *, timeout: float, slack: float) -> None:
-        """Prepare for these boards; use `open`, which also connects."""
+        """Store the boards; use `open`, which also connects."""
         self._boards = tuple(boards)
         self._encoder = FrameEncoder([board.image for board in self._boards])
         self._timeout = timeout
@@ -84,15 +83,15 @@ class MiniCluster:
         """Open all boards: check identity, liveness and image, program blank boards, and reset the machines.
 
         Args:
-            endpoints: Where the boards listen, in the order of the partition.
+            endpoints: Endpoints of the boards, in the order of the partition.
             images: The boards' images.
             timeout: Seconds for a board to listen, and for each of its answers.
-            slack: Seconds that a frame may take beyond the time of its cycles at the boards' speed.
+            slack: Seconds that a frame may take beyond the time for its cycles at the speed of the boards.
 
         Raises:
-            EndpointError: An endpoint's text is wrong.
+            EndpointError: An endpoint is invalid.
             ImageMismatchError: The images are not the parts of one model.
-            BoardError: A board cannot be opened; those opened before it are closed.
+            BoardError: A board cannot be opened; the boards opened before are closed.
         """
         places = [parse_endpoint(place) if isinstance(place, str) else place for place in endpoints]
         _check_images(len(places), images)
@@ -125,15 +124,15 @@ class MiniCluster:
         return self._boards[board].link is not None or self._boards[board] in self._interrupted
 
     def reopen(self, board: int, *, timeout: float | None = None) -> None:
-        """Reopen a board after its restart or a broken link, programming a blank one; without a timeout, in that of `open`.
+        """Reopen a board after its restart or a broken link, and program it if it is blank.
 
         Raises:
-            BoardError: It cannot be opened.
+            BoardError: The board cannot be opened.
         """
         self._open(self._boards[board], self._timeout if timeout is None else timeout)
 
     def close(self) -> None:
-        """Close all links; boards that run stop."""
+        """Close all links; running boards stop."""
         self._progress = None
         for board in self._boards:
             self._close(board, "the mini-cluster was closed")
@@ -143,11 +142,11 @@ class MiniCluster:
     def run(self, frame: FrameInput) -> FrameOutput:
         """Compute one frame on all boards.
 
-        After an error the frame is lost. The boards that did not fail are usable at once; the one that failed must be
-        reopened (`reopen`), unless it only refused.
+        After an error the frame is lost. The failed board must be reopened (`reopen`), unless it only refused
+        an access; the others are usable at once.
 
         Raises:
-            FrameInputError: The frame does not fit the machine; no board was touched.
+            FrameInputError: The frame does not fit the machine; no board was accessed.
             BoardError: A board failed; `error.board` is its number.
         """
         self.post(frame)
@@ -156,14 +155,14 @@ class MiniCluster:
         return output
 
     def post(self, frame: FrameInput) -> None:
-        """Start a frame on all boards without waiting; `collect` returns its result. Errors as `run`."""
+        """Start a frame on all boards without waiting; `collect` returns its result. Errors as for `run`."""
         if self._progress is not None:
             raise FrameInputError("A frame is in progress; collect its result before posting the next")
         words = self._encoder.encode(frame)
         self._make_ready()
         end = first_slice(frame.target_count) if frame.stop == "slices" else 0
         if end >= frame.max_cycles or (self._replicas > 1 and len(self._boards) == 1):
-            end = 0  # one slice, which ends where the frame does
+            end = 0  # one slice, which ends with the frame
         progress = self._progress = _Progress(frame.max_cycles, end, self._boards)
         try:
             for board, own in zip(self._boards, words, strict=True):
@@ -177,14 +176,14 @@ class MiniCluster:
             raise
 
     def collect(self, seconds: float) -> FrameOutput | None:
-        """Take the boards' answers to the posted frame, and start its next slice where there is one; errors as `run`.
+        """Receive the answers to the posted frame, and start its next slice if any. Errors as for `run`.
 
-        It waits for `seconds` at most if nothing has come yet. It returns the frame's result, or None while boards still run:
-        then `awaited` is the descriptor to poll.
+        It waits for at most `seconds` if nothing has arrived yet. It returns the result of the frame, or None
+        while boards are running: then `awaited` is the descriptor to poll.
         """
         progress = self._progress
         if progress is None:
-            raise FrameInputError("There is no frame in progress: post one first")
+            raise FrameInputError("No frame is in progress: post one first")
         try:
             if not self._receive(progress, seconds):
                 return None
@@ -207,12 +206,12 @@ class MiniCluster:
 
     @property
     def seconds_left(self) -> float:
-        """Seconds until a board of the posted frame is late: call `collect` by then."""
+        """Seconds until the deadline of the posted frame: call `collect` by then."""
         return 0.0 if self._progress is None else max(0.0, self._progress.deadline - time.monotonic())
 
     def _expect_done(self, progress: _Progress) -> None:
-        """Set the deadline of a slice that was just started on its boards."""
-        # emulated boards may all share one core
+        """Set the deadline of a slice that has just been started."""
+        # emulated boards may all run on one core
         cycles = (progress.end or progress.max_cycles) - progress.begun
         progress.cycles = cycles
         progress.limit = self._slack + cycles * len(self._boards) / min(board.speed for board in self._boards)
@@ -223,9 +222,9 @@ class MiniCluster:
         progress.clock_ns = now
 
     def _receive(self, progress: _Progress, seconds: float) -> bool:
-        """Receive from the boards, for this many seconds at most; return whether every running board is done."""
-        # The board that was started last is mostly the last to be done: waking for each of the others would take
-        # cores from those that compute. The poll of all boards sees one that fails or takes longer.
+        """Receive from the boards, for at most `seconds`; return whether every running board is done."""
+        # The board that was started last is usually the last to be done, and waking up for each of the others
+        # would take CPU time from those that compute. The poll of all boards detects a failed or slower one.
         if seconds and progress.left == len(progress.running):
             progress.running[-1].readable.poll(min(seconds, FIRST_WAIT_S) * 1000)
         while progress.left:
@@ -246,7 +245,7 @@ class MiniCluster:
         return True
 
     def _next_slice(self, progress: _Progress) -> FrameOutput | None:
-        """Return the frame's result after its last slice, else start the next slice and return None."""
+        """Return the frame's result after its last slice; otherwise start the next slice and return None."""
         now = time.perf_counter_ns()
         progress.waits_ns += now - progress.clock_ns
         progress.clock_ns = now
@@ -265,7 +264,7 @@ class MiniCluster:
             progress.running = running
             progress.begun, progress.end = progress.end, 2 * progress.end
             if progress.end >= progress.max_cycles:
-                progress.end = 0  # the last slice ends where the frame does
+                progress.end = 0  # the last slice ends with the frame
             for board in running:
                 try:
                     board.resume(progress.end, halts)
@@ -284,9 +283,9 @@ class MiniCluster:
         )
 
     def _boards_of_replicas(self, progress: _Progress) -> tuple[list[DrivenBoard], bytes]:
-        """Return the boards on which a replica goes on, and the words of HALT for the replicas that do not.
+        """Return the boards on which a replica continues, and the words of HALT for the other replicas.
 
-        A replica goes on if no board's part of it has overflowed; a part that has stopped needs no halt.
+        A replica continues if it has not overflowed on any board; a part that has stopped needs no halt.
         """
         reasons = np.stack([board.outcomes["reason"] for board in self._boards])
         over = (reasons == StopReason.OVERFLOW).any(axis=0)
@@ -300,7 +299,7 @@ class MiniCluster:
         return running, mask.to_bytes(4 * -(-self._replicas // 32), "little")
 
     def _abandon(self) -> None:
-        """Drop the frame, and stop the boards that still compute it by closing their links."""
+        """Drop the frame, and stop the boards that are still computing it by closing their links."""
         self._progress = None
         for board in self._boards:
             if board.waiting and board.link is not None:
@@ -308,15 +307,15 @@ class MiniCluster:
                 self._interrupted.append(board)
 
     def _fail(self, board: DrivenBoard, error: LinkError) -> NoReturn:
-        """Fail the frame because of this board, which is closed unless it only refused."""
+        """Fail the frame because of this board, which is closed unless it only refused an access."""
         if isinstance(error, AccessError) and not isinstance(error, StaleHandleError):
-            board.waiting = True  # it may have started nevertheless: the next frame reopens it
+            board.waiting = True  # it may have started anyway: the next frame reopens it
         else:
             self._close(board, str(error))
         raise board_error(board, error) from error
 
     def _make_ready(self) -> None:
-        """Reopen the boards that the last, failed frame interrupted."""
+        """Reopen the boards that were interrupted by a failed frame."""
         while self._interrupted:
             self._open(self._interrupted.pop(), self._timeout)
         for board in self._boards:
@@ -346,12 +345,12 @@ class MiniCluster:
         board.close(reason)
 
     def _descriptor(self, board: DrivenBoard) -> int | None:
-        """Return the descriptor that is polled for a board, even if its link has closed itself."""
+        """Return the descriptor to poll for a board, even if its link has closed itself."""
         return next((known for known, owner in self._by_descriptor.items() if owner is board), None)
 
 
 def _check_images(boards: int, images: Sequence[Image]) -> None:
-    """Refuse images that are not the parts of one model, in order."""
+    """Raise an error for images that are not the parts of one model in order."""
     if boards != len(images) or not images:
         raise ImageMismatchError(f"There are {boards} endpoints for {len(images)} images; one each is needed")
     offset = 0

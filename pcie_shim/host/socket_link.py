@@ -39,12 +39,12 @@ _CLOSING_CODES: Final = (ErrorCode.STALE, ErrorCode.HELD, ErrorCode.BAD_FRAME)
 
 
 class SocketLink(Link):
-    """One open link over a socket; once the stream cannot be trusted, it closes itself.
+    """An open link over a socket; it closes itself when the stream cannot be trusted.
 
     Attributes:
-        endpoint: Where the board listens.
-        greeting: The board's greeting when the link opened.
-        timeout: Seconds that an answer may take.
+        endpoint: Endpoint of the board.
+        greeting: Greeting of the board.
+        timeout: Timeout of an answer in seconds.
     """
 
     def __init__(self, endpoint: Endpoint, *, timeout: float, connect_timeout: float) -> None:
@@ -174,7 +174,7 @@ class SocketLink(Link):
         return int(value)
 
     def write32(self, address: int, value: int) -> None:
-        """Write one register and wait until the board has taken it."""
+        """Write one register and wait for the acknowledgement."""
         self.write_block(address, WORD.pack(value))
 
     def read_block(self, address: int, count: int) -> bytes:
@@ -190,17 +190,17 @@ class SocketLink(Link):
         return bytes(frame.payload)
 
     def write_block(self, address: int, words: Octets) -> None:
-        """Write little-endian words from `address` on and wait until the board has taken them."""
+        """Write little-endian words from `address` on and wait for the acknowledgement."""
         self.request(framing.WRITE, 0, address, len(words) // 4, words)
 
     # ---- for a host that drives many boards -----------------------------------------------------------
 
     def post(self, writes: Iterable[RegisterWrite]) -> None:
-        """Send posted writes; a refusal is raised where the next answer or interrupt is taken."""
+        """Send posted writes; a refusal is raised when the next answer or interrupt is received."""
         self._send(b"".join(self._posted(framing.WRITE, address, words) for address, words in writes))
 
     def post_part(self, offset: int, part: Octets) -> None:
-        """Send a part of a programming file, which begins at this offset, without waiting; errors as `post`."""
+        """Send a part of a programming file, from this offset on, without waiting; errors as for `post`."""
         self._send(self._posted(framing.PROGRAM, offset, part))
 
     def _posted(self, operation: int, address: int, words: Octets) -> bytes:
@@ -220,7 +220,7 @@ class SocketLink(Link):
         return self.take_done()
 
     def take_done(self) -> Done | None:
-        """Return the board's answer if it has been received completely, else None."""
+        """Return the board's answer if it has been received completely, otherwise None."""
         if self._done is not None:
             done, self._done = self._done, None
             return done
@@ -233,12 +233,12 @@ class SocketLink(Link):
             return None if frame is None else self._interrupt(frame)
         if frame.operation == framing.ERROR:
             self._refused(frame)
-        return self._give_up(SequenceError("an answer came without a request"))
+        return self._give_up(SequenceError("an answer arrived without a request"))
 
     def request(self, operation: int, flags: int, address: int, count: int, payload: Octets = b"") -> Frame:
-        """Send one request and return the answer; keep an interrupt that comes before it.
+        """Send one request and return the answer; store an interrupt that arrives before it.
 
-        The answer's payload is valid until the link receives again.
+        The payload of the answer is valid until the link receives again.
         """
         self._sequence = sequence = (self._sequence + 1) & ALL_ONES
         self._send(framing.encode(operation, flags, sequence, address, count, payload))
@@ -256,12 +256,12 @@ class SocketLink(Link):
             elif frame.sequence == sequence and frame.operation == operation and frame.flags & framing.REPLY:
                 return frame
             else:
-                self._give_up(SequenceError(f"answer {frame.sequence} came where answer {sequence} was due"))
+                self._give_up(SequenceError(f"answer {frame.sequence} arrived instead of {sequence}"))
 
     # ---- receiving ------------------------------------------------------------------------------------
 
     def _receive(self, deadline: float, timeout: float, what: str) -> Frame:
-        """Return the next frame of any kind; the socket's own timeout bounds each receive."""
+        """Return the next frame of any kind; the timeout of the socket bounds each receive."""
         while (frame := self._decoder.next_frame()) is None:
             if time.monotonic() > deadline:
                 raise self.late(timeout, what)
@@ -297,9 +297,7 @@ class SocketLink(Link):
             )
         self._interrupts = (self._interrupts + 1) & ALL_ONES
         if frame.sequence != self._interrupts:
-            self._give_up(
-                SequenceError(f"interrupt {frame.sequence} came where interrupt {self._interrupts} was due")
-            )
+            self._give_up(SequenceError(f"interrupt {frame.sequence} arrived instead of {self._interrupts}"))
         number, status, cycles, compute_ns = DONE_BLOCK.unpack_from(frame.payload)
         if number == status == ALL_ONES:
             self._give_up(
@@ -312,7 +310,7 @@ class SocketLink(Link):
     # ---- failing --------------------------------------------------------------------------------------
 
     def _refused(self, frame: Frame) -> NoReturn:
-        """Raise the error of an ERROR frame, and close the link after some codes."""
+        """Raise the error in an ERROR frame, after closing the link for some codes."""
         try:
             code, detail = framing.decode_error(frame)
         except FramingError as error:
@@ -334,7 +332,7 @@ class SocketLink(Link):
     def _broken_send(self, error: OSError) -> NoReturn:
         if isinstance(error, BlockingIOError):
             self._give_up(self.late(self.timeout, "accept the data"))
-        # A board sends the reason before it closes: its ERROR may be in the buffer.
+        # A board sends the reason before it closes: an ERROR may be in the buffer.
         frame = None
         with suppress(LinkError):
             deadline = time.monotonic() + self.timeout
@@ -347,7 +345,7 @@ class SocketLink(Link):
 
     def late(self, timeout: float, what: str) -> LinkTimeoutError:
         """Return the error that the board did not `what` within `timeout` seconds."""
-        rest = ": a frame began and did not end" if self._decoder.inside_frame else ""
+        rest = ": a frame is incomplete" if self._decoder.inside_frame else ""
         return LinkTimeoutError(
             f"The board at {self.endpoint} did not {what} within {timeout:.3g} s{rest}: the link is closed"
         )
@@ -358,7 +356,7 @@ class SocketLink(Link):
     def _give_up(self, error: LinkError) -> NoReturn:
         """Close the link, and raise the error."""
         if type(error) in {FramingError, CrcError, SequenceError}:
-            # the decoder knows no endpoint
+            # the decoder does not know the endpoint
             text = str(error)
             if str(self.endpoint) not in text:
                 error = type(error)(f"The link to the board at {self.endpoint} is broken and closed: {text}")
@@ -370,8 +368,8 @@ class SocketLink(Link):
             raise LinkClosedError(f"The link to the board at {self.endpoint} is closed: {self._closed}")
 
     def _limit(self, seconds: float) -> None:
-        """Let the kernel bound every blocking call, which is cheaper than Python's timeouts (a system call each)."""
-        # 0 microseconds would be no limit
+        """Let the kernel limit blocking calls, which is cheaper than Python's timeouts (a system call each)."""
+        # 0 microseconds would mean no limit
         value = struct.pack("@ll", *divmod(max(1, round(seconds * 1e6)), 10**6))
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, value)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, value)
