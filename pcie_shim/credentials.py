@@ -5,8 +5,6 @@ board's. Neither proof reveals the key, nor fits another link. The proofs protec
 afterwards is protected only by TLS.
 """
 
-from __future__ import annotations
-
 import hashlib
 import hmac
 import os

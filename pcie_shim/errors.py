@@ -1,7 +1,5 @@
 """Errors of boards and of the link; the text of each is one sentence for the user."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 

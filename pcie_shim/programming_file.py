@@ -8,8 +8,6 @@ that an error names the damaged part. The same image and build date always give 
 not the date or the version of the tools.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

@@ -1,7 +1,5 @@
 """Layouts shared by host and board: doorbell numbers, and registers read or written in one burst."""
 
-from __future__ import annotations
-
 import struct
 from typing import Final
 

@@ -1,7 +1,5 @@
 """Errors of the services, each with the exit code of its command."""
 
-from __future__ import annotations
-
 from terminal.errors import ExitCode
 
 

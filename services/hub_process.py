@@ -1,7 +1,5 @@
 """The hub as a process: the embedded rosbridge server with its status socket and announcement."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 from typing import Literal

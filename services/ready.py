@@ -3,8 +3,6 @@
 It imports little of the standard library and nothing else, because it runs every few seconds.
 """
 
-from __future__ import annotations
-
 import os
 import sys
 

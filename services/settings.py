@@ -1,7 +1,5 @@
 """Settings of all services, in one class: flag over `BM_*` variable over deployment over default."""
 
-from __future__ import annotations
-
 import asyncio
 import difflib
 import os

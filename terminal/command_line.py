@@ -1,7 +1,5 @@
 """The base of all command lines: common flags, start-up and exit."""
 
-from __future__ import annotations
-
 import math
 import sys
 from collections.abc import Callable, Iterator, Sequence

@@ -1,7 +1,5 @@
 """Messages for the user about lost and restored connections."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """Exit of a command: conversion of every error to one sentence and an exit code."""
 
-from __future__ import annotations
-
 import errno
 import os
 import sys

@@ -1,7 +1,5 @@
 """Exit codes of commands and of errors."""
 
-from __future__ import annotations
-
 from enum import IntEnum
 
 

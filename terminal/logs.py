@@ -1,7 +1,5 @@
 """Logging to standard error, in one line format for every process."""
 
-from __future__ import annotations
-
 import json
 import logging
 import sys

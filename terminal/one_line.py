@@ -3,8 +3,6 @@
 A path, a topic name or a server's answer may contain line ends and terminal control sequences.
 """
 
-from __future__ import annotations
-
 from typing import Final
 
 _LONGEST: Final = 80

@@ -1,7 +1,5 @@
 """Standard output and standard error: lines for people, JSON lines for programs."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

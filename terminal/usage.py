@@ -1,7 +1,5 @@
 """Sentences for usage errors: the place, the expected value, and where to read more."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Sequence
 from pathlib import Path

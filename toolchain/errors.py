@@ -1,7 +1,5 @@
 """Errors of the toolchain, each one sentence for the user."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import ClassVar
 

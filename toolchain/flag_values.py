@@ -1,7 +1,5 @@
 """The values of flags: KEY=VALUE, or names with commas between them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 from toolchain.errors import BuildError

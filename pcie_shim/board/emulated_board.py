@@ -5,8 +5,6 @@ machine runs in chunks of about 50 ms (`EmulatedBoard.step`), between which the 
 Chunks do not change results, because a machine that is stopped and resumed gives the same bits.
 """
 
-from __future__ import annotations
-
 import math
 import struct
 import time

@@ -1,7 +1,5 @@
 """Deliberate faults of an emulated board, for tests of hosts."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 from enum import StrEnum

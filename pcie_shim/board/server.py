@@ -5,8 +5,6 @@ process never waits longer than one chunk. When a host disconnects, the board is
 that violates the protocol gets an ERROR, and its link is closed.
 """
 
-from __future__ import annotations
-
 import hashlib
 import hmac
 import logging

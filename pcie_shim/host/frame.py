@@ -1,7 +1,5 @@
 """A frame of the mini-cluster: its input, the result of each board, and its output."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

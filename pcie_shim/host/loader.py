@@ -1,7 +1,5 @@
 """The loader, which programs a board through its programming port (thesis 3.4: SofLoader)."""
 
-from __future__ import annotations
-
 import hashlib
 from pathlib import Path
 from typing import Final

@@ -4,8 +4,6 @@ The sensors and the start of a frame are posted to every board before waiting fo
 are received as the boards stop. Boards stop together (`slices`) or independently (`own`, as in the thesis).
 """
 
-from __future__ import annotations
-
 import select
 import time
 from collections.abc import Sequence

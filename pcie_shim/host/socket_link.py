@@ -1,7 +1,5 @@
 """The link over a blocking socket (AF_UNIX or TCP): frames with sequence numbers and CRCs."""
 
-from __future__ import annotations
-
 import hmac
 import socket
 import struct

@@ -1,7 +1,5 @@
 """The command `board`."""
 
-from __future__ import annotations
-
 import os
 import sys
 from dataclasses import replace

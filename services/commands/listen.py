@@ -1,7 +1,5 @@
 """The command `listen`."""
 
-from __future__ import annotations
-
 import contextlib
 from pathlib import Path
 from typing import Annotated

@@ -1,7 +1,5 @@
 """The command `loader`: programs a board over its own port, without a restart of the host (thesis 3.4, SofLoader)."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """The commands `master`, which runs the stack, and `master reload`, which sends an order to a running one."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

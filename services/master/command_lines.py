@@ -1,7 +1,5 @@
 """Command lines of the processes that a master starts, so that they use the settings of its run."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from pcie_shim.endpoint import Endpoint

@@ -5,8 +5,6 @@
 While a run reloads, readings for the next deployment wait beside those for the one in force.
 """
 
-from __future__ import annotations
-
 import asyncio
 import time
 from collections import Counter, deque

@@ -3,8 +3,6 @@
 Their records are passed by calls instead of over local sockets. Boards remain processes, or devices, of their own.
 """
 
-from __future__ import annotations
-
 import asyncio
 import threading
 from collections.abc import Callable, Coroutine

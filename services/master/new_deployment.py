@@ -1,7 +1,5 @@
 """A deployment that is to replace the one in force: read, compared in shape, and copied for the run's children."""
 
-from __future__ import annotations
-
 import shutil
 import stat
 from collections.abc import Callable

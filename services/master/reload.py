@@ -4,8 +4,6 @@ readings of the old one ──▶ finished ──┐
 readings of the new one ──▶ wait ······┴─ boards get the new tables ──▶ computed
 """
 
-from __future__ import annotations
-
 import asyncio
 import time
 from pathlib import Path

@@ -1,7 +1,5 @@
 """One run of the master: its peers, the flow of frames between them, its reloads, and its end."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import sys

@@ -1,7 +1,5 @@
 """A listener: receives the posteriors of a stack, and shows and saves them."""
 
-from __future__ import annotations
-
 from typing import Final
 
 from bridge.client import connect

@@ -1,7 +1,5 @@
 """Results that `master` prints on standard output: a JSON object a line, or one sentence."""
 
-from __future__ import annotations
-
 import sys
 
 import orjson

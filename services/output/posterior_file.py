@@ -1,7 +1,5 @@
 """Posteriors in a file: JSON or CSV lines that are appended, or one NumPy archive that is always complete."""
 
-from __future__ import annotations
-
 import contextlib
 import csv
 import io

@@ -1,7 +1,5 @@
 """Frames on standard output: a line, a JSON object or a picture each."""
 
-from __future__ import annotations
-
 import contextlib
 import time
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """Emulated boards as processes: one alone, or a mini-cluster forked from a process that has loaded the kernels."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal

@@ -1,7 +1,5 @@
 """Connections to the rosbridge servers of a deployment, and reports of failures to the master."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 from collections.abc import Callable, Iterable

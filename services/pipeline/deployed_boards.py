@@ -1,7 +1,5 @@
 """A deployment's boards: programmed, opened, given frames, recovered after restarts, switched to another deployment."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 

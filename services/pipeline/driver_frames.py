@@ -1,7 +1,5 @@
 """Frames as the driver takes them, and its results as records."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -3,8 +3,6 @@
 There is no socket and no clock here: messages go in, complete sets of addresses come out.
 """
 
-from __future__ import annotations
-
 from collections import Counter, deque
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar

@@ -3,8 +3,6 @@
 The master numbers a run's deployments, and sends the current number in its greeting (docs/how-to/operating.md, Another deployment without stopping).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The posterior that a frame's counts stand for, and the report about the frame."""
 
-from __future__ import annotations
-
 from itertools import accumulate
 
 import numpy as np

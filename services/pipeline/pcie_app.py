@@ -4,8 +4,6 @@ One blocking thread serves the master and all boards: it posts a frame's reading
 the counts, and returns the result.
 """
 
-from __future__ import annotations
-
 import selectors
 import socket
 import time

@@ -1,7 +1,5 @@
 """The publisher: publishes results as posteriors on /BMresults (thesis 3.1, Publisher.jar)."""
 
-from __future__ import annotations
-
 import asyncio
 import time
 from collections import Counter

@@ -1,7 +1,5 @@
 """The topics that results are published on, and what becomes of each result."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import math

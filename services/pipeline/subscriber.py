@@ -1,7 +1,5 @@
 """The subscriber: turns the messages of a deployment's topics into readings (thesis 3.1, Subscriber.jar)."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import time

@@ -6,8 +6,6 @@ between topics any order gives the same sets, as long as delays differ by less t
 A topic's period is the median of its last intervals. A topic is *alive* until it was silent for `ALIVE_PERIODS` of its periods.
 """
 
-from __future__ import annotations
-
 import statistics
 from collections import deque
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Readings delivered in time: a frame assembler with the event loop's clock."""
 
-from __future__ import annotations
-
 import asyncio
 import time
 from collections.abc import Callable

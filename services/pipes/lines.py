@@ -1,7 +1,5 @@
 """Lines of standard input, bounded in length and decoded once; `terminal.output.put_json` writes those of standard output."""
 
-from __future__ import annotations
-
 import asyncio
 import os
 import stat

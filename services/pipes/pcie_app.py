@@ -1,7 +1,5 @@
 """`pcie-app` without a master: computes the readings of standard input and prints their counts."""
 
-from __future__ import annotations
-
 from typing import Annotated, Any
 
 import msgspec

@@ -1,7 +1,5 @@
 """`publisher` without a master: publishes the results of standard input."""
 
-from __future__ import annotations
-
 import time
 from collections import Counter
 from typing import Annotated

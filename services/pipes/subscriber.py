@@ -1,7 +1,5 @@
 """`subscriber` without a master: prints variables, or addresses."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 from typing import Any

@@ -4,8 +4,6 @@
 Orders are bounded in size, time and number; anything else gets one sentence, and the connection is closed.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 from collections.abc import AsyncIterator, Awaitable, Callable

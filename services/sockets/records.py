@@ -4,8 +4,6 @@ Every record is a MessagePack array whose first element is its tag. Times called
 time; those called `*_tick` are the machine's monotonic clock, comparable between its processes.
 """
 
-from __future__ import annotations
-
 from enum import StrEnum
 from importlib.metadata import version
 

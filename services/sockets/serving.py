@@ -1,7 +1,5 @@
 """A service's side of a local socket: it listens, and serves one master at a time."""
 
-from __future__ import annotations
-
 import asyncio
 import socket
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """All processes of a run: found by their status sockets, and asked for their status at once."""
 
-from __future__ import annotations
-
 import asyncio
 import os
 import tempfile

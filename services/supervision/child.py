@@ -1,7 +1,5 @@
 """Child processes: started, watched, restarted, and ended together."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import os

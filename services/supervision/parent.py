@@ -1,7 +1,5 @@
 """The end of a child: with its parent, however that ends, and without leaving files behind."""
 
-from __future__ import annotations
-
 import atexit
 import contextlib
 import ctypes

@@ -1,7 +1,5 @@
 """The private directory of a run: the sockets of its processes, and copies of its deployments."""
 
-from __future__ import annotations
-
 import contextlib
 import fcntl
 import os

@@ -1,7 +1,5 @@
 """The layout of the boards: which lines each one holds, and how many inputs and results its registers have."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Final
 

@@ -4,8 +4,6 @@ model ──▶ machine_parameters ──▶ quantise ──▶ whole_machine �
 └─▶ board_layout (lines and interface of each board, before tables are computed)
 """
 
-from __future__ import annotations
-
 import os
 import time
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """The images of the boards that a model is built for, and the deployment that names them."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Sequence

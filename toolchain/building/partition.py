@@ -1,7 +1,5 @@
 """The split of a machine's lines over boards, in contiguous blocks (thesis 3.4, 4.2)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -4,8 +4,6 @@ A factor that is the same for all lines changes nothing in the posterior, so eve
 divided by its maximum over all lines of all boards. Otherwise a machine would hardly ever count.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Final

@@ -1,7 +1,5 @@
 """Regeneration of one part of a deployment: memories, project, or `deployment.toml` with edits (thesis 3.4)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The file of `--sources`: which variable comes from which topic of which server."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal

@@ -5,8 +5,6 @@ codes are exact: a reading that is called impossible ends a frame as `impossible
 called dead never counts.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Findings of a check: severity, subject, mistake and advice."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass
 from enum import StrEnum
 from functools import partial

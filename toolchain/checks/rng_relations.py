@@ -5,8 +5,6 @@ different phases, so bits of two to four columns' numbers may XOR to 0 in every 
 independent, and no number of cycles averages that out.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 

@@ -4,8 +4,6 @@
 check. The subscriber applies it to every frame, the tests to every table.
 """
 
-from __future__ import annotations
-
 import math
 
 from toolchain.deployment import Variable

@@ -4,8 +4,6 @@ Each number follows the rule of `toolchain.deployment.address`. An array has its
 line), and a sensor's reading is missing on all lines of a machine or on none.
 """
 
-from __future__ import annotations
-
 import base64
 import binascii
 import math

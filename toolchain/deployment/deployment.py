@@ -1,7 +1,5 @@
 """The deployment: everything that follows from the model, checked as a whole (thesis 3.3, 3.4)."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from pathlib import Path

@@ -4,8 +4,6 @@ It covers everything that follows from the model, but not URIs and endpoints: a 
 at another robot, but not when a rule is edited that its tables were made from.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 

@@ -1,7 +1,5 @@
 """The types of the values in `deployment.toml`: URIs, topics, message types, paths in a message, names, hashes."""
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from typing import Annotated, Final, TypeVar

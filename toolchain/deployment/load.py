@@ -1,7 +1,5 @@
 """Reading a deployment: `deployment.toml`, its hash and its images, each mistake named with file and line."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from toolchain.deployment.deployment import FILE_NAME, FORMAT, Deployment, DeploymentFile

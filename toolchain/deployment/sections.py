@@ -1,7 +1,5 @@
 """The sections of `deployment.toml`, each checked by itself (thesis 3.3, 3.4)."""
 
-from __future__ import annotations
-
 import re
 from enum import StrEnum
 from pathlib import PurePosixPath

@@ -1,7 +1,5 @@
 """Writing `deployment.toml`: the same deployment gives the same bytes."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any, Final
 

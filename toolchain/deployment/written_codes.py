@@ -1,7 +1,5 @@
 """The codes of numbers that a frame brings: likelihoods (`sensor_mode = threshold`) and written priors."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 

@@ -9,8 +9,6 @@ each variable's own, with one outlier and one good reading in advance (the mode 
 looks like q, the model's own table or a uniform one.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

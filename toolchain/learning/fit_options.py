@@ -1,7 +1,5 @@
 """The options of `toolchain fit`: the method and its assumptions."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import StrEnum
 

@@ -1,7 +1,5 @@
 """A fit from recordings to file, and the report on what each table rests on."""
 
-from __future__ import annotations
-
 import hashlib
 import math
 import shlex

@@ -1,7 +1,5 @@
 """Fits as files, `.toml` of normals or `.npz` of counted tables, and models that use them."""
 
-from __future__ import annotations
-
 import json
 import math
 import zipfile

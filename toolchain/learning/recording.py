@@ -4,8 +4,6 @@ A CSV's columns are those of its heading. A bag's are TOPIC:PATH, such as `/scan
 messages of the first column's topic, each with the nearest message in time of every other topic.
 """
 
-from __future__ import annotations
-
 import csv
 import math
 import re

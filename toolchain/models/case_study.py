@@ -1,7 +1,5 @@
 """Loads a case study's `model.py` and calls its `model()` with the user's `--set key=value`s."""
 
-from __future__ import annotations
-
 import importlib.util
 import inspect
 import sys

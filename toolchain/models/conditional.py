@@ -4,8 +4,6 @@ A reading's address is the bin of half a step around it. Its probability is the 
 the density at its middle, so that coarse bins stay exact.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any, Final, Literal
 

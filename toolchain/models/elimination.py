@@ -3,8 +3,6 @@
 Exact, in float64. The next name is always the one whose table is the smallest; a table above the limit is refused.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The largest sizes of a model's parts, which are checked before anything is allocated."""
 
-from __future__ import annotations
-
 from typing import Final
 
 from toolchain.errors import ModelError

@@ -4,8 +4,6 @@ The machine computes P(S | k_1 ... k_N), proportional to P(S) P(k_1 | S) ... P(k
 model is the prior P(S), a table of P(K_i | S) for each known variable, and their order: the columns'.
 """
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from dataclasses import dataclass, field, fields

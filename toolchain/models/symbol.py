@@ -1,7 +1,5 @@
 """Symbols: the variables of a joint distribution, each with a type that defines its values, as in ProBT."""
 
-from __future__ import annotations
-
 import math
 import re
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """BIF, the Interchange Format for Bayesian networks (version 0.15): `variable` and `probability` blocks."""
 
-from __future__ import annotations
-
 import math
 from typing import Final
 

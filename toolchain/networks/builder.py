@@ -1,7 +1,5 @@
 """The variables and tables that a reader finds, bounded and checked as they come, each mistake with its line."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from itertools import chain

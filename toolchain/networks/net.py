@@ -1,7 +1,5 @@
 """NET, Hugin's format: `node` blocks with their states, `potential` blocks with their data."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Final
 

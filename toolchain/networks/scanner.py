@@ -1,7 +1,5 @@
 """A scanner of text files: words, quoted words, signs and numbers, with the line of each."""
 
-from __future__ import annotations
-
 import math
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """UAI: a network as numbers alone, BAYES or MARKOV; its variables are called 0, 1, 2 and so on."""
 
-from __future__ import annotations
-
 import math
 from typing import Final
 

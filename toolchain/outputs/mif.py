@@ -4,8 +4,6 @@ Written in one canonical form, an entry a line in hexadecimal; read in every for
 radices, runs (`A : D0 D1;`), ranges (`[A0..A1] : D;`) and both kinds of comments.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass

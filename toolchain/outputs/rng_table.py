@@ -1,7 +1,5 @@
 """The table of random numbers that `rng = table` plays (thesis 3.2): generated, or read from a user's MIF."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Final
 

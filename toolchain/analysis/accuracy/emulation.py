@@ -1,7 +1,5 @@
 """Emulation of a deployment's boards in this process, stopped as the host stops them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TypeAlias

@@ -1,7 +1,5 @@
 """Confidence intervals of figures over frames."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ flipped in copies of a machine's tables, random numbers and streams, in a machin
 reference does; the kernels know nothing of faults.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass

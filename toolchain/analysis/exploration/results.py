@@ -1,7 +1,5 @@
 """Results of a sweep: a point for each machine, a line each in a file, and their Pareto front."""
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Sequence
