@@ -57,7 +57,7 @@ def licence_of(package: Package, known: dict[str, str]) -> str:
         LicenceError: Neither has it, or both and they differ.
     """
     try:
-        stated = metadata(package.name).get("License-Expression")
+        stated = metadata(package.name).json.get("license_expression")
     except PackageNotFoundError:
         stated = None
     read = known.get(package.name)

@@ -37,7 +37,9 @@ def test_the_bill_has_every_locked_package_with_its_hashes_and_licence(tmp_path)
     hashes = set(re.findall(r"sha256:(\w{64})", (ROOT / "requirements.lock").read_text()))
     assert {each["content"] for one in required.values() for each in one["hashes"]} == hashes
     assert all(one["licenses"][0]["expression"] for one in required.values())
-    everything = set(re.findall(r"^([\w.-]+)==([\w.]+)", (ROOT / "requirements-dev.lock").read_text(), re.MULTILINE))
+    everything = set(
+        re.findall(r"^([\w.-]+)==([\w.]+)", (ROOT / "requirements-dev.lock").read_text(), re.MULTILINE)
+    )
     assert {(each["name"], each["version"]) for each in components} == everything | pins
 
 
