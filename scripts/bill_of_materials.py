@@ -57,9 +57,10 @@ def licence_of(package: Package, known: dict[str, str]) -> str:
         LicenceError: Neither has it, or both and they differ.
     """
     try:
-        stated = metadata(package.name).json.get("license_expression")
+        own = metadata(package.name).json.get("license_expression")
     except PackageNotFoundError:
-        stated = None
+        own = None
+    stated = own if isinstance(own, str) else None
     read = known.get(package.name)
     if stated and read:
         raise LicenceError(
