@@ -3,19 +3,15 @@
 One thread with an event loop forwards the bytes of all tunnels of a process. Links without TLS do not use it.
 """
 
-from __future__ import annotations
-
 import asyncio
 import functools
 import socket
 import ssl
 import threading
+from collections.abc import Coroutine
 from concurrent.futures import Future
 from contextlib import suppress
-from typing import TYPE_CHECKING, Final
-
-if TYPE_CHECKING:
-    from collections.abc import Coroutine
+from typing import Final
 
 HANDSHAKE_S: Final = 10.0
 """Seconds that a TLS handshake may take."""

@@ -1,11 +1,9 @@
 """One board of the mini-cluster: its link, the known contents of its registers, its part of a frame."""
 
-from __future__ import annotations
-
 import select
 import struct
 import time
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -39,15 +37,13 @@ from pcie_shim.errors import (
     UnreachableError,
 )
 from pcie_shim.host.frame import BoardResult
+from pcie_shim.host.frame_encoder import BoardWords
 from pcie_shim.host.link import Done, Link, RegisterWrite
 from pcie_shim.host.loader import program
 from pcie_shim.host.socket_link import SocketLink
 from pcie_shim.programming_file import Image, interface_words, is_plain
 from pcie_shim.register_layout import ALL_ONES, REPLICA_OUTCOME, next_doorbell
 from pcie_shim.register_map import BoardState
-
-if TYPE_CHECKING:
-    from pcie_shim.host.frame_encoder import BoardWords
 
 _ASSUMED_SPEED: Final = 1e4  # cycles per second of a board that does not report its speed
 _START: Final = struct.Struct("<QI")  # RUN_UNTIL, START

@@ -1,22 +1,17 @@
 """Register words that the host writes to each board to start a frame."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from machines.parameters import CYCLES_MAX, PriorMode, SensorMode
 from pcie_shim.errors import FrameInputError
+from pcie_shim.host.frame import FrameInput
 from pcie_shim.programming_file import Image, is_plain
 from pcie_shim.register_layout import SETTINGS
-
-if TYPE_CHECKING:
-    from pcie_shim.host.frame import FrameInput
-
 
 _Scalar = TypeVar("_Scalar", bound=np.generic)
 

@@ -1,16 +1,12 @@
 """Interface of a link to one board: its registers, and its answer when the machine has stopped."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Final, NamedTuple, Protocol, TypeAlias
+from typing import Final, NamedTuple, Protocol, TypeAlias
 
 from pcie_shim import register_map
-
-if TYPE_CHECKING:
-    from pcie_shim.endpoint import Endpoint
-    from pcie_shim.errors import LinkTimeoutError
-    from pcie_shim.framing import Octets
+from pcie_shim.endpoint import Endpoint
+from pcie_shim.errors import LinkTimeoutError
+from pcie_shim.framing import Octets
 
 LONGEST_POLL_S: Final = 3600.0
 """Maximum duration of a single wait in seconds, because poll expects milliseconds in 31 bits."""

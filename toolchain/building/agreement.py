@@ -1,16 +1,11 @@
 """Agreement of `deployment.toml` with the images that it names."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 from pcie_shim.programming_file import Image, Partition, read_image
 from toolchain.building.machine import MACHINE_KEYS
+from toolchain.deployment import Deployment
 from toolchain.errors import DeploymentError
-
-if TYPE_CHECKING:
-    from toolchain.deployment import Deployment
 
 
 def read_images(deployment: Deployment) -> list[Image]:

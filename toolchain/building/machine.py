@@ -1,20 +1,16 @@
 """The machine of a whole model, before it is split over boards."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from machines.bm1 import BM1Machine
 from machines.errors import ParameterError
 from machines.parameters import BM1Parameters, PriorMode, RngKind, SensorMode
+from toolchain.building.options import BuildOptions
+from toolchain.building.quantise import Quantised
 from toolchain.deployment import MachineSection
 from toolchain.errors import BuildError
+from toolchain.models.model import Model
 from toolchain.outputs.rng_table import random_table
-
-if TYPE_CHECKING:
-    from toolchain.building.options import BuildOptions
-    from toolchain.building.quantise import Quantised
-    from toolchain.models.model import Model
 
 _MOST_CODES: Final = 1 << 30
 """Of all columns together, 2 bytes each while they are computed."""

@@ -1,16 +1,12 @@
 """`report.txt` of a deployment: what was built and what was lost, in plain sentences."""
 
-from __future__ import annotations
-
 import re
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from machines.parameters import PriorMode, SensorMode
-
-if TYPE_CHECKING:
-    from toolchain.building.quantise import Quantised
-    from toolchain.deployment import Deployment, MachineSection
-    from toolchain.models.model import Model
+from toolchain.building.quantise import Quantised
+from toolchain.deployment import Deployment, MachineSection
+from toolchain.models.model import Model
 
 REPORT_NAME: Final = "report.txt"
 

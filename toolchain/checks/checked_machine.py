@@ -1,18 +1,14 @@
 """A whole machine to check, from a model or from a deployment's boards."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from machines.bm1 import BM1Machine
-    from machines.parameters import BM1Parameters
-    from toolchain.deployment import Deployment, Variable
-    from toolchain.models.model import Model
+from machines.bm1 import BM1Machine
+from machines.parameters import BM1Parameters
+from toolchain.deployment import Deployment, Variable
+from toolchain.models.model import Model
 
 
 @dataclass(frozen=True, slots=True, eq=False)

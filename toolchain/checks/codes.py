@@ -1,21 +1,17 @@
 """Findings about codes: lines that never count, readings without a posterior, columns without effect."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from machines.parameters import PriorMode, SensorMode
+from toolchain.building.options import BuildOptions
+from toolchain.building.quantise import Quantised
+from toolchain.checks.checked_machine import CheckedMachine
 from toolchain.checks.finding import Check, Finding, error, note, warning
 from toolchain.deployment import Deployment, Dimension, Scale, Variable
-
-if TYPE_CHECKING:
-    from toolchain.building.options import BuildOptions
-    from toolchain.building.quantise import Quantised
-    from toolchain.checks.checked_machine import CheckedMachine
 
 _MOST_RANGES: Final = 4
 _LOST_OFTEN: Final = 0.02

@@ -1,23 +1,19 @@
 """Findings about random numbers: their period, their steps, and relations between columns."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from itertools import pairwise
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from machines.bm1 import BM1Machine
 from machines.parameters import RngKind, RngReset
+from toolchain.checks.checked_machine import CheckedMachine
 from toolchain.checks.finding import Check, Finding, Severity, error, note, warning
 from toolchain.checks.rng_relations import relations
 from toolchain.outputs.memories import seed_words
-
-if TYPE_CHECKING:
-    from toolchain.checks.checked_machine import CheckedMachine
 
 _RANDOM_SIGMAS: Final = 5
 

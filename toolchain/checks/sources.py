@@ -1,15 +1,10 @@
 """Findings about sources: topics whose messages cannot be paired."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Final
+from collections.abc import Iterator
+from typing import Final
 
 from toolchain.checks.finding import Check, Finding, note, warning
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from toolchain.deployment import Deployment
+from toolchain.deployment import Deployment
 
 _WITHOUT_HEADER: Final = frozenset(
     f"geometry_msgs/{name}"

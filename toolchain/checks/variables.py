@@ -1,15 +1,10 @@
 """Findings about variables: the same reading twice, and ranges that don't fit the addresses."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
 from toolchain.checks.finding import Check, Finding, note, warning
-
-if TYPE_CHECKING:
-    from toolchain.deployment import Deployment
+from toolchain.deployment import Deployment
 
 
 def variable_findings(deployment: Deployment) -> Iterator[Finding]:

@@ -3,12 +3,10 @@
 Continuous distributions become tables here: a normal's integral over each value of its symbol, a function's value.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, TypeAlias
+from typing import Final, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,12 +15,10 @@ from toolchain.errors import ModelError
 from toolchain.models.conditional import normal_table, wrapped_normal_table
 from toolchain.models.limits import MAX_ENTRIES, check_size
 from toolchain.models.model import Normal
+from toolchain.models.symbol import Symbol
 
-if TYPE_CHECKING:
-    from toolchain.models.symbol import Symbol
-
-    Formula: TypeAlias = Callable[..., ArrayLike] | ArrayLike
-    """A function of the given symbols' values, one float64 array each of the same shape; or constant numbers."""
+Formula: TypeAlias = Callable[..., ArrayLike] | ArrayLike
+"""A function of the given symbols' values, one float64 array each of the same shape; or constant numbers."""
 
 _SUM_TOLERANCE: Final = 1e-6
 

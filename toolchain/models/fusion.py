@@ -1,17 +1,12 @@
 """Exact naive Bayesian fusion in float64 (equation 2.2): what a machine's posterior is measured against."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from toolchain.errors import ModelError
-
-if TYPE_CHECKING:
-    from toolchain.models.model import Model
+from toolchain.models.model import Model
 
 
 def exact_posterior(

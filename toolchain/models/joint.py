@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from graphlib import CycleError, TopologicalSorter
 from operator import itemgetter
-from typing import TYPE_CHECKING, Any, Final, TypeAlias
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,11 +23,9 @@ from toolchain.models.elimination import Term, eliminate, product, reduced
 from toolchain.models.limits import MAX_ENTRIES, MAX_MODEL_ENTRIES, check_size
 from toolchain.models.model import Known, Model, Normal, PriorSelect, dimension
 from toolchain.models.separation import Links, relevant, without_idle
+from toolchain.models.symbol import Symbol
 
-if TYPE_CHECKING:
-    from toolchain.models.symbol import Symbol
-
-    Named: TypeAlias = Symbol | str
+Named: TypeAlias = Symbol | str
 
 _LISTED: Final = 20
 

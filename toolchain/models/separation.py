@@ -1,19 +1,15 @@
 """The moral graph of a product of factors without its searched and given symbols: which symbols it joins."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from itertools import pairwise
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
 from toolchain.models.distribution import Distribution, Factor
-
-if TYPE_CHECKING:
-    from toolchain.models.elimination import Term
+from toolchain.models.elimination import Term
 
 _LONGEST_DRAWN: Final = 12
 """Symbols of a path that is drawn whole."""

@@ -5,11 +5,9 @@ holds the code of every line of the board, line 0 in the lowest bits. The prior 
 each line has a reading of its own, a tile is a memory by itself: its bits of those words.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,11 +15,9 @@ from numpy.typing import NDArray
 from machines.bm1 import BM1Machine
 from machines.parameters import BM1Parameters, PriorMode, RngKind, SensorMode
 from machines.rng import LFSR, POLYNOMIALS, generator_numbers, random_numbers
+from pcie_shim.programming_file import Image
+from toolchain.deployment import Deployment
 from toolchain.outputs.mif import mif_lines
-
-if TYPE_CHECKING:
-    from pcie_shim.programming_file import Image
-    from toolchain.deployment import Deployment
 
 FOLDER: Final = "bm_arch/Memory_MIFs"
 

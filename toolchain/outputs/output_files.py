@@ -1,7 +1,5 @@
 """The files that follow from a deployment, written together, and the change of each."""
 
-from __future__ import annotations
-
 import filecmp
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -10,10 +8,11 @@ from enum import StrEnum
 from functools import partial
 from itertools import zip_longest
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from machines.parameters import RngKind
 from pcie_shim.programming_file import Image, image_bytes
+from toolchain.deployment import Deployment
 from toolchain.errors import BuildError
 from toolchain.files.whole_file import whole_file
 from toolchain.outputs.memories import FOLDER as MEMORIES_FOLDER
@@ -21,9 +20,6 @@ from toolchain.outputs.memories import Memory, memories
 from toolchain.outputs.quartus import PROJECT, project_files
 from toolchain.outputs.vhdl_parameters import FILE as PARAMETERS_FILE
 from toolchain.outputs.vhdl_parameters import parameters_vhd
-
-if TYPE_CHECKING:
-    from toolchain.deployment import Deployment
 
 
 class Change(StrEnum):

@@ -1,15 +1,11 @@
 """The Quartus project of a deployment: a revision for every board, and a script that compiles them (thesis 3.2)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
+from toolchain.deployment import Deployment
 from toolchain.outputs.mif import printable
 from toolchain.outputs.vhdl_parameters import FILE as PARAMETERS_FILE
-
-if TYPE_CHECKING:
-    from toolchain.deployment import Deployment
 
 FAMILY: Final = "Stratix V"
 DEVICE: Final = "5SGSMD8K2F40C2"

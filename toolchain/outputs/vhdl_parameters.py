@@ -1,18 +1,14 @@
 """`bm1_parameters.vhd`: all parameters of a model that the machine's VHDL needs, in one package (thesis 3.2)."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from machines.parameters import BM1Parameters, PriorMode, RngKind, RngReset
 from machines.rng import POLYNOMIALS
+from pcie_shim.programming_file import Image
+from toolchain.deployment import Deployment
 from toolchain.outputs.memories import column_name, generators, seed_width, seed_words
 from toolchain.outputs.mif import printable
-
-if TYPE_CHECKING:
-    from pcie_shim.programming_file import Image
-    from toolchain.deployment import Deployment
 
 FILE: Final = "bm_arch/bm1_parameters.vhd"
 

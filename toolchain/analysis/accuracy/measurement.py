@@ -5,12 +5,10 @@ and of the machine (counts). The codes against the model show the loss by quanti
 sampling.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,12 +18,10 @@ from machines.encode import decode_code
 from machines.parameters import RngReset
 from toolchain.analysis.accuracy.emulation import EmulatedBoards, Inputs, inputs_of_boards
 from toolchain.analysis.accuracy.intervals import Interval, bootstrap, bootstrap_rows, share_of_frames
+from toolchain.analysis.accuracy.readings import Readings
 from toolchain.errors import BuildError, ModelError
 from toolchain.models.fusion import exact_posterior, fuse
-
-if TYPE_CHECKING:
-    from toolchain.analysis.accuracy.readings import Readings
-    from toolchain.models.model import Model
+from toolchain.models.model import Model
 
 EXPECTED_COUNT: Final = 5.0
 """z-scores are taken of lines that are expected to count at least so often: below, a count is not near normal."""

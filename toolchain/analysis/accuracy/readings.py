@@ -1,16 +1,16 @@
 """Readings as addresses of a machine's columns, drawn from a model or recorded."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from machines.bm1 import BM1Machine
 from machines.encode import decode_code
+from toolchain.analysis.accuracy.emulation import Inputs
 from toolchain.deployment import Dimension, Scale, Variable
 from toolchain.deployment.address import to_address
 from toolchain.deployment.written_codes import written_codes
@@ -18,10 +18,6 @@ from toolchain.errors import BuildError, ModelError, ReadingError
 from toolchain.flag_values import key_values
 from toolchain.learning.recording import read_recording
 from toolchain.models.model import Known, Model, PriorSelect
-
-if TYPE_CHECKING:
-    from machines.bm1 import BM1Machine
-    from toolchain.analysis.accuracy.emulation import Inputs
 
 MISSING: Final = -1
 MOST_FRAMES: Final = 100_000

@@ -1,17 +1,13 @@
 """Pictures of sweeps and claims; matplotlib is loaded only when one is drawn."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
+from toolchain.analysis.exploration.claims import Claims
+from toolchain.analysis.exploration.results import Point
 from toolchain.errors import BuildError
-
-if TYPE_CHECKING:
-    from toolchain.analysis.exploration.claims import Claims
-    from toolchain.analysis.exploration.results import Point
 
 _DPI: Final = 75
 _COLOURS: Final = ("#4477aa", "#ee6677", "#228833", "#ccbb44", "#66ccee", "#aa3377", "#bbbbbb")

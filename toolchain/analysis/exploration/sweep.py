@@ -1,14 +1,12 @@
 """Sweeps over a model's possible machines: accuracy against cycles and ALMs, kept point by point in a file."""
 
-from __future__ import annotations
-
 import hashlib
 import itertools
 import json
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from machines.bm1 import BM1Machine
 from machines.parameters import RngKind, SensorMode
@@ -17,6 +15,7 @@ from toolchain.analysis.accuracy.measurement import measure
 from toolchain.analysis.accuracy.readings import Readings, check_frames, readings_of_lines, sample_readings
 from toolchain.analysis.exploration.results import Point
 from toolchain.analysis.resources.boards_needed import with_lines
+from toolchain.analysis.resources.device import Device
 from toolchain.analysis.resources.estimate import Pcie, estimate
 from toolchain.building.board_layout import DEFAULT_INTERFACE, board_layout
 from toolchain.building.machine import machine_parameters, whole_machine
@@ -26,9 +25,6 @@ from toolchain.building.quantise import quantise
 from toolchain.deployment import Scale, Stop
 from toolchain.errors import BuildError
 from toolchain.models.model import Model
-
-if TYPE_CHECKING:
-    from toolchain.analysis.resources.device import Device
 
 MAX_POINTS: Final = 10_000
 

@@ -1,12 +1,8 @@
 """A sweep as text: a row for each machine, the Pareto front marked."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from toolchain.analysis.exploration.results import Point
+from toolchain.analysis.exploration.results import Point
 
 
 def table(points: Sequence[Point], front: Sequence[Point]) -> str:

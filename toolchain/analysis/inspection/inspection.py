@@ -1,12 +1,10 @@
 """Inspection of a deployment: its losses, accuracy, cycles, resources and energy."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
@@ -23,6 +21,7 @@ from toolchain.analysis.accuracy.readings import (
     recorded_readings,
     sample_readings,
 )
+from toolchain.analysis.resources.device import Device
 from toolchain.analysis.resources.energy import Energy, energy
 from toolchain.analysis.resources.estimate import Estimate, Pcie, estimate
 from toolchain.analysis.resources.table_memories import Tables
@@ -34,10 +33,7 @@ from toolchain.errors import BuildError, DeploymentError
 from toolchain.models.model import Model
 from toolchain.outputs.rng_table import table_length
 
-if TYPE_CHECKING:
-    from toolchain.analysis.resources.device import Device
-
-    Progress = Callable[[int], AbstractContextManager[Callable[[str], None]]]
+Progress = Callable[[int], AbstractContextManager[Callable[[str], None]]]
 
 FRAMES: Final = 200
 BANKS: Final = 4

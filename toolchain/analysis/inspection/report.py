@@ -1,20 +1,15 @@
 """Reports of an inspection: sentences and tables, or one JSON object."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import asdict
-from typing import TYPE_CHECKING
 
+from toolchain.analysis.accuracy.intervals import Interval
+from toolchain.analysis.accuracy.measurement import Difference
+from toolchain.analysis.inspection.inspection import Inspection
 from toolchain.analysis.resources.energy import ASSUMPTIONS
 from toolchain.analysis.resources.estimate import Pcie
 from toolchain.building.report import loss_heading, many_sentence
-
-if TYPE_CHECKING:
-    from toolchain.analysis.accuracy.intervals import Interval
-    from toolchain.analysis.accuracy.measurement import Difference
-    from toolchain.analysis.inspection.inspection import Inspection
 
 
 def report(found: Inspection) -> str:
