@@ -146,15 +146,9 @@ async def announced(
 ) -> AsyncIterator[None]:
     """Announce a rosbridge server while the context is open.
 
-    Args:
-        name: Name of the robot, unique on the network.
-        host: Address that the server listens on; `0.0.0.0` and `::` stand for all addresses of this machine. A
-            loopback address is announced to this machine only.
-        port: Port of the server.
-        ros_version: Its ROS version.
-        tls: Whether it uses TLS; clients then get this machine's host name, which has to be in its certificate.
-        token: Whether clients need a token.
-        interfaces: Addresses of this machine to answer on; None for all.
+    `host` is the address that the server listens on; `0.0.0.0` and `::` stand for all addresses of this machine, and a
+    loopback address is announced to this machine only. With `tls` clients get this machine's host name, which has to be in
+    its certificate; `token` says whether they need one. Without `interfaces` it answers on all.
 
     Raises:
         DiscoveryError: `zeroconf` is not installed, there is no network, or another server has the name.

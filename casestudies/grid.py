@@ -60,8 +60,7 @@ class Grid:
     def mean(self, posterior: Sequence[float]) -> tuple[float, float]:
         """Return the mean position (x, y) of a posterior over the cells' centres, in the map's units.
 
-        Args:
-            posterior: float[cells], row-major, not negative; it need not sum to 1.
+        The posterior is float64[cells], row-major and not negative; it need not sum to 1.
 
         Raises:
             ValueError: The length is wrong, or all values are 0.

@@ -201,10 +201,7 @@ class Subscription(_Handle):
             self._set_alarm(now)
 
     async def next(self, timeout: float) -> Message:  # noqa: ASYNC109  # the limit is part of the error
-        """Wait for one message.
-
-        Args:
-            timeout: Timeout in seconds.
+        """Wait for one message, `timeout` seconds at most.
 
         Raises:
             NoMessageError: None arrived in time; the sentence names topic, server and time, and the server's
@@ -299,14 +296,10 @@ class Publication(_Handle):
         self._register()
 
     async def publish(self, msg: Mapping[str, Any], *, timeout: float = 5.0) -> None:  # noqa: ASYNC109  # as above
-        """Send one message, and return when the socket has it.
+        """Send one message, whose values may be NumPy arrays, and return when the socket has it.
 
-        It is sent at once while the server keeps up; otherwise it waits for its turn. Nothing is kept over a lost
-        connection: old readings are worthless after it.
-
-        Args:
-            msg: The ROS message; values may be NumPy arrays.
-            timeout: Timeout in seconds for a slow server.
+        It is sent at once while the server keeps up; otherwise it waits for its turn, `timeout` seconds at most. Nothing is
+        kept over a lost connection: old readings are worthless after it.
 
         Raises:
             DisconnectedError: There is no connection now, or the publication or the client is closed.

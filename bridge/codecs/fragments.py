@@ -83,14 +83,9 @@ class Reassembler:
         return min((begun.touched for begun in self._sets.values()), default=math.inf) + self._max_age
 
     def take(self, fragment: Mapping[str, Any], now: float) -> bytes | None:
-        """Take one fragment.
+        """Take one fragment; `now` is in seconds of any monotonic clock.
 
-        Args:
-            fragment: The operation.
-            now: Seconds of any monotonic clock.
-
-        Returns:
-            The message that it completes; None if fragments are missing, or this one is a repetition.
+        It returns the message that is complete now; None if fragments are missing, or this one is a repetition.
 
         Raises:
             DecodeError: It is not a fragment, or its message is too large or inconsistent and was given up.

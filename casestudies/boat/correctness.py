@@ -34,15 +34,7 @@ def in_region(true_lines: ArrayLike, posteriors: ArrayLike, mass: float = REGION
     """Return for each frame whether its true cell lies in the smallest region that holds this much of the posterior.
 
     The region takes the most probable cells first; cells of equal probability enter together, so that the
-    answer does not depend on the order of lines.
-
-    Args:
-        true_lines: int[frames].
-        posteriors: float64[frames, lines], each summing to 1.
-        mass: of the region, 0..1.
-
-    Returns:
-        bool[frames].
+    answer does not depend on the order of lines. `posteriors` are float64[frames, lines], each summing to 1.
     """
     probabilities = _two_dimensional(posteriors)
     at_truth = np.take_along_axis(probabilities, np.asarray(true_lines)[:, None], axis=1)
@@ -69,13 +61,9 @@ def total_variation(posteriors: ArrayLike, exact: ArrayLike) -> NDArray[np.float
 
 
 def correctness(true_lines: ArrayLike, posteriors: ArrayLike, exact: ArrayLike, *, width: int) -> Correctness:
-    """Return all figures of the machine's posteriors.
+    """Return all figures of the machine's posteriors beside float64 fusion of the same readings.
 
-    Args:
-        true_lines: int[frames], the lines of the true cells.
-        posteriors: float64[frames, lines], as published.
-        exact: float64[frames, lines], float64 fusion of the same readings.
-        width: cells in a row of the grid.
+    `true_lines` are int[frames], both kinds of posteriors float64[frames, lines]; a row of the grid has `width` cells.
 
     Raises:
         ValueError: The shapes do not match, or there is no frame.

@@ -33,16 +33,8 @@ def unquantised_posterior(
 ) -> NDArray[np.float64]:
     """Return the posterior over the cells, float64[width * height] with line = y * width + x.
 
-    Args:
-        landmarks: The landmarks.
-        readings: One per landmark, in the same order.
-        width: Cells along x in [-2, 7] m.
-        height: Cells along y in [-7, 7] m.
-        floor: What an outlier gets everywhere, relative to the density's peak.
-
-    Raises:
-        ValueError: Another number of readings than landmarks.
-        toolchain.errors.ModelError: Readings that are impossible on every line (only without a floor).
+    There is a reading for each landmark, in the same order; an outlier gets the floor everywhere, relative to the
+    density's peak. Without a floor, readings that are impossible on every line are a ModelError.
     """
     y, x = cell_centres(interval("y", *Y_LIMITS, cells=height), interval("x", *X_LIMITS, cells=width))
     factors = []

@@ -84,22 +84,11 @@ async def play(
     timeout_s: float = 10.0,
     on_frame: Callable[[PlayedFrame], None] = lambda _: None,
 ) -> list[PlayedFrame]:
-    """Publish each frame and wait for its result before the next one.
+    """Publish each frame and wait for its result before the next one; return an entry for each frame, in order.
 
     Frames carry the time of their publication, which identifies their results. The first frame is published again
     every second until its result comes, since the subscriber may not be there yet; every other frame is published
-    once.
-
-    Args:
-        uri: The rosbridge server's.
-        frames: The frames to play.
-        topic: The topic to publish on.
-        first_timeout_s: Seconds until the first result.
-        timeout_s: Seconds until any other result; after them the frame has none.
-        on_frame: A callback after each frame.
-
-    Returns:
-        One entry for each frame, in order.
+    once, and has no result after `timeout_s`.
 
     Raises:
         NoResultError: The first frame had no result.

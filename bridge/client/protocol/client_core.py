@@ -78,15 +78,9 @@ class ClientCore:
         return self.wire.take()
 
     def receive(self, data: bytes | str, now: float) -> Event | None:
-        """Handle one WebSocket message.
+        """Return the meaning of one WebSocket message with any content; `now` is in monotonic seconds, for throttling.
 
-        Args:
-            data: The message, with any content.
-            now: Monotonic seconds, for throttled subscriptions.
-
-        Returns:
-            Its meaning; None for requests that were refused here, and for messages of topics or calls that were
-            given up.
+        It is None for requests that were refused here, and for messages of topics or calls that were given up.
         """
         if type(data) is bytes:
             subscriptions = self.subscriptions

@@ -56,12 +56,7 @@ class Services:
         self._wire.write(op="unadvertise_service", service=key)
 
     def answer(self, ticket: int, values: Mapping[str, Any] | str, *, ok: bool = True) -> None:
-        """Answer a request, unless its connection was lost.
-
-        Args:
-            ticket: Ticket of the request.
-            values: Fields of the answer, or with `ok=False` the reason as text.
-            ok: Whether the service succeeded.
+        """Answer a request with fields, or with `ok=False` a reason as text, unless its connection was lost.
 
         Raises:
             EncodeError: The values cannot be encoded as JSON; the request still waits for an answer.
