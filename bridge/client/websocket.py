@@ -18,13 +18,7 @@ from http import HTTPStatus
 from typing import Final
 
 from websockets.client import ClientProtocol
-from websockets.exceptions import (
-    InvalidHandshake,
-    InvalidMessage,
-    InvalidStatus,
-    InvalidURI,
-    PayloadTooBig,
-)
+from websockets.exceptions import InvalidHandshake, InvalidMessage, InvalidStatus, InvalidURI, PayloadTooBig
 from websockets.frames import CloseCode
 from websockets.http11 import USER_AGENT, Request, Response
 from websockets.uri import WebSocketURI, parse_uri

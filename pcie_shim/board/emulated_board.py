@@ -21,14 +21,7 @@ from machines.parameters import CYCLES_MAX, BM1Parameters, PriorMode, RngReset
 from pcie_shim import register_map as rm
 from pcie_shim.errors import ImageError, PcieShimError
 from pcie_shim.programming_file import Image, image_from_bytes, is_plain
-from pcie_shim.register_layout import (
-    ALL_ONES,
-    DONE_BLOCK,
-    REPLICA_OUTCOME,
-    SETTINGS,
-    WORD,
-    next_doorbell,
-)
+from pcie_shim.register_layout import ALL_ONES, DONE_BLOCK, REPLICA_OUTCOME, SETTINGS, WORD, next_doorbell
 from pcie_shim.register_map import BoardState, ErrorCode, MachineKind, RngKind, SensorMode
 
 CHUNK_S: Final = 0.05

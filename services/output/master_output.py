@@ -1,12 +1,9 @@
 """Results that `master` prints on standard output: a JSON object a line, or one sentence."""
 
-import sys
-
-import orjson
-
 from services.errors import StackError
 from services.pipeline.generations import InForce
 from services.sockets.records import Published
+from terminal.output import put_json
 from toolchain.deployment import Deployment
 
 
@@ -17,20 +14,17 @@ def print_json(record: Published, in_force: InForce) -> None:
         BrokenPipeError: The reader has closed the pipe.
         StackError: Standard output can't be written.
     """
-    line = orjson.dumps(
-        {
-            "frame": record.number,
-            "best": cell(in_force.deployment, record.best_line),
-            "probability": record.best_probability,
-            "cycles": record.cycles,
-            "ms": round(record.total_ns / 1e6, 3),
-            "seen": record.seen,
-            "generation": in_force.generation,
-        }
-    )
+    result = {
+        "frame": record.number,
+        "best": cell(in_force.deployment, record.best_line),
+        "probability": record.best_probability,
+        "cycles": record.cycles,
+        "ms": round(record.total_ns / 1e6, 3),
+        "seen": record.seen,
+        "generation": in_force.generation,
+    }
     try:
-        sys.stdout.buffer.write(line + b"\n")
-        sys.stdout.buffer.flush()
+        put_json(result)
     except BrokenPipeError:
         raise
     except OSError as error:

@@ -28,12 +28,7 @@ from services.sockets.records import (
     Trouble,
 )
 from services.sockets.serving import outdated
-from services.sockets.status import (
-    FrameCounts,
-    ProcessStatus,
-    reasons,
-    seconds_since,
-)
+from services.sockets.status import FrameCounts, ProcessStatus, reasons, seconds_since
 from terminal.errors import ExitCode, exit_code_of
 from terminal.logs import get_logger
 from terminal.signals import check_signals

@@ -166,17 +166,18 @@ class Scanner:
 
     def _floats(self, words: list[str], wanted: int, what: str, begin: int) -> NDArray[np.float64]:
         """Return words as numbers; the last word may be the rest of the text, and is only counted."""
-        try:
-            values = np.array([_float(word) for word in words[:wanted]])
-        except ValueError:
-            wrong = next(word for word in words if not _is_float(word))
-            at = self._text.find(wrong, begin)
-            self._start, self._end = at, at + 1
-            raise self.error(f"{_shown(wrong)} in {what} is not a number") from None
+        values = []
+        for word in words[:wanted]:
+            try:
+                values.append(_float(word))
+            except ValueError:
+                at = self._text.find(word, begin)
+                self._start, self._end = at, at + 1
+                raise self.error(f"{_shown(word)} in {what} is not a number") from None
         if len(words) != wanted:
             count = f"more than {wanted}" if len(words) > wanted else str(len(words))
             raise self.error(f"{what} has {count} numbers, expected {wanted}")
-        return values
+        return np.array(values)
 
 
 def _float(word: str) -> float:
@@ -184,14 +185,6 @@ def _float(word: str) -> float:
     if "_" in word or math.isnan(number):  # the former is Python's own notation
         raise ValueError
     return number
-
-
-def _is_float(word: str) -> bool:
-    try:
-        _float(word)
-    except ValueError:
-        return False
-    return True
 
 
 def _shown(piece: str) -> str:
