@@ -79,16 +79,9 @@ def quantise(
     scale: Scale = Scale.ADDRESS,
     sensor_mode: SensorMode = SensorMode.COLUMN,
 ) -> Quantised:
-    """Return the model's codes, and what quantising has lost.
+    """Return the model's codes of `prob_bits` bits (1 to 16, or a ParameterError), and what quantising has lost.
 
-    Args:
-        model: The model.
-        prob_bits: Bits of a code (W), 1 to 16.
-        scale: The part of a table that is divided by its maximum first; not addresses where cells have their own readings.
-        sensor_mode: The input of a cell.
-
-    Raises:
-        machines.errors.ParameterError: `prob_bits` is not 1 to 16.
+    `scale` is the part of a table that is divided by its maximum first; not addresses where cells have their own readings.
     """
     prior = model.prior_distribution
     prior_codes, prior_loss = _quantised_prior(model, prob_bits, scale)

@@ -37,15 +37,10 @@ class Relations:
 
 
 def relations(kind: RngKind, seeds: NDArray[np.uint64], prob_bits: int) -> Relations:
-    """Look for relations of 2, 3 or 4 bits between columns.
+    """Look for relations of 2, 3 or 4 bits between columns, in as many groups as a few seconds allow.
 
-    Args:
-        kind: The LFSR.
-        seeds: uint64[groups, columns]; the columns of a group are those whose bits are ANDed.
-        prob_bits: How many low bits of a state are compared with a code.
-
-    Returns:
-        The relations; as many groups are searched as a few seconds allow.
+    `seeds` are uint64[groups, columns]; the columns of a group are those whose bits are ANDed. Of a state `prob_bits` low
+    bits are compared with a code.
     """
     groups, columns = seeds.shape
     bits = columns * prob_bits
