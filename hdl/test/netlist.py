@@ -1,6 +1,6 @@
 """GHDL's synthesis and yosys: the hardware of an image as Verilog, and what an FPGA's logic it becomes.
 
-Tables are left out of the Verilog: they are memories, and only what stands around them is counted.
+Tables are left out of the Verilog: they are memories, and only the logic around them is counted.
 """
 
 from __future__ import annotations
@@ -38,19 +38,23 @@ class Netlist:
     Attributes:
         luts: Look-up tables by their inputs, 1 to 6.
         sums: Bits of carry chains.
-        registers: Flip-flops.
-        memory_bits: Bits of memories that are no tables: words that the host writes and reads back.
+        registers: Flip-flops; those at the output of a memory block are not among them.
     """
 
     luts: tuple[int, ...]
     sums: int
     registers: int
-    memory_bits: int
 
     @property
     def aluts(self) -> int:
         """Look-up tables of all kinds, carry chains among them."""
         return sum(self.luts) + self.sums
+
+    @property
+    def alms(self) -> float:
+        """ALMs: one holds a 6-input table, or two of up to 4, or two bits of a carry chain; a 5-input one shares if it can."""
+        *small, fives, sixes = self.luts
+        return 0.5 * (sum(small) + self.sums) + 0.75 * fives + sixes
 
 
 def verilog(
@@ -111,7 +115,6 @@ def synthesised(image: Image, folder: Path) -> Netlist:
         luts=(counts.get("NOT", 0), *(counts.get(f"ALUT{inputs}", 0) for inputs in range(2, 7))),
         sums=counts.get("ALUT_ARITH", 0),
         registers=counts.get("FF", 0),
-        memory_bits=640 * counts.get("MLAB", 0) + 10240 * counts.get("M10K", 0),
     )
 
 

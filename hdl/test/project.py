@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
+import numpy as np
+
 from machines.bm1 import BM1Machine, Start, StopReason
 from machines.kernel import BM1Kernel
 from machines.parameters import BM1Parameters, PriorMode, RngKind, RngReset, SensorMode
@@ -41,6 +43,7 @@ __all__ = [
     "StopReason",
     "image_bytes",
     "image_of",
+    "image_of_parameters",
     "interface_words",
     "next_doorbell",
     "reference_kernel",
@@ -71,6 +74,18 @@ def image_of(machine: BM1Machine, more_inputs: int = 0, more_results: int = 0) -
         build_date="2020-01-01T00:00:00Z",
         tool_version="test",
     )
+
+
+def image_of_parameters(parameters: BM1Parameters) -> Image:
+    """Return a board's image of a machine whose tables hold only ones: a synthesis leaves them out."""
+    from toolchain.outputs.rng_table import LENGTH
+
+    prior, *tables = (
+        np.full((1 << bits, parameters.lines), parameters.ones_code, np.uint16)
+        for bits in (parameters.prior_bits, *(parameters.sensor_bits if parameters.has_tables else ()))
+    )
+    numbers = np.zeros(LENGTH, np.uint32) if parameters.rng is RngKind.TABLE else None
+    return image_of(BM1Machine(parameters, prior, tuple(tables), numbers))
 
 
 def write_hardware_files(image: Image, folder: Path) -> None:

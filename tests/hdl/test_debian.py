@@ -18,22 +18,22 @@ def test_nothing_is_installed_where_nothing_is_missing(monkeypatch):
 def test_another_system_is_told_what_to_install(monkeypatch):
     monkeypatch.setattr(debian.shutil, "which", only(set()))
     with pytest.raises(
-        debian.MissingToolError, match=r"^iverilog and yosys not found; install iverilog yosys \(Debian"
+        debian.MissingToolError, match=r"^srec_cat and tclsh not found; install srecord tcl \(Debian"
     ):
-        debian.install({"iverilog": "iverilog", "yosys": "yosys"})
+        debian.install({"srec_cat": "srecord", "tclsh": "tcl"})
 
 
 def test_debian_installs_what_is_missing(monkeypatch):
-    found, said = {"apt-get", "yosys"}, []
+    found, said = {"apt-get", "tclsh"}, []
 
     def run(command, **_):
         said.append(command)
         if "install" in command:
-            found.add("iverilog")
+            found.add("srec_cat")
 
     monkeypatch.setattr(debian.shutil, "which", only(found))
     monkeypatch.setattr(debian.os, "geteuid", lambda: 0)
     monkeypatch.setattr(debian.subprocess, "run", run)
-    debian.install({"iverilog": "iverilog", "yosys": "yosys"})
+    debian.install({"srec_cat": "srecord", "tclsh": "tcl"})
     assert [command[:2] for command in said] == [["apt-get", "update"], ["apt-get", "install"]]
-    assert said[1][-1] == "iverilog"
+    assert said[1][-1] == "srecord"

@@ -1,12 +1,17 @@
-"""The logic of two small boards, pinned: a change that costs or saves look-up tables shows here."""
+"""The logic of two small boards, pinned: a change that costs or saves look-up tables shows here; and its estimate."""
 
 import shutil
 
-import numpy as np
 import pytest
 
 from hdl.test.netlist import synthesised
-from hdl.test.project import BM1Machine, BM1Parameters, RngKind, SensorMode, image_of
+from hdl.test.project import BM1Parameters, RngKind, SensorMode, image_of_parameters
+from hdl.test.simulation import HDL, run_tool
+from toolchain.analysis.resources.logic import WORST_ERROR, logic_of
+
+needs_ghdl = pytest.mark.skipif(
+    shutil.which("ghdl") is None, reason="ghdl is not installed (Debian: apt-get install ghdl)"
+)
 
 PLAIN = BM1Parameters(lines=4, sensor_bits=(3, 2))
 REPLICAS = BM1Parameters(
@@ -21,25 +26,22 @@ REPLICAS = BM1Parameters(
 )
 
 
-def image(parameters):
-    """Return a board with tables that hold anything: they are left out."""
-    random = np.random.default_rng(1)
-    prior = random.integers(1, parameters.ones_code, (1, parameters.lines)).astype(np.uint16)
-    tables = [
-        np.full((1 << bits, parameters.lines), parameters.ones_code, np.uint16)
-        for bits in parameters.sensor_bits
-    ]
-    return image_of(BM1Machine(parameters, prior, tuple(tables) if parameters.has_tables else ()))
-
-
-@pytest.mark.skipif(
-    shutil.which("ghdl") is None, reason="ghdl is not installed (Debian: apt-get install ghdl)"
-)
+@needs_ghdl
 @pytest.mark.parametrize(
     ("parameters", "aluts", "registers"),
-    [(PLAIN, 2247, 1234), (REPLICAS, 2072, 1388)],
+    [(PLAIN, 2142, 1234), (REPLICAS, 2180, 1388)],
     ids=["plain", "replicas"],
 )
 def test_a_small_board_takes_as_much_logic_as_it_did(tmp_path, parameters, aluts, registers):
-    found = synthesised(image(parameters), tmp_path)
+    found = synthesised(image_of_parameters(parameters), tmp_path)
     assert (found.aluts, found.registers) == (aluts, registers)
+    estimate = logic_of(parameters)
+    assert estimate.registers == registers
+    assert estimate.aluts == pytest.approx(found.aluts, rel=WORST_ERROR)
+    assert estimate.alms == pytest.approx(found.alms, rel=WORST_ERROR)
+
+
+@needs_ghdl
+def test_the_table_for_quartus_is_vhdl(tmp_path):
+    sources = [HDL / "bm1_table.vhd", HDL / "synthesis/bm1_table_block.vhd"]
+    run_tool(["ghdl", "-a", "--std=08", *map(str, sources)], tmp_path)

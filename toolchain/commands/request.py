@@ -12,7 +12,6 @@ from machines.errors import MachineError
 from machines.parameters import ADDRESS_BITS_MAX, RngKind
 from toolchain.analysis.resources.boards_needed import boards_needed
 from toolchain.analysis.resources.device import device_named
-from toolchain.building.board_layout import DEFAULT_INTERFACE
 from toolchain.building.machine import machine_parameters
 from toolchain.building.options import BuildOptions
 from toolchain.deployment import parse_interface
@@ -72,7 +71,6 @@ def fit_to_device(options: BuildOptions, model: Model, name: str | None) -> tupl
     count, why = boards_needed(
         parameters,
         device,
-        interface=options.interface or DEFAULT_INTERFACE,
         table_length=LENGTH if options.rng_table is None else options.rng_table.size,
     )
     if options.partitions > count:

@@ -4,45 +4,42 @@ from dataclasses import replace
 
 import pytest
 
-from machines.parameters import BM1Parameters, PriorMode, RngKind, RngReset, SensorMode
+from machines.parameters import BM1Parameters, PriorMode, RngKind, SensorMode
 from toolchain.analysis.resources.boards_needed import boards_needed, with_lines
 from toolchain.analysis.resources.device import DEVICES, device_named
 from toolchain.analysis.resources.estimate import Pcie, estimate
 from toolchain.analysis.resources.logic import logic_of
-from toolchain.analysis.resources.table_memories import Tables
 from toolchain.errors import BuildError
 
 D8 = DEVICES["proce-v-d8"]
 BOAT = BM1Parameters(lines=1024, sensor_bits=(7, 7, 7, 9, 9, 9))
 
 
-def on_d8(parameters, *, results=1200, **others):
-    return estimate(parameters, D8, interface=(20, results), **others)
-
-
-def test_readout_and_interface_registers_count():
-    small, large = on_d8(with_lines(BOAT, 4), results=4), on_d8(with_lines(BOAT, 4))
-    assert large.logic.registers - small.logic.registers == 1196 * 32
-    assert large.alms > small.alms + 1196 * 32 / 4
+def on_d8(parameters, **others):
+    return estimate(parameters, D8, **others)
 
 
 def test_tables_in_bits_and_blocks():
     quarter = with_lines(BOAT, 256)
     assert on_d8(quarter).memories.table_bits == 256 * 3 * 8 * (128 + 512)
-    assert on_d8(quarter).memories.blocks == 6 * 256  # a block a cell: 512 words of 8 bits, or fewer
+    seeds_and_inputs = 2
     # 256 codes of 8 bits side by side, 5 in each block of 512 words of 40 bits
-    assert on_d8(quarter, tables=Tables.COLUMN).memories.blocks == 6 * 52
-    assert on_d8(BOAT, tables=Tables.COLUMN).fits
+    assert on_d8(quarter).memories.blocks == 6 * 52 + seeds_and_inputs
     deep = BM1Parameters(lines=1, sensor_bits=(12,))
-    assert on_d8(deep).memories.blocks == 2  # 4096 words of 8 bits: two blocks of 4096 x 5
-    assert on_d8(replace(deep, prior_bits=9)).memories.blocks == 3
+    assert on_d8(deep).memories.blocks == 2 + seeds_and_inputs  # 4096 words of 8 bits: two blocks of 4096 x 5
+    assert on_d8(replace(deep, prior_bits=9)).memories.blocks == 3 + seeds_and_inputs
+    cells = on_d8(replace(BOAT, sensor_mode=SensorMode.CELL)).memories
+    # a block a cell: 512 words of 8 bits, or fewer; 12 blocks hold 6144 input words
+    assert cells.blocks == int(0.8 * 2567)
+    assert cells.logic_tables == 6 * 1024 - (cells.blocks - 12 - 1)
+    assert cells.table_bits == on_d8(BOAT).memories.table_bits
 
 
 def test_a_table_of_random_numbers_is_as_long_as_the_users():
     played = replace(with_lines(BOAT, 8), rng=RngKind.TABLE, steps_per_clock=1)
     made, own = on_d8(played), on_d8(played, table_length=500)
-    # 7 generators, 4 copies: of 65,536 words of 8 bits, or of 500
-    assert made.memories.blocks - own.memories.blocks == 4 * (32 - 1)
+    # 7 generators, each with a copy: of 65,536 words of 8 bits, or of 500
+    assert made.memories.blocks - own.memories.blocks == 7 * (32 - 1)
     assert made.logic.registers - own.logic.registers == 7 * (16 - 9)
 
 
@@ -52,26 +49,25 @@ def test_a_controller_of_logic_takes_8000_to_30000_elements():
     assert [round(alms * 2.65) for alms in soft.pcie_alms] == [8000, 30000]
     assert soft.alms - hard.alms == pytest.approx(soft.pcie_alms[1])
     with pytest.raises(BuildError):
-        estimate(BOAT, replace(D8, hard_pcie=False), interface=(20, 1200))
+        estimate(BOAT, replace(D8, hard_pcie=False))
 
 
 def test_registers_are_counted_exactly():
     # What yosys finds in these (scripts/verify resources has more).
     cell, threshold = SensorMode.CELL, SensorMode.THRESHOLD
     for lines, sensors, registers, others in (
-        (8, 3, 488, {}),
-        (8, 6, 596, {}),
-        (32, 3, 872, {}),
-        (8, 3, 572, {"sensor_mode": cell}),
-        (8, 3, 668, {"sensor_mode": threshold, "sensor_bits": (8, 8, 8)}),
-        (4, 2, 908, {"replicas": 4}),
-        (1, 1, 3216, {"replicas": 32}),
-        (8, 2, 1644, {"replicas": 4, "sensor_mode": threshold, "sensor_bits": (8, 8)}),
-        (4, 2, 1032, {"replicas": 4, "prior_mode": PriorMode.WRITTEN}),
-        (8, 3, 484, {"rng_reset": RngReset.FREE}),
+        (8, 3, 1309, {}),
+        (32, 3, 1501, {}),
+        (8, 3, 1388, {"sensor_mode": cell}),
+        (8, 3, 1676, {"sensor_mode": threshold, "sensor_bits": (8, 8, 8)}),
+        (4, 2, 1484, {"replicas": 2}),
+        (1, 1, 3833, {"replicas": 32}),
+        (16, 2, 1619, {"prior_mode": PriorMode.WRITTEN}),
+        (8, 3, 1699, {"shared": False, "rng": RngKind.LFSR16}),
+        (6, 2, 1451, {"shared": False, "rng": RngKind.TABLE}),
     ):
         parameters = BM1Parameters(**{"lines": lines, "sensor_bits": (4,) * sensors} | others)
-        assert logic_of(parameters, whole_words=False).registers == registers
+        assert logic_of(parameters).registers == registers
 
 
 @pytest.mark.parametrize(
@@ -90,7 +86,7 @@ def test_registers_are_counted_exactly():
     ],
 )
 def test_more_of_anything_takes_more(more):
-    base, larger = on_d8(BOAT, results=2048), on_d8(replace(BOAT, **more), results=2048)
+    base, larger = on_d8(BOAT), on_d8(replace(BOAT, **more))
     assert (larger.alms, larger.memories.blocks, larger.logic.registers) != (
         base.alms,
         base.memories.blocks,
@@ -103,13 +99,18 @@ def test_more_of_anything_takes_more(more):
 
 def test_boards_for_the_boat():
     count, why = boards_needed(BOAT, D8)
+    assert count == 1
+    assert why.startswith("All 1024 lines fit one Gidel Proce V D8")
+    # with an address for each cell, the tables of a column do not share a memory
+    cells = replace(BOAT, sensor_mode=SensorMode.CELL)
+    count, why = boards_needed(cells, D8)
     assert 2 <= count <= 4
     assert why.startswith("1024 lines need two boards: on one Gidel Proce V D8")
     assert "209,920 of 262,400 can be used" in why
-    assert boards_needed(with_lines(BOAT, 256), D8)[0] == 1
+    assert boards_needed(with_lines(cells, 256), D8)[0] == 1
     for boards in range(1, count):
-        assert not on_d8(with_lines(BOAT, -(-1024 // boards))).fits
-    assert on_d8(with_lines(BOAT, -(-1024 // count))).fits
+        assert not on_d8(with_lines(cells, -(-1024 // boards))).fits
+    assert on_d8(with_lines(cells, -(-1024 // count))).fits
 
 
 def test_boards_for_more_lines_than_the_register_map_holds():

@@ -17,7 +17,7 @@ from toolchain.analysis.exploration.results import Point
 from toolchain.analysis.resources.boards_needed import with_lines
 from toolchain.analysis.resources.device import Device
 from toolchain.analysis.resources.estimate import Pcie, estimate
-from toolchain.building.board_layout import DEFAULT_INTERFACE, board_layout
+from toolchain.building.board_layout import board_layout
 from toolchain.building.machine import machine_parameters, whole_machine
 from toolchain.building.options import BuildOptions, check_options
 from toolchain.building.partition import partition_lines, split
@@ -237,7 +237,7 @@ def with_resources(model: Model, task: Task, point: Point, device: Device) -> Po
         return point
     lines = partition_lines(model.lines, options.partitions)[0].lines
     largest = with_lines(machine_parameters(model, options), lines)
-    took = estimate(largest, device, interface=DEFAULT_INTERFACE, pcie=Pcie.HARD)
+    took = estimate(largest, device, pcie=Pcie.HARD)
     update = {"alms": took.alms, "blocks": took.memories.blocks, "fits": took.fits}
     return point.model_copy(update=update)
 

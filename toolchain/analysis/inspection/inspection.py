@@ -24,7 +24,6 @@ from toolchain.analysis.accuracy.readings import (
 from toolchain.analysis.resources.device import Device
 from toolchain.analysis.resources.energy import Energy, energy
 from toolchain.analysis.resources.estimate import Estimate, Pcie, estimate
-from toolchain.analysis.resources.table_memories import Tables
 from toolchain.building.agreement import read_images
 from toolchain.building.quantise import ColumnLoss, quantise
 from toolchain.building.report import REPORT_NAME
@@ -84,7 +83,6 @@ class Inspection:
     readings: Readings
     accuracy: Accuracy
     resources: tuple[Estimate, ...]
-    column_resources: Estimate | None
     energy: Energy
     clock_hz: float
 
@@ -104,28 +102,15 @@ def inspect_deployment(
         max_cycles=section.max_cycles,
         stop=section.stop,
     )
-    interface = (section.interface_sensors, section.interface_results)
     resources = tuple(
         estimate(
             machine.parameters,
             options.device,
-            interface=interface,
             pcie=options.pcie,
             table_length=table_length(machine),
         )
         for machine in machines
     )
-    side_by_side = None
-    wide = whole.parameters.shared and whole.parameters.sensor_mode is SensorMode.COLUMN
-    if wide and max(each.block_share for each in resources) > 0:
-        side_by_side = estimate(
-            whole.parameters,
-            options.device,
-            interface=(interface[0], max(interface[1], section.results)),
-            pcie=options.pcie,
-            tables=Tables.COLUMN,
-            table_length=table_length(whole),
-        )
     banks = options.banks or (SLOW_BANKS if _is_slow(whole) else BANKS)
     with progress(len(readings)) as advance:
         accuracy = measure(
@@ -144,7 +129,6 @@ def inspect_deployment(
         readings=readings,
         accuracy=accuracy,
         resources=resources,
-        column_resources=side_by_side,
         energy=energy(machines, readings),
         clock_hz=options.clock_hz,
     )

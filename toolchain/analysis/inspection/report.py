@@ -164,22 +164,12 @@ def _resource_part(found: Inspection) -> str:
         f"  together   {largest.alms:8,.0f} {largest.logic.registers:10,.0f}   {largest.alm_share:.0%} of {device.alms:,} ALMs",
         (
             f"  Table memories: {memories.table_bits:,} bits in {memories.blocks:,} of {device.blocks:,} M20K blocks "
-            f"({largest.block_share:.0%}), one a cell. PCIe controller {controller}."
+            f"({largest.block_share:.0%}). PCIe controller {controller}."
         ),
         "  It fits: up to 80 % of each can be used."
         if largest.fits
         else f"  It does not fit: {largest.why_not}; use more --partitions.",
     ]
-    if found.column_resources is not None:
-        wide = found.column_resources
-        rows.append(
-            f"  With a column's tables side by side in wide memories all {found.machine.parameters.lines} lines would "
-            + (
-                f"fit one board: {wide.alms:,.0f} ALMs, {wide.memories.blocks:,} blocks."
-                if wide.fits
-                else "not fit one board either."
-            )
-        )
     return "\n".join(rows)
 
 

@@ -25,7 +25,6 @@ def boards_needed(
     parameters: BM1Parameters,
     device: Device,
     *,
-    interface: tuple[int, int] = (20, 1200),
     largest_lines: int = 4096,
     pcie: Pcie = Pcie.HARD,
     table_length: int = LENGTH,
@@ -33,9 +32,7 @@ def boards_needed(
     """Return the fewest boards that hold a machine, and the reason as a sentence; a BuildError if no number does."""
 
     def on(lines: int) -> Estimate:
-        return estimate(
-            with_lines(parameters, lines), device, interface=interface, pcie=pcie, table_length=table_length
-        )
+        return estimate(with_lines(parameters, lines), device, pcie=pcie, table_length=table_length)
 
     room = interface_room(parameters)
     largest_lines = min(largest_lines, room[1] // parameters.replicas)

@@ -74,7 +74,7 @@ def energy(machines: Sequence[BM1Machine], readings: Readings) -> Energy:
     ends = np.cumsum([machine.parameters.lines for machine in machines]).tolist()
     for machine, end in zip(machines, ends, strict=True):
         p = machine.parameters
-        logic = logic_of(p, whole_words=False, table_length=table_length(machine))
+        logic = logic_of(p, table_length=table_length(machine))
         parts = {part.name: part for part in logic.parts}
         generators = parts["generators"]
         cells = p.replicas * p.lines * p.columns

@@ -1,7 +1,6 @@
-"""Resources of a BM1 on a board's FPGA: logic, tables, interface and PCIe controller.
+"""Resources of a BM1 on a board's FPGA: logic, memories and PCIe controller.
 
-Tables are memories, one a cell as in the thesis's tiles (figure 2.2), so that their content changes without a new
-compilation.
+Tables are memories, so that their content changes without a new compilation.
 """
 
 from __future__ import annotations
@@ -11,7 +10,7 @@ from enum import StrEnum
 from typing import TYPE_CHECKING, Final
 
 from toolchain.analysis.resources.logic import Logic, logic_of
-from toolchain.analysis.resources.table_memories import MLAB_ALMS, MLAB_SHARE, Memories, Tables, place_tables
+from toolchain.analysis.resources.table_memories import MLAB_ALMS, MLAB_SHARE, Memories, place_memories
 from toolchain.errors import BuildError
 from toolchain.outputs.rng_table import LENGTH
 
@@ -89,20 +88,17 @@ def estimate(
     parameters: BM1Parameters,
     device: Device,
     *,
-    interface: tuple[int, int],
     pcie: Pcie = Pcie.HARD,
-    tables: Tables = Tables.CELL,
     table_length: int = LENGTH,
 ) -> Estimate:
     """Return the resources that a machine takes of a device; a BuildError for generators or a controller it lacks."""
     if pcie is Pcie.HARD and not device.hard_pcie:
         raise BuildError(f"{device.title} has no hard PCIe controller; use --soft-pcie")
-    logic = logic_of(parameters, inputs=interface[0], results=interface[1], table_length=table_length)
     soft = tuple(elements / ELEMENTS_PER_ALM for elements in SOFT_PCIE_ELEMENTS)
     return Estimate(
         device=device,
-        logic=logic,
-        memories=place_tables(parameters, device, tables, table_length),
+        logic=logic_of(parameters, table_length=table_length),
+        memories=place_memories(parameters, device, table_length),
         pcie=pcie,
         pcie_alms=(0.0, 0.0) if pcie is Pcie.HARD else (soft[0], soft[1]),
     )

@@ -1,12 +1,15 @@
-"""Memories of a machine's tables in an FPGA: memory blocks, and memory LABs where those are all taken."""
+"""Memories of a machine in an FPGA, as the VHDL has them: memory blocks, and memory LABs where those are all taken."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from enum import StrEnum
 from typing import TYPE_CHECKING, Final
 
+from machines.parameters import PriorMode, SensorMode
+from pcie_shim.programming_file import interface_words
+from toolchain.analysis.resources.logic import WORD_BITS, state_bits
+from toolchain.outputs.memories import generators
 from toolchain.outputs.rng_table import LENGTH
 
 if TYPE_CHECKING:
@@ -24,20 +27,22 @@ BLOCK_SHAPES: Final = ((512, 40), (1024, 20), (2048, 10), (4096, 5), (8192, 2), 
 """Words and their bits that an M20K can be read as."""
 
 
-class Tables(StrEnum):
-    """The layout of tables in memory blocks."""
+@dataclass(frozen=True, slots=True, order=True)
+class _Memory:
+    words: int
+    width: int
+    count: int
 
-    CELL = "cell"
-    """Every cell has its own memory, as in the thesis's tile."""
-    COLUMN = "column"
-    """A column's tables lie side by side in wide memories: possible where a column shares one address."""
+    @property
+    def blocks(self) -> int:
+        """The fewest M20Ks that hold one of them."""
+        return min(math.ceil(self.words / deep) * math.ceil(self.width / wide) for deep, wide in BLOCK_SHAPES)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Memories:
-    """The memories that a machine's tables take; `logic_tables` found no block, and lie in memory LABs."""
+    """The memories that a machine takes; `logic_tables` found no block, and lie in memory LABs."""
 
-    tables: Tables
     table_bits: int
     blocks: int
     logic_tables: int
@@ -45,56 +50,56 @@ class Memories:
     alms: float
 
 
-def _table_bits(parameters: BM1Parameters) -> list[int]:
-    """Return the address bits of the columns with tables; a prior of one row, or a written one, is in registers."""
-    sensors = parameters.sensor_bits if parameters.has_tables else ()
-    return [bits for bits in (parameters.prior_bits, *sensors) if bits]
+def _tables(p: BM1Parameters) -> list[_Memory]:
+    """Return the tables: one for a column that has one address, else one for each cell; a prior of one row has none.
+
+    Every replica looks at addresses of its own, so it has tables of its own.
+    """
+    column, cell = (p.lines * p.prob_bits, p.replicas), (p.prob_bits, p.replicas * p.lines)
+    tables = [_Memory(1 << p.prior_bits, *column)] if p.prior_bits else []
+    if p.has_tables:
+        shape = column if p.sensor_mode is SensorMode.COLUMN else cell
+        tables += [_Memory(1 << bits, *shape) for bits in p.sensor_bits]
+    return tables
 
 
-def place_tables(
-    parameters: BM1Parameters, device: Device, tables: Tables, table_length: int = LENGTH
-) -> Memories:
-    """Put tables into memory blocks, the largest first, and the others into memory LABs."""
-    width, room = parameters.prob_bits, math.floor(device.usable * device.blocks)
+def _other_memories(p: BM1Parameters, table_length: int) -> list[_Memory]:
+    """Return the seeds, the table of random numbers (one for each generator), and the words that the host writes."""
+    inputs, results = interface_words(p)
+    memories = [
+        _Memory(p.rng_banks * generators(p), state_bits(p, table_length), 1),
+        _Memory(max(inputs, 1), WORD_BITS, 1),
+    ]
+    if p.rng.lfsr_bits is None:
+        memories.append(_Memory(table_length, p.prob_bits, generators(p)))
+    if p.replicas > 1:
+        memories.append(_Memory(p.replicas, WORD_BITS, 1))
+    if p.prior_mode is PriorMode.WRITTEN:
+        memories += [_Memory(results, WORD_BITS, 1), _Memory(p.lines, p.prob_bits, 1)]
+    return memories
+
+
+def place_memories(parameters: BM1Parameters, device: Device, table_length: int = LENGTH) -> Memories:
+    """Put tables into the memory blocks that other memories leave, the deepest first, and the rest into memory LABs."""
+    tables = _tables(parameters)
+    room = math.floor(device.usable * device.blocks)
+    blocks = sum(each.count * each.blocks for each in _other_memories(parameters, table_length))
     logic_tables = mlabs = 0
-    # Two generators read one copy of a table of random numbers, through a port each.
-    copies = (
-        0
-        if parameters.rng.lfsr_bits
-        else math.ceil(parameters.columns * (1 if parameters.shared else parameters.lines) / 2)
-    )
-    blocks = copies * _blocks(table_length, width)
     alms = 0.0
-    for bits in sorted(_table_bits(parameters), reverse=True):
-        if tables is Tables.COLUMN:
-            # As many of a block's words as possible side by side: the whole column or none of it.
-            wide, each = parameters.lines * width, parameters.replicas
-            own = _blocks(1 << bits, wide)
-            count = min(each, max(0, room - blocks) // own)
-        else:
-            # every replica looks at an address of its own, so it has tables of its own
-            wide, each = width, parameters.replicas * parameters.lines
-            own = _blocks(1 << bits, wide)
-            count = min(each, max(0, room - blocks) // own)
-        blocks += count * own
-        left = each - count
-        deep = math.ceil((1 << bits) / MLAB_SHAPE[0])
-        own_mlabs = deep * math.ceil(wide / MLAB_SHAPE[1])
-        logic_tables += left * (1 if tables is Tables.CELL else parameters.lines)
+    for table in sorted(tables, reverse=True):
+        count = min(table.count, max(0, room - blocks) // table.blocks)
+        blocks += count * table.blocks
+        left = table.count - count
+        deep = math.ceil(table.words / MLAB_SHAPE[0])
+        own_mlabs = deep * math.ceil(table.width / MLAB_SHAPE[1])
+        logic_tables += left
         mlabs += left * own_mlabs
-        alms += left * (own_mlabs * MLAB_ALMS + (deep - 1) * wide / 3)  # a third of a 4-to-1 multiplexer
+        # a third of a 4-to-1 multiplexer for a bit
+        alms += left * (own_mlabs * MLAB_ALMS + (deep - 1) * table.width / 3)
     return Memories(
-        tables=tables,
-        table_bits=sum(
-            parameters.replicas * parameters.lines * width << bits for bits in _table_bits(parameters)
-        ),
+        table_bits=sum(each.words * each.width * each.count for each in tables),
         blocks=blocks,
         logic_tables=logic_tables,
         mlabs=mlabs,
         alms=alms,
     )
-
-
-def _blocks(words: int, width: int) -> int:
-    """Return the fewest M20Ks that hold so many words of so many bits."""
-    return min(math.ceil(words / deep) * math.ceil(width / wide) for deep, wide in BLOCK_SHAPES)
