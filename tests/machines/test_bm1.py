@@ -108,20 +108,6 @@ def test_a_written_prior_has_one_code_a_line(make, codes):
         make(build(prior_mode=PriorMode.WRITTEN)).start(Start(**FINE, prior_codes=codes))
 
 
-def test_a_written_prior_holds_for_its_frame(make):
-    kernel = make(build(np.array([[0, 255, 0]]), prior_mode=PriorMode.WRITTEN))
-    kernel.start(Start(**FINE, prior_codes=np.array([255, 0, 0], dtype=np.uint16)))
-    assert kernel.counts.tolist() == [15, 0, 0]
-    kernel.start(Start(**FINE))
-    assert kernel.counts.tolist() == [0, 15, 0]
-
-
-def test_prior_addresses_select_a_row(make):
-    kernel = make(build(np.array([[255, 0, 0], [0, 0, 255]]), prior_bits=1))
-    kernel.start(Start(**FINE, prior_address=1))
-    assert kernel.counts.tolist() == [0, 0, 15]
-
-
 def test_numbers_may_be_numpys(make):
     kernel = make(build())
     kernel.start(

@@ -8,7 +8,7 @@ import pytest
 
 from machines.bm1 import BM1Machine, Start, StopReason
 from machines.fast import FastBM1
-from machines.kernel import make_kernel, warm_up
+from machines.kernel import make_kernel
 from machines.parameters import BM1Parameters, RngKind
 from machines.reference import ReferenceBM1
 
@@ -35,17 +35,13 @@ def test_a_machine_with_too_many_codes_for_the_fast_kernel_gets_the_reference():
     assert type(make_kernel(BM1Machine(parameters, np.full((1, 1), 100), ()))) is ReferenceBM1
 
 
-def test_warming_up_twice_is_no_harm():
-    warm_up()
-    warm_up()
-
-
-@pytest.mark.parametrize("module", ["parameters", "bm1", "encode", "posterior", "kernel", "reference", "rng"])
-def test_numba_is_not_loaded_before_it_is_needed(module):
-    code = f"import sys, machines.{module}; sys.exit('numba' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], check=False, timeout=240).returncode == 0
-
-
-def test_parameters_do_without_numpy():
-    code = "import sys, machines.parameters; sys.exit('numpy' in sys.modules)"
+@pytest.mark.parametrize(
+    ("module", "late"),
+    [
+        *((name, "numba") for name in ("bm1", "encode", "posterior", "kernel", "reference", "rng")),
+        *(("parameters", late) for late in ("numba", "numpy")),
+    ],
+)
+def test_a_library_is_not_loaded_before_it_is_needed(module, late):
+    code = f"import sys, machines.{module}; sys.exit('{late}' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False, timeout=240).returncode == 0

@@ -49,88 +49,84 @@ def start(**changes):
     return Start(**{"addresses": (0,), "target_count": 4, "max_cycles": 12, **changes})
 
 
-def shows(kernel, reason, cycles, counts, states):
-    assert kernel.reason is reason
-    assert kernel.cycles == cycles
-    assert kernel.counts.tolist() == counts
-    assert [f"{state:08b}" for state in kernel.rng_state.tolist()] == states
+def shown(kernel):
+    states = " ".join(f"{state:08b}" for state in kernel.rng_state.ravel().tolist())
+    return kernel.reason, kernel.cycles, kernel.counts.tolist(), states
 
 
-def test_before_any_cycle_the_seeds_of_bank_0_are_there(make):
-    shows(make(tiny()), StopReason.NONE, 0, [0, 0, 0, 0], ["10101111", "10010100"])
+OVERFLOW, MAX_CYCLES, SLICE = StopReason.OVERFLOW, StopReason.MAX_CYCLES, StopReason.SLICE
+SEEDS = (StopReason.NONE, 0, [0, 0, 0, 0], "10101111 10010100")
+SIXTH = (OVERFLOW, 6, [2, 4, 1, 0], "11100101 00001001")
+FIFTH = (MAX_CYCLES, 5, [2, 3, 1, 0], "11110010 10000100")
 
 
-def test_the_first_cycle_sees_the_seeds_and_the_generators_step_after_the_last(make):
-    kernel = make(tiny())
-    assert kernel.start(start(target_count=1)) is StopReason.OVERFLOW
-    shows(kernel, StopReason.OVERFLOW, 1, [0, 1, 0, 0], ["01011111", "00101000"])
-
-
-def test_a_line_stops_all_after_the_cycle_in_which_it_reaches_the_target(make):
-    kernel = make(tiny())
-    kernel.start(start(target_count=3))
-    shows(kernel, StopReason.OVERFLOW, 3, [0, 3, 0, 0], ["01111100", "10100001"])
-    kernel.start(start(target_count=4))
-    shows(kernel, StopReason.OVERFLOW, 6, [2, 4, 1, 0], ["11100101", "00001001"])
-
-
-def test_a_frame_ends_at_its_last_cycle(make):
-    kernel = make(tiny())
-    kernel.start(start(max_cycles=5))
-    shows(kernel, StopReason.MAX_CYCLES, 5, [2, 3, 1, 0], ["11110010", "10000100"])
-
-
-def test_an_overflow_in_the_last_cycle_wins(make):
-    kernel = make(tiny())
-    assert kernel.start(start(max_cycles=6)) is StopReason.OVERFLOW
-    assert kernel.start(start(max_cycles=6, run_until=6)) is StopReason.OVERFLOW
-    assert kernel.start(start(max_cycles=5, run_until=5)) is StopReason.MAX_CYCLES
-
-
-def test_all_that_is_counted_in_the_last_cycle_is_kept(make):
-    kernel = make(tiny())
-    kernel.start(start(bank=1, target_count=3))
-    shows(kernel, StopReason.OVERFLOW, 8, [3, 1, 1, 0], ["11100001", "01111000"])
-
-
-def test_a_bank_has_seeds_of_its_own(make):
-    kernel = make(tiny())
-    kernel.start(start(bank=1))
-    shows(kernel, StopReason.OVERFLOW, 9, [4, 2, 1, 0], ["11000010", "11110001"])
-    kernel.reset()
-    shows(kernel, StopReason.NONE, 0, [0, 0, 0, 0], ["10101111", "10010100"])
-
-
-def test_a_missing_reading_leaves_the_prior(make):
-    kernel = make(tiny())
-    kernel.start(start(addresses=(1,), target_count=9))
-    # Line 1 counts in every cycle: both of its codes are all-ones. Line 2 counts by its prior in 4 and 9.
-    shows(kernel, StopReason.OVERFLOW, 9, [4, 9, 2, 0], ["00101000", "01001111"])
+@pytest.mark.parametrize(
+    ("machine", "frames"),
+    [
+        ({}, [({"target_count": 1}, (OVERFLOW, 1, [0, 1, 0, 0], "01011111 00101000"))]),
+        ({}, [({"target_count": 3}, (OVERFLOW, 3, [0, 3, 0, 0], "01111100 10100001")), ({}, SIXTH)]),
+        ({}, [({"max_cycles": 5}, FIFTH), ({"max_cycles": 5, "run_until": 5}, FIFTH)]),
+        ({}, [({"max_cycles": 6}, SIXTH), ({"max_cycles": 6, "run_until": 6}, SIXTH)]),
+        ({}, [({"bank": 1, "target_count": 3}, (OVERFLOW, 8, [3, 1, 1, 0], "11100001 01111000"))]),
+        ({}, [({"bank": 1}, (OVERFLOW, 9, [4, 2, 1, 0], "11000010 11110001"))]),
+        # line 1 counts in every cycle: both of its codes are all-ones; line 2 counts by its prior in 4 and 9
+        ({}, [({"addresses": (1,), "target_count": 9}, (OVERFLOW, 9, [4, 9, 2, 0], "00101000 01001111"))]),
+        # the second frame has what were cycles 4 to 5
+        (
+            {"rng_reset": RngReset.FREE},
+            [
+                ({"target_count": 3}, (OVERFLOW, 3, [0, 3, 0, 0], "01111100 10100001")),
+                ({"target_count": 2, "bank": 1}, (OVERFLOW, 2, [2, 0, 1, 0], "11110010 10000100")),
+            ],
+        ),
+        # bank 0 is column 0's as above
+        (
+            {"sensor_bits": ()},
+            [({"addresses": (), "target_count": 7}, (OVERFLOW, 7, [3, 7, 1, 0], "11001010"))],
+        ),
+        # column 0 shows 3 2 1 1, column 1 shows 0 0 2 1
+        (
+            {"steps_per_clock": 2},
+            [({"max_cycles": 4}, (MAX_CYCLES, 4, [2, 2, 0, 0], "10010100 00100111"))],
+        ),
+    ],
+    ids=[
+        "the first cycle sees the seeds, and the generators step after the last",
+        "a line stops all after the cycle in which it reaches the target",
+        "a frame ends at its last cycle",
+        "an overflow in the last cycle wins",
+        "all that is counted in the last cycle is kept",
+        "a bank has seeds of its own",
+        "a missing reading leaves the prior",
+        "free generators go on from frame to frame",
+        "without sensors the prior is all",
+        "two steps a clock see every other state",
+    ],
+)
+def test_frames(make, machine, frames):
+    kernel = make(tiny(**machine))
+    assert shown(kernel)[:3] == SEEDS[:3]
+    for changes, expected in frames:
+        assert kernel.start(start(**changes)) is expected[0]
+        assert shown(kernel) == expected
+    if machine != {"sensor_bits": ()}:
+        kernel.reset()
+        assert shown(kernel) == SEEDS
 
 
 def test_slices_are_one_frame(make):
     kernel = make(tiny())
-    assert kernel.start(start(run_until=2)) is StopReason.SLICE
-    shows(kernel, StopReason.SLICE, 2, [0, 2, 0, 0], ["10111110", "01010000"])
+    kernel.start(start(run_until=2))
+    assert shown(kernel) == (SLICE, 2, [0, 2, 0, 0], "10111110 01010000")
     kernel.resume(5)
-    shows(kernel, StopReason.SLICE, 5, [2, 3, 1, 0], ["11110010", "10000100"])
+    assert shown(kernel) == (SLICE, *FIFTH[1:])
     kernel.resume(0)
-    shows(kernel, StopReason.OVERFLOW, 6, [2, 4, 1, 0], ["11100101", "00001001"])
-
-
-def test_free_generators_go_on_from_frame_to_frame(make):
-    kernel = make(tiny(rng_reset=RngReset.FREE))
-    kernel.start(start(target_count=3))
-    kernel.start(start(target_count=2, bank=1))
-    # What were cycles 4 to 5.
-    shows(kernel, StopReason.OVERFLOW, 2, [2, 0, 1, 0], ["11110010", "10000100"])
-    kernel.reset()
-    shows(kernel, StopReason.NONE, 0, [0, 0, 0, 0], ["10101111", "10010100"])
+    assert shown(kernel) == SIXTH
 
 
 @pytest.mark.parametrize(
     ("reset", "states"),
-    [(RngReset.BANK, ["10011111", "11100001"]), (RngReset.FREE, ["01111100", "10100001"])],
+    [(RngReset.BANK, "10011111 11100001"), (RngReset.FREE, "01111100 10100001")],
 )
 def test_a_machine_in_which_no_line_can_count_is_not_run(make, reset, states):
     machine = BM1Machine(
@@ -140,21 +136,7 @@ def test_a_machine_in_which_no_line_can_count_is_not_run(make, reset, states):
     kernel.start(start(addresses=(1,), target_count=3))
     assert kernel.cycles == 3
     assert kernel.start(start(bank=1)) is StopReason.IMPOSSIBLE
-    shows(kernel, StopReason.IMPOSSIBLE, 0, [0, 0, 0, 0], states)
-
-
-def test_without_sensors_the_prior_is_all(make):
-    kernel = make(tiny(sensor_bits=()))
-    kernel.start(start(addresses=(), target_count=7))
-    # Bank 0 is column 0's as above.
-    shows(kernel, StopReason.OVERFLOW, 7, [3, 7, 1, 0], ["11001010"])
-
-
-def test_two_steps_a_clock_see_every_other_state(make):
-    kernel = make(tiny(steps_per_clock=2))
-    kernel.start(start(max_cycles=4))
-    # Column 0 shows 3 2 1 1, column 1 shows 0 0 2 1.
-    shows(kernel, StopReason.MAX_CYCLES, 4, [2, 2, 0, 0], ["10010100", "00100111"])
+    assert shown(kernel) == (StopReason.IMPOSSIBLE, 0, [0, 0, 0, 0], states)
 
 
 def test_a_cell_of_its_own_generator_has_the_number_line_times_columns_plus_column():
@@ -162,13 +144,7 @@ def test_a_cell_of_its_own_generator_has_the_number_line_times_columns_plus_colu
     kernel.start(start(addresses=(), target_count=2))
     # The four rows of the table above, down the lines: line 0 (code 2) counts in 4, line 1 always, and line 2
     # (code 1) not yet.
-    assert kernel.counts.tolist() == [0, 2, 0, 0]
-    assert [f"{state:08b}" for (state,) in kernel.rng_state.tolist()] == [
-        "10111110",
-        "01010000",
-        "01111111",
-        "10000101",
-    ]
+    assert shown(kernel) == (OVERFLOW, 2, [0, 2, 0, 0], "10111110 01010000 01111111 10000101")
 
 
 def test_an_lfsr_that_comes_round_repeats_itself(make):
@@ -177,7 +153,7 @@ def test_an_lfsr_that_comes_round_repeats_itself(make):
     once = kernel.counts
     kernel.start(start(target_count=2**32 - 1, max_cycles=255 * 40))
     assert kernel.counts.tolist() == (40 * once).tolist()
-    assert [f"{state:08b}" for state in kernel.rng_state.tolist()] == ["10101111", "10010100"]
+    assert shown(kernel)[3] == SEEDS[3]
     # A maximal LFSR of 8 bits shows each of 1 to 3 in 64 of its 255 states, and 0 in 63.
     kernel.start(start(addresses=(1,), target_count=2**32 - 1, max_cycles=255))
     assert kernel.counts.tolist() == [127, 255, 63, 0]

@@ -31,14 +31,6 @@ def test_other_generators_make_one(rng):
     assert BM1Parameters(lines=1, sensor_bits=(), rng=rng).steps_per_clock == 1
 
 
-def test_a_number_of_steps_stands_as_it_is():
-    assert BM1Parameters(lines=1, sensor_bits=(), steps_per_clock=1).steps_per_clock == 1
-
-
-def test_the_default_and_its_number_are_the_same_machine():
-    assert BM1Parameters(lines=1, sensor_bits=()) == BM1Parameters(lines=1, sensor_bits=(), steps_per_clock=8)
-
-
 @given(st.sampled_from(RngKind), st.integers(1, 16))
 def test_an_lfsr_must_be_wider_than_a_code(kind, prob_bits):
     def build():

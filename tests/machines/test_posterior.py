@@ -18,25 +18,22 @@ def counts(*boards):
     return [np.array(board, dtype=np.uint32) for board in boards]
 
 
-def test_one_board_is_its_counts_normalised():
-    assert joint_posterior(counts([1, 3, 0]), [100]).tolist() == [0.25, 0.75, 0]
-
-
-def test_a_board_that_ran_longer_weighs_less():
-    # Rates of 0.1 and 0.3 on the first board, of 0.1 on the second: not one half for each board.
-    joint = joint_posterior(counts([10, 30], [10, 0]), [100, 100])
-    assert joint == pytest.approx([0.2, 0.6, 0.2, 0])
-    joint = joint_posterior(counts([10, 30], [100, 0]), [100, 1000])
-    assert joint == pytest.approx([0.2, 0.6, 0.2, 0])
-
-
-def test_a_board_that_did_not_run_has_no_weight():
-    assert joint_posterior(counts([0, 0], [2, 2]), [0, 64]).tolist() == [0, 0, 0.5, 0.5]
-
-
-@pytest.mark.parametrize(("boards", "cycles"), [(([0, 0], [0]), (0, 64)), (([0],), (0,)), ((), ())])
-def test_without_counts_there_is_none(boards, cycles):
-    assert joint_posterior(counts(*boards), cycles) is None
+@pytest.mark.parametrize(
+    ("boards", "cycles", "expected"),
+    [
+        (([1, 3, 0],), (100,), [0.25, 0.75, 0]),
+        # rates of 0.1 and 0.3 on the first board, of 0.1 on the second: not one half for each board
+        (([10, 30], [10, 0]), (100, 100), [0.2, 0.6, 0.2, 0]),
+        (([10, 30], [100, 0]), (100, 1000), [0.2, 0.6, 0.2, 0]),
+        (([0, 0], [2, 2]), (0, 64), [0, 0, 0.5, 0.5]),
+        (([0, 0], [0]), (0, 64), None),
+        (([0],), (0,), None),
+        ((), (), None),
+    ],
+)
+def test_counts_of_boards_are_weighed_by_their_cycles(boards, cycles, expected):
+    joint = joint_posterior(counts(*boards), cycles)
+    assert joint is None if expected is None else joint == pytest.approx(expected)
 
 
 def test_boards_and_cycles_must_belong_together():

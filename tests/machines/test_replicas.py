@@ -19,7 +19,7 @@ from machines.reference import ReferenceBM1
 from tests.machines.random_machines import LFSRS, codes, seen, sessions
 
 
-@settings(max_examples=80, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=50, deadline=None, suppress_health_check=list(HealthCheck))
 @given(
     sessions(kinds=tuple(RngKind), shared=(True, False), replicas=st.sampled_from([2, 3, 5, 16])),
     st.booleans(),

@@ -83,35 +83,3 @@ def test_counts_spread_as_equation_2_1_says(parameters, banks):
     assert (np.abs(rates.mean(axis=0) - p) < 4 * limit / np.sqrt(banks)).all()
     # What so many draws spread is known to 1 in sqrt(2 banks).
     assert rates.std(axis=0) == pytest.approx(limit, rel=3.5 / np.sqrt(2 * banks))
-
-
-def test_one_step_a_clock_keeps_the_mean_and_widens_the_spread():
-    """The thesis's generators step once a cycle; neighbouring cycles share bits then."""
-    codes = np.array([[60, 40, 90], [250, 220, 230]])
-    spreads = {}
-    for steps_per_clock in (1, 8):
-        machine = machine_of(codes, steps_per_clock=steps_per_clock)
-        rates = counts_of(machine, 1000, 400) / 1000
-        p = exact(machine)
-        spreads[steps_per_clock] = rates.var(axis=0) / (p * (1 - p) / 1000)
-        assert rates.mean(axis=0) == pytest.approx(p, abs=0.004)
-    assert spreads[8] == pytest.approx(1, abs=0.25)
-    assert (spreads[1] > 1.3).all()
-    assert (spreads[1] < 3).all()
-
-
-def test_lines_of_equal_codes_count_alike_where_generators_are_shared():
-    codes = np.array([[100, 100], [200, 200]])
-    shared = counts_of(machine_of(codes), 500, 4)
-    assert (shared[:, 0] == shared[:, 1]).all()
-    unshared = counts_of(machine_of(codes, shared=False), 500, 4)
-    assert (unshared[:, 0] != unshared[:, 1]).any()
-
-
-def test_a_played_table_is_as_good_as_what_is_in_it():
-    numbers = np.random.default_rng(5).integers(0, 2**32, 20_000, dtype=np.uint32)
-    parameters = BM1Parameters(lines=2, sensor_bits=(1,), counter_bits=32, rng=RngKind.TABLE)
-    machine = BM1Machine(parameters, np.array([[128, 200]]), (np.array([[100, 50], [255, 255]]),), numbers)
-    rates = counts_of(machine, 20_000, 1)[0] / 20_000
-    p = exact(machine)
-    assert (np.abs(rates - p) < 4 * np.sqrt(p * (1 - p) / 20_000)).all()

@@ -8,7 +8,8 @@ import select
 import signal
 import socket
 import struct
-from collections.abc import Sequence
+import tempfile
+from collections.abc import Iterator, Sequence
 from typing import TypeAlias
 
 import numpy as np
@@ -19,6 +20,7 @@ from machines.parameters import BM1Parameters, RngKind, SensorMode
 from pcie_shim.board.misbehaviour import Misbehaviour
 from pcie_shim.board.server import StopSignal, serve_board
 from pcie_shim.host.frame import FrameInput
+from pcie_shim.host.mini_cluster import MiniCluster
 from pcie_shim.programming_file import Image, Partition, interface_words
 
 _FORK = multiprocessing.get_context("fork")
@@ -118,6 +120,26 @@ class BoardProcess:
     def kill(self) -> None:
         self.process.kill()
         self.process.join(60)
+
+
+def endpoints_of(boards: Sequence[BoardProcess]) -> list[str]:
+    return [board.endpoint for board in boards]
+
+
+@contextlib.contextmanager
+def opened(parts: Sequence[Image], *, tcp: bool = False) -> Iterator[MiniCluster]:
+    """A mini-cluster of well-behaved boards that hold these parts; they end in order."""
+    with tempfile.TemporaryDirectory(prefix="bm") as base:
+        boards = [
+            BoardProcess(tcp_endpoint() if tcp else f"unix:{base}/board{at}.sock", index=at)
+            for at in range(len(parts))
+        ]
+        try:
+            with MiniCluster.open(endpoints_of(boards), parts) as cluster:
+                yield cluster
+        finally:
+            for board in boards:
+                assert board.stop() == 0
 
 
 Outcomes: TypeAlias = list[tuple[list[int], int, StopReason]]

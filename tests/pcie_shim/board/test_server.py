@@ -274,31 +274,18 @@ def test_the_host_hears_why_its_link_was_closed(start_board: StartBoard) -> None
 # ---- starting and stopping ----
 
 
-def test_sockets_are_private_and_go_away(start_board: StartBoard, folder: Path) -> None:
-    board = start_board()
-    names = {"board0.sock", "board0.program.sock"}
-    assert {path.name for path in folder.iterdir()} == names
-    assert all(path.stat().st_mode & 0o777 == 0o600 for path in folder.iterdir())
-    with open_link(board):
-        assert board.stop() == 0
-    assert list(folder.iterdir()) == []
-
-
-def test_a_running_machine_does_not_keep_a_board_from_stopping(start_board: StartBoard, folder: Path) -> None:
+def test_sockets_are_private_and_go_away_though_the_machine_runs(
+    start_board: StartBoard, folder: Path
+) -> None:
     board = programmed(start_board, never_stopping())
+    assert {path.name for path in folder.iterdir()} == {"board0.sock", "board0.program.sock"}
+    assert all(path.stat().st_mode & 0o777 == 0o600 for path in folder.iterdir())
     with open_link(board) as link:
         run_for_minutes(link)
         assert board.stop() == 0
         with pytest.raises(LinkClosedError):
             link.read32(rm.ID)
     assert list(folder.iterdir()) == []
-
-
-def test_a_killed_boards_place_is_taken_by_the_next(start_board: StartBoard) -> None:
-    board = start_board()
-    board.kill()
-    with open_link(start_board(board.endpoint)) as link:
-        assert not any(bytes.fromhex(link.greeting.image_hash))
 
 
 def test_a_taken_place_is_refused_and_left_alone(start_board: StartBoard) -> None:
@@ -331,22 +318,16 @@ def test_a_stop_signal_can_be_set_early_and_often(folder: Path) -> None:
 
 def test_a_blank_board_is_programmed_and_programmed_again(start_board: StartBoard) -> None:
     board = start_board()
-    first, second = image(MACHINE), image(machine(2, lines=3))
+    first, second = image(machine(3, lines=300, sensor_bits=(7, 7, 7, 7))), image(machine(2, lines=3))
     with open_link(board) as link:
         assert not any(bytes.fromhex(link.greeting.image_hash))
+    assert len(image_bytes(first)) > 300_000  # it comes in parts
     assert program(board.endpoint, first) == first.image_hash
     assert program(board.endpoint, image_bytes(second)) == second.image_hash
     with open_link(board) as link:
         assert link.read_block(rm.IMAGE_HASH, 8).hex() == link.greeting.image_hash == second.image_hash
         assert link.read32(rm.CAP_LINES) == 3
         assert link.read32(rm.PROGRAMMED) == 2
-
-
-def test_large_images_come_in_parts(start_board: StartBoard) -> None:
-    board = start_board()
-    large = image(machine(3, lines=300, sensor_bits=(7, 7, 7, 7)))
-    assert len(image_bytes(large)) > 300_000
-    assert program(board.endpoint, large) == large.image_hash
 
 
 def test_the_loader_is_refused_while_a_host_holds_the_board(start_board: StartBoard) -> None:
@@ -382,7 +363,7 @@ def test_a_running_board_is_not_programmed_even_by_its_host(start_board: StartBo
 
 def test_one_loader_at_a_time(start_board: StartBoard) -> None:
     board = start_board()
-    first = SocketLink.open(parse_endpoint(board.endpoint).programming, timeout=PATIENCE)
+    first = open_programming(board)
     first.read32(rm.ID)
     with pytest.raises(HeldError):
         program(board.endpoint, image(MACHINE))
@@ -396,67 +377,60 @@ def test_a_loader_that_says_nothing_loses_its_turn(
     # long enough for a loader that does speak, however busy the machine
     monkeypatch.setattr(board_module, "PROGRAMMING_SILENCE_S", 3.0)
     board = start_board()
-    silent = SocketLink.open(parse_endpoint(board.endpoint).programming, timeout=PATIENCE)
+    silent = open_programming(board)
     silent.read32(rm.ID)
     with pytest.raises(LinkClosedError):
         wait_done(silent, 1)
     program(board.endpoint, image(MACHINE))
 
 
-def begin(content: bytes, size: int | None = None) -> bytes:
-    """What a loader says before it sends ``content``."""
-    digest = hashlib.sha256(content).digest()
-    wanted = len(content) if size is None else size
-    return framing.ProgramBegin(size=wanted, sha256=digest, token=framing.NO_TOKEN).encode()
+def begin(link: SocketLink, size: int, digest: bytes) -> None:
+    payload = framing.ProgramBegin(size=size, sha256=digest, token=framing.NO_TOKEN).encode()
+    link.request(framing.PROGRAM, framing.BEGIN, 0, len(payload) // 4, payload)
 
 
-def test_a_file_that_changes_on_the_way_is_refused(start_board: StartBoard) -> None:
-    board = start_board()
+def open_programming(board: BoardProcess) -> SocketLink:
+    return SocketLink.open(parse_endpoint(board.endpoint).programming, timeout=PATIENCE)
+
+
+def foreign(content: bytes) -> bytes:
+    """A file for another register map."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(rm, "MAP_SHA256", "77" * 32)
+        return image_bytes(image(MACHINE))
+
+
+@pytest.mark.parametrize(
+    ("announced", "sent"),
+    [(bytes, lambda content: content[:-4] + bytes(4)), (foreign, foreign)],
+    ids=["changed on the way", "for another map"],
+)
+def test_a_file_that_no_loader_has_checked_is_checked_by_the_board(
+    start_board: StartBoard, announced: Callable[[bytes], bytes], sent: Callable[[bytes], bytes]
+) -> None:
     content = image_bytes(image(MACHINE))
-    changed = content[:-4] + bytes(4)
-    with SocketLink.open(parse_endpoint(board.endpoint).programming, timeout=PATIENCE) as link:
-        payload = begin(content)
-        link.request(framing.PROGRAM, framing.BEGIN, 0, len(payload) // 4, payload)
-        padded = changed + bytes(-len(changed) % 4)
+    announced_content, sent_content = announced(content), sent(content)
+    with open_programming(start_board()) as link:
+        begin(link, len(announced_content), hashlib.sha256(announced_content).digest())
+        padded = sent_content + bytes(-len(sent_content) % 4)
         link.request(framing.PROGRAM, 0, 0, len(padded) // 4, padded)
         with pytest.raises(AccessError):
-            link.request(framing.PROGRAM, framing.END, len(content), 0)
+            link.request(framing.PROGRAM, framing.END, len(sent_content), 0)
         assert link.read_block(rm.IMAGE_HASH, 8) == bytes(32)
 
 
-def test_an_endless_file_is_refused(start_board: StartBoard) -> None:
-    with SocketLink.open(parse_endpoint(start_board().endpoint).programming, timeout=PATIENCE) as link:
-        payload = begin(b"", size=2**40)
-        with pytest.raises(AccessError):
-            link.request(framing.PROGRAM, framing.BEGIN, 0, len(payload) // 4, payload)
+def test_the_loader_refuses_a_file_for_another_map(start_board: StartBoard) -> None:
+    with pytest.raises(ImageMismatchError):
+        program(start_board().endpoint, foreign(b""))
 
 
-def test_the_programming_port_takes_no_registers_writes_and_no_part_out_of_turn(
+def test_the_programming_port_takes_no_registers_writes_no_part_out_of_turn_and_no_endless_file(
     start_board: StartBoard,
 ) -> None:
     board = start_board()
-    port = parse_endpoint(board.endpoint).programming
-    with SocketLink.open(port, timeout=PATIENCE) as link, refused(ErrorCode.BAD_FRAME):
+    with open_programming(board) as link, refused(ErrorCode.BAD_FRAME):
         link.write32(rm.CONTROL, 1)
-    with SocketLink.open(port, timeout=PATIENCE) as link, refused(ErrorCode.BAD_FRAME):
+    with open_programming(board) as link, refused(ErrorCode.BAD_FRAME):
         link.request(framing.PROGRAM, 0, 0, 1, words(1))
-
-
-def test_an_image_for_another_map_is_refused_by_the_board_too(
-    start_board: StartBoard, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    ours = rm.MAP_SHA256
-    monkeypatch.setattr(rm, "MAP_SHA256", "77" * 32)
-    content = image_bytes(image(MACHINE))
-    monkeypatch.setattr(rm, "MAP_SHA256", ours)
-    board = start_board()
-    with pytest.raises(ImageMismatchError):
-        program(board.endpoint, content)
-    # a loader that does not look
-    with SocketLink.open(parse_endpoint(board.endpoint).programming, timeout=PATIENCE) as link:
-        payload = begin(content)
-        link.request(framing.PROGRAM, framing.BEGIN, 0, len(payload) // 4, payload)
-        padded = content + bytes(-len(content) % 4)
-        link.request(framing.PROGRAM, 0, 0, len(padded) // 4, padded)
-        with pytest.raises(AccessError):
-            link.request(framing.PROGRAM, framing.END, len(content), 0)
+    with open_programming(board) as link, pytest.raises(AccessError):
+        begin(link, 2**40, hashlib.sha256().digest())

@@ -6,7 +6,6 @@ MiniCluster (this process) ══ 4 links ══ 4 board processes
 import dataclasses
 import re
 import select
-import tempfile
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -39,14 +38,16 @@ from pcie_shim.host.frame import FrameInput, FrameOutput
 from pcie_shim.host.frame_encoder import BoardWords
 from pcie_shim.host.loader import program
 from pcie_shim.host.mini_cluster import MiniCluster
+from pcie_shim.programming_file import Image
 from tests.pcie_shim.boards import (
     BoardProcess,
+    endpoints_of,
     expected,
     image,
     images,
     machine,
     never_stopping,
-    tcp_endpoint,
+    opened,
 )
 
 StartBoard = Callable[..., BoardProcess]
@@ -80,19 +81,8 @@ frames = st.builds(
 @pytest.fixture(scope="module", params=["unix", "tcp"])
 def cluster(request: pytest.FixtureRequest) -> Iterator[MiniCluster]:
     """Four boards that misbehave in nothing, opened once for many frames."""
-    with tempfile.TemporaryDirectory(prefix="bm") as base:
-        boards = [
-            BoardProcess(
-                f"unix:{base}/board{index}.sock" if request.param == "unix" else tcp_endpoint(), index=index
-            )
-            for index in range(4)
-        ]
-        try:
-            with MiniCluster.open(endpoints_of(boards), PARTS) as opened:
-                yield opened
-        finally:
-            for board in boards:
-                assert board.stop() == 0
+    with opened(PARTS, tcp=request.param == "tcp") as cluster:
+        yield cluster
 
 
 @settings(max_examples=80, deadline=None)
@@ -123,30 +113,20 @@ def test_a_frame_in_pieces_is_the_same_frame(cluster: MiniCluster) -> None:
     assert outcome(cluster.run(whole)) == expected(PARTS, whole)
 
 
-def test_slices_end_together(cluster: MiniCluster) -> None:
+def test_an_output_says_how_each_board_ended_and_where_the_time_went(cluster: MiniCluster) -> None:
     output = cluster.run(frame(None, None, target_count=255, max_cycles=2**17))
+    kept = outcome(output)
     ends = {board.cycles for board in output.boards if board.reason is StopReason.SLICE}
     stopped = [board.cycles for board in output.boards if board.reason is StopReason.OVERFLOW]
-    assert stopped
     assert ends == {512 << output.slices - 1}
-    assert max(stopped) <= min(ends)
-
-
-def test_times_say_where_a_frame_went(cluster: MiniCluster) -> None:
-    output = cluster.run(frame(None, None, target_count=255))
+    assert 0 < max(stopped) <= min(ends)
     assert output.register_writes_ns > 0
     assert output.reads_ns > 0
     assert 0 < output.boards_compute_ns < output.compute_ns + output.register_writes_ns
-    assert output.slices >= 1
-
-
-def test_results_are_the_callers_own(cluster: MiniCluster) -> None:
-    first = cluster.run(frame(None, None))
-    kept = outcome(first)
-    cluster.run(frame(3, 4))
-    assert outcome(first) == kept
-    assert first.boards[0].counts.dtype == np.uint32
-    assert first.boards[0].counts.flags.owndata
+    cluster.run(frame(3, 4))  # the results are the caller's own
+    assert outcome(output) == kept
+    assert output.boards[0].counts.dtype == np.uint32
+    assert output.boards[0].counts.flags.owndata
 
 
 @pytest.mark.parametrize(
@@ -178,10 +158,6 @@ def test_a_frame_that_does_not_fit_is_refused(cluster: MiniCluster, bad: dict) -
 def boards(start_board: StartBoard) -> list[BoardProcess]:
     """Two blank boards."""
     return [start_board(index=index) for index in range(2)]
-
-
-def endpoints_of(boards: list[BoardProcess]) -> list[str]:
-    return [board.endpoint for board in boards]
 
 
 def test_written_priors_are_split_over_the_boards(boards: list[BoardProcess]) -> None:
@@ -228,19 +204,19 @@ def test_what_did_not_change_is_not_written(
             assert written == [rm.SENSORS, first]
 
 
-def test_a_machine_without_sensors_runs(start_board: StartBoard) -> None:
-    parts = images(40, (6,), sensor_bits=())
-    with MiniCluster.open([start_board().endpoint], parts) as cluster:
-        given_frame = FrameInput(addresses=(), target_count=9, max_cycles=500)
-        assert outcome(cluster.run(given_frame)) == expected(parts, given_frame)
-
-
-def test_all_boards_impossible(boards: list[BoardProcess]) -> None:
-    parts = images(50, (3, 2), zeros=1.0)
+@pytest.mark.parametrize(
+    ("parts", "given_frame"),
+    [
+        (images(40, (3, 2), sensor_bits=()), FrameInput(addresses=(), target_count=9, max_cycles=500)),
+        (images(50, (3, 2), zeros=1.0), frame()),
+    ],
+    ids=["no sensors", "impossible on every board"],
+)
+def test_frames_that_need_no_readings_or_no_cycles(
+    boards: list[BoardProcess], parts: list[Image], given_frame: FrameInput
+) -> None:
     with MiniCluster.open(endpoints_of(boards), parts) as cluster:
-        output = cluster.run(frame())
-        assert outcome(output) == [([0] * 3, 0, StopReason.IMPOSSIBLE), ([0] * 2, 0, StopReason.IMPOSSIBLE)]
-        assert output.slices == 1
+        assert outcome(cluster.run(given_frame)) == expected(parts, given_frame)
 
 
 # ---- opening ----
@@ -288,30 +264,29 @@ def test_a_board_that_is_not_there_is_named(start_board: StartBoard, folder: Pat
     assert caught.value.board == 1
 
 
+ONE, TWO = images(1, (3, 2))
+
+
 @pytest.mark.parametrize(
-    "parts",
+    ("parts", "endpoints"),
     [
-        [],
-        images(1, (3, 2))[:1],
-        images(1, (3, 2))[::-1],
-        [images(1, (3, 2))[0], images(1, (4, 2))[1]],
-        [image(machine(1), total=99)],
+        ([], ""),
+        ([ONE], "a"),
+        ([TWO, ONE], "ab"),
+        ([ONE, images(1, (4, 2))[1]], "ab"),
+        ([image(machine(1), total=99)], "a"),
+        ([ONE, dataclasses.replace(TWO, model_hash="cd" * 32)], "ab"),
+        ([ONE, TWO], "a"),
     ],
 )
-def test_images_that_are_not_the_parts_of_one_model_are_refused(parts: list) -> None:
+def test_images_that_are_not_the_parts_of_one_model_are_refused(parts: list[Image], endpoints: str) -> None:
     with pytest.raises(ImageMismatchError):
-        MiniCluster.open(["unix:/tmp/x.sock"] * len(parts), parts)
+        MiniCluster.open([f"unix:/tmp/{name}.sock" for name in endpoints], parts)
 
 
-def test_images_of_two_models_are_refused() -> None:
-    first, second = images(1, (3, 2))
-    other = dataclasses.replace(second, model_hash="cd" * 32)
-    with pytest.raises(ImageMismatchError):
-        MiniCluster.open(["unix:/tmp/x.sock", "unix:/tmp/y.sock"], [first, other])
-    with pytest.raises(ImageMismatchError):
-        MiniCluster.open(["unix:/tmp/x.sock"], [first, second])
+def test_a_text_that_is_not_an_endpoint_is_refused() -> None:
     with pytest.raises(EndpointError):
-        MiniCluster.open(["x", "y"], [first, second])
+        MiniCluster.open(["x", "y"], [ONE, TWO])
 
 
 # ---- boards that fail ----
@@ -321,74 +296,50 @@ SLACK = 3.0
 """Seconds that a board has beyond its cycles: enough for one that does answer, however busy the machine."""
 
 
-class Failing:
-    """A mini-cluster whose second board misbehaves from its second start on."""
-
-    def __init__(self, start_board: StartBoard, misbehave: str, **parameters) -> None:
-        self.boards = [start_board(index=0), start_board(index=1, misbehave=misbehave), start_board(index=2)]
-        self.parts = images(70, (3, 2, 2), **parameters)
-        self.cluster = MiniCluster.open(endpoints_of(self.boards), self.parts, timeout=20, slack=SLACK)
-
-    def run(self, given_frame: FrameInput) -> None:
-        assert outcome(self.cluster.run(given_frame)) == expected(self.parts, given_frame)
-
-
 OWN = {"stop": "own"}
 
 
 @pytest.mark.parametrize(
-    ("kind", "error"),
+    ("kind", "error", "on_opening"),
     [
-        ("drop", BoardSilentError),
-        ("stall", BoardSilentError),
-        ("never-done", BoardSilentError),
-        ("endless", BoardSilentError),
-        ("short-read", BoardLinkError),
-        ("wrong-sequence", BoardLinkError),
-        ("wrong-crc", BoardLinkError),
-        ("done-twice", BoardLinkError),
-        ("all-ones", BoardGoneError),
+        ("drop", BoardSilentError, True),
+        ("stall", BoardSilentError, True),
+        ("never-done", BoardSilentError, False),
+        ("endless", BoardSilentError, True),
+        ("short-read", BoardLinkError, True),
+        ("wrong-sequence", BoardLinkError, True),
+        ("wrong-crc", BoardLinkError, True),
+        ("done-twice", BoardLinkError, False),
+        ("all-ones", BoardGoneError, True),
     ],
 )
 def test_a_misbehaving_board_fails_the_frame_and_comes_back(
-    start_board: StartBoard, kind: str, error: type[PcieShimError]
+    start_board: StartBoard, kind: str, error: type[PcieShimError], on_opening: bool
 ) -> None:
-    failing = Failing(start_board, f"{kind}:1:1")
-    cluster = failing.cluster
-    failing.run(frame(**OWN))
-    with pytest.raises(error) as caught:
-        cluster.run(frame(**OWN))
-    assert caught.value.board == 1
-    assert caught.value.exit_code == 5
-    assert not cluster.is_open(1)
-    assert cluster.is_open(0)
-    with pytest.raises(BoardGoneError):
-        cluster.run(frame(**OWN))
-    cluster.reopen(1, timeout=240)
-    for stop in ("own", "slices"):
-        failing.run(frame(stop=stop, bank=3))
-    cluster.close()
+    boards = [start_board(index=0), start_board(index=1, misbehave=f"{kind}:1:1"), start_board(index=2)]
+    parts = images(70, (3, 2, 2))
+    with MiniCluster.open(endpoints_of(boards), parts, timeout=20, slack=SLACK) as cluster:
+        assert outcome(cluster.run(frame(**OWN))) == expected(parts, frame(**OWN))
+        with pytest.raises(error) as caught:
+            cluster.run(frame(**OWN))
+        assert (caught.value.board, caught.value.exit_code) == (1, 5)
+        assert [cluster.is_open(at) for at in (0, 1)] == [True, False]
+        with pytest.raises(BoardGoneError):
+            cluster.run(frame(**OWN))
+        cluster.reopen(1, timeout=240)
+        for given_frame in (frame(bank=3, **OWN), frame(bank=3)):
+            assert outcome(cluster.run(given_frame)) == expected(parts, given_frame)
+    if on_opening:
+        refuse_on_opening(start_board(index=3, misbehave=kind), error)
 
 
-@pytest.mark.parametrize(
-    ("kind", "error"),
-    [
-        ("drop", BoardSilentError),
-        ("stall", BoardSilentError),
-        ("endless", BoardSilentError),
-        ("short-read", BoardLinkError),
-        ("wrong-sequence", BoardLinkError),
-        ("wrong-crc", BoardLinkError),
-        ("all-ones", BoardGoneError),
-        ("wrong-map", BoardMismatchError),
-    ],
-)
-def test_a_board_that_misbehaves_on_opening_is_refused(
-    start_board: StartBoard, kind: str, error: type[PcieShimError]
-) -> None:
-    board = start_board(misbehave=kind)
+def refuse_on_opening(board: BoardProcess, error: type[PcieShimError]) -> None:
     with pytest.raises(error):
         MiniCluster.open([board.endpoint], images(1, (3,)), timeout=2.0)
+
+
+def test_a_board_of_another_register_map_is_refused(start_board: StartBoard) -> None:
+    refuse_on_opening(start_board(misbehave="wrong-map"), BoardMismatchError)
 
 
 def test_the_slowest_board_sets_the_deadline(boards: list[BoardProcess]) -> None:
@@ -402,12 +353,14 @@ def test_the_slowest_board_sets_the_deadline(boards: list[BoardProcess]) -> None
 
 
 def test_a_failure_in_a_later_slice(start_board: StartBoard) -> None:
-    failing = Failing(start_board, "drop:2:1", zeros=0.0, counter_bits=16)
+    boards = [start_board(index=0), start_board(index=1, misbehave="drop:2:1")]
+    parts = images(70, (3, 2), zeros=0.0, counter_bits=16)
     slow = frame(5, 8, target_count=500, max_cycles=100000)
-    with pytest.raises(BoardSilentError):
-        failing.cluster.run(slow)
-    failing.cluster.reopen(1)
-    failing.run(slow)
+    with MiniCluster.open(endpoints_of(boards), parts, timeout=20, slack=SLACK) as cluster:
+        with pytest.raises(BoardSilentError):
+            cluster.run(slow)
+        cluster.reopen(1)
+        assert outcome(cluster.run(slow)) == expected(parts, slow)
 
 
 def test_a_killed_board_is_gone_and_its_successor_is_programmed(boards: list[BoardProcess]) -> None:
@@ -443,39 +396,59 @@ def test_a_board_that_is_killed_while_it_computes(boards: list[BoardProcess]) ->
             cluster.run(FrameInput(addresses=(1,), target_count=1, max_cycles=5))
 
 
-def test_an_interrupted_frame_leaves_all_boards_usable(
-    boards: list[BoardProcess], monkeypatch: pytest.MonkeyPatch
+def interrupt(patch: pytest.MonkeyPatch, cluster: MiniCluster) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    patch.setattr(cluster, "_receive", interrupted)
+
+
+def expect_another_number(patch: pytest.MonkeyPatch, cluster: MiniCluster) -> None:
+    good = cluster._expect_done
+
+    def expecting_another(course: object) -> None:
+        cluster._boards[1].number += 1
+        good(course)
+
+    patch.setattr(cluster, "_expect_done", expecting_another)
+
+
+def write_what_is_refused(patch: pytest.MonkeyPatch, cluster: MiniCluster) -> None:
+    refused = [BoardWords(bytes(20), bytes(8), b"", None)] * 2
+    patch.setattr(cluster._encoder, "encode", lambda _: refused)
+
+
+def program_behind_the_hosts_back(_: pytest.MonkeyPatch, cluster: MiniCluster) -> None:
+    board = cluster._boards[1]
+    program(str(board.endpoint), board.image, token=board.link.greeting.token)
+
+
+@pytest.mark.parametrize(
+    ("breaks", "error", "stays_open"),
+    [
+        (interrupt, KeyboardInterrupt, None),
+        (expect_another_number, BoardLinkError, False),
+        (write_what_is_refused, BoardRefusedError, True),
+        (program_behind_the_hosts_back, BoardStaleError, False),
+    ],
+)
+def test_a_frame_that_fails_leaves_boards_that_can_be_used_again(
+    boards: list[BoardProcess],
+    breaks: Callable[[pytest.MonkeyPatch, MiniCluster], None],
+    error: type[BaseException],
+    stays_open: bool | None,
 ) -> None:
     parts = images(90, (3, 2))
     with MiniCluster.open(endpoints_of(boards), parts) as cluster:
-
-        def interrupted(*_: object) -> None:
-            raise KeyboardInterrupt
-
-        with monkeypatch.context() as patch:
-            patch.setattr(cluster, "_receive", interrupted)
-            with pytest.raises(KeyboardInterrupt):
+        with pytest.MonkeyPatch.context() as patch:
+            breaks(patch, cluster)
+            with pytest.raises(error):
                 cluster.run(frame())
+        if stays_open is not None:
+            assert [cluster.is_open(at) for at in (0, 1)] == [True, stays_open]
+        if stays_open is False:
+            cluster.reopen(1)
         assert outcome(cluster.run(frame(bank=5))) == expected(parts, frame(bank=5))
-
-
-def test_a_done_of_another_number_is_not_taken(
-    boards: list[BoardProcess], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    parts = images(95, (3, 2))
-    with MiniCluster.open(endpoints_of(boards), parts) as cluster:
-        good = cluster._expect_done
-
-        def expecting_another(course: object) -> None:
-            cluster._boards[1].number += 1
-            good(course)
-
-        with monkeypatch.context() as patch:
-            patch.setattr(cluster, "_expect_done", expecting_another)
-            with pytest.raises(BoardLinkError):
-                cluster.run(frame())
-        cluster.reopen(1)
-        assert outcome(cluster.run(frame())) == expected(parts, frame())
 
 
 def test_doorbell_numbers_go_round(start_board: StartBoard, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -492,34 +465,6 @@ def test_doorbell_numbers_go_round(start_board: StartBoard, monkeypatch: pytest.
         for number in (0xFFFFFFFE, 0xFFFFFFFF, 1, 2):
             assert outcome(cluster.run(frame(stop="own"))) == expected(parts, frame(stop="own"))
             assert cluster._boards[0].number == number
-
-
-def test_a_refusing_board_fails_the_frame_and_stays_usable(
-    boards: list[BoardProcess], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    parts = images(100, (3, 2))
-    with MiniCluster.open(endpoints_of(boards), parts) as cluster:
-        with monkeypatch.context() as patch:
-            patch.setattr(
-                cluster._encoder, "encode", lambda _: [BoardWords(bytes(20), bytes(8), b"", None)] * 2
-            )
-            with pytest.raises(BoardRefusedError):
-                cluster.run(frame())
-        assert cluster.is_open(0)
-        assert cluster.is_open(1)
-        assert outcome(cluster.run(frame())) == expected(parts, frame())
-
-
-def test_a_board_programmed_behind_the_hosts_back_is_stale(boards: list[BoardProcess]) -> None:
-    parts = images(110, (3, 2))
-    with MiniCluster.open(endpoints_of(boards), parts) as cluster:
-        token = cluster._boards[1].link.greeting.token
-        program(boards[1].endpoint, parts[1], token=token)
-        with pytest.raises(BoardStaleError):
-            cluster.run(frame())
-        assert not cluster.is_open(1)
-        cluster.reopen(1)
-        assert outcome(cluster.run(frame())) == expected(parts, frame())
 
 
 def test_a_closed_cluster_runs_nothing(boards: list[BoardProcess]) -> None:
