@@ -270,7 +270,9 @@ class Peers:
             except Exception as error:
                 self._events.fail(error)
 
-        (self._inside if inside else self._tasks).append(asyncio.ensure_future(guarded()))
+        task = asyncio.ensure_future(guarded())
+        task.add_done_callback(lambda _: work.close())  # one that ends before it began has not awaited it
+        (self._inside if inside else self._tasks).append(task)
 
     def _start_inside(self) -> None:
         """With `--fused`, run each service as a task of this process."""
