@@ -6,21 +6,26 @@ Robot (websockets + json) <--> hub (a process) <--> master and its children (pro
 import asyncio
 import contextlib
 import fcntl
+import inspect
 import json
 import os
 import re
 import signal
-import socket
 import subprocess
 import sys
 import time
 import uuid
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import psutil
 import pytest
 import websockets
+
+from tests.command_runner import invoke
+from tests.pcie_shim.boards import tcp_endpoint
+from toolchain.commands import main
 
 ROOT = Path(__file__).resolve().parents[2]
 BIN = Path(sys.executable).parent
@@ -31,6 +36,19 @@ PID_MAX = int(Path("/proc/sys/kernel/pid_max").read_text())
 LOOP = ("master", "--loop", "--connect-timeout", "30")
 READING = {"D1": 71, "D2": 50, "D3": 50, "B1": 45, "B2": 0, "B3": 90}
 """What a boat in the middle of the map sees."""
+
+
+async def until(true: Callable[[], Any], why: Callable[[], str] = str) -> Any:
+    """Wait until a function, or what it returns awaited, returns something that is true; return that."""
+    deadline = time.monotonic() + PATIENCE
+    while True:
+        found = true()
+        if inspect.isawaitable(found):
+            found = await found
+        if found:
+            return found
+        assert time.monotonic() < deadline, why()
+        await asyncio.sleep(0.02)
 
 
 class Running:
@@ -60,22 +78,23 @@ class Running:
     def err(self) -> str:
         return self._err.read_text()
 
-    async def end(self, timeout: float = PATIENCE) -> int:
+    async def end(self) -> int:
         """Its exit code."""
-        deadline = time.monotonic() + timeout
-        while self.process.poll() is None:
-            assert time.monotonic() < deadline, f"{self.name} did not end: {self.err}"
-            await asyncio.sleep(0.02)
+        await until(lambda: self.process.poll() is not None, lambda: f"{self.name} did not end: {self.err}")
         return self.process.returncode
 
-    async def says(self, pattern: str, timeout: float = PATIENCE, times: int = 1) -> re.Match[str]:
+    async def says(self, pattern: str) -> re.Match[str]:
         """Wait for a line on its standard error."""
-        deadline = time.monotonic() + timeout
-        while len(found := list(re.finditer(pattern, self.err))) < times:
-            assert self.process.poll() is None, f"{self.name} ended: {self.err}"
-            assert time.monotonic() < deadline, f"{self.name} never said {pattern!r}: {self.err}"
-            await asyncio.sleep(0.02)
-        return found[times - 1]
+
+        def said() -> re.Match[str] | None:
+            ended = self.process.poll() is not None
+            found = re.search(pattern, self.err)
+            assert found or not ended, f"{self.name} ended: {self.err}"
+            return found
+
+        found = await until(said, lambda: f"{self.name} never said {pattern!r}: {self.err}")
+        assert found is not None
+        return found
 
     def send(self, number: signal.Signals) -> None:
         self.process.send_signal(number)
@@ -88,7 +107,6 @@ class Stage:
         self.where = where
         self.run = uuid.uuid4().hex
         self.running: list[Running] = []
-        self._places: list[socket.socket] = []
         self.runs = where / "runs"
         self.runs.mkdir()
 
@@ -98,16 +116,8 @@ class Stage:
         return running
 
     def place(self) -> int:
-        """A port that is free, and the next one; both stay this test's: bound, never listening, nobody else is given them."""
-        while True:
-            one, two = socket.socket(), socket.socket()
-            self._places += [one, two]
-            for place in (one, two):
-                place.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            one.bind(("127.0.0.1", 0))
-            with contextlib.suppress(OSError, OverflowError):
-                two.bind(("127.0.0.1", one.getsockname()[1] + 1))
-                return one.getsockname()[1]
+        """A port that is free, and the next one; nobody else is given them."""
+        return int(tcp_endpoint().rsplit(":", 1)[1])
 
     async def hub(self, port: int = 0) -> tuple[Running, str]:
         """A hub and its address; another one may follow it at its port."""
@@ -161,15 +171,15 @@ class Stage:
 
     async def status(self, name: str, wanted: Callable[[dict], bool] = bool) -> dict:
         """Wait for a status of a process in the run directory that is as wanted."""
-        deadline = time.monotonic() + PATIENCE
-        while True:
-            found: dict = {}
+        found: dict = {}
+
+        async def is_wanted() -> bool:
             with contextlib.suppress(OSError, ValueError):
-                found = await status_of(self.runs, name)
-            if found and wanted(found):
-                return found
-            assert time.monotonic() < deadline, f"{name}: {found}"
-            await asyncio.sleep(0.05)
+                found.update(await status_of(self.runs, name))
+            return bool(found) and wanted(found)
+
+        await until(is_wanted, lambda: f"{name}: {found}")
+        return found
 
     def start_boards(self) -> tuple[Path, str]:
         """Start four boards; return the folder of their sockets, and their endpoints."""
@@ -194,15 +204,15 @@ class Stage:
             lambda status: status["ready"] and sum(board["restarts"] for board in status["boards"]) >= times,
         )
 
-    async def nothing_left(self, *except_for: str, timeout: float = PATIENCE) -> None:
+    async def nothing_left(self, *except_for: str) -> None:
         """All processes but the named have ended, and no socket or private directory is left."""
-        deadline = time.monotonic() + timeout
-        while left := {name: all_ for name, all_ in self.processes().items() if name not in except_for}:
-            assert time.monotonic() < deadline, f"still running: {left}"
-            await asyncio.sleep(0.05)
-        while left := list(self.where.glob("rosbayes-*")):
-            assert time.monotonic() < deadline, f"left behind: {[list(each.iterdir()) for each in left]}"
-            await asyncio.sleep(0.05)
+
+        def left() -> list[str]:
+            directories = [str(path) for path in self.where.glob("rosbayes-*/*")]
+            return sorted(set(self.processes()) - set(except_for)) + directories
+
+        await until(lambda: not left(), lambda: f"left: {left()}")
+        assert not list(self.where.glob("rosbayes-*"))
 
     def end_all(self) -> None:
         for all_ in self.processes().values():
@@ -211,8 +221,6 @@ class Stage:
                     process.kill()
         for running in self.running:
             running.process.wait(PATIENCE)
-        for place in self._places:
-            place.close()
 
 
 class Robot:
@@ -295,23 +303,21 @@ class Robot:
 
     async def answer(self, stamp_ns: int) -> tuple[dict, dict | None]:
         """Wait for what comes of the reading with a stamp: its frame's report, and the result unless there is none."""
-        deadline = time.monotonic() + PATIENCE
-        while True:
+
+        def answered() -> tuple[dict, dict | None] | None:
             before = 0
             for frame in self.frames:
                 published = frame["status"][0]["level"] == 0
                 if stamp_of(frame) == stamp_ns and len(self.results) >= before + published:
                     return frame, self.results[before] if published else None
                 before += published
-            assert time.monotonic() < deadline, "nothing came of the reading"
-            await asyncio.sleep(0.01)
+            return None
 
-    async def have(self, count: int, timeout: float = PATIENCE) -> None:
+        return await until(answered, lambda: "nothing came of the reading")
+
+    async def have(self, count: int) -> None:
         """Wait until so many results have come."""
-        deadline = time.monotonic() + timeout
-        while len(self.results) < count:
-            assert time.monotonic() < deadline, f"{len(self.results)} results of {count}"
-            await asyncio.sleep(0.01)
+        await until(lambda: len(self.results) >= count, lambda: f"{len(self.results)} results of {count}")
 
 
 def stamp_of(message: dict) -> int:
@@ -362,11 +368,12 @@ def stage(tmp_path_factory):
 
 
 def toolchain(*arguments: str | Path) -> None:
-    subprocess.run([BIN / "toolchain", *arguments], check=True, capture_output=True, timeout=240)
+    ended = invoke(main.app, arguments)
+    assert ended.exit_code == 0, ended.output
 
 
 def build(model: Path, directory: Path, *options: str) -> Path:
-    """A deployment, built by the command as a user builds it."""
+    """A deployment, built by the command line in this process."""
     topic = ("--uri", "ws://127.0.0.1:9090", "--topic", "/boat/sensors", "--type", "boat_msgs/Sensors")
     toolchain("build", model, "-o", directory, *topic, *options)
     return directory

@@ -1,6 +1,6 @@
-"""A robot of roslibpy, a client that this project did not write: publishes readings if told to, and keeps what it hears.
+"""A listener of roslibpy, a client that this project did not write.
 
-    python roslibpy_listener.py URI FILE COUNT [READING_JSON]
+    python roslibpy_listener.py URI FILE COUNT
 
 Writes one JSON line per message heard and ends after COUNT results, or 240 s.
 """
@@ -20,7 +20,7 @@ TOPICS = {
 }
 
 
-def main(uri: str, file: str, count: int, reading: dict | None) -> int:
+def main(uri: str, file: str, count: int) -> int:
     host, port = uri.removeprefix("ws://").rsplit(":", 1)
     ros = roslibpy.Ros(host=host, port=int(port))
     ros.run(timeout=240)
@@ -37,14 +37,9 @@ def main(uri: str, file: str, count: int, reading: dict | None) -> int:
     topics = [roslibpy.Topic(ros, topic, type_) for topic, type_ in TOPICS.items()]
     for topic in topics:
         topic.subscribe(keep(topic.name))
-    publisher = roslibpy.Topic(ros, "/boat/sensors", "boat_msgs/Sensors")
     print("listening", file=sys.stderr, flush=True)
     deadline = time.monotonic() + 240
     while results[0] < count and time.monotonic() < deadline:
-        if reading is not None:
-            seconds, nanoseconds = divmod(time.time_ns(), 10**9)
-            stamp = {"sec": seconds, "nanosec": nanoseconds}
-            publisher.publish(roslibpy.Message({"header": {"stamp": stamp, "frame_id": "map"}, **reading}))
         time.sleep(0.05)
     ros.terminate()
     with Path(file).open("w") as out:
@@ -54,8 +49,4 @@ def main(uri: str, file: str, count: int, reading: dict | None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(
-        main(
-            sys.argv[1], sys.argv[2], int(sys.argv[3]), json.loads(sys.argv[4]) if len(sys.argv) > 4 else None
-        )
-    )
+    sys.exit(main(sys.argv[1], sys.argv[2], int(sys.argv[3])))

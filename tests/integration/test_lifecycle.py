@@ -9,11 +9,20 @@ import os
 import pty
 import signal
 import socket
-import time
 
 import pytest
 
-from tests.integration.conftest import BIN, LOOP, MARK, PATIENCE, READING, Robot, endpoints_in, only_error
+from tests.integration.conftest import (
+    BIN,
+    LOOP,
+    MARK,
+    PATIENCE,
+    READING,
+    Robot,
+    endpoints_in,
+    only_error,
+    until,
+)
 
 both_ways = pytest.mark.parametrize("how", [(), ("--fused",)], ids=["processes", "fused"])
 
@@ -72,10 +81,7 @@ async def test_a_closed_terminal_leaves_nothing(stage, boat):
             os.execv(BIN / "master", [*LOOP, "-d", str(boat), "--uri", uri])
         await robot.have(2)
         os.close(terminal)
-        deadline = time.monotonic() + PATIENCE
-        while not (ended := os.waitpid(pid, os.WNOHANG))[0]:
-            assert time.monotonic() < deadline
-            await asyncio.sleep(0.05)
+        ended = await until(lambda: (ended := os.waitpid(pid, os.WNOHANG))[0] and ended)
         assert os.waitstatus_to_exitcode(ended[1]) == 129
         await stage.nothing_left("hub")
 
@@ -154,21 +160,6 @@ async def test_loop_gives_up_on_the_fourth_death_of_a_board(stage, boat):
     await stage.nothing_left("hub")
 
 
-async def test_a_second_set_of_boards_leaves_the_first_alone(stage, tmp_path):
-    first = stage.start("board", "--boards", "2", "--directory", str(tmp_path))
-    paths = {f"board{at}{kind}.sock" for at in (0, 1) for kind in ("", ".program")}
-    deadline = time.monotonic() + PATIENCE
-    while {path.name for path in tmp_path.glob("*.sock")} < paths:
-        assert time.monotonic() < deadline, first.err
-        await asyncio.sleep(0.05)
-    second = stage.start("board", "--boards", "2", "--directory", str(tmp_path))
-    assert await second.end() == 2
-    assert only_error(second) == second.err.strip()
-    assert {path.name for path in tmp_path.glob("*.sock")} >= paths
-    first.send(signal.SIGTERM)
-    assert await first.end() == 143
-
-
 async def test_the_parts_alone_make_a_pipeline(stage, boat):
     _, uri = await stage.hub()
     _, boards = stage.start_boards()
@@ -207,7 +198,8 @@ async def shell(stage, command: str) -> tuple[int, str]:
 
 
 @pytest.mark.parametrize(
-    ("redirection", "code"), [("--json | head -1", 0), (">&-", 143), ("2>&-", 143), ("--json >/dev/full", 2)]
+    ("redirection", "code"),
+    [("--fused --json | head -1", 0), (">&- 2>&-", 143), ("--fused --json >/dev/full", 2)],
 )
 async def test_closed_and_full_streams_leave_no_run_behind(stage, boat, redirection, code):
     _, uri = await stage.hub()

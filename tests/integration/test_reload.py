@@ -4,10 +4,8 @@ robot ──▶ hub ──▶ master, subscriber, publisher, pcie-app, boards   
  └─ keeps what it sent, by stamp, and compares every result with what boards in this process count
 """
 
-import asyncio
 import shutil
 import signal
-import time
 from collections import Counter
 from functools import cache
 from pathlib import Path
@@ -15,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from pcie_shim.programming_file import read_image
+from services.sockets.control_socket import ReloadOrder, control_socket, give_order
 from services.sockets.records import LossReason
 from tests.integration.conftest import (
     LOOP,
@@ -29,6 +28,7 @@ from tests.integration.conftest import (
     stamp_of,
     status_of,
     toolchain,
+    until,
 )
 from toolchain.analysis.accuracy.emulation import EmulatedBoards
 from toolchain.deployment import load_deployment
@@ -107,11 +107,9 @@ def start_reload(stage, *options, runs=None):
     return stage.start("master", "reload", "--directory", str(runs or stage.runs), *options)
 
 
-async def until(true):
-    deadline = time.monotonic() + PATIENCE
-    while not await true():
-        assert time.monotonic() < deadline
-        await asyncio.sleep(0.02)
+async def order(stage, folder):
+    """What `master reload` asks, without a process of its own."""
+    return await give_order(control_socket(stage.runs), ReloadOrder(str(folder)), timeout=PATIENCE)
 
 
 def pids(stage):
@@ -129,8 +127,7 @@ async def test_every_frame_is_of_one_deployment(stage, boat, other_boat, options
     runs = stage.runs
     before = pids(stage)
     for generation in (1, 2, 3):
-        reloading = await reload_(stage, "-d", str(folders[generation]))
-        assert str(folders[generation]) in reloading.out
+        assert str(folders[generation]) in await order(stage, folders[generation])
         await robot.have(len(robot.results) + 10)
     assert sorted(robot.generations()) == [0, 1, 2, 3]
     assert pids(stage) == before
@@ -187,7 +184,7 @@ async def a_death_while_boards_are_programmed(stage, robot, folder, victim):
     assert max(robot.generations()) == generation
     # the old images are back when the command has answered, or when pcie-app is: no frame fails for that
     assert LossReason.FAILED not in (await status_of(runs, "master"))["frames"]["lost"]
-    await reload_(stage, "-d", str(folder))
+    await order(stage, folder)
     await robot.have(len(robot.results) + 5)
 
 
@@ -206,10 +203,8 @@ def unfit(boat, where):
 
 
 async def test_what_is_refused_changes_nothing(stage, boat, other_boat, tmp_path):
-    # nothing to do with each other, and two processors have time for both
-    (hub, robot, master), (larger, elsewhere, damaged) = await asyncio.gather(
-        looping(stage, boat, witness=(boat, other_boat, boat)), asyncio.to_thread(unfit, boat, tmp_path)
-    )
+    larger, elsewhere, damaged = unfit(boat, tmp_path)
+    hub, robot, master = await looping(stage, boat, witness=(boat, other_boat, boat))
     for folder, *named in (
         (larger, "[machine] lines", "64", "144"),
         (elsewhere, "[[source]] 0 topic", "/boat/sensors", "/other/topic", "[[output]] 0 topic"),
@@ -229,7 +224,7 @@ async def test_what_is_refused_changes_nothing(stage, boat, other_boat, tmp_path
     hub.send(signal.SIGKILL)
     await hub.end()
     await stage.status("publisher", lambda status: not status["ready"])
-    await reload_(stage, "-d", str(boat))
+    await order(stage, boat)
     before = len(robot.results)
     await stage.hub(int(robot.uri.rsplit(":", 1)[1]))
     await robot.have(before + 5)
@@ -249,7 +244,7 @@ async def test_a_corrected_table_in_the_same_folder(stage, boat, tmp_path):
     _, robot, master = await looping(stage, folder, witness=(before, folder))
     source = model / "model.py"
     source.write_text(source.read_text().replace("sigma=BEARING_SIGMA", "sigma=2 * BEARING_SIGMA"))
-    await asyncio.to_thread(toolchain, "regenerate", "memories", folder, "--model", str(model), *size)
+    toolchain("regenerate", "memories", folder, "--model", str(model), *size)
     assert load_deployment(folder).hash != load_deployment(before).hash
     # a service that dies now still finds the deployment that is in force
     stage.processes()["subscriber"][0].kill()
@@ -314,11 +309,7 @@ async def test_there_must_be_a_run(stage, boat, tmp_path):
     options = ("--boards", endpoints_in(tmp_path), "--peer-timeout", "60")
     master = stage.start("master", "--loop", "-d", str(boat), "--uri", uri, *options, environment=environment)
     control = orders / "master.control.sock"
-
-    async def listens():
-        return control.exists()
-
-    await until(listens)
+    await until(control.exists)
     assert control.stat().st_mode & 0o777 == 0o600
     assert not (tmp_path / control.name).exists()
     reloading = stage.start("master", "reload", environment=environment)

@@ -12,10 +12,8 @@ import numpy as np
 import pytest
 import websockets
 
-from posteriors.posterior import read_posterior
-from tests.integration import test_prior, test_replicas
-from tests.integration.conftest import LOOP, PATIENCE, READING, status_of, toolchain
-from tests.integration.test_reload import looping, reload_, start_reload, until
+from tests.integration.conftest import LOOP, PATIENCE, READING, build, status_of, toolchain, until
+from tests.integration.test_reload import looping, order, reload_, start_reload
 from toolchain.deployment import load_deployment
 
 
@@ -27,57 +25,42 @@ def by_generation(robot):
         yield int(values["generation"]), int(values["number"]), result
 
 
-async def test_a_written_prior(stage, tmp_path, monkeypatch):
-    written = ("--prior-mode", "written", "--prior-path", "belief")
-    before = test_prior.built(tmp_path / "before", select=False, options=written)
-    monkeypatch.setattr(test_prior, "HEARD", test_prior.HEARD[:, [1, 3, 0, 2]])
-    after = test_prior.built(tmp_path / "after", select=False, options=written)
-    heard = {1: test_prior.HEARD[1]}
-    monkeypatch.undo()
-    heard[0] = test_prior.HEARD[1]
-    belief = np.array([4, 2, 1, 1])
-    _, robot, _ = await stage.loop(before, rate=40, reading={"heard": 1, "belief": belief.tolist()})
+HEARD = np.array([[0.9, 0.4, 0.4, 0.1], [0.1, 0.6, 0.6, 0.9]])
+ROOMS = """
+import numpy as np
+from toolchain.models.model import Known, Model, dimension
+
+def model():
+    heard = Known(name="heard", table=np.array({heard}))
+    return Model(name="rooms", searched=(dimension("room", size=4),), known=(heard,))
+"""
+
+
+async def test_a_written_prior(stage, tmp_path):
+    options = ("--prob-bits", "14", "--counter-bits", "16", "--target-count", "20000", "--partitions", "2")
+    tables = HEARD, HEARD[:, [1, 3, 0, 2]]
+    for at, heard in enumerate(tables):
+        (tmp_path / f"{at}").mkdir()
+        (tmp_path / f"{at}/model.py").write_text(ROOMS.format(heard=heard.tolist()))
+        written = ("--prior-mode", "written", "--prior-path", "belief")
+        build(tmp_path / f"{at}", tmp_path / f"built{at}", *options, *written)
+    belief = np.array([4, 2, 0, 1])
+    reading = {"heard": 1, "belief": belief.tolist()}
+    _, robot, _ = await stage.loop(tmp_path / "built0", rate=40, reading=reading)
     async with robot:
-        await reload_(stage, "-d", str(after))
+        await order(stage, tmp_path / "built1")
         await have_of(robot, 1)
         found = list(by_generation(robot))
     assert {generation for generation, _, _ in found} == {0, 1}
     for generation, _, result in found:
-        joint = belief * heard[generation]
+        joint = belief * tables[generation][1]
         assert result["data"] == pytest.approx((joint / joint.sum()).tolist(), abs=0.02)
 
 
 async def have_of(robot, generation, count=3):
     """Wait for results of a generation: those of the one before may still be on their way."""
 
-    async def have():
-        return sum(each == generation for each, _, _ in by_generation(robot)) >= count
-
-    await until(have)
-
-
-async def test_replicas_of_cells(stage, tmp_path):
-    options = ("--sensor-mode", "cell", "--replicas", "3", "--partitions", "2")
-    folders = [
-        test_replicas.built(tmp_path / "before", *options),
-        test_replicas.built(tmp_path / "after", *options, "--target-count", "100"),
-    ]
-    text = (tmp_path / "after" / "model.py").read_text()
-    (tmp_path / "after" / "model.py").write_text(text.replace("default_rng(3)", "default_rng(4)"))
-    toolchain("regenerate", "memories", folders[1], "--model", str(tmp_path / "after"))
-    deployments = [load_deployment(folder) for folder in folders]
-    message = test_replicas.message_of(deployments[0], 2)
-    _, robot, _ = await stage.loop(folders[0], rate=40, reading=message)
-    async with robot:
-        await reload_(stage, "-d", str(folders[1]))
-        await have_of(robot, 1)
-        found = list(by_generation(robot))
-    assert {generation for generation, _, _ in found} == {0, 1}
-    for generation, number, result in (*found[:2], *found[-2:]):
-        exact = test_replicas.exact_posteriors(test_replicas.wanted(deployments[generation], message, number))
-        posterior = read_posterior(result, 0)
-        assert posterior.probabilities == tuple(np.concatenate(exact).tolist())
-        assert posterior.replicas == 3
+    await until(lambda: sum(each == generation for each, _, _ in by_generation(robot)) >= count)
 
 
 async def test_several_outputs(stage, boat, other_boat, tmp_path):
@@ -91,7 +74,7 @@ async def test_several_outputs(stage, boat, other_boat, tmp_path):
     second = []
     async with websockets.connect(robot.uri, open_timeout=PATIENCE) as listener:
         await listener.send(json.dumps({"op": "subscribe", "topic": "/second"}))
-        await reload_(stage, "-d", str(folders[1]))
+        await order(stage, folders[1])
         refused = await reload_(stage, "-d", str(boat), code=2)
         assert "[[output]]" in refused.err
         await have_of(robot, 1)
@@ -113,7 +96,7 @@ async def test_boards_over_tcp(stage, boat, other_boat):
     folders = boat, other_boat, boat
     _, robot, master = await looping(stage, boat, "--boards", endpoints, witness=folders)
     for generation in (1, 2):
-        await reload_(stage, "-d", str(folders[generation]))
+        await order(stage, folders[generation])
         await have_of(robot, generation)
     assert sorted(robot.generations()) == [0, 1, 2]
     master.send(signal.SIGINT)

@@ -77,7 +77,10 @@ class Robots:
         self._tasks: list[asyncio.Task[None]] = []
 
     async def __aenter__(self):
-        self._tasks = [asyncio.create_task(self._first()), asyncio.create_task(self._second())]
+        self._tasks = [
+            asyncio.create_task(self._publish(uri, read))
+            for uri, read in zip(self.uris, (self._first, self._second), strict=True)
+        ]
         return self
 
     async def __aexit__(self, *_):
@@ -86,37 +89,34 @@ class Robots:
         for ended in await asyncio.gather(*self._tasks, return_exceptions=True):
             assert isinstance(ended, asyncio.CancelledError), ended
 
-    def _header(self, late_s: float = 0.0) -> dict:
-        return header(time.time_ns() - round(late_s * 1e9), "robot", 2)
-
-    async def _first(self) -> None:
-        async with connect(self.uris[0], ros_version="2", connect_timeout=PATIENCE) as ros:
-            ranges = await ros.advertise("/range", "sensor_msgs/Range")
-            cells = await ros.advertise("/cells", "std_msgs/UInt8MultiArray")
+    async def _publish(self, uri, read) -> None:
+        async with connect(uri, ros_version="2", connect_timeout=PATIENCE) as ros:
+            topics = [await ros.advertise(topic, type_) for topic, type_, _ in read()]
             while True:
                 with contextlib.suppress(BridgeError):
-                    await ranges.publish({"header": self._header(), "max_range": 4.0, "range": 2.0})
-                    await cells.publish({"layout": {"dim": []}, "data": bytes([9, 9, 4])})
+                    for topic, (_, _, message) in zip(topics, read(), strict=True):
+                        await topic.publish(message)
                 await asyncio.sleep(0.05)
 
-    async def _second(self) -> None:
+    def _first(self):
+        now = header(time.time_ns(), "robot", 2)
+        cells = {"layout": {"dim": []}, "data": bytes([9, 9, 4])}
+        return (
+            ("/range", "sensor_msgs/Range", {"header": now, "max_range": 4.0, "range": 2.0}),
+            ("/cells", "std_msgs/UInt8MultiArray", cells),
+        )
+
+    def _second(self):
+        now = header(time.time_ns() - round(self.late_s * 1e9), "robot", 2)
         beams = np.full(360, np.float32(7))
         beams[0], beams[90] = 4.0, 1.0
-        async with connect(self.uris[1], ros_version="2", connect_timeout=PATIENCE) as ros:
-            scans = await ros.advertise("/scan", "sensor_msgs/LaserScan")
-            imus = await ros.advertise("/imu", "sensor_msgs/Imu")
-            while True:
-                turn = {"x": 9.0, "y": 9.0, "z": 0.0}
-                with contextlib.suppress(BridgeError):
-                    await scans.publish({"header": self._header(self.late_s), "ranges": beams})
-                    await imus.publish(
-                        {
-                            "header": self._header(self.late_s),
-                            "angular_velocity": turn,
-                            "linear_acceleration": {"x": 1.0, "y": 1.0, "z": 9.8},
-                        }
-                    )
-                await asyncio.sleep(0.05)
+        turn, felt = {"x": 9.0, "y": 9.0, "z": 0.0}, {"x": 1.0, "y": 1.0, "z": 9.8}
+        moved = {"header": now, "angular_velocity": turn, "linear_acceleration": felt}
+        return ("/scan", "sensor_msgs/LaserScan", {"header": now, "ranges": beams}), (
+            "/imu",
+            "sensor_msgs/Imu",
+            moved,
+        )
 
 
 @pytest.fixture
@@ -127,20 +127,15 @@ async def robots(stage):
 
 
 @pytest.fixture
-async def deployment(stage, robots):
+def deployment(stage, robots):
     case = stage.where / "corridor"
     case.mkdir()
     (case / "model.py").write_text(MODEL)
     sources = stage.where / "sources.toml"
     one, two = robots.uris
     sources.write_text(SOURCES.format(one=one, two=two))
-    await build(case, stage.where / "out", sources, "--tolerance", "0.5")
+    toolchain("build", case, "-o", stage.where / "out", "--sources", sources, "--tolerance", "0.5")
     return stage.where / "out"
-
-
-async def build(case, directory, sources, *options):
-    """Build a deployment, while the robots go on publishing."""
-    await asyncio.to_thread(toolchain, "build", case, "-o", directory, "--sources", sources, *options)
 
 
 async def test_the_subscriber_alone(stage, deployment):
@@ -157,7 +152,7 @@ async def test_the_subscriber_alone(stage, deployment):
     # and a beam that is not there
     sources = stage.where / "sources.toml"
     sources.write_text(sources.read_text().replace("ranges[90]", "ranges[360]"))
-    await build(stage.where / "corridor", deployment, sources)
+    toolchain("build", stage.where / "corridor", "-o", deployment, "--sources", sources)
     subscriber = stage.start("subscriber", "-d", str(deployment))
     assert await subscriber.end() == 4
     assert "/scan: the message has no field 'ranges[360]'" in only_error(subscriber)

@@ -5,9 +5,8 @@ import json
 import os
 import re
 import signal
-import time
 
-from tests.integration.conftest import PATIENCE, Robot
+from tests.integration.conftest import Robot, until
 
 SERVICES = {"master", "subscriber", "publisher", "pcie-app", "board0", "board1", "board2", "board3"}
 
@@ -18,16 +17,16 @@ async def ask(stage, *options):
     return await asked.end(), asked.out + asked.err
 
 
-async def ask_until(stage, wanted, timeout=PATIENCE):
+async def ask_until(stage, wanted):
     """The stack's status once `wanted` says so, and the exit code with it."""
-    deadline = time.monotonic() + timeout
-    while True:
+
+    async def asked():
         code, printed = await ask(stage, "--json")
         stack = json.loads(printed) if code in {0, 6} else None
-        if stack is not None and wanted(stack):
-            return code, stack
-        assert time.monotonic() < deadline, printed
-        await asyncio.sleep(0.2)
+        await asyncio.sleep(0.3)
+        return (code, stack) if stack is not None and wanted(stack) else None
+
+    return await until(asked)
 
 
 def by_name(stack):
@@ -46,7 +45,7 @@ async def test_the_status_of_a_stack(stage, boat):
         await robot.keep_publishing()
         master = stage.start(
             *("master", "--loop", "-d", str(boat), "--uri", uri, "--log-level", "debug"),
-            environment={"BM_READY_TIMEOUT": "6"},
+            environment={"BM_READY_TIMEOUT": "4"},
         )
         await robot.have(3)
         await is_ready(stage, uri)
@@ -68,12 +67,11 @@ async def is_ready(stage, uri):
     code, stack = await ask_until(stage, lambda stack: stack["ready"])
     assert code == 0
     assert set(by_name(stack)) == SERVICES
-    deadline = time.monotonic() + PATIENCE
-    while (answer := await ready_exit(stage, "master", stack["directory"])) != (
-        0,
-        "master: results flow",
-    ):
-        assert time.monotonic() < deadline, answer
+
+    async def flows():
+        return await ready_exit(stage, "master", stack["directory"]) == (0, "master: results flow")
+
+    await until(flows)
     assert by_name(stack)["publisher"]["connections"] == [
         {"uri": uri, "state": "connected", "reconnections": 0}
     ]
@@ -82,10 +80,11 @@ async def is_ready(stage, uri):
     assert {board["state"] for board in boards} == {"programmed"}
     assert len({board["image"] for board in boards}) == 4
 
-    deadline = time.monotonic() + PATIENCE
-    while (answer := await ask(stage))[0] != 0:
-        assert time.monotonic() < deadline, answer
-    screen = answer[1]
+    async def shown():
+        code, screen = await ask(stage)
+        return code == 0 and screen
+
+    screen = await until(shown)
     assert "all 8 processes are ready" in screen
     assert boards[2]["image"][:12] in screen
 

@@ -1,14 +1,11 @@
 """Settings: flag over variable over default, and an error that names the setting for every mistake."""
 
-import os
-import subprocess
-import sys
-from pathlib import Path
-
 import pytest
 
+from services.commands import hub
 from services.errors import SettingsError
 from services.settings import endpoint_in, load_settings
+from tests.command_runner import invoke
 
 
 def test_flag_over_variable_over_default(monkeypatch):
@@ -62,10 +59,9 @@ def test_a_variable_may_be_empty_or_a_list(name, text, value, monkeypatch):
     assert getattr(load_settings(), name) == value
 
 
-def test_a_command_refuses_an_unknown_variable_in_one_sentence_with_the_nearest():
-    command = [Path(sys.executable).parent / "hub", "--port", "0"]
-    environment = os.environ | {"BM_CONECT_TIMEOUT": "1"}
-    ended = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=240, check=False)
-    assert ended.returncode == 2
+def test_a_command_refuses_an_unknown_variable_in_one_sentence_with_the_nearest(monkeypatch):
+    monkeypatch.setenv("BM_CONECT_TIMEOUT", "1")
+    ended = invoke(hub.app, ["--port", "0"])
+    assert ended.exit_code == 2
     assert ended.stderr.count("\n") == 1
     assert "did you mean BM_CONNECT_TIMEOUT?" in ended.stderr

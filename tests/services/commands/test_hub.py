@@ -2,26 +2,21 @@
 
 import asyncio
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 from websockets.asyncio.client import connect
 
-from bridge.discovery import UnknownRobotError
+from bridge.discovery import Robot, UnknownRobotError
+from services.commands import discover, hub
 from services.errors import SettingsError
 from services.settings import load_settings
 from services.supervision.child import own_command
+from tests.command_runner import invoke
 
 PATIENCE = 60
 EVERYWHERE = "0.0.0.0"  # noqa: S104  # the hub is to refuse it, or to want tokens
-HUB = own_command("hub")
 TOKEN = "correct-horse-battery-staple"
-
-
-def _run(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(arguments, capture_output=True, text=True, timeout=PATIENCE, check=False)
 
 
 @pytest.mark.parametrize(
@@ -40,11 +35,10 @@ def _run(*arguments: str) -> subprocess.CompletedProcess[str]:
     ],
 )
 def test_what_the_hub_refuses_is_one_sentence(arguments: tuple[str, ...], said: str) -> None:
-    done = _run(*HUB, *arguments)
-    assert done.returncode == 2
-    assert said in done.stderr.splitlines()[-1]
-    assert "Traceback" not in done.stderr
-    assert done.stdout == ""
+    ended = invoke(hub.app, arguments)
+    assert ended.exit_code == 2
+    assert said in ended.stderr.splitlines()[-1]
+    assert ended.stdout == ""
 
 
 async def test_a_hub_with_tokens_on_another_address(tmp_path: Path) -> None:
@@ -53,60 +47,55 @@ async def test_a_hub_with_tokens_on_another_address(tmp_path: Path) -> None:
     tokens.write_text(TOKEN + "\n")
     tokens.chmod(0o600)
     options = ("--insecure", "--port", "0", "--ros-version", "2", "--token-file", str(tokens))
-    hub = await asyncio.create_subprocess_exec(
-        *HUB, "--host", EVERYWHERE, *options, stderr=asyncio.subprocess.PIPE
+    process = await asyncio.create_subprocess_exec(
+        *own_command("hub"), "--host", EVERYWHERE, *options, stderr=asyncio.subprocess.PIPE
     )
     try:
-        assert hub.stderr is not None
-        line = (await asyncio.wait_for(hub.stderr.readline(), PATIENCE)).decode()
+        assert process.stderr is not None
+        line = (await asyncio.wait_for(process.stderr.readline(), PATIENCE)).decode()
         uri = line.split()[-1].replace(EVERYWHERE, "127.0.0.1")
         async with connect(uri, additional_headers={"Authorization": f"Bearer {TOKEN}"}) as socket:
             await socket.send(json.dumps({"op": "call_service", "service": "/rosapi/get_ros_version"}))
             answer = json.loads(await asyncio.wait_for(socket.recv(), PATIENCE))
             assert answer["values"]["version"] == 2
-        hub.terminate()
-        said = line + (await asyncio.wait_for(hub.stderr.read(), PATIENCE)).decode()
+        process.terminate()
+        said = line + (await asyncio.wait_for(process.stderr.read(), PATIENCE)).decode()
         assert TOKEN not in said
-        assert await hub.wait() == 143
+        assert await process.wait() == 143
     finally:
-        if hub.returncode is None:
-            hub.kill()
-            await hub.wait()
+        if process.returncode is None:
+            process.kill()
+            await process.wait()
 
 
-def _discover(robots: str, *arguments: str) -> subprocess.CompletedProcess[str]:
-    """The command with these robots on its network."""
-    code = f"""
-import sys
-import bridge.discovery
-from bridge.discovery import Robot
-async def found(timeout):
-    return {robots}
-bridge.discovery.discover = found
-sys.argv = ["discover", *{arguments!r}]
-from services.commands.discover import app
-app()
-"""
-    return _run(sys.executable, "-c", code)
+@pytest.fixture
+def discovered(monkeypatch: pytest.MonkeyPatch) -> list[Robot]:
+    """The robots on the network."""
+    robots: list[Robot] = []
+
+    async def found(_timeout: float) -> list[Robot]:
+        return robots
+
+    monkeypatch.setattr("bridge.discovery.discover", found)
+    return robots
 
 
-def test_discover_lists_robots() -> None:
-    robots = (
-        "[Robot('Mr. [bold]', 'ws://192.0.2.7:9090', 1), Robot('Zoë', 'wss://zoe.local:9090', None, True)]"
-    )
-    done = _discover(robots)
-    assert done.returncode == 0
+def test_discover_lists_robots(discovered: list[Robot]) -> None:
+    discovered.append(Robot("Mr. [bold]", "ws://192.0.2.7:9090", 1))
+    discovered.append(Robot("Zoë", "wss://zoe.local:9090", None, token=True))
+    listed = invoke(discover.app, [])
+    assert listed.exit_code == 0
     for shown in ("[bold]", "ws://192.0.2.7:9090", "Zoë", "wanted", "?"):
-        assert shown in done.stdout
-    lines = [json.loads(line) for line in _discover(robots, "--json").stdout.splitlines()]
+        assert shown in listed.stdout
+    lines = [json.loads(line) for line in invoke(discover.app, ["--json"]).stdout.splitlines()]
     assert lines[1] == {"name": "Zoë", "uri": "wss://zoe.local:9090", "ros_version": None, "token": True}
 
 
+@pytest.mark.usefixtures("discovered")
 def test_a_network_without_robots_is_one_sentence() -> None:
-    done = _discover("[]", "--timeout", "0.2", "--json")
-    assert done.returncode == 3
-    assert done.stdout == ""
-    assert "within 0.2 s" in done.stderr
+    ended = invoke(discover.app, ["--timeout", "0.2", "--json"])
+    assert (ended.exit_code, ended.stdout) == (3, "")
+    assert "within 0.2 s" in ended.stderr
 
 
 async def test_a_robots_name_stands_for_its_uri(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -20,7 +20,7 @@ from terminal.logs import get_logger
 
 LATE = """
 import socket, sys, time
-time.sleep(2)
+time.sleep(1)
 with socket.socket(socket.AF_UNIX) as listener:
     listener.bind(sys.argv[1])
     listener.listen()

@@ -34,12 +34,16 @@ def start(tmp_path):
         process.communicate()
 
 
-def test_several_say_once_that_they_are_there_and_that_one_is_back(start, tmp_path):
+def test_several_keep_their_places_and_say_once_that_they_are_there_and_that_one_is_back(start, tmp_path):
     boards = start("--boards", "3", "--directory", str(tmp_path))
     assert (
         boards.stderr.readline()
         == f"3 boards listen at unix:{tmp_path}/board0.sock ... unix:{tmp_path}/board2.sock\n"
     )
+    second = start("--boards", "2", "--directory", str(tmp_path))
+    _, refused = second.communicate(timeout=120)
+    assert (second.returncode, refused.count("\n"), refused[:7]) == (2, 1, "error: ")
+    assert len(list(tmp_path.glob("*.sock"))) == 6  # those of the first are left alone
     children = psutil.Process(boards.pid).children()
     assert len(children) == 3
     children[1].kill()

@@ -1,23 +1,14 @@
 """Replicas and readings for each line: rows of addresses in, posteriors one after the other out."""
 
-import json
-
 import numpy as np
-import orjson
 import pytest
 
 from machines.bm1 import StopReason
 from machines.parameters import SensorMode
 from pcie_shim.errors import FrameInputError
-from pcie_shim.host.frame import BoardResult
-from posteriors.frame_report import read_frame_report, write_frame_report
-from posteriors.posterior import posterior_layout, read_posterior
 from services.errors import VariableError
-from services.output.posterior_picture import axes_of
-from services.pipeline.driver_frames import encode_boards, machine_inputs
+from services.pipeline.driver_frames import machine_inputs
 from services.pipeline.frames import FrameAssembler
-from services.pipeline.inference import Inference, report_of
-from services.sockets.records import FrameResult, Publish
 from toolchain.building.build import assemble
 from toolchain.building.options import BuildOptions
 from toolchain.models.model import Known, Model, PriorSelect, dimension
@@ -56,10 +47,20 @@ def test_a_written_prior_is_for_all_replicas_or_each():
         assert np.frombuffer(reading.prior_codes, "<u2").tolist() == codes
 
 
-@pytest.mark.parametrize("message", [{"K": [0] * 5, "P": [0, 0, 0]}, {"K": [0] * 6, "P": [0, 0]}])
-def test_an_array_of_another_length_is_refused(message):
+WRITTEN = {"written": True, "replicas": 2, "prior_mode": "written", "prior_path": "belief"}
+
+
+@pytest.mark.parametrize(
+    ("of", "message"),
+    [
+        (CELLS, {"K": [0] * 5, "P": [0, 0, 0]}),
+        (CELLS, {"K": [0] * 6, "P": [0, 0]}),
+        (deployment(**WRITTEN), {"K": [0, 1], "belief": [1, 2, 3]}),
+    ],
+)
+def test_an_array_of_another_length_is_refused(of, message):
     with pytest.raises(VariableError):
-        FrameAssembler(CELLS).take(0, message, 5, 6)
+        FrameAssembler(of).take(0, message, 5, 6)
 
 
 @pytest.mark.parametrize(
@@ -92,47 +93,7 @@ def test_rows_that_do_not_fit_are_refused(addresses):
         machine_inputs(CELLS, addresses)
 
 
-def result(*boards) -> FrameResult:
-    return FrameResult(7, encode_boards(boards), 1, 2, 3, 4)
-
-
-def board(counts, cycles, reasons) -> BoardResult:
-    words = np.array(counts, "<u4").tobytes()
-    return BoardResult(words, max(cycles), reasons[0], tuple(cycles), tuple(reasons))
-
-
 OVERFLOW, SLICE, IMPOSSIBLE = StopReason.OVERFLOW, StopReason.SLICE, StopReason.IMPOSSIBLE
-
-
-def test_posteriors_are_normalised_over_boards_and_by_replica():
-    # lines 0 and 1 on one board, line 2 on another; the last replica has no posterior
-    counted = result(
-        board([[10, 30], [4, 4], [0, 0]], [100, 8, 0], [OVERFLOW, OVERFLOW, IMPOSSIBLE]),
-        board([[100], [8], [0]], [1000, 16, 0], [SLICE, SLICE, IMPOSSIBLE]),
-    )
-    inferred = Inference(counted)
-    assert inferred.posterior == pytest.approx([0.2, 0.6, 0.2, 1 / 3, 1 / 3, 1 / 3, 0, 0, 0])
-    assert (inferred.totals, inferred.best) == ([48, 108], 1)
-    nothing = Inference(result(board([[0], [0]], [0, 0], [IMPOSSIBLE] * 2)))
-    assert (nothing.posterior, nothing.best, nothing.totals) == (None, -1, [0])
-
-
-def test_a_published_frame_is_read_back():
-    counted = result(board([[1, 3], [0, 0], [2, 2]], [100, 0, 40], [OVERFLOW, IMPOSSIBLE, SLICE]))
-    inferred = Inference(counted)
-    message = {"layout": posterior_layout(CELLS), "data": inferred.posterior.tolist()}
-    assert message["layout"]["dim"] == [
-        {"label": "replica", "size": 3, "stride": 6},
-        {"label": "s", "size": 2, "stride": 2},
-    ]
-    posterior = read_posterior(message, 0)
-    assert posterior.values.tolist() == [[0.25, 0.75], [0, 0], [0.5, 0.5]]
-    assert [axis.label for axis in axes_of(posterior, CELLS)] == ["replica", "s"]
-    publish = Publish(counted, 1, 2, 3, 4, 5)
-    said = write_frame_report(report_of(publish, inferred, CELLS, 0, now=(10, 9), previous_out_ns=0), 2)
-    (of_board,) = read_frame_report(json.loads(orjson.dumps(said)), 0).boards
-    assert of_board.replica_cycles == (100, 0, 40)
-    assert of_board.replica_stopped == ("overflow", "impossible", "slice")
 
 
 @pytest.mark.parametrize("value", [None, [], [[], []]])

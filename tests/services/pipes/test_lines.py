@@ -2,19 +2,20 @@
 
 import json
 import os
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+from services.commands import master, subscriber
 from services.errors import InputLineError
 from services.pipeline.inference import Inference
 from services.pipes import lines
 from services.pipes.pcie_app import reading_from_line
 from services.pipes.publisher import result_from_line
+from tests.command_runner import invoke
 
-BIN = Path(sys.executable).parent
+BOAT = Path(__file__).parents[3] / "casestudies" / "boat"
 
 
 def test_a_reading():
@@ -78,55 +79,19 @@ def test_a_line_that_is_not_a_result_is_refused(line, count, replicas):
         result_from_line(line.encode(), 3, count, replicas)
 
 
-@pytest.fixture(scope="module")
-def deployment(tmp_path_factory):
-    where = tmp_path_factory.mktemp("deployment")
-    (where / "model.py").write_text(
-        "import numpy as np\n"
-        "from toolchain.models import Known, Model, dimension\n"
-        "def model():\n"
-        "    known = tuple(Known(name=name, table=np.full((2, 4), 0.5)) for name in 'ABC')\n"
-        "    return Model(name='tiny', searched=(dimension('s', size=4),), known=known)\n"
-    )
-    target = ("--uri", "ws://127.0.0.1:1", "--topic", "/r", "--type", "std_msgs/Float64")
-    command = [BIN / "toolchain", "build", where, "-o", where / "built", *target]
-    subprocess.run(command, check=True, capture_output=True, timeout=240)
-    return where / "built"
-
-
-def run(*command, **options):
-    return subprocess.run(
-        [BIN / command[0], *command[1:]], capture_output=True, text=True, timeout=240, check=False, **options
-    )
-
-
-def test_a_line_with_too_few_addresses_is_named(deployment, tmp_path):
-    socket = tmp_path / "b.sock"
-    board = subprocess.Popen([BIN / "board", "--listen", f"unix:{socket}"], stderr=subprocess.PIPE)
-    try:
-        assert b"listens" in board.stderr.readline()
-        lines = '{"addresses": [0, 1, 0]}\n\n{"addresses": [0, 1]}\n'
-        done = run("pcie-app", "-d", deployment, "--boards", f"unix:{socket}", input=lines)
-    finally:
-        board.kill()
-        board.communicate()
-    assert (done.returncode, done.stdout.count("\n")) == (2, 1)
-    assert done.stderr.splitlines()[-1].startswith("error: line 3 of standard input: ")
-
-
 @pytest.mark.parametrize(
-    "command",
+    ("command", "flags"),
     [
-        ("subscriber", "--topic", "/t"),
-        ("subscriber", "--variables", "A"),
-        ("master", "--once", "--connect", "/nowhere"),
+        (subscriber, ("--topic", "/t")),
+        (subscriber, ("--variables", "A")),
+        (master, ("--once", "--connect", "/nowhere")),
     ],
 )
-def test_flags_without_a_meaning_are_refused_at_once(deployment, command):
-    done = run(*command, "-d", deployment)
-    assert done.returncode == 2
-    assert done.stderr.startswith(f"error: {' '.join(command[-2:])} ")
-    assert done.stderr.count("\n") == 1
+def test_flags_without_a_meaning_are_refused_at_once(built, command, flags):
+    ended = invoke(command.app, [*flags, "-d", built])
+    assert ended.exit_code == 2
+    assert ended.stderr.startswith(f"error: {' '.join(flags[-2:])} ")
+    assert ended.stderr.count("\n") == 1
 
 
 async def test_a_line_has_a_limit_however_it_arrives(monkeypatch, tmp_path):

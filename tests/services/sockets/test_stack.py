@@ -4,7 +4,6 @@ import asyncio
 import contextlib
 import io
 import socket
-import subprocess
 import sys
 import threading
 from pathlib import Path
@@ -165,34 +164,6 @@ async def test_the_only_live_run_is_found(places):
         async with served(two, master=process()):
             with pytest.raises(SettingsError, match="2 runs"):
                 await status.find_run()
-
-
-async def test_exit_codes_and_json(places):
-    run = make_run(places, "it")
-    nothing = await asyncio.to_thread(subprocess_status, places)
-    assert (nothing.returncode, nothing.stderr.count("\n")) == (2, 1)
-    async with served(run, master=process()):
-        async with asyncio.timeout(120):
-            # on a busy machine the answer may come too late for it once
-            while (whole := await asyncio.to_thread(subprocess_status, places, "--json")).returncode == 6:
-                pass
-        assert whole.returncode == 0
-        stack = msgspec.json.decode(whole.stdout, type=status.StackStatus)
-        assert (stack.directory, stack.processes[0].name) == (str(run), "master")
-    async with served(run, master=process(is_ready=False, why="waiting")):
-        assert (await asyncio.to_thread(subprocess_status, places, "--directory", str(run))).returncode == 6
-
-
-def subprocess_status(places, *arguments):
-    environment = {"PATH": "/usr/bin:/bin", "TMPDIR": str(places)}
-    return subprocess.run(
-        [sys.executable, "-m", "services.commands.status", *arguments],
-        capture_output=True,
-        text=True,
-        env=environment,
-        timeout=240,
-        check=False,
-    )
 
 
 async def test_watching_prints_a_line_every_second_until_it_is_ended(places):
