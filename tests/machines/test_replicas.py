@@ -16,7 +16,7 @@ from machines.errors import StartError
 from machines.kernel import make_kernel
 from machines.parameters import BM1Parameters, RngKind, RngReset, SensorMode
 from machines.reference import ReferenceBM1
-from tests.machines.random_machines import LFSRS, codes, seen, sessions
+from tests.machines.random_machines import codes, sessions
 
 
 @settings(max_examples=50, deadline=None, suppress_health_check=list(HealthCheck))
@@ -140,27 +140,3 @@ def test_the_only_replica_cannot_be_halted(make):
     alone.start(Start(addresses=(0, 0), target_count=255, max_cycles=2**17, run_until=9))
     with pytest.raises(StartError):
         alone.resume(0, {0})
-
-
-@pytest.mark.parametrize("kind", LFSRS)
-def test_cells_of_their_own_address_are_rows_of_the_same_tables(kind):
-    """A cell machine whose cells all have one address is the column machine."""
-    columns = machine_of(1, rng=kind, prob_bits=6)
-    cells = replace(columns, parameters=replace(columns.parameters, sensor_mode=SensorMode.CELL))
-    thresholds = BM1Machine(
-        replace(columns.parameters, sensor_mode=SensorMode.THRESHOLD, sensor_bits=(6, 6)),
-        columns.prior,
-        (),
-    )
-    kernels = [make_kernel(machine) for machine in (columns, cells, thresholds)]
-    for one, two in ((0, 1), (3, 2), (2, 3)):
-        given = (
-            (one, two),
-            np.repeat([[one], [two]], 12, axis=1),
-            np.stack([columns.tables[0][one], columns.tables[1][two]]),
-        )
-        shown = [
-            seen(kernel, kernel.start(Start(addresses=own, target_count=60, max_cycles=9000)))
-            for kernel, own in zip(kernels, given, strict=True)
-        ]
-        assert shown[0] == shown[1] == shown[2]

@@ -2,12 +2,11 @@
 
 import contextlib
 import socket
-import stat
 from pathlib import Path
 
 import pytest
 
-from pcie_shim.endpoint import Endpoint, connect, listen, parse_endpoint, remove_listener
+from pcie_shim.endpoint import Endpoint, connect, listen, parse_endpoint
 from pcie_shim.errors import EndpointError, UnreachableError
 
 
@@ -42,16 +41,6 @@ def test_paths_that_no_socket_takes_are_refused() -> None:
     assert parse_endpoint("unix:/" + "x" * 98).programming.path
     with pytest.raises(EndpointError):
         parse_endpoint("unix:/" + "x" * 99)
-
-
-def test_a_unix_socket_is_its_owners_alone_and_goes_away(folder: Path) -> None:
-    endpoint = Endpoint(path=str(folder / "a.sock"))
-    server = listen(endpoint)
-    assert stat.S_IMODE((folder / "a.sock").stat().st_mode) == 0o600
-    with connect(endpoint, timeout=240):
-        pass
-    remove_listener(endpoint, server)
-    assert list(folder.iterdir()) == []
 
 
 def test_a_dead_processs_socket_is_replaced_and_a_served_one_is_not(folder: Path) -> None:

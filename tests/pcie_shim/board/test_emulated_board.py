@@ -192,19 +192,6 @@ def test_a_long_value_is_never_torn(board: EmulatedBoard) -> None:
 # ---- the machine ----
 
 
-def test_a_frame_gives_what_the_kernel_gives(board: EmulatedBoard) -> None:
-    start(board, 3, 9, target=20, bank=3)
-    kernel = make_kernel(MACHINE)
-    reason = kernel.start(Start(addresses=(3, 9), target_count=20, max_cycles=5000, bank=3))
-    assert status(board) == (BoardState.DONE, reason, ErrorCode.NONE)
-    assert board.read(rm.RESULTS, 8) == kernel.counts.tobytes()
-    assert read64(board, rm.CYCLES) == kernel.cycles > 0
-    assert read64(board, rm.COMPUTE_NS) > 0
-    assert read(board, rm.DONE) == read(board, rm.START) == 1
-    interrupt = board.interrupt_words()
-    assert interrupt == board.read(rm.DONE, 6) + board.read(rm.RESULTS, 8)
-
-
 @settings(max_examples=60, deadline=None)
 @given(data=st.data())
 def test_chunks_and_slices_do_not_change_a_bit(data: st.DataObject) -> None:

@@ -25,7 +25,6 @@ from pcie_shim.errors import (
     HeldError,
     ImageMismatchError,
     LinkClosedError,
-    StaleHandleError,
 )
 from pcie_shim.host.link import Done
 from pcie_shim.host.loader import program
@@ -123,44 +122,11 @@ def test_without_interrupts_the_host_reads_done(start_board: StartBoard) -> None
         assert link.take_done() is None
 
 
-def test_a_refused_access_leaves_the_link_usable(start_board: StartBoard) -> None:
-    with open_link(start_board()) as link:
-        with refused(ErrorCode.OUTSIDE):
-            link.read32(0x3FFC)
-        with refused(ErrorCode.MISALIGNED):
-            link.write32(2, 0)
-        with pytest.raises(AccessError):
-            link.write32(rm.ID, 0)
-        with refused(ErrorCode.BLANK):
-            link.write32(rm.START, 1)
-        assert link.read32(rm.STATUS) >> 8 == ErrorCode.BLANK
-        link.write32(rm.CONTROL, rm.CONTROL_RESET_MASK)
-        assert link.read32(rm.STATUS) == 0
-
-
 def test_a_refused_posted_write_is_heard_of(start_board: StartBoard) -> None:
     with open_link(start_board()) as link:
         link.post([(rm.RESULTS, words(1))])
         with refused(ErrorCode.BLANK):
             wait_done(link, 1)
-
-
-def test_a_running_board_answers_and_can_be_reset(start_board: StartBoard) -> None:
-    board = programmed(start_board, never_stopping())
-    with open_link(board) as link:
-        run_for_minutes(link)
-        with refused(ErrorCode.BUSY):
-            link.write32(rm.TARGET_COUNT, 1)
-        first = link.read_block(rm.CYCLES, 2)
-        deadline = time.monotonic() + PATIENCE
-        while link.read_block(rm.CYCLES, 2) == first:
-            assert time.monotonic() < deadline
-            time.sleep(0.02)
-        link.write32(rm.CONTROL, rm.CONTROL_RESET_MASK | ENABLE)
-        assert link.read32(rm.STATUS) == BoardState.IDLE | ErrorCode.NONE << 8
-        link.write32(rm.TARGET_COUNT, 10)
-        link.write32(rm.START, 1)
-        assert wait_done(link, 1).reason == StopReason.OVERFLOW
 
 
 # ---- one host at a time ----
@@ -288,14 +254,6 @@ def test_sockets_are_private_and_go_away_though_the_machine_runs(
     assert list(folder.iterdir()) == []
 
 
-def test_a_taken_place_is_refused_and_left_alone(start_board: StartBoard) -> None:
-    board = start_board()
-    with pytest.raises(EndpointError):
-        board_module.serve_board(board.endpoint, index=1, stop=board_module.StopSignal(), pin=False)
-    with open_link(board) as link:
-        assert link.greeting.board == 0
-
-
 def test_a_taken_programming_port_leaves_no_socket_behind(start_board: StartBoard, folder: Path) -> None:
     start_board(f"unix:{folder}/a.program.sock")
     with pytest.raises(EndpointError):
@@ -338,27 +296,6 @@ def test_the_loader_is_refused_while_a_host_holds_the_board(start_board: StartBo
             program(board.endpoint, image(machine(2)))
         assert link.read32(rm.PROGRAMMED) == 1
     assert program(board.endpoint, image(machine(2))) == image(machine(2)).image_hash
-
-
-def test_a_handle_open_across_a_reprogramming_is_stale(start_board: StartBoard) -> None:
-    board = programmed(start_board, MACHINE)
-    link = open_link(board)
-    program(board.endpoint, image(machine(2)), token=link.greeting.token)
-    with pytest.raises(StaleHandleError):
-        link.read32(rm.ID)
-    with pytest.raises(LinkClosedError):
-        link.read32(rm.ID)
-    with open_link(board) as link:
-        assert link.read32(rm.CAP_LINES) == 8
-
-
-def test_a_running_board_is_not_programmed_even_by_its_host(start_board: StartBoard) -> None:
-    board = programmed(start_board, never_stopping())
-    with open_link(board) as link:
-        run_for_minutes(link)
-        with refused(ErrorCode.BUSY):
-            program(board.endpoint, image(MACHINE), token=link.greeting.token)
-        assert link.read32(rm.STATUS) & 15 == BoardState.RUNNING
 
 
 def test_one_loader_at_a_time(start_board: StartBoard) -> None:

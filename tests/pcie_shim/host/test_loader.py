@@ -22,12 +22,6 @@ from tests.pcie_shim.boards import BoardProcess, image, machine
 StartBoard = Callable[..., BoardProcess]
 
 
-def test_a_file_is_loaded_by_its_path(start_board: StartBoard, folder: Path) -> None:
-    board = start_board()
-    (folder / "board0.bm").write_bytes(image_bytes(image(machine(1))))
-    assert program(board.endpoint, folder / "board0.bm") == image(machine(1)).image_hash
-
-
 def test_a_damaged_or_missing_file_is_refused_before_the_board_is_touched(folder: Path) -> None:
     nowhere = f"unix:{folder}/nobody.sock"
     path = folder / "board0.bm"
