@@ -37,14 +37,6 @@ def test_a_point_is_at_most_half_a_cell_from_its_cells_centre(grid, data):
     assert abs(centre_y - y) <= grid.cell_height / 2 * (1 + 1e-9)
 
 
-@given(grids(), st.data())
-def test_the_mean_of_a_certain_cell_is_its_centre(grid, data):
-    line = data.draw(st.integers(0, grid.cells - 1))
-    posterior = [0.0] * grid.cells
-    posterior[line] = 0.25
-    assert grid.mean(posterior) == pytest.approx(grid.centre(line))
-
-
 def test_lines_are_row_major_from_the_lower_left_corner():
     assert BOAT.line(-49.9, -49.9) == 0
     assert BOAT.line(49.9, -49.9) == 31

@@ -72,10 +72,6 @@ def test_the_next_frame_ends_the_waiting():
     assert truths.flush() == []
 
 
-def test_without_truths_nothing_is_waited_for():
-    assert told(Truths().add_frame(frame(1))) == [(1, None)]
-
-
 def test_a_result_without_a_report_has_no_truth():
     truths = Truths()
     truths.add_truth(truth(1))

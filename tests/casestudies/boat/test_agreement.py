@@ -7,15 +7,11 @@ import numpy as np
 import pytest
 
 from casestudies.boat.correctness import correctness
-from casestudies.boat.geometry import SENSOR_NAMES, map_grid
+from casestudies.boat.geometry import map_grid
 from casestudies.boat.model import model
 from casestudies.boat.normaliser import normalise
 from casestudies.boat.simulator import Boat
 from toolchain.models.fusion import exact_posterior
-
-
-def test_the_columns_are_in_the_order_of_the_sensors():
-    assert tuple(known.name for known in model().known) == SENSOR_NAMES
 
 
 @pytest.mark.parametrize("seed", [1, 2])

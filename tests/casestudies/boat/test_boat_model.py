@@ -11,9 +11,7 @@ from casestudies.boat.geometry import BEACONS, SENSOR_NAMES, bearing, distance, 
 from casestudies.boat.model import model
 from machines.parameters import BM1Parameters
 from toolchain.building.quantise import quantise
-from toolchain.deployment.address import to_address
 from toolchain.errors import ModelError
-from toolchain.models.fusion import exact_posterior
 
 BOAT = model()
 GRID = map_grid()
@@ -62,11 +60,6 @@ def test_a_bearing_is_the_wrapped_gaussian_over_its_degree(line, beacon, reading
     assert BOAT.known[3 + beacon].table[reading, line] == pytest.approx(expected, abs=1e-12)
 
 
-def test_every_line_is_a_distribution():
-    for known in BOAT.known:
-        assert known.table.sum(axis=0) == pytest.approx(np.ones(1024), abs=1e-12)
-
-
 @pytest.mark.parametrize(
     ("width", "height", "distance_step", "bearing_step"), [(64, 64, 1, 1), (8, 4, 7, 45), (1, 1, 100, 360)]
 )
@@ -95,31 +88,11 @@ def test_sizes_that_do_not_fit(wrong):
         model(**wrong)
 
 
-@pytest.mark.parametrize(
-    ("name", "value", "address"),
-    [("D1", 100, 100), ("D1", 141.4, 100), ("D1", -3, 0), ("B1", 359, 359), ("B1", 360, 0), ("B1", -90, 270)],
-)
-def test_readings_clamp_and_wrap(name, value, address):
-    variable = BOAT.known[SENSOR_NAMES.index(name)].as_variable()
-    assert to_address(variable, value) == address
-
-
 def test_an_array_of_readings_has_paths_and_the_same_tables():
     array = model(4, 4, array=True)
     assert [known.as_variable().path for known in array.known] == [f"data[{place}]" for place in range(6)]
     assert [known.as_variable().path for known in model(4, 4).known] == [""] * 6
     assert np.array_equal(array.known[0].table, model(4, 4).known[0].table)
-
-
-@given(LINES)
-def test_exact_readings_point_at_their_cell(line):
-    x, y = GRID.centre(line)
-    readings = [to_address(BOAT.known[i].as_variable(), distance(x, y, BEACONS[i])) for i in range(3)]
-    readings += [to_address(BOAT.known[3 + i].as_variable(), bearing(x, y, BEACONS[i])) for i in range(3)]
-    posterior = exact_posterior(BOAT, readings)
-    mean = posterior @ np.array([GRID.centre(each) for each in range(GRID.cells)])
-    if max(distance(x, y, beacon) for beacon in BEACONS) <= 100:
-        assert math.dist(mean, (x, y)) < 10
 
 
 def test_codes_keep_the_missing_address_and_lose_little():

@@ -1,15 +1,14 @@
 """From raw readings to whole numbers in the ranges of the machine's columns."""
 
 import math
-import subprocess
-import sys
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from casestudies.boat.messages import BadReadingError, read_raw, readings_message
-from casestudies.boat.normaliser import normalise, normalise_bearing, normalise_distance
+from casestudies.boat.normaliser import app, normalise, normalise_bearing, normalise_distance
+from tests.command_runner import invoke
 
 HEAD = {"stamp": {"secs": 5, "nsecs": 6}, "frame_id": "map", "seq": 3}
 RAW = {"D1": 1.5, "D2": -3, "D3": 170.0, "B1": 0.0, "B2": math.pi, "B3": -math.pi / 2}
@@ -76,13 +75,8 @@ def test_an_array_needs_six_numbers(data):
 
 
 def test_the_message_types_can_be_printed():
-    done = subprocess.run(
-        [sys.executable, "-m", "casestudies.boat.normaliser", "--print-msg"],
-        capture_output=True,
-        text=True,
-        check=True,
-        timeout=240,
-    )
-    assert "# boat_msgs/Sensors" in done.stdout
-    assert "uint16 B3" in done.stdout
-    assert not done.stderr
+    ended = invoke(app, ["--print-msg"])
+    assert ended.exit_code == 0
+    assert "# boat_msgs/Sensors" in ended.stdout
+    assert "uint16 B3" in ended.stdout
+    assert not ended.stderr

@@ -99,28 +99,13 @@ def test_bearings_on_both_sides_of_where_a_turn_ends(data, tmp_path):
 @pytest.mark.parametrize(
     ("file", "old", "new", "place"),
     [
-        (
-            "Barcodes.dat",
-            "# Subject",
-            "Subject",
-            "Barcodes.dat, line 1",
-        ),
+        ("Barcodes.dat", "# Subject", "Subject", "Barcodes.dat, line 1"),
         ("Barcodes.dat", "    1 ", "   21 ", "line 2"),
         ("Landmark_Groundtruth.dat", "6   5", "5   5", "line 2"),
         ("Robot3_Groundtruth.dat", "3.00000000\n", "nan\n", "line 2"),
-        (
-            "Robot3_Groundtruth.dat",
-            f"{T0:.3f}",
-            f"{T0 + 9:.3f}",
-            "Robot3_Groundtruth.dat",
-        ),
+        ("Robot3_Groundtruth.dat", f"{T0:.3f}", f"{T0 + 9:.3f}", "Robot3_Groundtruth.dat"),
         ("Robot3_Measurement.dat", None, None, "Robot3_Measurement.dat"),
-        (
-            "Barcodes.dat",
-            None,
-            None,
-            "Barcodes.dat",
-        ),
+        ("Barcodes.dat", None, None, "Barcodes.dat"),
     ],
 )
 def test_what_is_damaged_is_named(data, tmp_path, file, old, new, place):

@@ -94,12 +94,6 @@ def test_bins_and_codes_are_as_accurate_as_raw_float64(robot, codes, outlier):
     assert np.median(coded) < 1.15 * np.median(raw)
 
 
-def test_one_wild_reading_leaves_no_line_impossible(robot, codes):
-    for known, table in zip(robot.known, codes, strict=True):
-        assert (table[: known.values] > 0).all()
-    assert not quantise(robot).warnings
-
-
 def test_a_floor_that_codes_cannot_hold_is_said(path):
     warnings = quantise(model(path, floor=1e-3)).warnings
     assert len(warnings) == 2 * len(LANDMARKS)
@@ -131,16 +125,6 @@ def test_unquantised_fusion_is_density_and_floor_at_the_centres(x, y, range_m, b
         expected.append(product)
     if sum(expected) > 1e-200:
         assert found == pytest.approx(np.array(expected) / sum(expected), rel=1e-6, abs=1e-12)
-
-
-def test_bearings_of_any_turn_and_ranges_beyond_the_last(robot):
-    bearing = robot.known[1].as_variable()
-    assert to_address(bearing, -math.pi) == to_address(bearing, math.pi)
-    assert to_address(bearing, 0.5) == to_address(bearing, 0.5 + 4 * math.pi)
-    distance = robot.known[0].as_variable()
-    assert to_address(distance, 40.0) == robot.known[0].values - 1
-    assert to_address(distance, None) is None
-    assert to_address(distance, math.nan) is None
 
 
 def test_the_command_lines_settings_reach_it(path):

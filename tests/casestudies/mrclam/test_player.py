@@ -11,11 +11,12 @@ import sys
 import pytest
 
 from bridge.errors import BridgeError
-from casestudies.mrclam.player import LOST_DISTANCE, PlayedFrame, median_distance, play
+from casestudies.mrclam.player import LOST_DISTANCE, PlayedFrame, app, median_distance, play
 from casestudies.mrclam.recording import SIGHTINGS_TOPIC, RecordedFrame, Sighting, area_grid
 from posteriors.errors import BadResultError, NoResultError
 from posteriors.posterior import Posterior
 from tests.casestudies.pretend_stack import PretendStack, certain
+from tests.command_runner import invoke
 from tests.fake_rosbridge import FakeRosbridge
 
 GRID = area_grid()
@@ -35,15 +36,7 @@ def right(_number, message):
     return certain(int(message["range_6"]))
 
 
-async def test_every_frame_gets_its_own_result():
-    async with FakeRosbridge() as fake, PretendStack(fake, SIGHTINGS_TOPIC, right):
-        played = await play(fake.uri, FRAMES)
-    assert [one.frame for one in played] == FRAMES
-    assert [one.distance() for one in played] == pytest.approx([0.0] * 8, abs=1e-9)
-    assert [one.cycles for one in played] == list(range(801, 809))
-
-
-async def test_the_next_frame_waits_for_the_result():
+async def test_every_frame_gets_its_own_result_and_the_next_one_waits_for_it():
     """The pretend master looks at the server when it answers: no reading is ahead of it."""
     ahead = []
 
@@ -52,8 +45,11 @@ async def test_the_next_frame_waits_for_the_result():
         return right(number, message)
 
     async with FakeRosbridge() as fake, PretendStack(fake, SIGHTINGS_TOPIC, answer):
-        await play(fake.uri, FRAMES)
+        played = await play(fake.uri, FRAMES)
     assert ahead == [0] * 8
+    assert [one.frame for one in played] == FRAMES
+    assert [one.distance() for one in played] == pytest.approx([0.0] * 8, abs=1e-9)
+    assert [one.cycles for one in played] == list(range(801, 809))
 
 
 async def test_a_lost_and_an_impossible_frame_have_no_result_and_the_rest_goes_on():
@@ -131,44 +127,37 @@ def test_a_posterior_of_something_else():
         PlayedFrame(frame=FRAMES[0], posterior=result, cycles=1, outcome="").estimate()
 
 
-class TestCommand:
-    def recording(self, tmp_path):
-        path = tmp_path / "robot.csv"
-        lines = ["time_s,ref_x_m,ref_y_m,ref_std_m,heading_rad,range_6_m,bearing_6_rad"]
-        lines += [f"{f.number},{f.x!r},{f.y!r},0.04,0.1,{f.sightings[0].range_m},0.5" for f in FRAMES]
-        path.write_text("\n".join(lines) + "\n")
-        return path
+async def test_the_command_prints_a_line_a_frame_and_a_sum(tmp_path):
+    path = tmp_path / "robot.csv"
+    lines = ["time_s,ref_x_m,ref_y_m,ref_std_m,heading_rad,range_6_m,bearing_6_rad"]
+    lines += [f"{f.number},{f.x!r},{f.y!r},0.04,0.1,{f.sightings[0].range_m},0.5" for f in FRAMES]
+    path.write_text("\n".join(lines) + "\n")
 
-    async def run(self, *arguments):
+    def answer(number, message):
+        return None if number == 2 else right(number, message)
+
+    async with FakeRosbridge() as fake, PretendStack(fake, SIGHTINGS_TOPIC, answer):
         process = await asyncio.create_subprocess_exec(
-            *(sys.executable, "-m", "casestudies.mrclam.player", *arguments),
+            *(sys.executable, "-m", "casestudies.mrclam.player", str(path), "--uri", fake.uri),
+            *("--json", str(tmp_path / "n.json")),
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
         )
         async with asyncio.timeout(60):
             out, err = await process.communicate()
-        return process.returncode, out.decode(), err.decode()
+    assert process.returncode == 0, err.decode()
+    lines = out.decode().splitlines()
+    assert len(lines) == 10
+    assert "no posterior: impossible on every board" in lines[2]
+    assert lines[-1].startswith("8 frames, 1 without a result, median distance 0.000 m")
+    numbers = json.loads((tmp_path / "n.json").read_text())
+    assert numbers["without_result"] == 1
+    assert numbers["distances_m"][1] == LOST_DISTANCE
 
-    async def test_a_line_a_frame_and_a_sum(self, tmp_path):
-        def answer(number, message):
-            return None if number == 2 else right(number, message)
 
-        async with FakeRosbridge() as fake, PretendStack(fake, SIGHTINGS_TOPIC, answer):
-            code, out, err = await self.run(
-                str(self.recording(tmp_path)), "--uri", fake.uri, "--json", str(tmp_path / "n.json")
-            )
-        assert code == 0, err
-        lines = out.splitlines()
-        assert len(lines) == 10
-        assert "no posterior: impossible on every board" in lines[2]
-        assert lines[-1].startswith("8 frames, 1 without a result, median distance 0.000 m")
-        numbers = json.loads((tmp_path / "n.json").read_text())
-        assert numbers["without_result"] == 1
-        assert numbers["distances_m"][1] == LOST_DISTANCE
-
-    async def test_a_wrong_file_is_one_sentence(self, tmp_path):
-        code, out, err = await self.run(str(tmp_path / "none.csv"))
-        assert (code, out) == (2, "")
-        assert err.startswith("error: ")
-        assert "none.csv" in err
-        assert len(err.splitlines()) == 1
+def test_a_wrong_file_is_one_sentence(tmp_path):
+    ended = invoke(app, [tmp_path / "none.csv"])
+    assert (ended.exit_code, ended.stdout) == (2, "")
+    assert ended.stderr.startswith("error: ")
+    assert "none.csv" in ended.stderr
+    assert ended.stderr.count("\n") == 1

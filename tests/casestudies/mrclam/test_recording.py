@@ -5,7 +5,6 @@ import pytest
 from casestudies.errors import DataFileError
 from casestudies.mrclam.model import X_LIMITS, Y_LIMITS
 from casestudies.mrclam.recording import (
-    SIGHTINGS_MSG,
     RecordedFrame,
     Sighting,
     area_grid,
@@ -87,8 +86,3 @@ def test_the_area_is_the_models():
     assert ((grid.x_low, grid.x_high), (grid.y_low, grid.y_high)) == (X_LIMITS, Y_LIMITS)
     assert grid.centre(0) == pytest.approx((-2 + 9 / 64, -7 + 14 / 64))
     assert grid.cells == 1024
-
-
-def test_the_message_type_has_thirty_fields():
-    assert SIGHTINGS_MSG.count("float64") == 30
-    assert "float64 bearing_20\n" in SIGHTINGS_MSG
