@@ -27,11 +27,11 @@ app()
 """
 
 
-def end_of(body, *, stdout=subprocess.DEVNULL):
+def end_of(body, *arguments, stdout=subprocess.DEVNULL):
     """Run a command with this body; return its exit code and what it wrote to standard error."""
     code = PROGRAM.replace("{body}", body.strip().replace("\n", "\n    "))
     ended = subprocess.run(
-        [sys.executable, "-W", "error", "-c", code],
+        [sys.executable, "-W", "error", "-c", code, *arguments],
         check=False,
         stdout=stdout,
         stderr=subprocess.PIPE,
@@ -74,10 +74,13 @@ def test_a_dropped_signal_counts_at_the_end_of_a_command():
     assert end_of(body)[0] == ExitCode.INTERRUPTED
 
 
-@pytest.mark.parametrize("printed", ["print(1)", "print(1, flush=True)", "put_json(1)", "Console().print(1)"])
-def test_a_full_disk_behind_standard_output_is_one_sentence(printed):
+@pytest.mark.parametrize(
+    "command",
+    [["print(1)"], ["print(1, flush=True)"], ["put_json(1)"], ["Console().print(1)"], ["pass", "--help"]],
+)
+def test_a_full_disk_behind_standard_output_is_one_sentence(command):
     with Path("/dev/full").open("w") as full:
-        code, lines = end_of(printed, stdout=full)
+        code, lines = end_of(*command, stdout=full)
     assert (code, len(lines)) == (ExitCode.USAGE, 1)
 
 

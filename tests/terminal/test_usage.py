@@ -1,9 +1,7 @@
 """Mistakes in a command line: one sentence that says what, where, what was expected, and where to read on."""
 
-import subprocess
 import sys
 from enum import StrEnum
-from pathlib import Path
 from typing import Annotated
 
 import pytest
@@ -100,24 +98,3 @@ def test_no_command_is_answered_with_help():
     assert code == 2
     assert "paint" in out + err
     assert "error" not in out + err
-
-
-@pytest.mark.parametrize("arguments", [["--help"], ["paint", "shed"]])
-def test_a_full_disk_behind_the_output_is_one_sentence(arguments):
-    program = (
-        "from terminal.command_line import CommandLine\n"
-        "app = CommandLine()\n"
-        "app.callback()(lambda: None)\n"
-        "app.command('paint')(lambda wall: print('painted', wall))\n"
-        "app()"
-    )
-    with Path("/dev/full").open("w") as full:
-        done = subprocess.run(
-            [sys.executable, "-c", program, *arguments],
-            stdout=full,
-            stderr=subprocess.PIPE,
-            text=True,
-            timeout=120,
-            check=False,
-        )
-    assert (done.returncode, done.stderr.count("\n")) == (2, 1)

@@ -176,7 +176,6 @@ def _live(seed: int, steps: int) -> None:
         elif step == "reconnect":
             visitor.peer.disconnect()
             visitors[who] = _Visitor(hub)
-        hub.check()
         ready = hub.broker.take_ready()
         assert len(set(ready)) == len(ready)
     _end(hub, visitors)

@@ -105,6 +105,7 @@ def test_a_flood_of_nonsense_does_not_flood_the_log(caplog: pytest.LogCaptureFix
 _JSON = st.recursive(
     st.one_of(st.none(), st.booleans(), st.integers(), st.floats(), st.text()),
     lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner),
+    max_leaves=6,
 )
 _KNOWN_FIELDS = st.fixed_dictionaries(
     {"op": st.sampled_from(sorted(Harness().broker._operations))},

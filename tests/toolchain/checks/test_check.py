@@ -87,7 +87,7 @@ def test_the_machine_bears_it_out(sparse, scale, data):
 
     def run(*addresses):
         """Counts over all boards, and whether no board had anything to count."""
-        start = Start(addresses=addresses, target_count=200, max_cycles=2000)
+        start = Start(addresses=addresses, target_count=50, max_cycles=500)
         reasons = {kernel.start(start) for kernel in kernels}
         return np.concatenate([kernel.counts for kernel in kernels]), reasons == {StopReason.IMPOSSIBLE}
 
