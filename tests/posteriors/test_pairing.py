@@ -32,12 +32,6 @@ def pairs(frames):
     return [(each.number, each.probabilities[0] if isinstance(each, Posterior) else None) for each in frames]
 
 
-def test_a_result_goes_to_the_frame_before_it():
-    pairing = Pairing()
-    assert pairing.add_report(report(1, 10)) == []
-    assert pairs(pairing.add_posterior(result(1, 11))) == [(1, 1)]
-
-
 @given(st.integers(0, 2**32 - 1), st.integers(1, 12), st.sets(st.integers(1, 12)))
 def test_the_order_across_topics_does_not_matter(seed, frames, without):
     """Any interleaving of the two topics gives the same pairs, each once."""
@@ -82,13 +76,6 @@ def test_a_server_that_swaps_a_report_and_its_result():
     pairing.add_report(report(5, 50))
     assert pairs(pairing.add_posterior(result(5, 55))) == [(5, 5)]
     assert pairing.announced_only == 1
-
-
-def test_results_without_any_report_come_out_at_the_end():
-    pairing = Pairing()
-    pairing.add_posterior(result(1, 11))
-    assert pairs(pairing.flush()) == [(None, 1)]
-    assert pairing.flush() == []
 
 
 def test_memory_is_bounded_where_only_one_topic_speaks():

@@ -165,18 +165,6 @@ def test_a_wrong_target_is_refused_before_the_model_is_read(case, option, value)
     assert_refused(result, f"error: {option}: ")
 
 
-def test_a_question_is_a_model_too(case):
-    (case / "model.py").write_text(
-        "from toolchain.models.distribution import uniform\n"
-        "from toolchain.models.joint import JointDistribution\n"
-        "from toolchain.models.symbol import IntegerType, Symbol\n"
-        "def model():\n"
-        "    return JointDistribution('q', (uniform(Symbol('s', IntegerType(1, 6))),)).ask(['s'])\n"
-    )
-    assert build(case).exit_code == 0
-    assert load_deployment(case.parent / "out").searched[0].value(0) == 1
-
-
 @pytest.mark.parametrize("missing", ["--uri", "--topic", "--type"])
 def test_a_target_with_a_part_missing(case, missing):
     at = TARGET.index(missing)

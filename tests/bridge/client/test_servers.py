@@ -103,3 +103,4 @@ async def test_no_operation_of_the_client_makes_a_server_deaf(double):
             await ros.call("/nothing", timeout=PATIENCE)
         assert not any(client.dead for client in double._clients)
         assert all(received.op is not None for received in double.received)
+        assert double.ops("fragment"), "what is larger than its fragments leaves in them"

@@ -240,7 +240,7 @@ async def test_a_delayed_hub_closes_no_client() -> None:
         def sweep(self, now: float) -> None:
             swept.append(now)
 
-    hub = server._Hub(HubLimits(), AccessPolicy(), 1)
+    hub = server._Hub(HubLimits(), AccessPolicy(), 1, loopback=True)
     hub.connections.add(Connection())  # type: ignore[arg-type]  # a double with the one method that is called
     hub._swept -= 10
     hub.sweep()
