@@ -1,5 +1,5 @@
-"""rosbridge without ROS: protocol core, asyncio client, finding fields in messages, embedded server.
+"""rosbridge without ROS: protocol core, asyncio client, field lookup in messages, embedded server.
 
 Start at `bridge.client` (`connect`: topics, services and actions), `posteriors.listening` (`listen`: results in one call) or
-`bridge.hub.server` (`serve_hub`: a server for programs and tests). `bridge.errors` has what can go wrong, under one root.
+`bridge.hub.server` (`serve_hub`: a server for programs and tests). `bridge.errors` contains all errors.
 """

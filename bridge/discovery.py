@@ -1,8 +1,8 @@
 """Discovery of rosbridge servers on the local network by multicast DNS, as in Bonjour and Avahi.
 
-A server announces itself as an instance of the service `_rosbridge._tcp.local.`, under the robot's name. Its
-properties are `path` of the URL, `tls`, `token` and `ros` (1 or 2). All of them are optional, so that a line in Avahi's
-configuration suffices to announce any rosbridge server.
+A server announces itself as an instance of the service `_rosbridge._tcp.local.`, under the name of the robot.
+Its properties are `path` of the URL, `tls`, `token` and `ros` (1 or 2). All are optional, so a line in the
+configuration of Avahi is sufficient to announce a rosbridge server.
 
 `zeroconf` is an extra (`pip install zeroconf`), imported when one of these functions is called.
 Data from the network is not trusted: it is bounded and printable.
@@ -28,9 +28,9 @@ if TYPE_CHECKING:
 
 SERVICE_TYPE: Final = "_rosbridge._tcp.local."
 MAX_ROBOTS: Final = 256
-"""Limit of robots listed."""
+"""Maximum number of listed robots."""
 _LONGEST_NAME: Final = 63
-"""Longest name in bytes (RFC 6763, section 4.1.1)."""
+"""Maximum length of a name in bytes (RFC 6763, section 4.1.1)."""
 _PATH: Final = re.compile(r"/[A-Za-z0-9._~/-]{0,200}")
 _HOST: Final = re.compile(r"[A-Za-z0-9.-]{1,253}")
 _LAST_PORT: Final = 65535
@@ -45,7 +45,7 @@ class DiscoveryError(BridgeError):
 
 
 class UnknownRobotError(BridgeError):
-    """Raised when no robot of a name announces a rosbridge server."""
+    """Raised when no robot of this name announces a rosbridge server."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,9 +70,10 @@ async def discover(
     *,
     interfaces: Sequence[str] | None = None,
 ) -> list[Robot]:
-    """Return the rosbridge servers that answer within `timeout` seconds, which are used up, sorted by name.
+    """Return the rosbridge servers that answer within `timeout` seconds, sorted by name.
 
-    It asks on `interfaces`, addresses of this machine; None for all.
+    It always waits for the whole time. `interfaces` are the addresses of this machine to query from; None for
+    all.
 
     Raises:
         DiscoveryError: `zeroconf` is not installed, or there is no network.
@@ -116,7 +117,7 @@ async def resolve(
     *,
     interfaces: Sequence[str] | None = None,
 ) -> str:
-    """Return the URI of the rosbridge server that a robot announces; without `interfaces`, it is asked for on all.
+    """Return the URI of the rosbridge server of a robot; `interfaces` as for `discover`.
 
     Raises:
         UnknownRobotError: No robot of that name answers in time.
@@ -146,9 +147,10 @@ async def announced(
 ) -> AsyncIterator[None]:
     """Announce a rosbridge server while the context is open.
 
-    `host` is the address that the server listens on; `0.0.0.0` and `::` stand for all addresses of this machine, and a
-    loopback address is announced to this machine only. With `tls` clients get this machine's host name, which has to be in
-    its certificate; `token` says whether they need one. Without `interfaces` it answers on all.
+    `host` is the address on which the server listens; `0.0.0.0` and `::` mean all addresses of this machine,
+    and a loopback address is announced only to this machine. With `tls`, clients get the host name of this
+    machine, which must be in the certificate; `token` tells whether they need one. Without `interfaces`, it
+    answers on all of them.
 
     Raises:
         DiscoveryError: `zeroconf` is not installed, there is no network, or another server has the name.
@@ -156,13 +158,13 @@ async def announced(
     _check_name(name)
     addresses = _addresses(host, interfaces)
     if interfaces is None and all(ipaddress.ip_address(address).is_loopback for address in addresses):
-        interfaces = ("127.0.0.1",)  # no other machine reaches it
+        interfaces = ("127.0.0.1",)  # other machines cannot reach it
     async with _zeroconf(interfaces) as zeroconf:
         from zeroconf.asyncio import AsyncServiceInfo
 
         if await _ask(zeroconf, f"{name}.{SERVICE_TYPE}", _TAKEN_TIME) is not None:
             raise DiscoveryError(
-                f"another rosbridge server on this network is called {name} already: choose another name"
+                f"another rosbridge server on this network is already called {name}: choose another name"
             )
         properties = {"path": "/", "tls": str(int(tls)), "token": str(int(token))}
         if ros_version is not None:
@@ -202,7 +204,7 @@ def _addresses(host: str, interfaces: Sequence[str] | None) -> list[str]:
         return sorted({str(info[4][0]) for info in socket.getaddrinfo(host, None)})
     if not address.is_unspecified:
         return [str(address)]
-    import ifaddr  # zeroconf's own dependency
+    import ifaddr  # a dependency of zeroconf
 
     every = [ip.ip for adapter in ifaddr.get_adapters() for ip in adapter.ips if isinstance(ip.ip, str)]
     return [each for each in every if not ipaddress.ip_address(each).is_loopback] or ["127.0.0.1"]
@@ -221,7 +223,7 @@ async def _zeroconf(interfaces: Sequence[str] | None) -> AsyncIterator[AsyncZero
         zeroconf = AsyncZeroconf(interfaces=InterfaceChoice.All if interfaces is None else list(interfaces))
     except (OSError, Error) as error:
         raise DiscoveryError(
-            f"robots cannot be looked for by name here, as there is no network for multicast DNS ({error})"
+            f"robots cannot be found by name here, because there is no network for multicast DNS ({error})"
         ) from None
     try:
         yield zeroconf
@@ -230,7 +232,7 @@ async def _zeroconf(interfaces: Sequence[str] | None) -> AsyncIterator[AsyncZero
 
 
 async def _ask(zeroconf: AsyncZeroconf, full_name: str, patience: float) -> Robot | None:
-    """Query a robot; None if it does not answer in time, or its answer is unusable."""
+    """Query a robot; return None if it does not answer in time, or its answer is unusable."""
     from zeroconf import BadTypeInNameException
     from zeroconf.asyncio import AsyncServiceInfo
 
@@ -242,12 +244,12 @@ async def _ask(zeroconf: AsyncZeroconf, full_name: str, patience: float) -> Robo
 
 
 def _robot(info: AsyncServiceInfo) -> Robot | None:
-    """Return the robot of an announcement; None if the announcement is unusable."""
+    """Return the robot in an announcement; None if the announcement is unusable."""
     name = info.name.removesuffix(f".{SERVICE_TYPE}")
     properties = info.decoded_properties
     addresses = sorted(info.parsed_addresses(), key=lambda address: (":" in address, address))
     tls = properties.get("tls") == "1"
-    # A certificate contains a name, hardly ever an address.
+    # A certificate contains a name, rarely an address.
     host = (info.server or "").rstrip(".") if tls else addresses[0] if addresses else ""
     path = properties.get("path") or "/"
     if not name or not name.isprintable() or not host or not 1 <= (info.port or 0) <= _LAST_PORT:

@@ -1,7 +1,7 @@
-"""Errors between this host and a rosbridge server, each with one sentence for the user.
+"""Errors of rosbridge connections, each with one sentence for the user.
 
-`str(error)` states what happened, where, what was expected and, where it helps, what to do. `exit_code` is the exit code
-of a command that the error ends.
+`str(error)` states what happened, where, what was expected and, if it helps, what to do. `exit_code` is the
+exit code of a command that ends with the error.
 
 * `BridgeError` (3: the server, or what it sent)
     * `UsageError` (2: usage, configuration or credentials)
@@ -12,19 +12,19 @@ from typing import ClassVar
 
 
 class BridgeError(Exception):
-    """Root of all errors of `bridge`."""
+    """Base class of all errors of `bridge`."""
 
     exit_code: ClassVar[int] = 3
 
 
 class UsageError(BridgeError):
-    """Base of the errors that the caller or the configuration causes."""
+    """Base class of errors caused by the caller or the configuration."""
 
     exit_code = 2
 
 
 class UriError(UsageError):
-    """Raised when a URI is not one of a WebSocket (`ws://host:port` or `wss://host:port`)."""
+    """Raised when a URI is not a WebSocket URI (`ws://host:port` or `wss://host:port`)."""
 
 
 class NameFormError(UsageError):
@@ -36,11 +36,11 @@ class TypeConflictError(UsageError):
 
 
 class OptionError(UsageError):
-    """Raised when an option is out of its range (a rate, a queue's size, a time)."""
+    """Raised when an option is out of range (a rate, a queue size, a time)."""
 
 
 class ConcurrentReadError(UsageError):
-    """Raised when two tasks wait on one subscription, so that each message would reach only one of them."""
+    """Raised when two tasks wait for one subscription, because each message would reach only one of them."""
 
 
 class EncodeError(UsageError):
@@ -52,19 +52,19 @@ class DecodeError(BridgeError):
 
 
 class UnreachableError(BridgeError):
-    """Raised when nothing answers at the URI: refused, no such host, no route, or no answer in time."""
+    """Raised when nothing answers at the URI: refused, unknown host, no route, or no answer in time."""
 
 
 class NotRosbridgeError(BridgeError):
-    """Raised when something answers at the URI, but not as a WebSocket server does."""
+    """Raised when something other than a WebSocket server answers at the URI."""
 
 
 class AccessRefusedError(UsageError):
-    """Raised when a server refuses this client for its token or certificate."""
+    """Raised when a server refuses this client because of its token or certificate."""
 
 
 class DisconnectedError(BridgeError):
-    """Raised when there is no connection now, or when it was lost while something waited on it."""
+    """Raised when there is no connection, or when it was lost while something waited for it."""
 
 
 class StateTimeoutError(BridgeError):
@@ -80,7 +80,7 @@ class NoAnswerError(BridgeError):
 
 
 class SlowPeerError(BridgeError):
-    """Raised when the server does not accept messages in time, or too many wait for it."""
+    """Raised when the server does not accept messages in time, or too many are waiting."""
 
 
 class ServiceError(BridgeError):
@@ -91,7 +91,7 @@ class ServiceError(BridgeError):
     """
 
     def __init__(self, reason: str, service: str = "") -> None:
-        """Store the reason apart from the sentence: a handler's reason is sent unchanged."""
+        """Store the reason separately from the sentence, because the reason of a handler is sent unchanged."""
         self.reason = reason
         self.service = service
         where = f"service {service} refused the call" if service else "the call was refused"
@@ -125,6 +125,6 @@ class FieldMissingError(BridgeError):
 
 
 class FieldAmbiguousError(BridgeError):
-    """Raised when a bare name occurs more than once in a message; the sentence lists the places."""
+    """Raised when a bare name occurs more than once in a message; the sentence lists the paths."""
 
     exit_code = 4

@@ -1,10 +1,11 @@
-"""Search for variables in ROS messages, by bare name or by path.
+"""Lookup of variables in ROS messages, by bare name or by path.
 
-The rules of `deployment.toml`'s variables: a name with `.` or `[` is a path (`pose.position.x`,
-`ranges[3]`). A bare name is searched in the whole message, depth first, not inside arrays. It may occur only
-once, and its place in the first message is kept for later ones.
+These are the rules for the variables in `deployment.toml`: a name with `.` or `[` is a path
+(`pose.position.x`, `ranges[3]`). A bare name is searched in the whole message, depth first, except inside
+arrays. It may occur only once, and its path in the first message is reused for later ones.
 
-An index works on every form of an array: a list, a NumPy array, bytes, and the base64 text of `uint8[]` in JSON.
+An index reaches into every form of an array: a list, a NumPy array, bytes, and the base64 text of `uint8[]`
+in JSON.
 """
 
 import base64
@@ -14,12 +15,12 @@ from typing import Any, Final
 from bridge.errors import FieldAmbiguousError, FieldMissingError, PathError
 
 Place = tuple[str | int, ...]
-"""Place in a message: keys of objects and indices of arrays, from outside to inside."""
+"""Place in a message: keys of objects and indices of arrays, the outermost first."""
 
 MAX_LISTED: Final = 24
-"""Limit of fields listed in an error."""
+"""Maximum number of fields listed in an error."""
 MAX_SHOWN: Final = 80
-"""Limit of characters of each of them."""
+"""Maximum number of characters of each field."""
 
 _STEP = re.compile(r"([A-Za-z_][A-Za-z0-9_]*)|\[([0-9]{1,9})\]")
 
@@ -29,7 +30,7 @@ class Field:
 
     Attributes:
         name: The configured bare name or path.
-        place: Its place; for a bare name None until it is found in a message.
+        place: Place of the variable; None for a bare name until it is found in a message.
     """
 
     __slots__ = ("_is_path", "name", "place")
@@ -38,7 +39,7 @@ class Field:
         """Read a bare name or a path.
 
         Raises:
-            PathError: It is neither.
+            PathError: The text is neither.
         """
         self.name = name
         self._is_path = "." in name or "[" in name
@@ -50,13 +51,13 @@ class Field:
             )
 
     def value(self, message: dict[str, Any]) -> tuple[bool, Any]:
-        """Look the variable up.
+        """Look up the variable.
 
         Returns:
             Whether the message has it, and its unchanged value (None if it is missing or null).
 
         Raises:
-            FieldAmbiguousError: A bare name, not found before, occurs more than once.
+            FieldAmbiguousError: A bare name that was not found before occurs more than once.
         """
         place = self.place
         if place is None:
@@ -113,10 +114,10 @@ class Field:
 
 
 def parse_path(path: str) -> Place:
-    """Read a path: names joined by dots, whole numbers from 0 in brackets.
+    """Parse a path: names joined by dots, and whole numbers from 0 in brackets.
 
     Raises:
-        PathError: It is malformed; the sentence names the position.
+        PathError: The path is malformed; the sentence names the position.
     """
     steps: list[str | int] = []
     at = 0
@@ -128,7 +129,7 @@ def parse_path(path: str) -> Place:
         # A dot stands before every name but the first, and before nothing else.
         if step is None or (step[1] is not None) != (at > start or not steps):
             raise PathError(
-                f"the path {path[:MAX_SHOWN]!r} breaks at character {at + 1}: it must be names joined by dots with "
+                f"the path {path[:MAX_SHOWN]!r} is malformed at character {at + 1}: expected names joined by dots, with "
                 "indices in brackets (examples: pose.position.x, ranges[3])"
             )
         steps.append(step[1] if step[1] is not None else int(step[2]))
@@ -147,7 +148,7 @@ def format_place(place: Place) -> str:
 
 
 def find_places(message: dict[str, Any], name: str) -> list[Place]:
-    """Return all places of a bare name, depth first in the message's order, not inside arrays."""
+    """Return all places of a bare name, depth first in the order of the message, except inside arrays."""
     places: list[Place] = []
     inner: list[tuple[Place, dict[str, Any]]] = [((), message)]
     while inner:
@@ -163,7 +164,7 @@ def find_places(message: dict[str, Any], name: str) -> list[Place]:
 
 
 def _list_fields(message: dict[str, Any]) -> str:
-    """List the paths of all fields, arrays with their lengths."""
+    """Return the paths of all fields as text, arrays with their lengths."""
     listed: list[str] = []
     inner: list[tuple[Place, Any]] = [((key,), value) for key, value in reversed(message.items())]
     while inner:
@@ -180,7 +181,7 @@ def _list_fields(message: dict[str, Any]) -> str:
 
 
 def _show(place: Place) -> str:
-    """Return a place for an error's sentence, shortened and printable."""
+    """Return the path of a place for an error, shortened and printable."""
     text = format_place(place)
     if len(text) > MAX_SHOWN:
         text = text[: MAX_SHOWN - 3] + "..."
@@ -190,7 +191,7 @@ def _show(place: Place) -> str:
 def _length(value: Any) -> int | None:
     """Return the length of an array in any form; None if the value is not an array."""
     if isinstance(value, str):
-        # Four characters are three bytes, less one for each =.
+        # Four characters are three bytes, minus one for each =.
         return None if len(value) % 4 or not value else len(value) // 4 * 3 - value[-2:].count("=")
     if isinstance(value, list | bytes) or getattr(value, "ndim", 0) == 1:
         return len(value)
@@ -198,7 +199,7 @@ def _length(value: Any) -> int | None:
 
 
 def _element(value: Any, index: int) -> Any:
-    """Return one element; None if the text is not base64 there."""
+    """Return one element; None if the text is not base64 at this place."""
     if isinstance(value, str):
         four = value[index // 3 * 4 : index // 3 * 4 + 4]
         try:

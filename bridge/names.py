@@ -1,4 +1,4 @@
-"""Names of ROS topics, services and types: `pkg/Type` of ROS 1 and `pkg/msg/Type` of ROS 2 alike.
+"""Names of ROS topics, services and types, in ROS 1 (`pkg/Type`) and ROS 2 (`pkg/msg/Type`).
 
 Sources: http://wiki.ros.org/Names, https://design.ros2.org/articles/topic_and_service_names.html.
 """
@@ -12,7 +12,7 @@ from bridge.errors import NameFormError
 Kind = Literal["msg", "srv", "action"]
 
 MAX_NAME = 255
-"""Longest name in characters; ROS 2 allows 255 for a topic."""
+"""Maximum length of a name in characters; ROS 2 allows 255 for a topic."""
 
 _TYPE = re.compile(r"([A-Za-z][A-Za-z0-9_]*)/(?:(msg|srv|action)/)?([A-Za-z][A-Za-z0-9_]*)")
 _TOPIC = re.compile(r"[~/]?[A-Za-z_][A-Za-z0-9_]*(?:/[A-Za-z_][A-Za-z0-9_]*)*")
@@ -21,7 +21,7 @@ _EDGE_NAME_SIZE = 1024
 
 @lru_cache(maxsize=_EDGE_NAME_SIZE)
 def split_type(name: str) -> tuple[str, str, str]:
-    """Return a type's package, kind (`msg`, `srv`, `action`, or nothing in the ROS 1 form) and own name."""
+    """Return the package, kind (`msg`, `srv`, `action`, or empty in the ROS 1 form) and name of a type."""
     match = _TYPE.fullmatch(name) if len(name) <= MAX_NAME else None
     if match is None:
         raise NameFormError(
@@ -32,19 +32,19 @@ def split_type(name: str) -> tuple[str, str, str]:
 
 
 def ros1_type(name: str) -> str:
-    """Return the ROS 1 form of a type's name: `std_msgs/String`."""
+    """Return the ROS 1 form of a type name: `std_msgs/String`."""
     package, _kind, own = split_type(name)
     return f"{package}/{own}"
 
 
 def ros2_type(name: str, kind: Kind = "msg") -> str:
-    """Return the ROS 2 form of a type's name, `std_msgs/msg/String`, with `kind` if the name has none."""
+    """Return the ROS 2 form of a type name, `std_msgs/msg/String`, with `kind` if the name has none."""
     package, its_kind, own = split_type(name)
     return f"{package}/{its_kind or kind}/{own}"
 
 
 def same_type(one: str, other: str) -> bool:
-    """Return whether two names of any form mean one type. Malformed names have to be equal."""
+    """Return whether two names of any form denote the same type. Malformed names must be equal."""
     if one == other:
         return True
     try:
@@ -56,7 +56,7 @@ def same_type(one: str, other: str) -> bool:
 
 
 def ros_version_of_type(name: str) -> Literal[1, 2] | None:
-    """Return the ROS version of a type's form, or None if the name is malformed."""
+    """Return the ROS version of a type name, or None if the name is malformed."""
     try:
         return 2 if split_type(name)[1] else 1
     except NameFormError:
@@ -64,7 +64,7 @@ def ros_version_of_type(name: str) -> Literal[1, 2] | None:
 
 
 def check_name(name: str) -> str:
-    """Return the name of a topic or a service unless it is invalid in ROS; the server resolves a relative one."""
+    """Return the name of a topic or a service if it is valid in ROS; the server resolves relative names."""
     if len(name) > MAX_NAME:
         raise NameFormError(
             f"name {name[:40]!r}... has {len(name)} characters, at most {MAX_NAME} are allowed"

@@ -1,7 +1,7 @@
-"""Quality of service of a ROS 2 topic, as servers take it in `advertise` and `subscribe` (field `qos`).
+"""Quality of service of a ROS 2 topic, for the field `qos` of `advertise` and `subscribe`.
 
-Newer servers of ROS 2 read it; older ones and those of ROS 1 ignore it silently. Omitted settings are up to the server,
-which adapts a subscription to its publishers.
+Newer ROS 2 servers read it; older ones and ROS 1 servers silently ignore it. The server chooses omitted
+settings, and adapts a subscription to its publishers.
 """
 
 import math
@@ -23,11 +23,11 @@ class Qos:
     """Quality of service of a topic between ROS nodes.
 
     Attributes:
-        history: Whether the last `depth` messages are kept for a slow reader, or all.
-        depth: Number of messages that are kept.
+        history: Whether the last `depth` messages are queued for a slow reader, or all.
+        depth: Number of queued messages.
         reliability: Whether lost messages are sent again.
         durability: Whether a late subscriber gets earlier messages (`transient_local`).
-        deadline: Longest expected time between messages in seconds; infinity for none.
+        deadline: Maximum expected time between messages in seconds; infinity for none.
         lifespan: Seconds after which a message expires; infinity for never.
     """
 
@@ -44,11 +44,11 @@ class Qos:
             if value is not None and value not in choices:
                 raise OptionError(f"qos {name} must be one of {', '.join(choices)}, not {value!r}")
         if self.depth is not None and (type(self.depth) is not int or self.depth < 0):
-            raise OptionError(f"qos depth must be a whole number from 0 up, not {self.depth!r}")
+            raise OptionError(f"qos depth must be a whole number of at least 0, not {self.depth!r}")
         for name in ("deadline", "lifespan"):
             value = getattr(self, name)
             if value is not None and (isinstance(value, bool) or not value >= 0):
-                raise OptionError(f"qos {name} must be seconds from 0 up, not {value!r}")
+                raise OptionError(f"qos {name} must be a non-negative number of seconds, not {value!r}")
 
     def as_operation(self) -> dict[str, Any]:
         """Return the value of an operation's field `qos`."""

@@ -1,4 +1,4 @@
-"""Time in messages: `secs`/`nsecs` of ROS 1 and `sec`/`nanosec` of ROS 2, built and read."""
+"""Time stamps in messages: `secs`/`nsecs` in ROS 1 and `sec`/`nanosec` in ROS 2."""
 
 from collections.abc import Mapping
 from typing import Any, Final, Literal
@@ -8,7 +8,7 @@ _KEYS: Final = (("sec", "nanosec", 2), ("secs", "nsecs", 1))
 
 
 def stamp(time_ns: int, ros_version: Literal[1, 2] | None = None) -> dict[str, int]:
-    """Return nanoseconds since 1970 as a message's `stamp` of a ROS version; None has the keys of both."""
+    """Return nanoseconds since 1970 as a `stamp` for a ROS version; None for the keys of both."""
     seconds, nanoseconds = divmod(time_ns, _NS)
     time: dict[str, int] = {}
     for second, nanosecond, version in _KEYS:
@@ -24,7 +24,7 @@ def header(time_ns: int, frame_id: str = "", ros_version: Literal[1, 2] | None =
 
 
 def stamp_ns(time: object) -> int | None:
-    """Return the nanoseconds since 1970 of a message's time of either ROS; None if it is not a time."""
+    """Return a time of either ROS version in nanoseconds since 1970; None if it is not a time."""
     if not isinstance(time, Mapping):
         return None
     for second, nanosecond, _version in _KEYS:
@@ -37,13 +37,13 @@ def stamp_ns(time: object) -> int | None:
 
 
 def header_stamp_ns(msg: Mapping[str, Any]) -> int | None:
-    """Return the nanoseconds since 1970 of a message's `header.stamp`; None if it is missing or zero."""
+    """Return the `header.stamp` of a message in nanoseconds since 1970; None if it is missing or zero."""
     head = msg.get("header")
     return (stamp_ns(head.get("stamp")) or None) if isinstance(head, Mapping) else None
 
 
 def ros_version_of_message(msg: Mapping[str, Any]) -> Literal[1, 2] | None:
-    """Return the ROS version of a message with a header; None without one, or with the keys of both."""
+    """Return the ROS version of a message according to its header; None without a header, or with both forms."""
     head = msg.get("header")
     time = head.get("stamp") if isinstance(head, Mapping) else None
     if not isinstance(time, Mapping) or ("sec" in time) == ("secs" in time):

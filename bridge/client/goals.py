@@ -1,4 +1,4 @@
-"""Goals of ROS 2 actions for their sender: feedback, result and cancelling."""
+"""Goals of ROS 2 actions for their sender: feedback, result and cancellation."""
 
 import asyncio
 import time
@@ -12,7 +12,7 @@ from bridge.client.session import Session
 from bridge.errors import ConcurrentReadError, DisconnectedError, GoalError, NoAnswerError
 
 FEEDBACK_QUEUE_SIZE: Final = 64
-"""Limit of queued feedback; beyond it the oldest is dropped."""
+"""Maximum number of queued feedback messages; then the oldest is dropped."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +31,7 @@ class GoalResult:
 class Goal:
     """One active goal: `async for feedback in goal`, then `await goal.result(timeout)`.
 
-    The iteration ends with the goal. If the connection is lost meanwhile, iteration and result fail, because a server
+    The iteration ends with the goal. If the connection is lost, iteration and result fail, because the server
     forgets the sender of a goal and never reports its end.
 
     Attributes:
@@ -67,7 +67,7 @@ class Goal:
         """End the goal without a result."""
         if not self._ended.done():
             self._ended.set_exception(DisconnectedError(f"{reason} during a goal of {self.action}"))
-            self._ended.exception()  # marked as retrieved: nobody has to await it
+            self._ended.exception()  # mark the exception as retrieved, because it need not be awaited
         self._wake()
 
     def _wake(self) -> None:
@@ -80,16 +80,16 @@ class Goal:
         return self._ended.done()
 
     async def cancel(self) -> None:
-        """Ask the server to cancel the goal; `result` returns whether it did. Ignore a goal that has ended."""
+        """Ask the server to cancel the goal, if it is active; `result` returns whether it did."""
         self._session.core.goals.cancel(self._identity)
         self._session.flush()
 
     async def result(self, timeout: float) -> GoalResult:  # noqa: ASYNC109  # part of the error
-        """Wait for the end of the goal, repeatedly if need be; return its status even if canceled or aborted.
+        """Wait for the end of the goal; return its status even if canceled or aborted. May be repeated.
 
         Raises:
             GoalError: The action refused the goal, or does not exist.
-            NoAnswerError: It did not end in time, but is still active.
+            NoAnswerError: The goal did not end in time, and is still active.
             DisconnectedError: The connection was lost before it ended.
         """
         try:
@@ -115,7 +115,7 @@ class Goal:
                 raise StopAsyncIteration
             if self._reader is not None:
                 raise ConcurrentReadError(
-                    f"another task already waits for feedback of this goal of {self.action}"
+                    f"another task is already waiting for feedback of this goal of {self.action}"
                 )
             self._reader = asyncio.get_running_loop().create_future()
             try:

@@ -1,4 +1,4 @@
-"""Handles that a program holds: subscriptions to read, publications to write, services to serve."""
+"""Handles for a program: subscriptions, publications and services."""
 
 import asyncio
 import logging
@@ -24,11 +24,11 @@ from bridge.names import absolute, same_type
 from bridge.qos import Qos
 
 QUEUE_SIZE: Final = 64
-"""Default limit of messages queued for a subscription's reader."""
+"""Default maximum number of messages queued for the reader of a subscription."""
 PUBLISH_QUEUE_SIZE: Final = 100
-"""Default limit of messages of one topic that wait for a slow server."""
+"""Default maximum number of messages of one topic that wait for a slow server."""
 EXPLAIN_TIMEOUT: Final = 0.5
-"""Seconds in which the reason of a topic's silence is looked up."""
+"""Timeout in seconds for finding out why a topic is silent."""
 
 Handler = Callable[[dict[str, Any]], Awaitable[Mapping[str, Any] | None]]
 
@@ -36,7 +36,7 @@ _log = logging.getLogger("bridge")
 
 
 class _Handle:
-    """Something that is closed once: explicitly, by leaving its `async with`, or with its client."""
+    """Base of handles, which are closed once: explicitly, by leaving their `async with`, or with the client."""
 
     def __init__(self, session: Session) -> None:
         if session.state is State.CLOSED:
@@ -45,7 +45,7 @@ class _Handle:
         self._closed = False
 
     def _register(self) -> None:
-        """Have the handle closed with its client, and send its operation."""
+        """Register the handle for closing with its client, and send its operation."""
         self._session.on_closed.add(self.end)
         self._session.flush()
 
@@ -58,7 +58,7 @@ class _Handle:
         raise NotImplementedError
 
     async def close(self) -> None:
-        """Withdraw this from the server. Repeating it does nothing."""
+        """Withdraw this from the server. Further calls have no effect."""
         if not self._closed:
             self.end()
             self._session.on_closed.discard(self.end)
@@ -81,13 +81,13 @@ def _check_queue_size(size: int, topic: str) -> int:
 class Subscription(_Handle):
     """The messages of one topic, to be read by one task: `async for message in subscription`.
 
-    If the reader is too slow the oldest messages are dropped, and nothing else slows down. The iteration survives
-    a lost connection, and ends when the subscription or the client is closed.
+    If the reader is too slow, the oldest messages are dropped; the connection is not affected. The iteration
+    continues after a lost connection, and ends when the subscription or the client is closed.
 
     Attributes:
         topic: Name of the topic.
         lost: Number of messages dropped because the queue was full.
-        blind_seconds: Total time without connection; each message has the time just before it.
+        blind_seconds: Total time without a connection; each message has the time just before it.
     """
 
     def __init__(
@@ -111,7 +111,7 @@ class Subscription(_Handle):
         self._type = type_name
         self._queue: deque[Message] = deque(maxlen=queue_size)
         self._waiter: asyncio.Future[None] | None = None
-        self._deadline = inf  # of who waits
+        self._deadline = inf  # of the waiting task
         self._alarm: asyncio.TimerHandle | None = None
         self._rings = inf
         self._number = session.core.subscriptions.subscribe(
@@ -141,7 +141,7 @@ class Subscription(_Handle):
         self.blind_seconds += seconds
 
     def _keep_blind(self, message: Message) -> Message:
-        """Move the blind seconds of the message that is dropped now to the one after it."""
+        """Add the blind seconds of the message to drop to those of the next message."""
         queue = self._queue
         blind = queue[0].blind_seconds
         if self._size == 1:
@@ -171,7 +171,7 @@ class Subscription(_Handle):
     def _check_alone(self) -> None:
         if self._waiter is not None:
             raise ConcurrentReadError(
-                f"another task already waits for messages of {self.topic}: give the second reader its "
+                f"another task is already waiting for messages of {self.topic}: give each reader its "
                 "own subscription"
             )
 
@@ -180,10 +180,10 @@ class Subscription(_Handle):
             self._waiter.set_result(None)
 
     def _set_alarm(self, now: float) -> None:
-        """Have the reader woken at its deadline.
+        """Schedule a call that wakes the reader at its deadline.
 
-        An alarm that is due earlier is kept, and set again when it is due: setting one for each message would take longer
-        than everything else.
+        An earlier call is kept, and schedules the next one, because scheduling a call for each message would
+        take longer than everything else.
         """
         if self._alarm is not None:
             if self._rings <= self._deadline:
@@ -201,13 +201,13 @@ class Subscription(_Handle):
             self._set_alarm(now)
 
     async def next(self, timeout: float) -> Message:  # noqa: ASYNC109  # the limit is part of the error
-        """Wait for one message, `timeout` seconds at most.
+        """Wait for one message, at most `timeout` seconds.
 
         Raises:
-            NoMessageError: None arrived in time; the sentence names topic, server and time, and the server's
-                information about the topic if rosapi has any (which takes at most half a second more).
+            NoMessageError: None arrived in time; the sentence names topic, server and time, and information
+                about the topic from rosapi, if any (which takes up to half a second more).
             DisconnectedError: The subscription or the client is closed.
-            ConcurrentReadError: Another task waits here.
+            ConcurrentReadError: Another task is already waiting.
         """
         queue = self._queue
         if queue:
@@ -233,7 +233,7 @@ class Subscription(_Handle):
         )
 
     async def _why_silent(self, begun: float) -> str:
-        """Return the end of an error's sentence: why the topic was silent since a time."""
+        """Return the end of an error's sentence: the reason why the topic has been silent."""
         session = self._session
         if session.state is not State.CONNECTED:
             return f"; the connection is {session.state}: {session.last_error}"
@@ -247,15 +247,15 @@ class Subscription(_Handle):
                     return f"; the server knows it as {known_type[:80]}, not as {self._type}"
                 found = await ask_rosapi(session, "publishers", {"topic": self.topic}, EXPLAIN_TIMEOUT)
                 if found.get("publishers") == []:
-                    return "; nobody publishes it"
-        except TimeoutError:  # a server without rosapi answers that at once
+                    return "; it has no publisher"
+        except TimeoutError:  # a server without rosapi answers at once
             return session.context_since(begun) or (
-                f"; nor did it answer a call of rosapi within {EXPLAIN_TIMEOUT:g} s: is it a rosbridge server?"
+                f"; a call to rosapi was not answered either within {EXPLAIN_TIMEOUT:g} s: is it a rosbridge server?"
             )
         return session.context_since(begun)
 
     def end(self) -> None:
-        """End the iteration, after what waits in the queue."""
+        """End the iteration after the queued messages."""
         super().end()
         if self._alarm is not None:
             self._alarm.cancel()
@@ -296,21 +296,21 @@ class Publication(_Handle):
         self._register()
 
     async def publish(self, msg: Mapping[str, Any], *, timeout: float = 5.0) -> None:  # noqa: ASYNC109  # as above
-        """Send one message, whose values may be NumPy arrays, and return when the socket has it.
+        """Send one message, whose values may be NumPy arrays, and return when the socket has accepted it.
 
-        It is sent at once while the server keeps up; otherwise it waits for its turn, `timeout` seconds at most. Nothing is
-        kept over a lost connection: old readings are worthless after it.
+        It is sent at once if the server keeps up; otherwise it waits for its turn, at most `timeout` seconds.
+        Messages are not stored while the connection is lost, because old readings are useless.
 
         Raises:
             DisconnectedError: There is no connection now, or the publication or the client is closed.
-            SlowPeerError: The server did not accept it in time, or `queue_size` messages wait already.
-            EncodeError: It cannot be sent as JSON; a NaN or infinity is named with its place.
+            SlowPeerError: The server did not accept it in time, or `queue_size` messages are already waiting.
+            EncodeError: It cannot be sent as JSON; for a NaN or infinity, the sentence gives its path.
         """
         session = self._session
         if session.must_wait():
             if self._waiting >= self._size:
                 raise SlowPeerError(
-                    f"{session.uri} does not keep up: {self._waiting} messages of {self.topic} wait already"
+                    f"{session.uri} does not keep up: {self._waiting} messages of {self.topic} are already waiting"
                 )
             self._waiting += 1
             try:
@@ -323,16 +323,16 @@ class Publication(_Handle):
 
     @property
     def must_wait(self) -> bool:
-        """Whether a message would have to wait for a slow server, or for a connection."""
+        """Whether a message would have to wait for a slow server or for a connection."""
         return not self._session.is_open or self._session.must_wait()
 
     async def ready(self, timeout: float = 5.0) -> None:  # noqa: ASYNC109  # as above
-        """Wait until the server has accepted what was sent before; it fails as `publish` does."""
+        """Wait until the server has accepted all previous messages; errors as for `publish`."""
         if self._session.must_wait():
             await self._session.wait_turn(f"a message of {self.topic}", timeout)
 
     def publish_nowait(self, msg: Mapping[str, Any]) -> None:
-        """Send one message at once, or raise `SlowPeerError` instead of waiting (else as `publish`)."""
+        """Send one message at once, or raise `SlowPeerError` instead of waiting. Otherwise like `publish`."""
         session = self._session
         if session.must_wait():
             raise SlowPeerError(
@@ -342,7 +342,7 @@ class Publication(_Handle):
 
     def _encode(self, msg: Mapping[str, Any]) -> bytes:
         if self._closed:
-            raise DisconnectedError(f"{self.topic} is not advertised any more: its publication was closed")
+            raise DisconnectedError(f"{self.topic} is no longer advertised: its publication was closed")
         return self._publications.publish(self._number, msg)
 
     def _withdraw(self) -> None:
@@ -368,7 +368,7 @@ class Service(_Handle):
         self._register()
 
     async def _serve(self, request: ServiceRequested) -> None:
-        """Answer one request, whatever happens in its handler."""
+        """Answer one request, even if its handler fails."""
         values: Mapping[str, Any] | str
         ok = False
         try:
@@ -396,7 +396,7 @@ class Service(_Handle):
 
 
 async def ask_rosapi(session: Session, name: str, args: Mapping[str, Any], limit: float) -> dict[str, Any]:
-    """Call a rosapi service; return nothing if it fails, since many servers lack rosapi."""
+    """Call a rosapi service; return an empty answer if it fails, because many servers do not have rosapi."""
     try:
         answer = await session.call(f"/rosapi/{name}", args, limit)
     except BridgeError:

@@ -1,4 +1,4 @@
-"""The asyncio rosbridge client: topics, services and actions over one connection that reconnects by itself.
+"""The asyncio rosbridge client: topics, services and actions over one connection with automatic reconnection.
 
     async with connect("ws://127.0.0.1:9090") as ros:
         async for message in ros.subscribe("/boat/sensors", "boat_msgs/Sensors"):
@@ -38,13 +38,13 @@ from bridge.qos import Qos
 __all__ = ["Goal", "Message", "Publication", "Qos", "Ros", "Service", "State", "Subscription", "connect"]
 
 DETECT_TIMEOUT: Final = 2.0
-"""Seconds in which the server's ROS version is looked up."""
+"""Timeout in seconds for detecting the ROS version of the server."""
 FAREWELL_TIMEOUT: Final = 0.3
-"""Seconds that a server has, before the client disconnects, to show that it has read everything."""
+"""Maximum wait in seconds, before disconnecting, until the server has read everything."""
 
 
 class Ros:
-    """A client of one rosbridge server, made by `connect`, and opened and closed once by `async with`."""
+    """A client of one rosbridge server, created by `connect`, and opened and closed once by `async with`."""
 
     def __init__(self, session: Session) -> None:
         self._session = session
@@ -58,10 +58,10 @@ class Ros:
         await self.close()
 
     async def close(self) -> None:
-        """Close the connection after what was published before, and end everything that waits.
+        """Close the connection after all published messages, and end everything that waits.
 
-        Some servers drop what they have not yet read when a client disconnects. So a client that has published waits
-        for an answer, which follows everything that it sent; a third of a second at most.
+        Some servers drop unread messages when a client disconnects. So a client that has published first
+        makes a call, whose answer follows all its messages, and waits for the answer for at most 0.3 s.
         """
         try:
             if self._publishes and self._session.state is State.CONNECTED:
@@ -70,10 +70,10 @@ class Ros:
             await self._session.close()
 
     def together(self) -> AbstractContextManager[None]:
-        """Send everything published inside the block in one piece: `with ros.together(): ...`.
+        """Write everything published inside the block at once: `with ros.together(): ...`.
 
-        Messages that belong together then wake the server once. Nothing is sent before the block ends, so it should not
-        wait for anything else.
+        Messages that belong together then wake up the server only once. Nothing is sent before the block
+        ends, so it should not wait for anything.
         """
         return self._session.together()
 
@@ -96,12 +96,12 @@ class Ros:
 
     @property
     def last_error(self) -> str:
-        """Why the connection was lost, or why the last attempt to reconnect failed; empty if never."""
+        """Reason of the lost connection, or of the last failed attempt to reconnect; empty if there is none."""
         return self._session.last_error
 
     @property
     def unusable(self) -> int:
-        """Number of received messages that no client can use."""
+        """Number of unusable messages received."""
         return self._session.unusable
 
     @property
@@ -113,7 +113,7 @@ class Ros:
         """Wait until the connection is in a state.
 
         Raises:
-            StateTimeoutError: It was not in time.
+            StateTimeoutError: It did not reach the state in time.
             DisconnectedError: The client is closed.
         """
         await self._session.wait_for_state(state, timeout)
@@ -131,15 +131,16 @@ class Ros:
     ) -> Publication:
         """Advertise a topic.
 
-        A server of a real ROS informs its network first: subscribers there may miss messages in the first tenths of a
-        second.
+        A ROS server must first announce the topic to its network: subscribers there may miss messages in the
+        first tenths of a second.
 
         Args:
             topic: Name of the topic.
             type: Type in the form of ROS 1 or ROS 2.
-            latch: Whether the server keeps the last message for later subscribers; it is sent again after a
+            latch: Whether the server stores the last message for later subscribers; it is sent again after a
                 reconnection.
-            queue_size: Limit of messages that wait for a slow server; the server gets it too, for ROS.
+            queue_size: Maximum number of messages that wait for a slow server; also passed to the server, for
+                ROS.
             qos: Quality of service in ROS 2; older servers ignore it.
 
         Raises:
@@ -168,16 +169,16 @@ class Ros:
 
         Args:
             topic: Name of the topic.
-            type: Type of the messages; None leaves it to the server. The subscription is then repeated every two
-                seconds until a message arrives, since servers forget subscriptions to unknown topics.
-            throttle_rate: Minimum of milliseconds between two messages; the server drops others.
-            queue_length: Number of throttled messages that the server keeps.
-            queue_size: Limit of messages queued here; beyond it the oldest is dropped and counted.
-            compression: `cbor` for long arrays in a tenth of JSON's time, `cbor-raw` for the serialised bytes
-                alone (`Message.raw`), `png` for servers of ROS 1 over slow networks. A server that does not know
-                it sends JSON, or nothing.
+            type: Type of the messages; None for any. Without a type, the subscription is repeated every two
+                seconds until a message arrives, because servers drop subscriptions to unknown topics.
+            throttle_rate: Minimum number of milliseconds between two messages; the server drops others.
+            queue_length: Number of throttled messages that the server queues.
+            queue_size: Maximum number of messages queued here; then the oldest is dropped and counted.
+            compression: `cbor` for long arrays in a tenth of the time of JSON, `cbor-raw` for only the
+                serialised bytes (`Message.raw`), `png` for ROS 1 servers over slow networks. A server that
+                does not support it sends JSON, or nothing.
             arrays: Python type of arrays of numbers: `list`, or `numpy` for NumPy arrays, read-only from CBOR.
-            fragment_size: Limit of characters that the server sends in one piece.
+            fragment_size: Maximum number of characters that the server sends in one fragment.
             qos: Quality of service in ROS 2; older servers ignore it.
 
         Raises:
@@ -215,8 +216,8 @@ class Ros:
             Fields of the answer.
 
         Raises:
-            ServiceError: It answered that it failed; with the server's text.
-            NoAnswerError: It did not answer in time.
+            ServiceError: The service refused; with the server's text.
+            NoAnswerError: The service did not answer in time.
             SlowPeerError: The server did not accept the call in time.
             DisconnectedError: There is no connection, or it was lost meanwhile.
             EncodeError: The arguments cannot be sent as JSON.
@@ -236,14 +237,14 @@ class Ros:
         Args:
             service: Name of the service.
             type: Its type, in the form of ROS 1 or ROS 2.
-            handler: Awaited with the fields of each request; returns the fields of the answer. If it raises
-                `ServiceError`, the caller gets its reason; any other error is logged, and the caller gets its name.
-                Up to 64 requests are handled concurrently.
+            handler: Coroutine function that is called with the fields of each request and returns the fields
+                of the answer. If it raises `ServiceError`, the caller gets its reason; any other error is
+                logged, and the caller gets its name. Up to 64 requests are handled concurrently.
             handler_timeout: Timeout of the handler in seconds.
 
         Raises:
             NameFormError: The name or the type is malformed.
-            TypeConflictError: This client already serves it.
+            TypeConflictError: This client already serves this service.
             DisconnectedError: The client was closed.
         """
         return Service(self._session, service, type, handler, handler_timeout)
@@ -292,12 +293,12 @@ class Ros:
     async def detect_ros_version(self, timeout: float = DETECT_TIMEOUT) -> RosVersion | None:  # noqa: ASYNC109  # all of it
         """Detect the ROS version of the server, if possible.
 
-        The option of `connect` comes first, then the stamps of received messages, then rosapi: the version itself, or the
-        form of the type of `/rosout`. Later advertisements and subscriptions, and those restored after a reconnection,
-        use type names of the detected form.
+        The sources are, in this order: the option of `connect`, the stamps of received messages, and rosapi
+        (the version, or the spelling of the type of `/rosout`). Later advertisements and subscriptions, and
+        those restored after a reconnection, use type names of the detected version.
 
         Returns:
-            1 or 2; None without rosapi and without a message with a header, and after `timeout` seconds.
+            1 or 2; None if there is neither rosapi nor a message with a header, or after `timeout` seconds.
         """
         if self.ros_version is None:
             asked = (self._ask_version(timeout), self._ask_rosout_type(timeout))
@@ -339,32 +340,34 @@ def connect(
     ping_timeout: float = 5.0,
     on_state: StateCallback | None = None,
 ) -> Ros:
-    """Make a client of a rosbridge server, which `async with` opens and closes.
+    """Create a client of a rosbridge server, which `async with` opens and closes.
 
-    Entering fails if the first connection does, with `UnreachableError` or `NotRosbridgeError`. A connection that is
-    lost later is opened again, with a back-off from 0.1 s to 5 s, and everything that was advertised, subscribed and
-    served is restored.
+    If the first connection fails, `async with` raises `UnreachableError` or `NotRosbridgeError`. If the
+    connection is lost later, the client reconnects with a back-off from 0.1 s to 5 s, and restores all
+    advertisements, subscriptions and services.
 
     Args:
-        uri: `ws://host:port`, or `wss://` for TLS, whose certificate is always checked.
+        uri: `ws://host:port`, or `wss://` for TLS; the certificate is always verified.
         connect_timeout: Timeout of the first connection in seconds.
-        ros_version: ROS version of type names on the wire. `auto` uses ROS 1, which servers of ROS 2 accept
-            too, until `Ros.detect_ros_version` has detected it.
+        ros_version: ROS version of type names on the wire. `auto` uses ROS 1, which ROS 2 servers accept too,
+            until `Ros.detect_ros_version` has detected the version.
         token: Sent as `Authorization: Bearer TOKEN`; like all headers it is never logged.
         headers: Additional headers of the handshake.
-        ca_file: Certificate authorities (PEM) for the server, instead of the system's.
+        ca_file: Certificate authorities (PEM) for the server, instead of those of the system.
         client_certificate: Certificate and key (PEM) of this client, in one file or in two.
-        tls: Complete TLS settings, instead of these two.
+        tls: An SSL context, instead of these two.
         proxy: `http://proxy:3128`, `https://` or `socks5h://` (with the package python-socks), or
-            `environment` for the one in HTTPS_PROXY etc. None connects directly.
-        max_size: Largest message in bytes, in both directions. A larger one that arrives ends the connection.
-        fragment_size: Characters beyond which a message is sent in fragments; None for never.
+            `environment` for the proxy in HTTPS_PROXY etc.; None for a direct connection.
+        max_size: Maximum size of a message in bytes, in both directions. A larger inbound message ends the
+            connection.
+        fragment_size: Maximum number of characters of a message before it is sent in fragments; None for no
+            limit.
         ping_interval: Seconds of silence after which the server is pinged.
-        ping_timeout: Seconds that it then has, before the connection counts as lost.
-        on_state: Called with each new state and its reason.
+        ping_timeout: Seconds to wait for data after a ping before the connection counts as lost.
+        on_state: Callback for each new state and its reason.
 
     Raises:
-        UriError: It is not a WebSocket URI.
+        UriError: The URI is not a WebSocket URI.
         OptionError: An option is out of its range, or a file cannot be read.
     """
     if ros_version not in {"auto", "1", "2"}:
@@ -387,5 +390,5 @@ def connect(
         proxy=proxy,
     )
     core = ClientCore(ros_version=configured_version, max_size=max_size, fragment_size=fragment_size)
-    parsed = replace(parsed, username=None, password=None)  # they are in the route
+    parsed = replace(parsed, username=None, password=None)  # the credentials are in the route
     return Ros(Session(parsed, shown(uri), core, limits, on_state, route=route))

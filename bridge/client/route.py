@@ -1,7 +1,7 @@
 """Route of a connection to its server: TLS and certificates, headers and tokens, proxies.
 
-Secrets stay out of logs and errors: the repr of a `Route` has no headers, and `shown` removes credentials and queries from
-a URI.
+Secrets do not appear in logs and errors: the repr of a `Route` does not contain headers, and `shown` removes
+credentials and queries from a URI.
 """
 
 import asyncio
@@ -48,7 +48,7 @@ class Route:
 
     Attributes:
         tls: TLS settings; None for `ws://`.
-        headers: Headers of the handshake beside the WebSocket's own.
+        headers: Additional headers of the handshake.
         proxy: The proxy, or None for a direct connection.
     """
 
@@ -67,10 +67,10 @@ def make_route(
     tls: ssl.SSLContext | None = None,
     proxy: str | None = None,
 ) -> Route:
-    """Check a user's options of the route (see `bridge.client.connect`); a user in the URI becomes a header.
+    """Check the options of a route (see `bridge.client.connect`); credentials in the URI become a header.
 
     Raises:
-        OptionError: An option is unusable; the sentence names it, but no secret.
+        OptionError: An option is invalid; the sentence names it, without secrets.
     """
     fields = dict(headers or {})
     authorized = any(name.lower() == "authorization" for name in fields)
@@ -117,7 +117,7 @@ def _tls(
             client_certificate if isinstance(client_certificate, tuple) else (client_certificate, None)
         )
         try:
-            # Without a password given here, OpenSSL would ask for one on the terminal.
+            # Without a password argument, OpenSSL would ask for one on the terminal.
             context.load_cert_chain(certificate, key, password=lambda: b"")
         except (OSError, ssl.SSLError, ValueError) as error:
             named = fspath(certificate) + (f" and {fspath(key)}" if key is not None else "")
@@ -135,14 +135,14 @@ def _proxy(uri: WebSocketURI, proxy: str | None) -> Proxy | None:
     except (InvalidProxy, ValueError) as error:
         reason = error.msg if isinstance(error, InvalidProxy) else "it is not a URL"
         raise OptionError(
-            f"proxy {shown(proxy)!r} cannot be used ({reason}): it must be like http://proxy:3128"
+            f"proxy {shown(proxy)!r} cannot be used ({reason}): expected, for example, http://proxy:3128"
         ) from None
 
 
 async def connect_along(
     route: Route, uri: WebSocketURI, shown_uri: str, factory: Callable[[], _ConnectionT]
 ) -> _ConnectionT:
-    """Open the transport of a WebSocket connection; `shown_uri` names the server in errors.
+    """Open the transport of a WebSocket connection; `shown_uri` identifies the server in errors.
 
     Raises:
         UnreachableError: The proxy refuses or fails.

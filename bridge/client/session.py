@@ -1,4 +1,4 @@
-"""A rosbridge connection that reconnects by itself: its states, sending in order, and dispatch of what arrives."""
+"""A rosbridge connection with automatic reconnection: states, sending in order, dispatch of messages."""
 
 import asyncio
 import logging
@@ -36,17 +36,17 @@ from bridge.errors import (
 )
 
 FIRST_DELAY: Final = 0.1
-"""First and longest delay in seconds before an attempt to reconnect."""
+"""First and maximum delay in seconds before an attempt to reconnect."""
 MAX_DELAY: Final = 5.0
 ATTEMPT_TIMEOUT: Final = 5.0
-"""Seconds that one attempt to reconnect may take."""
+"""Timeout in seconds of one attempt to reconnect."""
 STEADY: Final = 5.0
-"""Seconds that a connection must last to reset the back-off."""
+"""Minimum duration in seconds of a connection that resets the back-off."""
 UNTYPED_RETRY: Final = 2.0
-"""Seconds between two subscriptions to a topic of unknown type without messages."""
+"""Seconds between repeated subscriptions to a topic of unknown type without messages."""
 KEPT_STATUSES: Final = 16
-"""Latest status messages of the server that are kept."""
-# Messages that are sent in a row before other tasks get their turn.
+"""Number of status messages of the server that are stored."""
+# Number of messages sent in a row before other tasks get their turn.
 _LONGEST_BURST: Final = 32
 
 _log = logging.getLogger("bridge")
@@ -80,11 +80,11 @@ class Message(NamedTuple):
 
     Attributes:
         topic: Name of the topic in the server's spelling.
-        msg: The ROS message; shared by all subscriptions of the topic, so not to be changed.
+        msg: The ROS message; shared by all subscriptions of the topic, so do not modify it.
         received_ns: `time.time_ns()` at its arrival, the same for all messages that arrive together.
         received_monotonic_ns: `time.monotonic_ns()` at the same time.
-        blind_seconds: How long the connection was lost just before this message; 0 except in the first message
-            after a reconnection.
+        blind_seconds: Time without a connection just before this message; 0 except in the first message after
+            a reconnection.
     """
 
     topic: str
@@ -98,32 +98,32 @@ class Message(NamedTuple):
         """The serialised bytes of a message of a `cbor-raw` subscription.
 
         Raises:
-            DecodeError: It has none: it was subscribed otherwise, or the server does not know cbor-raw.
+            DecodeError: There are none, because the subscription or the server does not use cbor-raw.
         """
         data = self.msg.get("bytes")
         if type(data) is not bytes:
             raise DecodeError(
                 f"a message of {self.topic} has no serialised bytes: was it subscribed with "
-                "compression='cbor-raw', and does the server know that?"
+                "compression='cbor-raw', and does the server support that?"
             )
         return data
 
 
 class Session:
-    """The one connection of a client, over all of its WebSockets.
+    """The connection of a client, over its successive WebSockets.
 
     Attributes:
         uri: URI of the server, without secrets.
-        core: The protocol's state: everything that was advertised, subscribed and called.
+        core: The protocol state: advertisements, subscriptions, services and calls.
         state: State of the connection.
         reconnections: Number of completed reconnections.
-        last_error: Why the connection was lost, or why the last attempt failed.
-        unusable: Number of messages that no client can use.
+        last_error: Reason of the lost connection or of the last failed attempt.
+        unusable: Number of unusable messages received.
         statuses: Latest status messages of the server, newest last.
         receivers: Callbacks for messages, by number of the subscription.
         on_blind: Callbacks for the seconds without connection, after a reconnection.
         servers: Handlers of requests, by service of this client.
-        goals: Receivers of events, by identity of the action goal.
+        goals: Receivers of events, by id of the goal.
         on_closed: Callbacks for the final close.
     """
 
@@ -164,7 +164,7 @@ class Session:
         self._reconnecting: asyncio.Task[None] | None = None  # the last one, done or not
         self._retry_timer: asyncio.TimerHandle | None = None
         self._burst = 0
-        self._turn = asyncio.Lock()  # fair: first come, first served
+        self._turn = asyncio.Lock()  # fair: first in, first out
         self._waiting = 0
         self._serving: set[asyncio.Task[None]] = set()
         self._calls: dict[str, asyncio.Future[CallAnswered]] = {}
@@ -175,7 +175,9 @@ class Session:
     async def open(self) -> None:
         """Connect for the first time (see `bridge.client.connect`)."""
         if self._entered:
-            raise DisconnectedError(f"this client of {self.uri} was opened before: connect() makes a new one")
+            raise DisconnectedError(
+                f"this client of {self.uri} was already opened: connect() creates a new one"
+            )
         self._entered = True
         try:
             await self._connect(self._limits.connect_timeout)
@@ -184,7 +186,7 @@ class Session:
             raise
 
     async def close(self, reason: str = "closed by this client") -> None:
-        """Close the connection after what was sent before, and end everything that waits."""
+        """Close the connection after all sent messages, and end everything that waits."""
         if self.state is State.CLOSED:
             return
         websocket, self._websocket = self._websocket, None
@@ -245,7 +247,7 @@ class Session:
 
     async def _reconnect(self) -> None:
         while True:
-            # Up to a fifth earlier, so that the clients of one server do not all reconnect at once.
+            # Up to a fifth earlier, so that the clients of a server do not all reconnect at once.
             await asyncio.sleep(self._delay * random.uniform(0.8, 1.0))
             self._delay = min(2 * self._delay, MAX_DELAY)
             try:
@@ -303,7 +305,7 @@ class Session:
         return self._websocket is not None and self._websocket.is_open
 
     def must_wait(self) -> bool:
-        """Return whether a message has to wait for its turn; an error without a connection."""
+        """Return whether a message must wait for its turn; raise an error without a connection."""
         return self._connected().paused or self._waiting > 0
 
     def _connected(self) -> WebSocket:
@@ -315,7 +317,7 @@ class Session:
         return websocket
 
     def send_now(self, data: bytes) -> None:
-        """Hand a message to the socket; an error without a connection."""
+        """Write a message to the socket; raise an error without a connection."""
         self._connected().send(tuple(self.core.wire.pieces(data)))
 
     def should_yield(self) -> bool:
@@ -327,12 +329,12 @@ class Session:
         return True
 
     def together(self) -> AbstractContextManager[None]:
-        """Send everything inside the block in one piece (see `bridge.client.Ros.together`)."""
+        """Write everything sent inside the block at once (see `bridge.client.Ros.together`)."""
         websocket = self._websocket
         return nullcontext() if websocket is None else websocket.together()
 
     async def wait_turn(self, what: str, limit: float) -> None:
-        """Wait until the server has accepted everything that was sent before; `what` describes the message in errors."""
+        """Wait until the server has accepted all previous messages; `what` names the message in errors."""
         self._waiting += 1
         try:
             async with asyncio.timeout(limit), self._turn:
@@ -344,7 +346,7 @@ class Session:
             self._waiting -= 1
 
     def flush(self) -> None:
-        """Send the core's output, which is small and rare enough never to wait."""
+        """Send the output of the core, which is too small and rare to wait."""
         for message in self.core.data_to_send():
             if self.is_open:
                 self.send_now(message)
@@ -383,7 +385,7 @@ class Session:
         return answer.values
 
     def context_since(self, since: float) -> str:
-        """Return the end of an error's sentence: how the server was lost, or its last status, if after `since`."""
+        """Return the end of an error's sentence: the lost connection or the last status since a time."""
         if self._lost_at > since:
             return f"; meanwhile the connection was lost: {self.last_error}"
         return f"; the server reported: {self.statuses[-1].text[:200]}" if self._status_at > since else ""
@@ -398,7 +400,7 @@ class Session:
             event = receive(data, now)
             if type(event) is MessageReceived:
                 topic, msg, subscriptions = event
-                # What a named tuple's own constructor does takes three times as long.
+                # The constructor of a named tuple takes three times as long.
                 message = tuple.__new__(Message, (topic, msg, received_ns, received_monotonic_ns, 0.0))
                 for number in subscriptions:
                     receivers[number](message)
@@ -429,7 +431,8 @@ class Session:
                     _log.log(level, "%s reports (%.20s): %.500s", self.uri, event.level, event.text)
             case Unusable():
                 self.unusable += 1
-                # The 1st, 2nd, 4th, 8th ...: a faulty server does not fill the log (as with statuses).
+                # Only the 1st, 2nd, 4th, 8th ..., so that a faulty server does not fill the log (as for
+                # statuses).
                 if self.unusable & (self.unusable - 1) == 0:
                     _log.warning("%s, %d so far: %s", self.uri, self.unusable, event.reason)
             case _:

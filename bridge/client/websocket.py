@@ -1,9 +1,9 @@
-"""One WebSocket connection of the client: opened with clear errors, and given up when the server falls silent.
+"""One WebSocket connection of the client, with clear errors and detection of silent servers.
 
-A message goes from the socket's callback straight to its receiver, with no queue and no task in between.
+A message goes directly from the socket's callback to its receiver, without a queue or a task in between.
 
-Anything that the server sends counts as a sign of life, not pongs alone. A silent server is given up within
-`ping_interval + ping_timeout`.
+All data from the server counts as a sign of life, not only pongs. The connection to a silent server is closed
+after `ping_interval + ping_timeout`.
 """
 
 import asyncio
@@ -36,18 +36,18 @@ from bridge.errors import (
 from bridge.transport.websocket import WebSocketTransport
 
 WRITE_LIMIT: Final = 1 << 16
-"""Bytes that may wait for the server before publishers have to wait too."""
+"""Maximum number of bytes that wait for the server before publishers must wait too."""
 CLOSE_TIMEOUT: Final = 1.0
-"""Seconds that the closing handshake may take."""
+"""Timeout in seconds of the closing handshake."""
 _OVERSLEPT: Final = 0.5
-"""Seconds by which the watchdog may be late before that counts as this process having slept, not the server."""
+"""Delay of the watchdog in seconds that means that this process was suspended, not the server."""
 
 
 class _NoDebug(logging.LoggerAdapter[logging.Logger]):
-    """Logger for the library without its debug lines, which contain all headers, tokens too."""
+    """Logger for the library without debug lines, which would contain all headers, including tokens."""
 
     def isEnabledFor(self, level: int) -> bool:  # noqa: N802  # the standard library's name
-        """Return whether a line of that level is wanted."""
+        """Return whether to log at a level."""
         return level > logging.DEBUG and super().isEnabledFor(level)
 
 
@@ -66,7 +66,7 @@ def check_uri(uri: str) -> WebSocketURI:
     except (InvalidURI, ValueError) as error:  # ValueError: a bad port, half a bracket, odd letters
         reason = error.msg if isinstance(error, InvalidURI) else str(error)
         raise UriError(
-            f"{shown(uri)!r} is not a rosbridge URI ({reason}): it must be like ws://192.168.1.10:9090"
+            f"{shown(uri)!r} is not a rosbridge URI ({reason}): expected, for example, ws://192.168.1.10:9090"
         ) from None
     return parsed
 
@@ -88,10 +88,10 @@ class Limits:
 
 
 class WebSocket(WebSocketTransport):
-    """A WebSocket client connection that calls back for messages and for its end.
+    """A WebSocket client connection with callbacks for messages and for its end.
 
     Attributes:
-        opened: whether it was taken up after its handshake; only then does it call back.
+        opened: whether `begin` was called after the handshake; only then are callbacks called.
     """
 
     def __init__(
@@ -115,7 +115,7 @@ class WebSocket(WebSocketTransport):
         self._silent_for = 0.0
 
     async def handshake(self, headers: tuple[tuple[str, str], ...]) -> None:
-        """Ask the server for a WebSocket, or raise why it does not give one."""
+        """Perform the opening handshake, or raise its error."""
         request = self._client_protocol.connect()
         request.headers.update(headers)
         request.headers.setdefault("User-Agent", USER_AGENT)
@@ -127,20 +127,20 @@ class WebSocket(WebSocketTransport):
 
     @property
     def handshake_error(self) -> Exception | None:
-        """Why the handshake failed."""
+        """The error of the handshake."""
         return self._client_protocol.handshake_exc
 
     def begin(self) -> None:
-        """Take up the connection after its handshake."""
+        """Begin to call back after the handshake."""
         self.opened = True
         self.last_heard = time.monotonic()
         self._schedule(self._limits.ping_interval)
         early, self._early = self._early, []
-        if early:  # they came in one piece with the handshake
+        if early:  # they arrived together with the handshake
             self._on_messages(early)
 
     async def close(self) -> None:
-        """End the connection; what was sent before still goes out."""
+        """Close the connection after sending what was written before."""
         if self.is_open:
             self.start_closing(CloseCode.NORMAL_CLOSURE)
         await self.drain()
@@ -156,18 +156,18 @@ class WebSocket(WebSocketTransport):
         self._answered.set()
 
     def messages_received(self, messages: list[bytes]) -> None:
-        """Hand messages over."""
+        """Pass messages on."""
         if self.opened:
             self._on_messages(messages)
         else:
             self._early += messages
 
     def close_expected(self) -> None:
-        """Give the server a limited time to end the connection."""
+        """Limit the time in which the server must end the connection."""
         if self.opened:
             self._schedule(CLOSE_TIMEOUT)
         else:
-            self.abort()  # a peer that speaks another protocol may never hang up
+            self.abort()  # a peer with another protocol may never close the connection
 
     def ended(self, exc: Exception | None) -> None:
         """Report the end."""
@@ -178,18 +178,18 @@ class WebSocket(WebSocketTransport):
 
     def _why_lost(self, exc: Exception | None) -> str:
         if self._silent_for:
-            return f"nothing was heard from the server for {self._silent_for:.3g} s"
+            return f"no data came from the server for {self._silent_for:.3g} s"
         closed = self._protocol.close_exc
         if isinstance(closed.__cause__, PayloadTooBig):
             return (
                 f"the server sent a message of more than {self._max_size} bytes (max_size allows larger ones)"
             )
         if closed.rcvd is not None and closed.rcvd.code == CloseCode.MESSAGE_TOO_BIG:
-            return "the server closed it: a message was larger than it takes (code 1009)"
+            return "the server closed it: a message was too large for it (code 1009)"
         if closed.rcvd is not None:
             return f"the server closed it (code {closed.rcvd.code})"
         if closed.sent is not None:
-            return f"the server broke the WebSocket protocol ({closed.sent.reason})"
+            return f"the server violated the WebSocket protocol ({closed.sent.reason})"
         return reason_of(exc) if isinstance(exc, OSError) else "the connection broke off"
 
     # Watching for silence
@@ -231,13 +231,13 @@ async def open_websocket(
 ) -> WebSocket:
     """Connect, without permessage-deflate: on a local network it costs more than it saves.
 
-    `shown_uri` is the URI without secrets, for the errors. `on_messages` is called with messages that came together,
-    `on_lost` once with the reason when the connection ends.
+    `shown_uri` is the URI without secrets, for errors. `on_messages` is called with messages that arrived
+    together, and `on_lost` once, with the reason, when the connection ends.
 
     Raises:
         UnreachableError: nothing answers there.
         NotRosbridgeError: something answers there, but not as a WebSocket server.
-        AccessRefusedError: it wants a token or a certificate, or another one.
+        AccessRefusedError: the token or certificate is missing or wrong.
     """
     attempt: WebSocket | None = None
 
@@ -256,7 +256,8 @@ async def open_websocket(
             attempt.abort()
             answered, heard = attempt.is_connected, attempt.first_bytes
             if isinstance(error, Exception) and attempt.handshake_error is not None:
-                # It says more than what came of it: a service that greets first breaks off the request.
+                # The first bytes say more than the error: a service that sends a greeting interrupts the
+                # request.
                 error = attempt.handshake_error
         if isinstance(error, BridgeError) or not isinstance(error, OSError | InvalidHandshake):
             raise
@@ -275,16 +276,16 @@ def _connect_error(
         response = error.response
         seen = f"HTTP {response.status_code} {response.reason_phrase[:80]}".rstrip()
         if response.status_code in {HTTPStatus.UNAUTHORIZED, HTTPStatus.FORBIDDEN}:
-            return AccessRefusedError(f"{uri} does not let this client in ({seen}): check token and headers")
+            return AccessRefusedError(f"{uri} refuses this client ({seen}): check token and headers")
         if response.status_code == HTTPStatus.SERVICE_UNAVAILABLE:
-            return UnreachableError(f"{uri} takes no more clients now ({seen})")
+            return UnreachableError(f"{uri} accepts no more clients now ({seen})")
         to = response.headers.get("Location")
         seen += f", to {to[:200]}" if to else ""
         return NotRosbridgeError(
-            f"{uri} is not a rosbridge server: it answers as a web server ({seen}); check port and path"
+            f"{uri} is not a rosbridge server: it answers like a web server ({seen}); check port and path"
         )
     if isinstance(error, InvalidMessage) and not heard:
-        perhaps = " (as servers do that want a client_certificate)" if uri.startswith("wss:") else ""
+        perhaps = " (some servers do so without a client_certificate)" if uri.startswith("wss:") else ""
         return UnreachableError(f"{uri} is unreachable: it closed the connection without an answer{perhaps}")
     if isinstance(error, InvalidHandshake) or (isinstance(error, TimeoutError) and heard):
         why = f"within {seconds:g} s " if isinstance(error, TimeoutError) else ""
@@ -292,20 +293,18 @@ def _connect_error(
             f"{uri} is not a rosbridge server: it did not answer {why}as a WebSocket server but with {excerpt(heard)}"
         )
     if isinstance(error, ssl.SSLCertVerificationError):
-        return UnreachableError(f"{uri} is not to be trusted: its certificate: {error.verify_message}")
+        return UnreachableError(f"{uri} cannot be trusted; certificate error: {error.verify_message}")
     if isinstance(error, ssl.SSLError) and "ALERT" in (error.reason or ""):
-        return AccessRefusedError(
-            f"{uri} does not let this client in ({error.reason}): check client_certificate"
-        )
+        return AccessRefusedError(f"{uri} refuses this client ({error.reason}): check client_certificate")
     if isinstance(error, ssl.SSLError):
         return NotRosbridgeError(
             f"{uri} does not speak TLS ({error.reason}): is it ws:// rather than wss://?"
         )
-    if isinstance(error, TimeoutError) and error.errno is None:  # the kernel's own has a number
-        done = "it took the connection but did not answer" if answered else "it did not answer"
+    if isinstance(error, TimeoutError) and error.errno is None:  # the kernel's error has a number
+        done = "it accepted the connection but did not answer" if answered else "it did not answer"
         return UnreachableError(f"{uri} is unreachable: {done} within {seconds:g} s")
     if isinstance(error, socket.gaierror):
-        return UnreachableError(f"{uri} is unreachable: its host name is not known ({reason_of(error)})")
+        return UnreachableError(f"{uri} is unreachable: its host name is unknown ({reason_of(error)})")
     return UnreachableError(
         f"{uri} is unreachable: {reason_of(error)}; is the rosbridge server running, and is the port right?"
     )

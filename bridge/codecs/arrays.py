@@ -1,7 +1,7 @@
 """Conversion of whole messages between lists of numbers and NumPy arrays.
 
-It serves topics whose wire form differs from the reader's wish: one that was requested as CBOR and arrives as JSON, or
-two subscriptions of one client of which one wants arrays and the other lists.
+It is used when the encoding differs from the requested form: CBOR was requested but JSON arrives, or one of
+two subscriptions of a client requests arrays and the other one lists.
 """
 
 from typing import Any, Final
@@ -12,8 +12,8 @@ _REALS: Final = frozenset({int, float, type(None)})
 def with_arrays(value: Any) -> Any:
     """Replace every list of numbers in a message that arrived as JSON, in place.
 
-    Floats become float64, with NaN for a null among them; integers become int64, or uint64 where int64 is too
-    small; bytes become uint8. Lists of anything else, also of numbers mixed with booleans, stay lists.
+    Floats become float64, with NaN for null; integers become int64, or uint64 if int64 is too small; bytes
+    become uint8. All other lists, including numbers mixed with booleans, remain lists.
     """
     import numpy as np
 

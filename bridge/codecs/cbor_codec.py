@@ -7,7 +7,7 @@ Inbound, only the part of CBOR that ROS messages need is accepted: maps with tex
 numbers, booleans, null, and typed arrays. Every other tag (shared references, bignums, regular expressions, dates)
 is refused before it is decoded. NaN and infinities are numbers here, as in ROS.
 
-NumPy is imported with the first array that a reader wants.
+NumPy is imported when the first array is requested.
 """
 
 from array import array
@@ -63,7 +63,8 @@ def decode(
         The map. Its numbers may be NaN or infinite.
 
     Raises:
-        DecodeError: The data is too large, too deep, not a CBOR map, or contains what ROS messages cannot.
+        DecodeError: The data is too large, too deep, not a CBOR map, or contains values that ROS messages
+            cannot contain.
     """
     if len(data) > max_size:
         raise DecodeError(f"a message of {len(data)} bytes arrived, expected at most {max_size}")
@@ -82,7 +83,7 @@ def decode(
 
 
 class _Tags(dict[int, _Decoder]):
-    """Decoders of the accepted tags, and a refusal for every other."""
+    """Decoders of the accepted tags, and refusal of all others."""
 
     def __missing__(self, tag: int) -> _Decoder:
         """Refuse a tag, even one that the library could decode."""
@@ -111,7 +112,7 @@ def _decoder(tag: int, arrays: Arrays) -> _Decoder:
             return np.frombuffer(value, name)
         numbers = array(
             code, value
-        )  # `_check` makes the list, so that no tag around it can take it for its content
+        )  # `_check` creates the list, so that a tag around it cannot use it as its content
         if byteorder == "big":
             numbers.byteswap()
         return numbers
@@ -145,7 +146,7 @@ def _check(message: dict[str, Any], arrays: Arrays, data: bytes) -> None:
             elif kind is array:
                 container[key] = value.tobytes() if value.typecode == "B" else value.tolist()
             elif kind is cbor2.CBORSimpleValue or value is cbor2.undefined:
-                raise DecodeError(f"a message with a meaningless value arrived: {excerpt(data)}")
+                raise DecodeError(f"a message with an unsupported value arrived: {excerpt(data)}")
 
 
 def encode(
@@ -158,16 +159,16 @@ def encode(
     """Write one message.
 
     Args:
-        message: The object. NumPy arrays (of any shape, flattened in C order) become typed arrays, byte strings
-            stay such; `typed_array` makes typed arrays of anything else.
+        message: The object. NumPy arrays (of any shape, flattened in C order) become typed arrays, and byte
+            strings remain byte strings; for typed arrays from other values, use `typed_array`.
         max_size: Maximum of bytes.
         max_depth: Maximum of nested maps and arrays.
-        pack_floats: Whether lists of numbers with at least one float become typed arrays of float64, with NaN for a
-            None (JSON's null). A server does so that has the message as JSON and no definition of its type; lists
-            of integers alone stay lists, because their width is unknown.
+        pack_floats: Whether lists of numbers with at least one float become typed arrays of float64, with NaN
+            for None (null in JSON). This is for a server that has the message as JSON without a definition of
+            its type. Lists of only integers remain lists, because their width is unknown.
 
     Raises:
-        EncodeError: A type without a CBOR form here, a key that is not a string, too deep or too large.
+        EncodeError: A type is not supported, a key is not a string, or the message is too deep or too large.
     """
     try:
         data = cbor2.dumps(_prepare(message, max_depth, pack_floats))
@@ -179,14 +180,14 @@ def encode(
 
 
 def typed_array(values: Any, elements: str) -> cbor2.CBORTag:
-    """Make a typed array, as a value in a message for `encode`.
+    """Return a typed array, for use as a value in a message for `encode`.
 
     Args:
         values: Any iterable of numbers.
         elements: Their type: `u1 u2 u4 u8 i1 i2 i4 i8 f4 f8`.
 
     Raises:
-        EncodeError: A value does not have this type, or the type has another name.
+        EncodeError: A value does not have this type, or the type is unknown.
     """
     tag = _TAGS.get(elements)
     if tag is None:
@@ -203,7 +204,7 @@ def typed_array(values: Any, elements: str) -> cbor2.CBORTag:
 
 
 def _prepare(value: Any, levels: int, pack_floats: bool) -> Any:
-    """Return the value with CBOR types only, nested at most `levels` deep."""
+    """Return the value with only CBOR types, nested at most `levels` deep."""
     kind = type(value)
     if kind in _LEAVES or kind is bytes or kind is cbor2.CBORTag:
         return value
@@ -233,7 +234,7 @@ def _packed_floats(values: list[Any] | tuple[Any, ...], kinds: set[type]) -> Any
 def _from_numpy(value: Any) -> Any:
     """Return the CBOR form of a NumPy array or scalar."""
     if isinstance(value, str | int | float) and not hasattr(value, "dtype"):
-        return value  # of a subclass, an enumeration for example
+        return value  # of a subclass, for example an enumeration
     dtype = getattr(value, "dtype", None)
     if dtype is None or dtype.kind not in "buifU":
         raise EncodeError(f"{type(value).__name__} is not a type of messages")

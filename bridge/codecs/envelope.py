@@ -1,4 +1,4 @@
-"""The envelope of a publish operation: the bytes before its message, recognised when they repeat.
+"""The envelope of a publish operation: the bytes before its message, which can be recognised later.
 
 A publisher writes the same bytes before each message of a topic: `{"op":"publish","topic":"/t","msg":`. Once such
 an envelope is proven, any data that starts with it, continues with one JSON object and ends with a brace is a publish
@@ -11,7 +11,7 @@ import orjson
 
 _KEY: Final = b'"msg":'
 LONGEST: Final = 512
-"""Bytes in which the end of an envelope is searched."""
+"""Maximum length of an envelope in bytes."""
 BRACE: Final = ord("}")
 """The last byte of an operation."""
 
@@ -25,9 +25,10 @@ def envelope_of(data: bytes) -> bytes:
 def topic_of(envelope: bytes) -> str | None:
     """Return the topic of an envelope, or None if it is not one.
 
-    It is an envelope if an empty message and a brace complete it to a publish operation with nothing but a topic and
-    a message. The brace closes the operation, so the message is the value of its last key. Neither `op` nor `topic`
-    has that value, so this key is `msg`, and any other object in its place is the message as well.
+    It is an envelope if, completed by an empty message and a brace, it is a publish operation with only a
+    topic and a message. The brace closes the operation, so the message is the value of its last key. Neither
+    `op` nor `topic` has that value, so this key is `msg`, and any other object in its place is also the
+    message.
     """
     try:
         operation: Any = orjson.loads(envelope + b"{}}")

@@ -1,10 +1,11 @@
-"""Fragments: cut a message that is too large for one piece, and put the pieces together again.
+"""Fragments of large messages: splitting and reassembly.
 
-A fragment is `{"op": "fragment", "id": ..., "data": ..., "num": ..., "total": ...}`; the `data` of a message's
-fragments, concatenated in the order of `num`, is its JSON. Servers differ (`docs/reference/rosbridge-differences.md`): `num`
-counts from 0 or from 1, `total` may be a float with a fraction, either may be a string, ids are strings or integers
-and are reused. All of that is accepted; fragments that cannot become a message are refused, and incomplete
-messages are bounded in number, in bytes and in time.
+A fragment is `{"op": "fragment", "id": ..., "data": ..., "num": ..., "total": ...}`; the `data` of a
+message's fragments, concatenated in the order of `num`, is its JSON. Servers differ
+(`docs/reference/rosbridge-differences.md`): `num` counts from 0 or from 1, `total` may be a float with a
+fraction, either may be a string, ids are strings or integers and are reused. All of this is accepted.
+Fragments that cannot form a message are refused, and incomplete messages are bounded in number, bytes and
+time.
 """
 
 import math
@@ -19,13 +20,13 @@ from bridge.codecs.json_codec import MAX_SIZE
 from bridge.errors import DecodeError
 
 MAX_SETS: Final = 16
-"""Maximum of incomplete messages; the oldest is given up for another."""
+"""Maximum number of incomplete messages; a new one replaces the oldest."""
 MAX_FRAGMENTS: Final = 1 << 16
-"""Maximum of fragments in one message."""
+"""Maximum number of fragments in a message."""
 MAX_AGE: Final = 10.0
-"""Seconds without a further fragment after which a message is given up."""
+"""Seconds without another fragment after which a message is discarded."""
 OVERHEAD: Final = 128
-"""Minimum of bytes that storing a fragment takes beyond its data, so that empty ones count too."""
+"""Minimum overhead in bytes of a stored fragment, so that empty fragments count too."""
 _LONGEST_ID: Final = 1024
 _CONTINUATION: Final = 0x80, 0xC0
 """Value and mask of UTF-8 bytes inside a character."""
@@ -46,12 +47,12 @@ class _Set:
 
     @property
     def charged(self) -> int:
-        """Bytes that the fragments occupy."""
+        """Number of bytes that the fragments occupy."""
         return self.size + OVERHEAD * len(self.parts)
 
 
 class Reassembler:
-    """Puts one connection's messages together. The caller reads the clock."""
+    """Reassembly of the messages of one connection. The caller reads the clock."""
 
     def __init__(
         self, *, max_size: int = MAX_SIZE, max_sets: int = MAX_SETS, max_age: float = MAX_AGE
@@ -59,19 +60,19 @@ class Reassembler:
         """Start without fragments.
 
         Args:
-            max_size: Maximum of bytes in a complete message; all incomplete ones together may occupy four times
-                as many, storage overhead included.
-            max_sets: Maximum of incomplete messages.
+            max_size: Maximum size of a complete message in bytes; all incomplete ones together may occupy
+                four times as many, including overhead.
+            max_sets: Maximum number of incomplete messages.
             max_age: Seconds that a message waits for its next fragment.
         """
         self.given_up = 0
-        """Messages that were begun and never became complete."""
+        """Number of messages that were discarded before they were complete."""
         self.waiting_bytes = 0
-        """Bytes that incomplete messages occupy."""
+        """Number of bytes that incomplete messages occupy."""
         self._max_size = max_size
         self._max_sets = max_sets
         self._max_age = max_age
-        self._sets: dict[FragmentId, _Set] = {}  # in the order in which they began
+        self._sets: dict[FragmentId, _Set] = {}  # in the order of their first fragments
 
     def __len__(self) -> int:
         """Return the number of incomplete messages."""
@@ -79,22 +80,22 @@ class Reassembler:
 
     @property
     def deadline(self) -> float:
-        """When `expire` is due, infinity for never."""
+        """Time at which `expire` is due; infinity for never."""
         return min((begun.touched for begun in self._sets.values()), default=math.inf) + self._max_age
 
     def take(self, fragment: Mapping[str, Any], now: float) -> bytes | None:
-        """Take one fragment; `now` is in seconds of any monotonic clock.
+        """Add one fragment; `now` is in seconds of any monotonic clock.
 
-        It returns the message that is complete now; None if fragments are missing, or this one is a repetition.
+        Returns the complete message; None if fragments are missing, or this one is a duplicate.
 
         Raises:
-            DecodeError: It is not a fragment, or its message is too large or inconsistent and was given up.
+            DecodeError: It is not a fragment, or its message is too large or inconsistent and was discarded.
         """
         key, data, number, total = _read(fragment)
         self.expire(now)
         begun = self._sets.get(key)
         if begun is not None and (begun.total != total or begun.parts.get(number, data) != data):
-            self._give_up(key)  # the id was reused: the message before will never be complete
+            self._give_up(key)  # the id was reused: the previous message will never be complete
             begun = None
         if begun is None:
             if total == 1:
@@ -121,7 +122,7 @@ class Reassembler:
         return None
 
     def expire(self, now: float) -> None:
-        """Give up the messages that have waited too long for a fragment."""
+        """Discard the messages that have waited too long for a fragment."""
         for key in [key for key, begun in self._sets.items() if begun.touched + self._max_age <= now]:
             self._give_up(key)
 
@@ -155,10 +156,11 @@ class Reassembler:
 
 
 def split(message: bytes, fragment_size: int, fragment_id: FragmentId) -> Iterator[bytes]:
-    """Cut an operation as JSON into fragments of at most so many bytes, which always hold one character at least.
+    """Split an operation as JSON into fragments of at most `size` bytes, but at least one character.
 
     Yields:
-        The message itself if it fits into one fragment, else its fragments as JSON, in order, numbered from 0.
+        The message itself if it fits into one fragment, otherwise its fragments as JSON, in order, numbered
+        from 0.
     """
     if len(message) <= fragment_size:
         yield message
@@ -174,14 +176,14 @@ def split(message: bytes, fragment_size: int, fragment_id: FragmentId) -> Iterat
 
 
 def _ends(message: bytes, fragment_size: int) -> Iterator[int]:
-    """Find where fragments of whole characters end."""
+    """Find the ends of fragments of whole characters."""
     inside, mask = _CONTINUATION
     begin = 0
     while begin < len(message):
         end = min(begin + fragment_size, len(message))
         while end < len(message) and message[end] & mask == inside:
             end -= 1
-        if end == begin:  # a character of more bytes than a fragment has
+        if end == begin:  # a character with more bytes than a fragment
             end += 1
             while end < len(message) and message[end] & mask == inside:
                 end += 1
@@ -213,7 +215,7 @@ def _read(fragment: Mapping[str, Any]) -> tuple[FragmentId, bytes, int, int]:
 
 
 def _number(value: object) -> float | None:
-    """Read a number from 0 up, also one in a string."""
+    """Read a non-negative number, also from a string."""
     if isinstance(value, str) and _DIGITS.fullmatch(value):
         return float(value)
     if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value <= 1e9:

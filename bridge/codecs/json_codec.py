@@ -1,16 +1,16 @@
-"""JSON on the wire: one object per message, within limits of size and depth, and finite numbers only.
+"""JSON on the wire: one object per message, with limits of size and depth, and only finite numbers.
 
 Inbound:
 
 * One WebSocket message holds one object. The last of several equal keys wins, as in the servers' parsers.
 * `NaN`, `Infinity`, `-Infinity`, which some servers leak although JSON excludes them, and numbers beyond float64
   (`1e999`) are read as None, which is how the reference server's `null` is read.
-  Only a message that strict JSON refuses pays for this second attempt.
+  Only messages that are not strict JSON need this second attempt.
 * Integers beyond 64 bits become floats.
 
-Outbound: NaN and infinities either leave as `null`, as the reference server sends them, or are refused with their
-place, because servers silently drop `null` in a float field. NumPy arrays and scalars are written without
-intermediate lists; NumPy is never imported here. Bytes are written as base64, the servers' form of `uint8[]`.
+Outbound: NaN and infinities are either sent as `null`, as by the reference server, or refused with their
+path, because servers silently drop `null` in a float field. NumPy arrays and scalars are written without
+intermediate lists; NumPy is never imported here. Bytes are written as base64, like `uint8[]` by servers.
 """
 
 import base64
@@ -26,16 +26,16 @@ import orjson
 from bridge.errors import DecodeError, EncodeError
 
 MAX_SIZE: Final = 1 << 20
-"""Default maximum of bytes in one message, in both directions."""
+"""Default maximum size of a message in bytes, in both directions."""
 MAX_DEPTH: Final = 64
-"""Default maximum of nested objects and arrays. The deepest standard ROS message has about ten levels."""
+"""Default maximum nesting of objects and arrays. The deepest standard ROS message has about ten levels."""
 
 _OPTIONS: Final = orjson.OPT_SERIALIZE_NUMPY
 _EXCERPT: Final = 60
 _COUNTED: Final = 4096
-"""Bytes up to which counting a character is faster than searching for each occurrence."""
+"""Size in bytes up to which counting a character is faster than searching for each occurrence."""
 _HOPS: Final = 64
-"""Occurrences of one character to check before searching for the whole word."""
+"""Number of occurrences of one character to check before searching for the whole word."""
 _NO_BRACKETS: Final = bytes(byte for byte in range(256) if byte not in b"[]{}")
 _STEPS: Final = bytes.maketrans(b"[{]}", b"\x01\x01\xff\xff")
 """One level up or down, as signed bytes."""
@@ -48,7 +48,7 @@ def excerpt(data: bytes | str) -> str:
 
 
 def text_of(value: Any) -> str:
-    """Return a server's explanation as text, although some servers send an object instead of a string."""
+    """Return the explanation of a server as text; some servers send an object instead of a string."""
     if isinstance(value, str):
         return value
     if value is None:
@@ -65,7 +65,7 @@ def decode(data: bytes | str, *, max_size: int = MAX_SIZE, max_depth: int = MAX_
     Args:
         data: A whole WebSocket message, as UTF-8 or decoded.
         max_size: Maximum of bytes (of characters in a str).
-        max_depth: Maximum of nested objects and arrays, including the outermost.
+        max_depth: Maximum nesting of objects and arrays, including the outermost.
 
     Returns:
         The object, with finite numbers only.
@@ -87,7 +87,7 @@ def decode(data: bytes | str, *, max_size: int = MAX_SIZE, max_depth: int = MAX_
 
 
 def is_deeper(data: bytes | str, limit: int) -> bool:
-    """Return whether valid JSON nests more than `limit` objects and arrays, without visiting its values."""
+    """Return whether valid JSON is nested deeper than `limit`, without visiting its values."""
     if len(data) <= 2 * limit:
         return False
     if isinstance(data, str):
@@ -102,7 +102,7 @@ def is_deeper(data: bytes | str, limit: int) -> bool:
 
 
 def _has_more_brackets(data: bytes, limit: int) -> bool:
-    """Return whether JSON has more than `limit` opening brackets; most messages need no closer look."""
+    """Return whether JSON has more than `limit` opening brackets, which most messages do not have."""
     if len(data) <= _COUNTED:
         return data.count(b"{") + data.count(b"[") > limit
     # Searching for the next bracket skips long arrays of numbers forty times faster than counting.
@@ -117,15 +117,15 @@ def _has_more_brackets(data: bytes, limit: int) -> bool:
 
 
 def _decode_leniently(data: bytes | str, error: orjson.JSONDecodeError) -> Any:
-    """Read JSON with non-finite numbers, which become None, and refuse everything else."""
+    """Read JSON with non-finite numbers, which become None; raise an error for everything else."""
     try:
         text = data if isinstance(data, str) else data.decode()
         if "infinity when parsed" not in error.msg and "NaN" not in text and "Infinity" not in text:
-            raise ValueError  # noqa: TRY301 - the same refusal as for all that follows
+            raise ValueError  # noqa: TRY301 - the same error as for the other cases
         message = json.loads(
             text, parse_constant=lambda _: None, parse_float=_finite_or_none, parse_int=_int_of_64_bits
         )
-        orjson.dumps(message)  # refuses unpaired surrogates and extreme depth, as strict reading does
+        orjson.dumps(message)  # refuses unpaired surrogates and extreme depth, like strict reading
     except (ValueError, TypeError, RecursionError):  # ValueError: also bad UTF-8, an integer of 5000 digits
         raise DecodeError(f"a message that is not JSON arrived ({error.msg}): {excerpt(data)}") from None
     return message
@@ -154,23 +154,21 @@ def encode(
         message: The object; values may be NumPy arrays, contiguous or not, and NumPy scalars.
         nonfinite: Treatment of NaN and infinities.
         max_size: Maximum of bytes.
-        max_depth: Maximum of nested objects and arrays.
+        max_depth: Maximum nesting of objects and arrays.
 
     Returns:
         UTF-8 JSON without whitespace.
 
     Raises:
         EncodeError: A type that JSON does not have, an integer beyond 64 bits, a key that is not a string, a NaN
-            or infinity with `nonfinite="refuse"` (the sentence names its place), too deep or too large.
+            or infinity with `nonfinite="refuse"` (the sentence gives its path), too deep or too large.
     """
     try:
         try:
             data = orjson.dumps(message, _to_json_type, _OPTIONS)
         except TypeError:
             data = orjson.dumps(_in_native_byte_order(message), _to_json_type, _OPTIONS)
-    except (
-        TypeError
-    ) as error:  # orjson.JSONEncodeError is a TypeError; the default function's error is its cause
+    except TypeError as error:  # of orjson; the error of the default function is its cause
         raise EncodeError(f"the message cannot be written as JSON: {error.__cause__ or error}") from None
     except RecursionError:
         raise EncodeError(f"the message is nested deeper than {max_depth} levels") from None
@@ -180,8 +178,8 @@ def encode(
         place = find_nonfinite(message)
         if place is not None:
             raise EncodeError(
-                f"{place} is NaN or infinite, which JSON cannot express and rosbridge servers drop silently: "
-                "leave it out, or send None where the receiver takes null"
+                f"{place} is NaN or infinite, which JSON cannot represent and rosbridge servers silently drop: "
+                "omit it, or send None if the receiver accepts null"
             )
     if is_deeper(data, max_depth):
         raise EncodeError(f"the message is nested deeper than {max_depth} levels")
@@ -190,11 +188,11 @@ def encode(
 
 def _has_null(data: bytes) -> bool:
     """Return whether `null` occurs in JSON, even inside a string."""
-    at = data.find(b"n")  # one byte is found several times faster than four
+    at = data.find(b"n")  # searching for one byte is several times faster than for four
     if at < 0:
         return False
     if len(data) > _COUNTED:
-        # Long arrays of numbers contain no n, so hopping from n to n skips them.
+        # Long arrays of numbers do not contain an n, so searching for n skips them.
         for _ in range(_HOPS):
             at = data.find(b"n", at)
             if at < 0 or data.startswith(b"null", at):
@@ -204,7 +202,7 @@ def _has_null(data: bytes) -> bool:
 
 
 def _to_json_type(value: object) -> Any:
-    """Convert what orjson does not know: non-contiguous arrays, bytes (`uint8[]`), mappings other than dict."""
+    """Convert types that orjson does not support: non-contiguous arrays, bytes (`uint8[]`), other mappings."""
     if isinstance(value, Mapping):
         return dict(value)
     if isinstance(value, bytes | bytearray):
@@ -217,7 +215,7 @@ def _to_json_type(value: object) -> Any:
 
 
 def _in_native_byte_order(value: Any) -> Any:
-    """Return the message with arrays of foreign byte order, which orjson refuses, in this machine's."""
+    """Return the message with arrays in native byte order, because orjson refuses others."""
     if isinstance(value, Mapping):
         return {key: _in_native_byte_order(part) for key, part in value.items()}
     if isinstance(value, list | tuple):
@@ -227,7 +225,7 @@ def _in_native_byte_order(value: Any) -> Any:
 
 
 def find_nonfinite(message: Any) -> str | None:
-    """Return the place of the first NaN or infinity (`scan.ranges[3]`), or None."""
+    """Return the path of the first NaN or infinity (`scan.ranges[3]`), or None."""
     inner: list[tuple[str, Any]] = [("", message)]
     while inner:
         place, value = inner.pop()
@@ -246,11 +244,11 @@ def find_nonfinite(message: Any) -> str | None:
 
 
 def _all_finite(value: Any) -> bool:
-    """Return whether a NumPy array or scalar certainly has neither NaN nor infinity."""
+    """Return whether a NumPy array or scalar certainly contains neither NaN nor infinity."""
     if value.dtype.kind in "bui":
         return True
     if value.dtype.kind != "f":
         return False  # its elements are checked one by one
-    import numpy as np  # already loaded: the value is NumPy's
+    import numpy as np  # already imported, because the value is from NumPy
 
     return bool(np.isfinite(value).all())

@@ -1,7 +1,7 @@
-"""Decoding of serialised ROS messages (`compression: cbor-raw`), in ROS 1's form or in CDR.
+"""Decoding of serialised ROS messages (`compression: cbor-raw`), in the format of ROS 1 or in CDR.
 
-The types and the decoding are those of `rosbags` (the extra `messages`), which knows some 160 standard types; others
-are registered by the text of their `.msg`. It is imported with the first message.
+Types and decoding come from `rosbags` (the extra `messages`), which knows about 160 standard types; register
+others with the text of their `.msg` file. It is imported with the first message.
 """
 
 from dataclasses import fields, is_dataclass
@@ -19,7 +19,7 @@ _TIMES: Final = frozenset({"builtin_interfaces/msg/Time", "builtin_interfaces/ms
 
 
 class MessageTypes:
-    """The types by which serialised messages are read.
+    """The known types of serialised messages.
 
     types = MessageTypes()
     async for message in ros.subscribe("/scan", "sensor_msgs/LaserScan", compression="cbor-raw"):
@@ -30,7 +30,7 @@ class MessageTypes:
         """Start with the standard types.
 
         Args:
-            ros_version: The ROS version whose bytes are read; None detects it for each message.
+            ros_version: The ROS version of the messages; None to detect it for each message.
         """
         self._version = ros_version
         self._registered: dict[str, str] = {}
@@ -40,9 +40,9 @@ class MessageTypes:
         """Add a type that is not a standard one.
 
         Args:
-            type_name: Its name, in the form of either ROS version.
-            definition: The text of its `.msg`; types that it uses may follow, each after a line of `=` and a
-                line `MSG: package/Type`, as in recordings.
+            type_name: Its name, in the spelling of either ROS version.
+            definition: The text of its `.msg` file; types that it uses may follow, each after a line of `=`
+                and a line `MSG: package/Type`, as in bag files.
 
         Raises:
             DefinitionError: The text is not a definition, or rosbags is missing.
@@ -63,11 +63,11 @@ class MessageTypes:
 
         Args:
             data: Its bytes.
-            type_name: Its type, in the form of either ROS version.
+            type_name: Its type, in the spelling of either ROS version.
 
         Returns:
-            Its fields as in JSON, except that arrays of numbers are NumPy arrays of their own type, which share the
-            message's memory.
+            Its fields as in JSON, except that arrays of numbers are NumPy arrays of the type in the message,
+            which share its memory.
 
         Raises:
             DecodeError: The bytes are not a message of that type.
@@ -79,7 +79,7 @@ class MessageTypes:
         versions = (2, 1) if self._version is None else (self._version,)
         if not any(name in self._store(version).fielddefs for version in versions):
             raise DefinitionError(
-                f"the type {type_name} is unknown: give the text of its .msg to MessageTypes.register"
+                f"the type {type_name} is unknown: pass the text of its .msg to MessageTypes.register"
             )
         if self._version is None and data[:4] not in _CDR:
             versions = (1,)
@@ -93,12 +93,10 @@ class MessageTypes:
                 return _as_dict(message, version)
             except KeyError as error:
                 raise DefinitionError(
-                    f"the type {type_name} uses {error}, which is unknown: give the text of its .msg to "
+                    f"the type {type_name} uses {error}, which is unknown: pass the text of its .msg to "
                     "MessageTypes.register"
                 ) from None
-            except (
-                Exception
-            ) as error:  # the code generated for the type fails in many ways on arbitrary bytes
+            except Exception as error:  # the generated code fails in many ways on arbitrary bytes
                 why = why or str(error)
         raise DecodeError(f"{len(data)} bytes are not a {type_name}: {why[:200]}")
 

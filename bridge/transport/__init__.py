@@ -1,1 +1,1 @@
-"""WebSocket frames in and out."""
+"""Transport of WebSocket messages."""

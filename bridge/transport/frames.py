@@ -1,7 +1,7 @@
-"""Fast reading and writing of WebSocket frames that hold a whole message each.
+"""Fast reading and writing of WebSocket frames that contain a whole message each.
 
-`whole_messages` finds them in the bytes of a socket. All other frames (control frames, fragments, malformed ones) are left
-to the sans-I/O protocol of `websockets`.
+`whole_messages` finds them in the bytes of a socket. All other frames (control frames, fragments, malformed
+ones) are left to the sans-I/O protocol of `websockets`.
 
 Source: RFC 6455, sections 5.2, 5.3 and 10.3.
 """
@@ -25,33 +25,33 @@ _MASKED: Final = 0x80
 _BRACE: Final = ord("{")
 _MEDIUM: Final = 126
 _LONG: Final = 1 << 16
-"""Payloads from these lengths on have a longer header."""
+"""Payload lengths from which on headers are longer."""
 _MEDIUM_HEADER: Final = Struct("!BBH").pack
 _LONG_HEADER: Final = Struct("!BBQ").pack
 _LONGEST_HEADER: Final = 8
-"""Bytes of the longest header that `only_message` reads; it leaves shorter data to the others."""
+"""Length in bytes of the longest header that `only_message` reads; shorter data is left to the others."""
 _SOUND: Final = frozenset(end | opcode for end in (0, 0x80) for opcode in (0, 1, 2, 8, 9, 10))
 """First bytes of valid frames: with or without FIN, no reserved bit, a defined opcode."""
 _KEYS: Final = 1024
-"""Masking keys that are drawn at once."""
+"""Number of masking keys generated at once."""
 
 UNKNOWN: Final = 0
-"""Instead of a frame's end: its header is incomplete."""
+"""Value instead of a frame's end: the header is incomplete."""
 UNSOUND: Final = -1
-"""Instead of a frame's end: the frame is invalid, and the library has to refuse it."""
+"""Value instead of a frame's end: the frame is invalid, and the library must refuse it."""
 
 
 def whole_messages(
     data: bytes, at: int, *, masked: bool, largest: int, count: int = sys.maxsize, until: int = sys.maxsize
 ) -> tuple[list[bytes], int]:
-    """Read consecutive messages, each whole in one frame, up to the first other or incomplete frame.
+    """Read consecutive single-frame messages, up to the first other or incomplete frame.
 
     Args:
         data: bytes from the socket.
         at: index in `data` at which a frame begins.
         masked: whether the peer is a client, which masks its frames.
-        largest: largest message in bytes; a larger one ends the reading.
-        count: most messages to read.
+        largest: maximum size of a message in bytes; reading stops at a larger one.
+        count: maximum number of messages to read.
         until: index from which on no message may begin.
 
     Returns:
@@ -88,7 +88,7 @@ def whole_messages(
 
 
 def only_message(data: bytes, *, masked: bool, largest: int) -> bytes | None:
-    """Return the payload if the data is exactly one whole message in one frame, else None.
+    """Return the payload if the data is exactly one single-frame message, otherwise None.
 
     This is `whole_messages` for the most frequent case.
     """
@@ -111,8 +111,9 @@ def frame_end(data: bytes, at: int, *, masked: bool, largest: int) -> int:
     """Find the end of the frame that begins at `at`.
 
     Returns:
-        The end, which is beyond `data` while the frame is incomplete; `UNKNOWN` while its header is incomplete;
-        `UNSOUND` if it is invalid or has more than `largest` bytes, so that the library has to see it at once.
+        The end, which is beyond `data` while the frame is incomplete; `UNKNOWN` while its header is
+        incomplete; `UNSOUND` if it is invalid or has more than `largest` bytes, so that the library must
+        handle it at once.
     """
     size = len(data)
     if size < at + 2:
@@ -132,7 +133,7 @@ def frame_end(data: bytes, at: int, *, masked: bool, largest: int) -> int:
 
 
 def unmasked(payloads: Sequence[bytes]) -> bytes:
-    """Write a server's frames of whole messages: text for JSON objects, binary for CBOR."""
+    """Return the frames of a server for whole messages: text for JSON objects, binary for CBOR."""
     parts: list[bytes] = []
     for payload in payloads:
         parts += _header(_TEXT if payload[0] == _BRACE else _BINARY, 0, len(payload)), payload
@@ -140,7 +141,7 @@ def unmasked(payloads: Sequence[bytes]) -> bytes:
 
 
 class Masker:
-    """Writes a client's frames of whole text messages, each masked with a key that is used once."""
+    """Encoder of a client's frames for whole text messages, each masked with a new key."""
 
     def __init__(self) -> None:
         self._keys = mask_keys()
@@ -155,7 +156,7 @@ class Masker:
 
 
 def mask_keys() -> Iterator[bytes]:
-    """Yield unpredictable masking keys, without end."""
+    """Yield unpredictable masking keys indefinitely."""
     while True:
         drawn = os.urandom(4 * _KEYS)
         for at in range(0, len(drawn), 4):
@@ -164,7 +165,7 @@ def mask_keys() -> Iterator[bytes]:
 
 @lru_cache(maxsize=4096)
 def _header(first: int, mask_bit: int, length: int) -> bytes:
-    """Return the header of a frame, up to its key where it has one."""
+    """Return the header of a frame, up to its masking key if it has one."""
     if length < _MEDIUM:
         return bytes((first, mask_bit | length))
     if length < _LONG:

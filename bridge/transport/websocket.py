@@ -1,9 +1,9 @@
-"""One WebSocket on an asyncio transport, for client and hub alike: bytes in, whole messages out.
+"""A WebSocket on an asyncio transport, for client and hub: bytes in, whole messages out.
 
-The sans-I/O protocol of `websockets` handles handshakes, control frames, fragments and everything malformed. Nearly all
-rosbridge traffic is unfragmented messages, which the functions of `bridge.transport.frames` read and write in a fraction of
-the time. The library is given whole frames only, so it always stands between two of them. Once anything is malformed or the
-closing handshake begins, it reads everything.
+The sans-I/O protocol of `websockets` handles handshakes, control frames, fragments and malformed frames.
+Nearly all rosbridge messages are unfragmented; the functions of `bridge.transport.frames` read and write them
+in a fraction of the time. The library gets only whole frames, so it is always between two of them. After a
+malformed frame or the beginning of the closing handshake, it reads everything.
 """
 
 import asyncio
@@ -23,10 +23,10 @@ from websockets.server import ServerProtocol
 from bridge.transport import frames
 
 QUICK_FRAMES = os.environ.get("ROSBAYES_QUICK_FRAMES", "1") != "0"
-"""Whether connections opened from now on read and write whole messages without the library; 0 turns it off."""
+"""Whether new connections read and write whole messages without the library; 0 disables this."""
 
 _OPEN: Final = State.OPEN
-"""A module's name is looked up faster than an enumeration's member."""
+"""Looking up a module-level name is faster than looking up an enumeration member."""
 _END_OF_HEADERS: Final = b"\r\n\r\n"
 _FIRST_BYTES: Final = 64
 _DATA_OPCODES: Final = frozenset((Opcode.TEXT, Opcode.BINARY, Opcode.CONT))
@@ -36,21 +36,21 @@ class WebSocketTransport(asyncio.Protocol):
     """A WebSocket connection; a subclass handles the handshake, the messages and the end.
 
     Attributes:
-        last_heard: monotonic seconds at which the peer last sent anything.
+        last_heard: monotonic time in seconds of the last data from the peer.
         is_open: whether messages can be sent.
         first_bytes: the beginning of the peer's answer, for error messages.
-        paused: whether so much waits for the peer that writers should wait too (see `drain`).
+        paused: whether so much data waits for the peer that writers should wait too (see `drain`).
     """
 
     turn_frames: ClassVar[int] = sys.maxsize
-    """Frames that are handled before other tasks of the event loop get their turn."""
+    """Number of frames handled before other tasks get their turn."""
     turn_bytes: ClassVar[int] = sys.maxsize
-    """Bytes of frames that are handled before other tasks get their turn."""
+    """Number of bytes handled before other tasks get their turn."""
     slice_bytes: ClassVar[int] = sys.maxsize
-    """Bytes that the library reads in one turn once it reads everything."""
+    """Number of bytes that the library reads in one turn when it reads everything."""
 
     def __init__(self, protocol: ClientProtocol | ServerProtocol, *, max_size: int, write_limit: int) -> None:
-        """Prepare the connection: `max_size` is that of `protocol`; from `write_limit` bytes on `paused` holds."""
+        """Prepare the connection: `max_size` is that of `protocol`; `write_limit` bytes set `paused`."""
         self.last_heard = time.monotonic()
         self.is_open = False
         self.first_bytes = b""
@@ -81,7 +81,7 @@ class WebSocketTransport(asyncio.Protocol):
     # For the subclass to implement
 
     def handshake_received(self, event: Request | Response) -> None:
-        """Handle the peer's half of the handshake."""
+        """Handle the handshake message of the peer."""
         raise NotImplementedError
 
     def messages_received(self, messages: list[bytes]) -> None:
@@ -89,7 +89,7 @@ class WebSocketTransport(asyncio.Protocol):
         raise NotImplementedError
 
     def close_expected(self) -> None:
-        """Give the peer a limited time to end the connection."""
+        """Limit the time in which the peer must end the connection."""
         raise NotImplementedError
 
     def ended(self, exc: Exception | None) -> None:
@@ -105,7 +105,7 @@ class WebSocketTransport(asyncio.Protocol):
 
     @property
     def is_blocked(self) -> bool:
-        """Return whether nothing may be read now: the peer causes output and does not read it."""
+        """Return whether to stop reading now, because the peer causes output and does not read it."""
         return self._pongs_unread
 
     @property
@@ -132,7 +132,7 @@ class WebSocketTransport(asyncio.Protocol):
         self._flush()
 
     def ping(self) -> None:
-        """Ask the peer for a sign of life."""
+        """Send a ping."""
         self._protocol.send_ping(b"")
         self._flush()
 
@@ -156,7 +156,7 @@ class WebSocketTransport(asyncio.Protocol):
 
     @contextmanager
     def together(self) -> Iterator[None]:
-        """Hold back what is sent inside the block, and write it in one piece at its end."""
+        """Write everything sent inside the block at once at its end."""
         if self._held is not None:
             yield
             return
@@ -170,10 +170,10 @@ class WebSocketTransport(asyncio.Protocol):
             self._flush()
 
     def _flush(self) -> None:
-        """Write everything that the library has to send, and take over its state."""
+        """Write everything that the library has to send, and copy its state."""
         self.is_open = self._protocol.state is _OPEN
         if self._held is not None:
-            return  # the end of `together` does it
+            return  # `together` does this at its end
         data = self._protocol.data_to_send()
         transport = self._transport
         if data and transport is not None and not transport.is_closing():
@@ -181,18 +181,18 @@ class WebSocketTransport(asyncio.Protocol):
                 transport.write(whole)
                 self._pongs_unread = self._is_server and self.paused
             if not data[-1]:
-                # Closing both halves could cost the last frame on its way, but TLS has no halves.
+                # Closing both halves could lose the last frame on its way, but TLS cannot close one half.
                 (transport.write_eof if transport.can_write_eof() else transport.close)()
 
     # Calls of the event loop
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Take the socket's transport."""
+        """Store the transport."""
         self._transport = cast("asyncio.Transport", transport)
         self._transport.set_write_buffer_limits(high=self._write_limit)
 
     def data_received(self, data: bytes) -> None:
-        """Handle bytes from the socket, down to the last answer that they cause."""
+        """Handle bytes from the socket, including all answers to them."""
         self.last_heard = time.monotonic()
         at = 0
         if self._rest:
@@ -206,7 +206,7 @@ class WebSocketTransport(asyncio.Protocol):
             data, at = begun + data[at:], 0
         elif self._quick and self._fragments is None:
             message = frames.only_message(data, masked=self._is_server, largest=self._max_size)
-            if message is not None:  # nearly always, unless messages come in floods
+            if message is not None:  # the usual case, except in bursts
                 self.messages_received([message])
                 if self._postponed or self.is_blocked:
                     self._interrupt(b"", 0)
@@ -230,12 +230,12 @@ class WebSocketTransport(asyncio.Protocol):
         self.ended(exc)
 
     def pause_writing(self) -> None:
-        """Have writers wait: the socket takes nothing now."""
+        """Make writers wait, because the socket accepts nothing now."""
         self.paused = True
         self._writable.clear()
 
     def resume_writing(self) -> None:
-        """Let writers go on."""
+        """Let writers continue."""
         self.paused = self._pongs_unread = False
         self._writable.set()
         self.proceed()
@@ -243,7 +243,7 @@ class WebSocketTransport(asyncio.Protocol):
     # Reading
 
     def _read_handshake(self, data: bytes) -> None:
-        """Give the library an HTTP message's headers; frames, or a body, begin after them."""
+        """Pass the headers of an HTTP message to the library; frames or a body follow them."""
         self.first_bytes = (self.first_bytes + data)[:_FIRST_BYTES]
         before = self._handshake_tail
         end = (before + data).find(_END_OF_HEADERS)
@@ -259,24 +259,24 @@ class WebSocketTransport(asyncio.Protocol):
             self._read_turn(data, at)
 
     def _read_turn(self, data: bytes, at: int) -> None:
-        """Handle bytes for one turn; the rest is handled after other tasks had theirs."""
+        """Handle bytes for one turn, and the rest after other tasks had their turn."""
         at = self._read(data, at)
         if at < len(data) or self._postponed or self.is_blocked:
             self._interrupt(data, at)
 
     def postpone(self, messages: list[bytes]) -> None:
-        """Handle these messages in a later turn, before everything that follows them."""
+        """Handle these messages in a later turn, before all later data."""
         self._postponed = messages
 
     def _interrupt(self, data: bytes, at: int) -> None:
-        """Stop reading until other tasks had their turn, and nothing blocks any more."""
+        """Stop reading until other tasks had their turn and reading is no longer blocked."""
         if not self.is_closing:
             cast("asyncio.Transport", self._transport).pause_reading()
             self._interrupted = data, at
             self.proceed()
 
     def proceed(self) -> None:
-        """Continue an interrupted turn after other tasks had theirs, unless something still blocks."""
+        """Continue an interrupted turn after other tasks had theirs, unless reading is still blocked."""
         if self._interrupted is not None and not self._is_scheduled and not self.is_blocked:
             self._is_scheduled = True
             asyncio.get_running_loop().call_soon(self._proceed)
@@ -293,7 +293,7 @@ class WebSocketTransport(asyncio.Protocol):
         self._read_turn(data, at)
 
     def _read(self, data: bytes, at: int) -> int:
-        """Handle a turn's frames and keep an incomplete one; return where the turn ended."""
+        """Handle the frames of a turn and store an incomplete one; return the index where the turn ended."""
         size, count, turn_end, masked = len(data), 0, at + self.turn_bytes, self._is_server
         while at < size and count < self.turn_frames and at < turn_end:
             if self._postponed or self.is_blocked:
@@ -319,7 +319,7 @@ class WebSocketTransport(asyncio.Protocol):
                 data, at, masked=masked, largest=self._max_size - len(self._fragments or b"")
             )
             if end == frames.UNSOUND:
-                self._quick = False  # the library refuses it before all of it has come
+                self._quick = False  # the library refuses it before it has arrived completely
             elif end == frames.UNKNOWN or end > size:
                 self._rest += data[at:]
                 self._wanted = end - at if end else 0
@@ -331,7 +331,7 @@ class WebSocketTransport(asyncio.Protocol):
         return at
 
     def _give_library(self, data: bytes) -> None:
-        """Have the library read bytes, and handle the events."""
+        """Pass bytes to the library, and handle the events."""
         self._protocol.receive_data(data)
         messages: list[bytes] = []
         for event in self._protocol.events_received():
@@ -354,7 +354,7 @@ class WebSocketTransport(asyncio.Protocol):
         if self._fragments is None:
             if frame.fin:
                 return data
-            self._fragments = bytearray()  # not a list: endless empty fragments take no memory
+            self._fragments = bytearray()  # not a list, so that endless empty fragments do not take memory
         self._fragments += data
         if not frame.fin:
             return None
@@ -362,7 +362,7 @@ class WebSocketTransport(asyncio.Protocol):
         return whole
 
     def _receive_eof(self) -> None:
-        """Give the library what there is of a frame, and the end of the stream."""
+        """Pass an incomplete frame and the end of the stream to the library."""
         self._quick = False
         if self._rest:
             self._protocol.receive_data(bytes(self._rest))

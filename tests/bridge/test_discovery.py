@@ -42,7 +42,7 @@ async def test_a_name_that_is_taken_is_refused(monkeypatch: pytest.MonkeyPatch) 
         monkeypatch.setattr(discovery, "_TAKEN_TIME", 0.5)
         await stack.enter_async_context(announced(name, "127.0.0.1", 9099, interfaces=LOOPBACK))
         monkeypatch.setattr(discovery, "_TAKEN_TIME", PATIENCE)
-        with pytest.raises(DiscoveryError, match=f"{name} already") as caught:
+        with pytest.raises(DiscoveryError, match=f"called {name}") as caught:
             await stack.enter_async_context(announced(name, "127.0.0.1", 9100, interfaces=LOOPBACK))
         assert caught.value.exit_code == 2
 

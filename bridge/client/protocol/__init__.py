@@ -1,10 +1,10 @@
-"""The rosbridge client as a state machine: objects in, events and bytes out, without sockets and clocks.
+"""The rosbridge client as a state machine without sockets and clocks: objects in, events and bytes out.
 
-It keeps the client's advertisements, subscriptions and services, so that `ClientCore.restore` can repeat them to a server
-that has lost them.
+It stores the client's advertisements, subscriptions and services, so that `ClientCore.restore` can repeat
+them on a new connection.
 
 Source: the rosbridge protocol, version 2 (https://github.com/RobotWebTools/rosbridge_suite), and
-its servers' deviations from it (`docs/reference/rosbridge-differences.md`).
+the deviations of servers from it (`docs/reference/rosbridge-differences.md`).
 """
 
 from bridge.client.protocol.client_core import ClientCore

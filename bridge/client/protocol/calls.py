@@ -1,4 +1,4 @@
-"""A client's service calls that wait for answers."""
+"""Pending service calls of a client."""
 
 from collections.abc import Mapping
 from typing import Any, Final
@@ -10,11 +10,11 @@ from bridge.errors import SlowPeerError
 from bridge.names import check_name
 
 MAX_CALLS: Final = 1000
-"""Limit of calls that wait for answers."""
+"""Maximum number of pending calls."""
 
 
 class Calls:
-    """The waiting calls, by identity on the wire."""
+    """The pending calls, by id on the wire."""
 
     def __init__(self, wire: Wire) -> None:
         self._wire = wire
@@ -24,12 +24,10 @@ class Calls:
         return len(self._waiting)
 
     def send(self, service: str, args: Mapping[str, Any]) -> str:
-        """Call a service, unless `MAX_CALLS` calls wait already; return the call's identity in its `CallAnswered`."""
+        """Call a service, unless `MAX_CALLS` calls are pending; return the id for its `CallAnswered`."""
         check_name(service)
         if len(self._waiting) >= MAX_CALLS:
-            raise SlowPeerError(
-                f"{MAX_CALLS} service calls wait for answers already, {service} is not called"
-            )
+            raise SlowPeerError(f"{MAX_CALLS} service calls are pending, so {service} is not called")
         call = f"call_service:{service}:{self._wire.number()}"
         self._wire.write(op="call_service", id=call, service=service, args=args)
         self._waiting.add(call)
@@ -40,11 +38,11 @@ class Calls:
         self._waiting.discard(call)
 
     def lost(self) -> None:
-        """Forget the calls of a lost connection."""
+        """Drop the calls of a lost connection."""
         self._waiting.clear()
 
     def receive(self, operation: dict[str, Any], data: bytes | str) -> CallAnswered | Unusable | None:
-        """Handle an answer; None if no call waits for it."""
+        """Handle an answer; return None if no call waits for it."""
         call = operation.get("id")
         if not isinstance(call, str):
             return Unusable(f"a service_response without the id of a call arrived: {excerpt(data)}")

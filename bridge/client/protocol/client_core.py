@@ -1,7 +1,7 @@
-"""The whole state of a client: its requests to the server, and the meaning of the server's messages.
+"""The protocol state of a client: its requests to the server, and the decoding of the server's messages.
 
-Messages to send collect in an outbox that the session empties with `ClientCore.data_to_send`. Nothing collects while there
-is no connection.
+Outgoing messages are collected in an outbox, which the session empties with `ClientCore.data_to_send`.
+Nothing is collected without a connection.
 """
 
 from typing import Any
@@ -28,7 +28,7 @@ class ClientCore:
         wire: The outbox.
         publications: The advertised topics.
         subscriptions: The subscribed topics.
-        calls: The service calls that wait for answers.
+        calls: The pending service calls.
         goals: The active goals.
         services: The services of this client.
     """
@@ -78,9 +78,10 @@ class ClientCore:
         return self.wire.take()
 
     def receive(self, data: bytes | str, now: float) -> Event | None:
-        """Return the meaning of one WebSocket message with any content; `now` is in monotonic seconds, for throttling.
+        """Return the event in a WebSocket message of any content; `now` is in monotonic seconds.
 
-        It is None for requests that were refused here, and for messages of topics or calls that were given up.
+        It is None for requests that were refused here, and for messages of topics or calls that no longer
+        exist.
         """
         if type(data) is bytes:
             subscriptions = self.subscriptions
@@ -88,7 +89,7 @@ class ClientCore:
                 event = subscriptions.receive_known(data)
                 if event is not None:
                     return event
-            if subscriptions.binary and data[:1] >= b"\x80":  # a map of CBOR begins so, but no JSON
+            if subscriptions.binary and data[:1] >= b"\x80":  # a CBOR map begins like this, but JSON does not
                 return self._receive_cbor(data, now)
         try:
             operation = self._decode(data)
@@ -116,7 +117,7 @@ class ClientCore:
         return Unusable(f"a CBOR message other than publish arrived: {excerpt(data)}")
 
     def _receive_wrapped(self, operation: dict[str, Any], now: float) -> Event | None:
-        """Handle a fragment or a PNG, which contain a message, perhaps one inside the other."""
+        """Handle a fragment or a PNG, which contain a message, possibly nested."""
         wrapped = ["fragment", "png"]
         data: bytes | str | None = None
         while (op := operation.get("op")) in wrapped:

@@ -1,4 +1,4 @@
-"""Events of the protocol core: the meaning of a server's messages."""
+"""Events of the protocol core: decoded messages of the server."""
 
 from dataclasses import dataclass
 from enum import IntEnum
@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 
 class MessageReceived(NamedTuple):
-    """A message of a subscribed topic: for these of this client's subscriptions (a tuple is made in a third of the time)."""
+    """A message for these subscriptions of the client (a tuple is created in a third of the time)."""
 
     topic: str
     msg: dict[str, Any]
@@ -24,7 +24,7 @@ class CallAnswered:
 
 @dataclass(frozen=True, slots=True)
 class ServiceRequested:
-    """A request to a service of this client; `Services.answer` takes its ticket."""
+    """A request to a service of this client; pass its ticket to `Services.answer`."""
 
     service: str
     args: dict[str, Any]
@@ -41,7 +41,7 @@ class StatusReceived:
 
 @dataclass(frozen=True, slots=True)
 class Unusable:
-    """A message that no client can use, and the reason as a sentence."""
+    """An unusable message, with the reason as a sentence."""
 
     reason: str
 

@@ -1,4 +1,4 @@
-"""A client's active goals of ROS 2 actions."""
+"""Active goals of a client for ROS 2 actions."""
 
 from collections.abc import Mapping
 from typing import Any, Final
@@ -10,11 +10,11 @@ from bridge.errors import SlowPeerError
 from bridge.names import check_name, ros2_type
 
 MAX_GOALS: Final = 100
-"""Limit of active goals."""
+"""Maximum number of active goals."""
 
 
 class Goals:
-    """Actions of the active goals, by identity on the wire."""
+    """Actions of the active goals, by id on the wire."""
 
     def __init__(self, wire: Wire) -> None:
         self._wire = wire
@@ -24,10 +24,10 @@ class Goals:
         return len(self._actions)
 
     def send(self, action: str, type_name: str, goal: Mapping[str, Any], *, feedback: bool) -> str:
-        """Send a goal (see `bridge.client.Ros.send_goal`), and return its identity in its events."""
+        """Send a goal (see `bridge.client.Ros.send_goal`), and return its id in events."""
         check_name(action)
         if len(self._actions) >= MAX_GOALS:
-            raise SlowPeerError(f"{MAX_GOALS} goals are active already, so none was sent to {action}")
+            raise SlowPeerError(f"{MAX_GOALS} goals are active, so none was sent to {action}")
         identity = f"send_action_goal:{action}:{self._wire.number()}"
         self._wire.write(
             op="send_action_goal",
@@ -41,7 +41,7 @@ class Goals:
         return identity
 
     def cancel(self, goal: str) -> None:
-        """Ask the server to cancel a goal; its end shows whether it did. Ignore a goal that has ended."""
+        """Ask the server to cancel a goal; its end shows whether it did. No effect after the end of the goal."""
         action = self._actions.get(goal)
         if action is not None:
             self._wire.write(op="cancel_action_goal", id=goal, action=action)
@@ -51,13 +51,13 @@ class Goals:
         self._actions.pop(goal, None)
 
     def lost(self) -> None:
-        """Forget the goals of a lost connection: servers forget their senders."""
+        """Drop the goals of a lost connection, because servers forget their senders."""
         self._actions.clear()
 
     def receive(
         self, operation: dict[str, Any], data: bytes | str
     ) -> GoalFeedback | GoalEnded | Unusable | None:
-        """Handle an event of a goal; None if the goal is unknown."""
+        """Handle an event of a goal; return None if the goal is unknown."""
         goal = operation.get("id")
         if not isinstance(goal, str):
             return Unusable(f"an action's message without the id of a goal arrived: {excerpt(data)}")

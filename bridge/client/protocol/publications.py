@@ -1,4 +1,4 @@
-"""A client's advertised topics: several advertisements of one topic share one on the wire."""
+"""Advertised topics of a client; all advertisements of a topic share one on the wire."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -21,7 +21,7 @@ class _Advertised:
     queue_size: int
     qos: Qos | None
     wire_id: str
-    prefix: bytes  # of its messages on the wire, which end with a brace
+    prefix: bytes  # start of its messages on the wire, which end with a brace
     holders: set[int] = field(default_factory=set)
     latched: bytes | None = None  # the last message, repeated after a reconnection
 
@@ -103,7 +103,7 @@ class Publications:
         return data
 
     def unadvertise(self, advertisement: int) -> None:
-        """End an advertisement; the last one of a topic withdraws it from the server."""
+        """End an advertisement; after the last one of a topic, withdraw the topic from the server."""
         advertised = self._advertisements.pop(advertisement)
         advertised.holders.discard(advertisement)
         if not advertised.holders:

@@ -1,4 +1,4 @@
-"""A client's services, and the requests to them that wait for answers."""
+"""Services of a client, and pending requests to them."""
 
 from collections.abc import Mapping
 from typing import Any, Final
@@ -10,7 +10,7 @@ from bridge.errors import TypeConflictError
 from bridge.names import absolute, check_name, split_type
 
 MAX_REQUESTS: Final = 64
-"""Limit of requests that wait for answers; more are refused."""
+"""Maximum number of pending requests; more are refused."""
 
 
 class Services:
@@ -33,7 +33,7 @@ class Services:
             self._send_advertise(service, type_name)
 
     def lost(self) -> None:
-        """Forget the requests of a lost connection."""
+        """Drop the requests of a lost connection."""
         self._requests.clear()
 
     def advertise(self, service: str, type_name: str) -> None:
@@ -59,7 +59,7 @@ class Services:
         """Answer a request with fields, or with `ok=False` a reason as text, unless its connection was lost.
 
         Raises:
-            EncodeError: The values cannot be encoded as JSON; the request still waits for an answer.
+            EncodeError: The values cannot be encoded as JSON; the request is still pending.
         """
         request = self._requests.get(ticket)
         if request is None:
@@ -70,18 +70,20 @@ class Services:
         del self._requests[ticket]
 
     def receive(self, operation: dict[str, Any], data: bytes | str) -> ServiceRequested | Unusable | None:
-        """Handle a request; None if it was refused here."""
+        """Handle a request; return None if it was refused here."""
         service = operation.get("service")
         args = operation.get("args")
         wire_id = operation.get("id")
         if not isinstance(service, str) or not isinstance(wire_id, str | int | None):
-            return Unusable(f"a call_service without a service or with an odd id arrived: {excerpt(data)}")
+            return Unusable(
+                f"a call_service without a service or with an invalid id arrived: {excerpt(data)}"
+            )
         ticket = self._wire.number()
         self._requests[ticket] = (service, wire_id)
         if absolute(service) not in self._types:
             self.answer(ticket, f"service {excerpt(service)} is not served here", ok=False)
         elif len(self._requests) > MAX_REQUESTS:
-            self.answer(ticket, f"{MAX_REQUESTS} requests wait here already", ok=False)
+            self.answer(ticket, f"{MAX_REQUESTS} requests are already pending here", ok=False)
         elif not isinstance(args, dict | None):
             self.answer(ticket, "args must be an object", ok=False)
         else:

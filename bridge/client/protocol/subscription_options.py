@@ -12,14 +12,14 @@ Compression = Literal["none", "png", "cbor", "cbor-raw"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Delivery:
-    """Delivery of a topic's messages, shared by all subscriptions of one client to one topic.
+    """Delivery of messages, shared by all subscriptions of a client to one topic.
 
     Attributes:
-        compression: `cbor` for long arrays, `cbor-raw` for the serialised bytes alone, `png` for servers of
-            ROS 1 over slow networks. Many servers ignore an unknown one, and send JSON.
-        arrays: Python type of arrays of numbers, whatever the server sends.
-        fragment_size: Limit of characters in one fragment; None for whole messages. Servers apply the last one
-            that a client requested to everything they send to it.
+        compression: `cbor` for long arrays, `cbor-raw` for only the serialised bytes, `png` for ROS 1 servers
+            over slow networks. Many servers ignore an unknown value and send JSON.
+        arrays: Python type of arrays of numbers, regardless of the encoding.
+        fragment_size: Maximum number of characters in a fragment; None for whole messages. Servers apply the
+            last value that a client requested to everything they send to it.
         qos: Quality of service in ROS 2.
     """
 
@@ -38,6 +38,6 @@ class Delivery:
 
 
 def check_fragment_size(size: int | None) -> None:
-    """Refuse a size of fragments that is neither None nor a positive integer."""
+    """Raise an error for a fragment size that is neither None nor a positive integer."""
     if size is not None and (type(size) is not int or size < 1):
-        raise OptionError(f"fragment_size must be a whole number from 1 up, or None, not {size!r}")
+        raise OptionError(f"fragment_size must be a whole number of at least 1, or None, not {size!r}")

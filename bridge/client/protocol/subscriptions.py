@@ -1,4 +1,4 @@
-"""A client's subscriptions: several of one topic share one on the wire.
+"""Subscriptions of a client; all subscriptions to a topic share one on the wire.
 
 Some servers deliver a first message twice, or not at all, to a client that subscribes twice.
 """
@@ -21,12 +21,12 @@ from bridge.stamps import ros_version_of_message
 _OF_ENVELOPE: Final = 3
 """Keys of an operation with a recognisable envelope: op, topic and msg."""
 _ENVELOPES: Final = 8
-"""Limit of envelopes tried for one topic: some servers never repeat one."""
+"""Maximum number of envelopes tried for one topic, because some servers never repeat one."""
 
 
 @dataclass(slots=True)
 class _Wanted:
-    """Options of one subscription; `due` is when its throttle passes the next message."""
+    """Options of one subscription; `due` is the time at which its throttle admits the next message."""
 
     throttle_rate: int
     queue_length: int
@@ -50,7 +50,7 @@ class _Subscribed:
     envelopes_tried: int = 0
 
     def combine(self) -> bool:
-        """Combine all options to the fastest rate and the longest queue; return whether that changed."""
+        """Combine the options to the fastest rate and the longest queue; return whether these changed."""
         before = (self.throttle_rate, self.queue_length)
         self.throttle_rate = min(w.throttle_rate for w in self.wanted.values())
         self.queue_length = max(w.queue_length for w in self.wanted.values())
@@ -82,7 +82,7 @@ class _Known(NamedTuple):
 
 
 _UNKNOWN: Final = _Known(b"\xff", 0, "", _Subscribed("", None, Delivery(), ""))
-"""Placeholder before the first envelope is known: no message begins so."""
+"""Placeholder before the first envelope is known, with which no message begins."""
 
 
 class Subscriptions:
@@ -131,7 +131,9 @@ class Subscriptions:
             split_type(type_name)
         for name, value in (("throttle_rate", throttle_rate), ("queue_length", queue_length)):
             if type(value) is not int or value < 0:  # servers silently drop a subscription with a float here
-                raise OptionError(f"{name} of topic {topic} must be a whole number from 0 up, not {value!r}")
+                raise OptionError(
+                    f"{name} of topic {topic} must be a whole number of at least 0, not {value!r}"
+                )
         number = self._wire.number()
         key = absolute(topic)
         subscribed = self._subscribed.get(key)
@@ -179,7 +181,7 @@ class Subscriptions:
         self.numpy = any(delivery.arrays == "numpy" for delivery in deliveries)
 
     def unsubscribe(self, subscription: int) -> None:
-        """End a subscription; the last one of a topic withdraws it from the server."""
+        """End a subscription; after the last one of a topic, unsubscribe from the server."""
         subscribed = self._subscriptions.pop(subscription)
         del subscribed.wanted[subscription]
         self.forget_envelopes()
@@ -194,7 +196,7 @@ class Subscriptions:
     def retry_untyped(self) -> bool:
         """Repeat subscriptions without a type to topics that have no messages yet; return whether there are any.
 
-        Servers forget such a subscription if they do not know the topic yet, most of them silently.
+        Servers drop such a subscription if they do not know the topic yet, most of them silently.
         """
         waiting = [s for s in self._subscribed.values() if s.type is None and not s.has_messages]
         for subscribed in waiting:
@@ -202,7 +204,7 @@ class Subscriptions:
         return bool(waiting)
 
     def receive_known(self, data: bytes) -> MessageReceived | None:
-        """Handle a message with a known envelope; None if `receive` has to handle it."""
+        """Handle a message with a known envelope; return None if `receive` has to handle it."""
         known = self._known
         if not data.startswith(known.envelope):
             found = self.envelopes.get(envelope_of(data))
@@ -221,7 +223,7 @@ class Subscriptions:
             return None
         if self.numpy and subscribed.delivery.arrays == "numpy":
             msg = with_arrays(msg)
-        # A named tuple's own constructor takes three times as long.
+        # The constructor of a named tuple takes three times as long.
         return tuple.__new__(MessageReceived, (known.topic, msg, subscribed.all_numbers))
 
     def _learn_envelope(self, data: bytes, topic: str, subscribed: _Subscribed) -> None:
@@ -233,7 +235,7 @@ class Subscriptions:
                 self.envelopes[envelope] = _Known(envelope, len(envelope), topic, subscribed)
 
     def forget_envelopes(self) -> None:
-        """Forget the known envelopes, since subscriptions or the server have changed."""
+        """Forget the known envelopes, because subscriptions or the server have changed."""
         self.envelopes.clear()
         self._known = _UNKNOWN
         for subscribed in self._subscribed.values():

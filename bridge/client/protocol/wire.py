@@ -1,4 +1,4 @@
-"""The outbox of a client: whole messages, in order, while there is a connection."""
+"""The outbox of a client: whole messages in order, while there is a connection."""
 
 from collections.abc import Callable, Iterator
 from itertools import count
@@ -13,15 +13,16 @@ RosVersion = Literal[1, 2]
 
 
 class Wire:
-    """The outbox that all parts of a client's core write to.
+    """The outbox for all parts of a client's core.
 
     Attributes:
-        connected: Whether messages are kept; without a connection they are dropped, since `restore` repeats them.
+        connected: Whether messages are stored; without a connection they are dropped, because `restore`
+            repeats them.
         ros_version: ROS version of the server, None while unknown.
-        fragment_size: Characters beyond which `pieces` splits a message; None for never.
-        max_size: Largest message in bytes.
-        max_depth: Deepest nesting of a message.
-        number: Returns a new number at each call.
+        fragment_size: Maximum number of characters in a message before `pieces` splits it; None for no limit.
+        max_size: Maximum size of a message in bytes.
+        max_depth: Maximum nesting of a message.
+        number: Function that returns a new number at each call.
     """
 
     def __init__(
@@ -37,7 +38,7 @@ class Wire:
         self.number: Callable[[], int] = count(1).__next__
 
     def type_name(self, name: str, kind: Kind = "msg") -> str:
-        """Return a type's name in the server's ROS version; if unknown, in that of ROS 1, which all servers accept."""
+        """Return a type name in the server's ROS version, or if unknown in ROS 1, which all servers accept."""
         return ros2_type(name, kind) if self.ros_version == 2 else ros1_type(name)
 
     def write(self, **operation: Any) -> None:

