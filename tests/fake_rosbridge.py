@@ -21,7 +21,11 @@ It behaves as real servers do (A: rosbridge_suite on ROS 1, B: on ROS 2, R: rosb
 * null where a published message may hold a number is refused (A, B, R), with `refuses_null`;
 * after a message that is JSON but not an object the connection is open and dead (A, B), with `zombies`;
 * every `/` leaves as `\\/` (A, B), with `escapes`;
-* type names of the ROS 2 form are refused (A), with `ros=1`; rosapi, if there, answers as that ROS does.
+* type names of the ROS 2 form are refused (A), with `ros=1`; rosapi, if there, answers as that ROS does;
+* a subscription made before a best-effort publisher began never hears it (B: `MultiSubscriber.__init__` in
+  rosbridge_library/internal/subscribers.py chooses the reliability once), for topics of `start_best_effort`;
+* a type with an array of fixed length is never sent as CBOR (A, B: `extract_cbor_values` in
+  rosbridge_library/internal/cbor_conversion.py fails on it), for topics in `fails_as_cbor`.
 """
 
 import asyncio
@@ -112,6 +116,9 @@ class FakeRosbridge:
         self.types: dict[str, str] = {}
         self.latched: dict[str, dict[str, Any]] = {}
         self.services: dict[str, Callable[[dict[str, Any]], Any]] = {}
+        self.fails_as_cbor: set[str] = set()
+        self._best_effort: dict[str, float] = {}
+        self._begun: dict[str, float] = {}
         self._clients: set[_Client] = set()
         self._server: Server | None = None
         self._place: socket.socket | None = None
@@ -195,6 +202,11 @@ class FakeRosbridge:
         return connection.respond(HTTPStatus(self.refuses), "the fake refuses\n")
 
     # What a test asks and says
+
+    def start_best_effort(self, topic: str, type_name: str) -> None:
+        """Begin publishing a topic best-effort: only subscriptions made from now on hear it."""
+        self.types[_slashed(topic)] = type_name
+        self._best_effort[_slashed(topic)] = time.monotonic()
 
     def ops(self, op: str, **fields: Any) -> list[dict[str, Any]]:
         """Return the received operations of one kind, with the given fields."""
@@ -358,7 +370,11 @@ class FakeRosbridge:
     def _times(self, client: _Client, topic: str) -> int:
         """Return how often a client gets a message: mostly once or never."""
         subscriptions = client.subscribed.get(topic, {})
-        if not subscriptions:
+        if not subscriptions or self._best_effort.get(topic, 0.0) > self._begun[topic]:
+            return 0
+        if topic in self.fails_as_cbor and any(
+            each.get("compression") == "cbor" for each in subscriptions.values()
+        ):
             return 0
         first = topic not in client.heard
         now = time.monotonic()
@@ -379,6 +395,8 @@ class FakeRosbridge:
         elif any(type(op.get(name, 0)) is not int for name in ("throttle_rate", "queue_length")):
             await self._complain(client, "throttle_rate must be an int")
         else:
+            if not any(each.subscribed.get(topic) for each in self._clients):
+                self._begun[topic] = time.monotonic()
             client.subscribed.setdefault(topic, {})[op.get("id")] = op
             if self.latched.get(topic):
                 await self._say(client, {"op": "publish", "topic": topic, "msg": self.latched[topic]})
@@ -434,7 +452,8 @@ class FakeRosbridge:
 
         def publishers(args: dict[str, Any]) -> dict[str, Any]:
             topic = _slashed(args.get("topic"))
-            return {"publishers": ["/fake"] if any(topic in c.advertised for c in self._clients) else []}
+            published = topic in self._best_effort or any(topic in c.advertised for c in self._clients)
+            return {"publishers": ["/fake"] if published else []}
 
         known: dict[str, Callable[[dict[str, Any]], Any]] = {
             "/rosapi/topics": lambda _args: {"topics": list(topics), "types": list(topics.values())},

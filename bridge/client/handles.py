@@ -120,7 +120,7 @@ class Subscription(_Handle):
         session.receivers[self._number] = self._receive
         session.on_blind.add(self._note_blind)
         self._register()
-        session.schedule_retry()
+        session.watch_silence()
 
     def _receive(self, message: Message) -> None:
         queue = self._queue
@@ -239,13 +239,13 @@ class Subscription(_Handle):
             return f"; the connection is {session.state}: {session.last_error}"
         try:
             async with asyncio.timeout(EXPLAIN_TIMEOUT):
-                known = await ask_rosapi(session, "topic_type", {"topic": self.topic}, EXPLAIN_TIMEOUT)
+                known = await session.ask_rosapi("topic_type", {"topic": self.topic}, EXPLAIN_TIMEOUT)
                 known_type = known.get("type")
                 if known_type == "":
                     return "; the server does not know the topic"
                 if isinstance(known_type, str) and self._type and not same_type(known_type, self._type):
                     return f"; the server knows it as {known_type[:80]}, not as {self._type}"
-                found = await ask_rosapi(session, "publishers", {"topic": self.topic}, EXPLAIN_TIMEOUT)
+                found = await session.ask_rosapi("publishers", {"topic": self.topic}, EXPLAIN_TIMEOUT)
                 if found.get("publishers") == []:
                     return "; it has no publisher"
         except TimeoutError:  # a server without rosapi answers at once
@@ -393,12 +393,3 @@ class Service(_Handle):
     def _withdraw(self) -> None:
         del self._session.servers[absolute(self.name)]
         self._session.core.services.unadvertise(self.name)
-
-
-async def ask_rosapi(session: Session, name: str, args: Mapping[str, Any], limit: float) -> dict[str, Any]:
-    """Call a rosapi service; return an empty answer if it fails, because many servers do not have rosapi."""
-    try:
-        answer = await session.call(f"/rosapi/{name}", args, limit)
-    except BridgeError:
-        return {}
-    return answer if isinstance(answer, dict) else {}

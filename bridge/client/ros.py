@@ -22,7 +22,6 @@ from bridge.client.handles import (
     Publication,
     Service,
     Subscription,
-    ask_rosapi,
 )
 from bridge.client.protocol import ClientCore, Compression, Delivery, RosVersion
 from bridge.client.protocol.events import StatusReceived
@@ -65,7 +64,7 @@ class Ros:
         """
         try:
             if self._publishes and self._session.state is State.CONNECTED:
-                await ask_rosapi(self._session, "get_time", {}, FAREWELL_TIMEOUT)
+                await self._session.ask_rosapi("get_time", {}, FAREWELL_TIMEOUT)
         finally:  # a cancelled client is closed too
             await self._session.close()
 
@@ -315,11 +314,11 @@ class Ros:
         return self.ros_version
 
     async def _ask_version(self, limit: float) -> RosVersion | None:
-        version = (await ask_rosapi(self._session, "get_ros_version", {}, limit)).get("version")
+        version = (await self._session.ask_rosapi("get_ros_version", {}, limit)).get("version")
         return 1 if version == 1 else 2 if version == 2 else None
 
     async def _ask_rosout_type(self, limit: float) -> RosVersion | None:
-        rosout_type = (await ask_rosapi(self._session, "topic_type", {"topic": "/rosout"}, limit)).get("type")
+        rosout_type = (await self._session.ask_rosapi("topic_type", {"topic": "/rosout"}, limit)).get("type")
         return ros_version_of_type(rosout_type) if isinstance(rosout_type, str) else None
 
 

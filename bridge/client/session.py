@@ -42,8 +42,11 @@ ATTEMPT_TIMEOUT: Final = 5.0
 """Timeout in seconds of one attempt to reconnect."""
 STEADY: Final = 5.0
 """Minimum duration in seconds of a connection that resets the back-off."""
-UNTYPED_RETRY: Final = 2.0
-"""Seconds between repeated subscriptions to a topic of unknown type without messages."""
+SILENCE: Final = 2.0
+"""Seconds without a message after which a subscription is looked at again."""
+LONGEST_SILENCE: Final = 30.0
+"""Longest delay in seconds between two looks, which doubles with each."""
+_ROSAPI_TIMEOUT: Final = 1.0
 KEPT_STATUSES: Final = 16
 """Number of status messages of the server that are stored."""
 # Number of messages sent in a row before other tasks get their turn.
@@ -163,6 +166,8 @@ class Session:
         self._delay = FIRST_DELAY
         self._reconnecting: asyncio.Task[None] | None = None  # the last one, done or not
         self._retry_timer: asyncio.TimerHandle | None = None
+        self._next_look = SILENCE
+        self._looking: asyncio.Task[None] | None = None
         self._burst = 0
         self._turn = asyncio.Lock()  # fair: first in, first out
         self._waiting = 0
@@ -192,7 +197,9 @@ class Session:
         websocket, self._websocket = self._websocket, None
         self.core.lost()
         # except the current task: a service's handler may close the client
-        ending = {*self._serving, *([self._reconnecting] if self._reconnecting is not None else [])}
+        if self._retry_timer is not None:
+            self._retry_timer.cancel()
+        ending = {*self._serving, *(each for each in (self._reconnecting, self._looking) if each is not None)}
         ending -= {asyncio.current_task()}
         for task in ending:
             task.cancel()
@@ -227,7 +234,7 @@ class Session:
                 callback(self._connected_at - self._blind_since)
         self.core.restore()
         self.flush()
-        self.schedule_retry()
+        self.watch_silence()
         self._set_state(State.CONNECTED, "")
 
     def _lost(self, websocket: WebSocket, reason: str) -> None:
@@ -351,16 +358,52 @@ class Session:
             if self.is_open:
                 self.send_now(message)
 
-    def schedule_retry(self) -> None:
-        """Repeat subscriptions to topics of unknown type until they have messages."""
-        if self._retry_timer is None and self._websocket is not None:
-            self._retry_timer = asyncio.get_running_loop().call_later(UNTYPED_RETRY, self._retry_untyped)
+    def watch_silence(self) -> None:
+        """Look after silent subscriptions from now on, until all have had a message on this connection."""
+        self._next_look = SILENCE
+        if self._websocket is not None:
+            self._schedule_look()
 
-    def _retry_untyped(self) -> None:
+    def _schedule_look(self) -> None:
+        if self._retry_timer is not None:
+            self._retry_timer.cancel()
+        self._retry_timer = asyncio.get_running_loop().call_later(self._next_look, self._look)
+
+    def _look(self) -> None:
+        """Repeat subscriptions to topics of unknown type, and renew those that should have messages."""
         self._retry_timer = None
-        if self.core.subscriptions.retry_untyped():
+        if not self.is_open:
+            return  # a new connection looks again
+        untyped = self.core.subscriptions.retry_untyped()
+        self.flush()
+        silent = self.core.subscriptions.silent()
+        if silent and (self._looking is None or self._looking.done()):
+            self._looking = asyncio.get_running_loop().create_task(self._renew(silent))
+        if untyped or silent:
+            self._next_look = SILENCE if untyped else min(2 * self._next_look, LONGEST_SILENCE)
+            self._schedule_look()
+
+    async def _renew(self, topics: list[str]) -> None:
+        """Subscribe anew to those of the topics that somebody publishes."""
+        for topic in topics:
+            answer = await self.ask_rosapi("publishers", {"topic": topic}, _ROSAPI_TIMEOUT)
+            if not answer.get("publishers") or not self.is_open:
+                continue
+            if self.core.subscriptions.renew(topic):
+                _log.warning(
+                    "%s sends nothing of %s as CBOR, although somebody publishes it; asking for JSON",
+                    self.uri,
+                    topic,
+                )
             self.flush()
-            self.schedule_retry()
+
+    async def ask_rosapi(self, name: str, args: Mapping[str, Any], limit: float) -> dict[str, Any]:
+        """Call a rosapi service; return nothing if it fails, since many servers lack rosapi."""
+        try:
+            answer = await self.call(f"/rosapi/{name}", args, limit)
+        except BridgeError:
+            return {}
+        return answer if isinstance(answer, dict) else {}
 
     async def call(self, service: str, args: Mapping[str, Any], limit: float) -> Any:
         """Call a service and wait for its answer (see `bridge.client.Ros.call`)."""

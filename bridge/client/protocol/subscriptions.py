@@ -47,6 +47,9 @@ class _Subscribed:
     all_numbers: tuple[int, ...] = ()
     has_throttled: bool = False
     has_messages: bool = False
+    renewals: int = 0
+    as_json: bool = False
+    """Whether JSON is asked for instead of CBOR."""
     envelopes_tried: int = 0
 
     def combine(self) -> bool:
@@ -110,6 +113,7 @@ class Subscriptions:
         self.forget_envelopes()
         for subscribed in self._subscribed.values():
             subscribed.has_messages = False
+            subscribed.renewals = 0
             self._send_subscribe(subscribed)
 
     def subscribe(
@@ -165,7 +169,7 @@ class Subscriptions:
         if subscribed.type is not None:
             operation["type"] = self._wire.type_name(subscribed.type)
         delivery = subscribed.delivery
-        if delivery.compression != "none":
+        if delivery.compression != "none" and not subscribed.as_json:
             operation["compression"] = delivery.compression
         if delivery.fragment_size is not None:
             operation["fragment_size"] = delivery.fragment_size
@@ -191,7 +195,10 @@ class Subscriptions:
         else:
             del self._subscribed[absolute(subscribed.topic)]
             self._note_deliveries()
-            self._wire.write(op="unsubscribe", id=subscribed.wire_id, topic=subscribed.topic)
+            self._send_unsubscribe(subscribed)
+
+    def _send_unsubscribe(self, subscribed: _Subscribed) -> None:
+        self._wire.write(op="unsubscribe", id=subscribed.wire_id, topic=subscribed.topic)
 
     def retry_untyped(self) -> bool:
         """Repeat subscriptions without a type to topics that have no messages yet; return whether there are any.
@@ -202,6 +209,28 @@ class Subscriptions:
         for subscribed in waiting:
             self._send_subscribe(subscribed)
         return bool(waiting)
+
+    def silent(self) -> list[str]:
+        """Return the topics with a type that have had no message on this connection."""
+        return [s.topic for s in self._subscribed.values() if s.type is not None and not s.has_messages]
+
+    def renew(self, topic: str) -> bool:
+        """Subscribe anew to a topic that is silent although somebody publishes it; return whether it gives up CBOR.
+
+        rosbridge for ROS 2 fixes the quality of service when it subscribes, so that a best-effort publisher which starts
+        later is not heard. Servers fail to write some types as CBOR: from the second renewal on, JSON is asked for.
+        """
+        subscribed = self._subscribed.get(absolute(topic))
+        if subscribed is None or subscribed.has_messages:
+            return False
+        subscribed.renewals += 1
+        gives_up_cbor = (
+            subscribed.renewals > 1 and subscribed.delivery.compression == "cbor" and not subscribed.as_json
+        )
+        subscribed.as_json = subscribed.as_json or gives_up_cbor
+        self._send_unsubscribe(subscribed)
+        self._send_subscribe(subscribed)
+        return gives_up_cbor
 
     def receive_known(self, data: bytes) -> MessageReceived | None:
         """Handle a message with a known envelope; return None if `receive` has to handle it."""

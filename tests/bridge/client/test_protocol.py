@@ -482,6 +482,8 @@ class Wishes(RuleBasedStateMachine):
     @rule()
     def ask_again(self) -> None:
         self.core.subscriptions.retry_untyped()
+        for topic in self.core.subscriptions.silent():
+            self.core.subscriptions.renew(topic)
 
     @rule(name=st.text(max_size=3), rate=st.sampled_from([-1, 0.5, None]))
     def want_nonsense(self, name: str, rate: Any) -> None:

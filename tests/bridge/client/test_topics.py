@@ -234,7 +234,7 @@ async def test_what_the_server_says_about_it_is_passed_on(ros):
 
 
 async def test_a_topic_of_unknown_type_is_found_when_it_appears(fake, monkeypatch):
-    monkeypatch.setattr("bridge.client.session.UNTYPED_RETRY", 0.05)
+    monkeypatch.setattr("bridge.client.session.SILENCE", 0.05)
     ros = connect(fake.uri)
     subscription = ros.subscribe("/late")
     async with ros:
@@ -248,6 +248,38 @@ async def test_a_topic_of_unknown_type_is_found_when_it_appears(fake, monkeypatc
         assert len(fake.ops("subscribe")) <= asked + 1, "it is not asked for any more"
         ros.subscribe("/later")
         await fake.wait_for_op("subscribe", count=3, topic="/later")
+
+
+@pytest.mark.parametrize("fake", [{"rosapi": True}], indirect=True)
+async def test_a_best_effort_publisher_that_starts_late_is_heard(fake, monkeypatch):
+    monkeypatch.setattr("bridge.client.session.SILENCE", 0.05)
+    async with connect(fake.uri) as ros:
+        subscription = ros.subscribe("/late", "p/T")
+        await fake.wait_for_op("call_service", service="/rosapi/publishers", count=2)
+        assert len(fake.ops("subscribe", topic="/late")) == 1, "nobody publishes it yet"
+        fake.start_best_effort("/late", "p/T")
+        assert await fake.publish("/late", {"n": 0}) == 0
+        await fake.wait_for_op("subscribe", count=2, topic="/late")
+        assert await fake.publish("/late", {"n": 1}) == 1
+        assert (await subscription.next(30)).msg == {"n": 1}
+        asked = len(fake.ops("subscribe", topic="/late"))
+        await asyncio.sleep(0.4)
+        assert len(fake.ops("subscribe", topic="/late")) == asked, "it has a message, so that is enough"
+
+
+@pytest.mark.parametrize("fake", [{"rosapi": True}], indirect=True)
+async def test_a_type_that_a_server_cannot_write_as_cbor_comes_as_json(fake, monkeypatch, caplog):
+    monkeypatch.setattr("bridge.client.session.SILENCE", 0.05)
+    fake.fails_as_cbor.add("/imu")
+    fake.start_best_effort("/imu", "sensor_msgs/Imu")
+    async with connect(fake.uri) as ros:
+        subscription = ros.subscribe("/imu", "sensor_msgs/Imu", compression="cbor", arrays="numpy")
+        while not await fake.publish("/imu", {"covariance": [1.0, 2.0]}):
+            await asyncio.sleep(0.02)
+        message = await subscription.next(30)
+        assert message.msg["covariance"].tolist() == [1.0, 2.0]
+        assert [op.get("compression") for op in fake.ops("subscribe", topic="/imu")] == ["cbor", "cbor", None]
+    assert sum("/imu" in each.getMessage() for each in caplog.records if each.levelname == "WARNING") == 1
 
 
 async def test_a_tight_loop_of_publications_lets_others_live(fake, ros):
