@@ -11,9 +11,9 @@ import typer
 from pcie_shim.board.misbehaviour import Misbehaviour
 from pcie_shim.credentials import Credentials, board_tls, read_key
 from pcie_shim.endpoint import Endpoint
+from services.boards.processes import BoardProcesses, serve_one
 from services.commands import flags as options
 from services.errors import SettingsError
-from services.pipeline.board_processes import BoardProcesses, serve_one
 from services.settings import load_settings
 from services.sockets.serving import endpoint_from
 from services.supervision.child import RESTARTS

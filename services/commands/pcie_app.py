@@ -4,8 +4,8 @@ from typing import Annotated
 
 import typer
 
+from services.boards.deployed import DeployedBoards
 from services.commands import flags as options
-from services.pipeline.deployed_boards import DeployedBoards
 from services.pipeline.pcie_app import ROLE, PcieApp
 from services.pipes.lines import require_pipe
 from services.pipes.pcie_app import compute_lines

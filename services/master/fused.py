@@ -10,8 +10,8 @@ from concurrent.futures import Future
 from typing import Any, TypeVar, cast
 
 from pcie_shim.errors import BoardError, PcieShimError
-from services.pipeline.deployed_boards import TICK, DeployedBoards
-from services.pipeline.driver_frames import frame_failed, result_record
+from services.boards.deployed import TICK, DeployedBoards
+from services.boards.frames import frame_failed, result_record
 from services.pipeline.pcie_app import ROLE as PCIE_APP
 from services.pipeline.pcie_app import Progress
 from services.pipeline.publisher import Publisher

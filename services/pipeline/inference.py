@@ -8,7 +8,7 @@ import numpy.typing as npt
 from machines.bm1 import StopReason
 from machines.posterior import joint_posterior, posterior_of_lines
 from posteriors.frame_report import BoardReport, FrameReport, StageTimes
-from services.pipeline.driver_frames import decode_boards
+from services.boards.frames import decode_boards
 from services.sockets.records import FrameResult, Publish
 from toolchain.deployment import Deployment
 

@@ -11,9 +11,9 @@ import time
 from pcie_shim.endpoint import Endpoint, listen, remove_listener
 from pcie_shim.errors import BoardError, PcieShimError
 from pcie_shim.host.frame import FrameOutput
+from services.boards.deployed import TICK, DeployedBoards
+from services.boards.frames import frame_failed, result_record
 from services.errors import LocalSocketError, OtherPeerError
-from services.pipeline.deployed_boards import TICK, DeployedBoards
-from services.pipeline.driver_frames import frame_failed, result_record
 from services.sockets.local_socket import BlockingRecordSocket, check_hello, own_hello
 from services.sockets.records import (
     AnyRecord,

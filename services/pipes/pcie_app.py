@@ -7,8 +7,8 @@ import numpy as np
 
 from pcie_shim.errors import FrameInputError
 from pcie_shim.host.frame import FrameOutput
+from services.boards.deployed import DeployedBoards
 from services.errors import InputLineError
-from services.pipeline.deployed_boards import DeployedBoards
 from services.pipeline.inference import REASON_WORDS
 from services.pipes.lines import blocking_lines, decoded
 from services.sockets.records import Addresses, Frame

@@ -9,8 +9,8 @@ import numpy as np
 
 from machines.bm1 import StopReason
 from pcie_shim.host.frame import BoardResult
+from services.boards.frames import encode_boards
 from services.errors import InputLineError
-from services.pipeline.driver_frames import encode_boards
 from services.pipeline.result_topics import ResultTopics
 from services.pipes.lines import decoded, lines
 from services.settings import Settings

@@ -9,9 +9,9 @@ import sys
 import pytest
 
 from pcie_shim.endpoint import Endpoint
+from services.boards.deployed import DeployedBoards
 from services.errors import NotPreparedError, NotReloadedError, SettingsError, ShapeError
 from services.master.new_deployment import forget, keep, read_new
-from services.pipeline.deployed_boards import DeployedBoards
 from services.pipeline.generations import Generations
 from services.settings import Settings
 from services.sockets.records import Hello, NotReloaded, Prepare, Prepared, Switch, Switched

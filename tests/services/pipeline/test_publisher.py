@@ -7,7 +7,7 @@ import numpy as np
 
 from bridge.client import State
 from pcie_shim.host.frame import BoardResult
-from services.pipeline.driver_frames import encode_boards
+from services.boards.frames import encode_boards
 from services.pipeline.publisher import Publisher
 from services.pipeline.result_topics import ResultTopics
 from services.settings import Settings

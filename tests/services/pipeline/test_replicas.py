@@ -6,8 +6,8 @@ import pytest
 from machines.bm1 import StopReason
 from machines.parameters import SensorMode
 from pcie_shim.errors import FrameInputError
+from services.boards.frames import machine_inputs
 from services.errors import VariableError
-from services.pipeline.driver_frames import machine_inputs
 from services.pipeline.frames import FrameAssembler
 from toolchain.building.build import assemble
 from toolchain.building.options import BuildOptions

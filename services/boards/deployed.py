@@ -18,8 +18,8 @@ from pcie_shim.host.frame import FrameInput, FrameOutput
 from pcie_shim.host.loader import program
 from pcie_shim.host.mini_cluster import PROGRAMMING_S, MiniCluster
 from pcie_shim.programming_file import Image, read_image
+from services.boards.frames import BoardAwayError, driver_input
 from services.errors import StackError
-from services.pipeline.driver_frames import BoardAwayError, driver_input
 from services.pipeline.generations import Generations
 from services.settings import Settings
 from services.sockets.records import Frame, NotReloaded, Switch, Switched
