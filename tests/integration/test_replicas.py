@@ -142,6 +142,9 @@ async def test_what_is_published_is_what_the_machines_count(stage, tmp_path, opt
             posterior = read_posterior(result, 0)
             assert posterior.probabilities == tuple(np.concatenate(exact).tolist())
             assert posterior.replicas == replicas
+            for at, board in enumerate(report.boards):
+                assert board.counts_total == sum(sum(each[at][0]) for each in of_replicas)
+                assert board.cycles == max(each[at][1] for each in of_replicas)
             if replicas > 1:
                 assert posterior.labels == ("replica", "disparity")
                 assert posterior.replica(2).probabilities == tuple(exact[2].tolist())

@@ -129,6 +129,24 @@ def test_a_refused_posted_write_is_heard_of(start_board: StartBoard) -> None:
             wait_done(link, 1)
 
 
+def test_a_running_board_answers_and_can_be_reset(start_board: StartBoard) -> None:
+    board = programmed(start_board, never_stopping())
+    with open_link(board) as link:
+        run_for_minutes(link)
+        with refused(ErrorCode.BUSY):
+            link.write32(rm.TARGET_COUNT, 1)
+        first = link.read_block(rm.CYCLES, 2)
+        deadline = time.monotonic() + PATIENCE
+        while link.read_block(rm.CYCLES, 2) == first:
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+        link.write32(rm.CONTROL, rm.CONTROL_RESET_MASK | ENABLE)
+        assert link.read32(rm.STATUS) == BoardState.IDLE | ErrorCode.NONE << 8
+        link.write32(rm.TARGET_COUNT, 10)
+        link.write32(rm.START, 1)
+        assert wait_done(link, 1).reason == StopReason.OVERFLOW
+
+
 # ---- one host at a time ----
 
 

@@ -6,9 +6,12 @@ import pytest
 from machines.bm1 import StopReason
 from machines.parameters import SensorMode
 from pcie_shim.errors import FrameInputError
-from services.boards.frames import machine_inputs
+from pcie_shim.host.frame import BoardResult
+from services.boards.frames import encode_boards, machine_inputs
 from services.errors import VariableError
 from services.pipeline.frames import FrameAssembler
+from services.pipeline.inference import Inference
+from services.sockets.records import FrameResult
 from toolchain.building.build import assemble
 from toolchain.building.options import BuildOptions
 from toolchain.models.model import Known, Model, PriorSelect, dimension
@@ -94,6 +97,31 @@ def test_rows_that_do_not_fit_are_refused(addresses):
 
 
 OVERFLOW, SLICE, IMPOSSIBLE = StopReason.OVERFLOW, StopReason.SLICE, StopReason.IMPOSSIBLE
+
+
+def result(*boards) -> FrameResult:
+    return FrameResult(7, encode_boards(boards), 1, 2, 3, 4)
+
+
+def board(counts, cycles, reasons) -> BoardResult:
+    words = np.array(counts, "<u4").tobytes()
+    return BoardResult(words, max(cycles), reasons[0], tuple(cycles), tuple(reasons))
+
+
+OVERFLOW, SLICE, IMPOSSIBLE = StopReason.OVERFLOW, StopReason.SLICE, StopReason.IMPOSSIBLE
+
+
+def test_posteriors_are_normalised_over_boards_and_by_replica():
+    # lines 0 and 1 on one board, line 2 on another; the last replica has no posterior
+    counted = result(
+        board([[10, 30], [4, 4], [0, 0]], [100, 8, 0], [OVERFLOW, OVERFLOW, IMPOSSIBLE]),
+        board([[100], [8], [0]], [1000, 16, 0], [SLICE, SLICE, IMPOSSIBLE]),
+    )
+    inferred = Inference(counted)
+    assert inferred.posterior == pytest.approx([0.2, 0.6, 0.2, 1 / 3, 1 / 3, 1 / 3, 0, 0, 0])
+    assert (inferred.totals, inferred.best) == ([48, 108], 1)
+    nothing = Inference(result(board([[0], [0]], [0, 0], [IMPOSSIBLE] * 2)))
+    assert (nothing.posterior, nothing.best, nothing.totals) == (None, -1, [0])
 
 
 @pytest.mark.parametrize("value", [None, [], [[], []]])
