@@ -5,7 +5,8 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
-from typing import Any, NoReturn, cast
+from importlib import import_module
+from typing import Any, Final, NoReturn, cast
 
 import typer
 from typer.core import TyperCommand, TyperGroup
@@ -17,6 +18,8 @@ from terminal.logs import escape_last_resort
 from terminal.output import open_standard_streams
 from terminal.signals import raise_on_signals
 from terminal.usage import RefusedValueError, metavar
+
+_COMPLETION: Final = frozenset({"install_completion", "show_completion"})
 
 
 class CommandLine(typer.Typer):
@@ -37,6 +40,17 @@ class CommandLine(typer.Typer):
     ) -> Callable[[Any], Any]:
         """Register a function as a command; its integer result is the exit code."""
         return super().command(name, cls=cls or _Command, **settings)
+
+    def add_later(self, name: str, module: str, *, purpose: str, panel: str) -> None:
+        """Add the command line `app` of a module as a subcommand; it is imported when the subcommand is named."""
+
+        def load() -> Any:
+            command = get_command(import_module(module).app)
+            # the group has one completion for all
+            command.params = [each for each in command.params if each.name not in _COMPLETION]
+            return command
+
+        self.command(name, cls=_Later, help=purpose, rich_help_panel=panel)(load)
 
     def __call__(self, arguments: Sequence[str] | None = None) -> NoReturn:
         """Run the command with `sys.argv`, or with these arguments, and exit."""
@@ -79,8 +93,18 @@ class _Command(_WithEnd, TyperCommand):
         return rest
 
 
+class _Later(_Command):
+    """A place-holder with the name and purpose of a subcommand; its callback returns the subcommand."""
+
+
 class _Group(_WithEnd, TyperGroup):
     """A group of commands."""
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
+        name, command, rest = super().resolve_command(ctx, args)
+        if isinstance(command, _Later) and command.callback is not None:
+            command = command.callback()
+        return name, command, rest
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         with _naming(ctx):

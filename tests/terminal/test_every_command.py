@@ -12,7 +12,7 @@ from terminal.command_line import CommandLine
 ROOT = Path(__file__).parents[2]
 SOURCES = [
     path
-    for package in ("services", "casestudies", "toolchain", "posteriors", "bridge", "pcie_shim")
+    for package in ("rosbayes", "services", "casestudies", "toolchain", "posteriors", "bridge", "pcie_shim")
     for path in sorted((ROOT / package).rglob("*.py"))
 ]
 COMMANDS = {
@@ -29,7 +29,7 @@ def flags_of(command):
 
 
 def test_the_commands_are_found():
-    assert len(COMMANDS) == 17
+    assert len(COMMANDS) == 18
     assert not [path for path in SOURCES if re.search(r"\btyper\.(Typer|run)\b", path.read_text())]
 
 

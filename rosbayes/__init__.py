@@ -1,0 +1,1 @@
+"""The umbrella command `rosbayes`, with all other commands as its subcommands."""

@@ -1,0 +1,87 @@
+"""The umbrella command: its subcommands, what it imports for them, its completion and its version."""
+
+import os
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+from typer.main import get_command
+
+from rosbayes.__main__ import app
+from tests.command_runner import invoke
+
+ROOT = Path(__file__).parents[2]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+SCRIPTS = {name: place.partition(":")[0] for name, place in PROJECT["scripts"].items() if name != "rosbayes"}
+HEAVY = {"numba", "numpy", "pydantic", "websockets"}
+
+
+def run_apart(code, **environment):
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env=os.environ | environment,
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert not done.stderr
+    return done.stdout
+
+
+def test_its_subcommands_are_the_other_commands():
+    group = get_command(app)
+    assert set(group.commands) == set(SCRIPTS)
+    for name, place in SCRIPTS.items():
+        loaded = group.resolve_command(None, [name])[1]
+        assert loaded.callback.__module__ in {place, f"{place.rpartition('.')[0]}.main"}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "not_imported"),
+    [([], HEAVY), (["hub"], {"numba", "numpy"}), (["toolchain", "build"], {"numba", "numpy"})],
+)
+def test_help_imports_only_the_named_subcommand(arguments, not_imported):
+    code = f"""
+import contextlib, io, sys
+from rosbayes.__main__ import app
+with contextlib.suppress(SystemExit), contextlib.redirect_stdout(io.StringIO()):
+    app({[*arguments, "--help"]})
+print(*sys.modules)
+"""
+    loaded = set(run_apart(code).split())
+    assert not loaded & not_imported
+    assert ("services.commands.hub" in loaded) is (arguments == ["hub"])
+
+
+def test_a_subcommand_has_the_flags_and_exit_codes_of_the_command():
+    ended = invoke(app, ["board", "--boards", "0"])
+    assert ended.exit_code == 2
+    assert " board --help" in ended.stderr
+    assert invoke(app, ["bord"]).exit_code == 2
+
+
+@pytest.mark.parametrize(
+    ("words", "found"),
+    [("rosbayes lis", "listen"), ("rosbayes toolchain reg", "regenerate"), ("rosbayes hub --po", "--port")],
+)
+def test_one_completion_serves_all_subcommands(words, found):
+    shown = run_apart(
+        "import sys; sys.argv = ['rosbayes']; from rosbayes.__main__ import app; app()",
+        _ROSBAYES_COMPLETE="complete_bash",
+        COMP_WORDS=words,
+        COMP_CWORD=str(words.count(" ")),
+    )
+    assert shown.split() == [found]
+    assert not [
+        each
+        for each in get_command(app).resolve_command(None, ["hub"])[1].params
+        if "completion" in each.name
+    ]
+
+
+def test_its_version_is_the_packages():
+    assert invoke(app, ["--version"]).stdout.split() == ["rosbayes", PROJECT["version"]]
