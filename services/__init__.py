@@ -1,1 +1,1 @@
-"""The processes: subscriber, publisher, pcie-app, master, board, loader and hub, and what they share."""
+"""The processes of a run: subscriber, publisher, pcie-app, master, board, loader and hub."""

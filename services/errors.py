@@ -4,10 +4,10 @@ from terminal.errors import ExitCode
 
 
 class StackError(Exception):
-    """Root of the services' errors; its text is one sentence for the user."""
+    """Base class of the services' errors; the text is one sentence for the user."""
 
     exit_code: int = ExitCode.USAGE
-    """Exit code of a command that this error ends."""
+    """Exit code of a command that ends with this error."""
 
 
 class SettingsError(StackError):
@@ -19,7 +19,7 @@ class InputLineError(StackError):
 
 
 class LocalSocketError(StackError):
-    """A local socket can't be made, or bytes from it are not a record."""
+    """A local socket can't be created, or bytes from it are not a record."""
 
     exit_code = ExitCode.CHILD
 
@@ -29,19 +29,19 @@ class OtherPeerError(StackError):
 
 
 class NoDataError(StackError):
-    """No reading came within the timeout of the first one."""
+    """No reading arrived within the timeout of the first one."""
 
     exit_code = ExitCode.ROSBRIDGE
 
 
 class RosbridgeLostError(StackError):
-    """The rosbridge server went away in a run of one frame."""
+    """The rosbridge server was lost in a run with `--once`."""
 
     exit_code = ExitCode.ROSBRIDGE
 
 
 class VariableError(StackError):
-    """A variable is missing in a message, or its value can't be used."""
+    """A variable is missing in a message, or its value is unusable."""
 
     exit_code = ExitCode.VARIABLE
 
@@ -53,13 +53,13 @@ class BoardFailedError(StackError):
 
 
 class ChildDiedError(StackError):
-    """A process that the master started ended when it should not have, or too often."""
+    """A process that the master started exited unexpectedly, or too often."""
 
     exit_code = ExitCode.CHILD
 
 
 class OverflowedQueueError(StackError):
-    """With `queue = all`, frames came faster than the boards compute them."""
+    """With `queue = all`, readings arrived faster than the boards compute frames."""
 
     exit_code = ExitCode.CHILD
 
@@ -79,17 +79,17 @@ class NotReloadedError(StackError):
 
 
 class ControlError(StackError):
-    """A control socket got a malformed order or answer, or is not there."""
+    """A control socket received a malformed order or answer, or does not exist."""
 
 
 class OutdatedError(StackError):
-    """A service's folder has changed since its start, and a master asks for the new deployment."""
+    """The folder of a service has changed since its start, and the master requires the new deployment."""
 
     exit_code = ExitCode.CHILD
 
 
 class ReportedError(StackError):
-    """A failure in another process, with that process's own sentence and exit code."""
+    """A failure in another process, with the sentence and the exit code of that process."""
 
     def __init__(self, exit_code: int, sentence: str) -> None:
         super().__init__(sentence)

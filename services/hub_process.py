@@ -1,4 +1,4 @@
-"""The hub as a process: the embedded rosbridge server with its status socket and announcement."""
+"""The process of the hub: the embedded rosbridge server with status socket and announcement."""
 
 import asyncio
 import logging
@@ -24,8 +24,8 @@ async def serve(
     ros_version: Literal[1, 2],
     announce: str | None,
 ) -> int:
-    """Serve rosbridge until this is cancelled; `port` 0 takes any free one, `announce` is its name on the network."""
-    # a refused client gets no explanation (as from the reference server): it is in the log only
+    """Serve rosbridge until cancelled; `port` 0 selects a free one, `announce` is the name on the network."""
+    # a refused client gets no explanation, as from the reference server; the reason is only in the log
     log_libraries(logging.WARNING, "hub: %(message)s")
     listening = asyncio.get_running_loop().create_future()
     graphs: list[Graph] = []

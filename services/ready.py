@@ -1,6 +1,6 @@
-"""Whether a process is ready, as an exit code: the health check of a container.
+"""The health check of a container: the readiness of a process as an exit code.
 
-It imports little of the standard library and nothing else, because it runs every few seconds.
+It imports only a small part of the standard library, because it runs every few seconds.
 """
 
 import os
@@ -13,7 +13,7 @@ _USAGE = "usage: python -m services.ready NAME [--directory DIR]"
 
 
 def main(arguments: list[str]) -> int:
-    """Return 0 if the process is ready, and 1 if not or on wrong usage (container engines reserve 2)."""
+    """Return 0 if the process is ready, otherwise 1, also for a usage error (container engines reserve 2)."""
     directory = os.environ.get("BM_RUN_DIRECTORY", "")
     names: list[str] = []
     rest = iter(arguments)

@@ -1,4 +1,4 @@
-"""Settings of all services, in one class: flag over `BM_*` variable over deployment over default."""
+"""Settings of all services: flags override `BM_*` variables, the deployment and the defaults, in this order."""
 
 import asyncio
 import difflib
@@ -15,7 +15,7 @@ from pcie_shim.errors import PcieShimError
 from services.errors import SettingsError
 
 SHORTEST_S, LONGEST_S = 0.001, 86_400.0
-"""Shortest and longest timeout."""
+"""Minimum and maximum timeout in seconds."""
 Seconds = Annotated[float, Field(ge=SHORTEST_S, le=LONGEST_S)]
 ENV_PREFIX = "BM_"
 ROBOT = "robot:"
@@ -23,37 +23,37 @@ ROBOT = "robot:"
 
 
 class Settings(BaseSettings):
-    """Settings of a user. A field of None or "" leaves the deployment's own value, or the default behaviour."""
+    """Settings of a user. None or "" means the value of the deployment, or the default behaviour."""
 
     model_config = SettingsConfigDict(env_prefix=ENV_PREFIX, extra="forbid", frozen=True)
 
-    deployment: Path | None = Field(default=None, description="folder that `toolchain build` wrote")
-    uri: str | None = Field(default=None, description="rosbridge server, instead of the deployment's")
+    deployment: Path | None = Field(default=None, description="folder written by `toolchain build`")
+    uri: str | None = Field(default=None, description="rosbridge server, instead of that of the deployment")
     ros_version: Literal["auto", "1", "2"] = Field(
-        default="auto", description="how time stamps and types are written"
+        default="auto", description="spelling of time stamps and types"
     )
     queue: Literal["latest", "all"] | None = Field(
-        default=None, description="what waits while a frame is computed"
+        default=None, description="readings that wait while a frame is computed"
     )
     stop: Literal["slices", "own"] | None = Field(default=None, description="when the boards stop")
     boards: Annotated[tuple[str, ...], NoDecode] = Field(
-        default=(), description="endpoints of boards that already run, comma-separated"
+        default=(), description="endpoints of running boards, comma-separated"
     )
     key_file: Path | None = Field(default=None, description="file with the key that boards over TCP share")
     board_ca: Path | None = Field(
         default=None,
         description="certificates (PEM) that sign those of boards over TLS; the system's without it",
     )
-    subscriber: str = Field(default="", description="endpoint of a subscriber that already runs")
-    publisher: str = Field(default="", description="endpoint of a publisher that already runs")
-    pcie_app: str = Field(default="", description="endpoint of a pcie-app that already runs")
+    subscriber: str = Field(default="", description="endpoint of a running subscriber")
+    publisher: str = Field(default="", description="endpoint of a running publisher")
+    pcie_app: str = Field(default="", description="endpoint of a running pcie-app")
     connect_timeout: Seconds = Field(default=10, description="seconds to reach the rosbridge server")
     first_data_timeout: Seconds = Field(default=30, description="seconds until the first reading")
     peer_timeout: Seconds = Field(default=10, description="seconds to reach a local process or a board")
     board_timeout: Seconds = Field(
         default=5, description="seconds a board may take beyond max_cycles at its speed"
     )
-    stop_timeout: Seconds = Field(default=5, description="seconds a process has to end")
+    stop_timeout: Seconds = Field(default=5, description="grace period in seconds for processes to exit")
     seen_timeout: Seconds = Field(default=2, description="seconds until a result is seen on the wire")
 
     fused: bool = Field(
@@ -67,7 +67,7 @@ class Settings(BaseSettings):
         default=10, description="seconds without a frame after which a process is not ready"
     )
     log_level: Literal["debug", "info", "warning"] = Field(
-        default="info", description="what is logged; debug has a line for every frame"
+        default="info", description="log level; debug logs one line per frame"
     )
 
     @field_validator(
@@ -75,7 +75,7 @@ class Settings(BaseSettings):
     )
     @classmethod
     def _no_directory(cls, value: object) -> object:
-        return value or None  # an empty variable means none, not the current folder
+        return value or None  # an empty variable means no folder, not the current one
 
     @field_validator("boards", mode="before")
     @classmethod
@@ -106,11 +106,11 @@ class Settings(BaseSettings):
 
 
 def load_settings(**flags: Any) -> Settings:
-    """Return the settings: flags (those that are not None) over the environment over the defaults.
+    """Return the settings: flags that are not None override the environment, which overrides the defaults.
 
     Raises:
-        SettingsError: A `BM_*` variable is unknown, or a value can't be used.
-        BridgeError: --uri names a robot that does not announce itself.
+        SettingsError: A `BM_*` variable is unknown, or a value is invalid.
+        BridgeError: The robot in --uri does not announce itself.
     """
     known = {ENV_PREFIX + name.upper() for name in Settings.model_fields}
     for name in sorted(os.environ):
@@ -139,7 +139,7 @@ def load_settings(**flags: Any) -> Settings:
 
 
 def _expected(name: str, message: str) -> str:
-    """Return what was expected of a setting: of a timeout both its limits."""
+    """Return the expected value of a setting, for a timeout both limits."""
     known = Settings.model_fields.get(name)
     if known is not None and known.annotation is float:
         return f"expected seconds from {SHORTEST_S:g} to {LONGEST_S:g}"
@@ -147,16 +147,16 @@ def _expected(name: str, message: str) -> str:
 
 
 def _found(robot: str) -> str:
-    """Return the URI of a robot that announces its rosbridge server, or raise a BridgeError."""
+    """Return the announced URI of a robot, or raise a BridgeError."""
     from bridge.discovery import resolve
 
-    # in a thread, because the caller may have a loop
+    # in a thread, because the caller may run an event loop
     with ThreadPoolExecutor(1) as pool:
         return pool.submit(lambda: asyncio.run(resolve(robot))).result()
 
 
 def endpoint_in(directory: Path, name: str) -> Endpoint:
-    """Return the endpoint of a named local socket in a directory; a SettingsError if the path is too long for one."""
+    """Return the endpoint of a named local socket in a directory, or raise a SettingsError for a long path."""
     try:
         return parse_endpoint(f"unix:{directory.absolute() / name}.sock")
     except PcieShimError as error:

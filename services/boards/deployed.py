@@ -1,4 +1,4 @@
-"""A deployment's boards: programmed, opened, given frames, recovered after restarts, switched to another deployment."""
+"""The boards of a deployment: programming, opening, frames, recovery after restarts, and reloads."""
 
 import time
 from collections.abc import Sequence
@@ -32,11 +32,11 @@ TICK = 0.2
 
 
 class DeployedBoards:
-    """The boards of the deployment in force; a board that restarts is opened and programmed again.
+    """The boards of the deployment in force; a restarted board is programmed and opened again.
 
     Attributes:
-        generations: The deployments that the boards can be switched to, with their images.
-        gone: Reasons why boards can't be used, by board number.
+        generations: The deployments to which the boards can be switched, with their images.
+        gone: Reasons why boards are unusable, by board number.
     """
 
     def __init__(
@@ -47,7 +47,7 @@ class DeployedBoards:
         *,
         reprogram: bool = False,
     ) -> None:
-        """Read the images; with `reprogram`, a board that holds another one is programmed instead of refused."""
+        """Read the images; with `reprogram`, boards with another image are programmed instead of refused."""
         self._settings = settings
         self.generations = Generations(deployment, _images_of, images=True)
         self._reprogram = reprogram
@@ -57,7 +57,7 @@ class DeployedBoards:
         self._times_gone = [0] * len(self._endpoints)
 
     def open(self) -> str:
-        """Open all boards, programming blank ones, and return a sentence for the user, or raise a PcieShimError."""
+        """Open all boards, program blank ones, and return a sentence for the user, or raise a PcieShimError."""
         programmed: set[int] = set()
         while self._cluster is None:
             try:
@@ -87,13 +87,12 @@ class DeployedBoards:
     def switch(self, record: Switch) -> Switched | NotReloaded:
         """Program all boards with the images of another generation, or restore all of them after a failure.
 
-        No frame may be under way. It takes as long as programming does; boards that hold the right image already
-        are left alone.
+        No frame may be in progress. Boards that already hold the right image are not touched.
         """
         try:
             _, images = self.generations.get(record.generation)
             cluster = self._whole_cluster()
-            self._reprogram = True  # from here on a board may hold either image
+            self._reprogram = True  # from here on, a board may hold either image
             try:
                 self._cluster = self._programmed(cluster, images)
             except PcieShimError:
@@ -104,7 +103,7 @@ class DeployedBoards:
         return self.generations.switch(record)
 
     def _programmed(self, cluster: MiniCluster, images: Sequence[Image]) -> MiniCluster:
-        """Return the boards, open, with these images."""
+        """Return the opened boards with these images."""
         cluster.close()
         for board, (held, wanted) in enumerate(zip(self._images, images, strict=True)):
             if held.image_hash != wanted.image_hash:
@@ -112,10 +111,10 @@ class DeployedBoards:
         return self._opened(images)
 
     def _restore(self, cluster: MiniCluster) -> None:
-        """Use the boards as before; those that do not come back in time stay in `gone`, to be recovered later."""
+        """Restore the boards; those that do not come back in time remain in `gone`, to be recovered later."""
         self._cluster = cluster
         cluster.close()
-        self.gone = dict.fromkeys(range(len(self._endpoints)), "its former image is being restored")
+        self.gone = dict.fromkeys(range(len(self._endpoints)), "its previous image is being restored")
         deadline = time.monotonic() + self._settings.peer_timeout
         while self.gone and time.monotonic() < deadline:
             self.recover()
@@ -130,7 +129,7 @@ class DeployedBoards:
                     self._endpoints[board], image, timeout=max(self._settings.peer_timeout, PROGRAMMING_S)
                 )
             except HeldError as error:
-                # over TCP, the end of our own link may reach the board after the loader does
+                # over TCP, the end of our own link may reach the board after the loader's connection
                 if time.monotonic() > deadline:
                     raise BoardHeldError(f"Board {board}: {error}", board=board) from error
                 time.sleep(TICK / 4)
@@ -142,7 +141,7 @@ class DeployedBoards:
                 return
 
     def status(self, output: FrameOutput | None) -> list[BoardStatus]:
-        """Return the state of each board, with its part of the last output; may be called by another thread."""
+        """Return the state of each board, with its part of the last output; for use in another thread."""
         gone = dict(self.gone)
         return [
             BoardStatus(
@@ -171,7 +170,7 @@ class DeployedBoards:
         self._whole_cluster().post(self._input(frame))
 
     def collect(self) -> FrameOutput | None:
-        """Return the posted frame's result, or None while boards still run; after a BoardError call `find_gone`."""
+        """Return the posted frame's result, or None while boards run; after a BoardError, call `find_gone`."""
         return self._whole_cluster().collect(0)
 
     @property
@@ -212,10 +211,10 @@ class DeployedBoards:
         self._times_gone[board] += 1
 
     def recover(self) -> list[int]:
-        """Try once to reopen the boards that are gone, and return the numbers of those that are back.
+        """Try once to reopen the missing boards, and return the numbers of those that are back.
 
         Raises:
-            BoardMismatchError: A board is back with another image, so that waiting would not help.
+            BoardMismatchError: A board is back with another image, so waiting would not help.
         """
         back = []
         for board in list(self.gone):

@@ -1,4 +1,4 @@
-"""Frames as the driver takes them, and its results as records."""
+"""Conversion of frames to the input of the driver, and of its results to records."""
 
 import math
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ _encoder = msgspec.msgpack.Encoder()
 _decoder = msgspec.msgpack.Decoder(list[BoardResult])
 
 PriorRow = int | tuple[int, ...]
-"""Row of the prior's table; with replicas one for each."""
+"""Row of the prior's table; with replicas, one for each."""
 
 
 class BoardAwayError(BoardError):
@@ -26,7 +26,7 @@ class BoardAwayError(BoardError):
 
 
 def driver_input(deployment: Deployment, frame: Frame, stop: str) -> FrameInput:
-    """Return a frame as the driver takes it; `stop` is `slices` or `own`. A FrameInputError if its addresses do not fit."""
+    """Return the driver's input for a frame, or raise a FrameInputError; `stop` is `slices` or `own`."""
     machine = deployment.machine
     prior = np.frombuffer(frame.prior_codes, "<u2") if frame.prior_codes else None
     addresses: tuple[int | None, ...] | npt.NDArray[np.int64]
@@ -59,10 +59,10 @@ def _one(address: int | list[int] | None) -> int | None:
 
 
 def machine_inputs(deployment: Deployment, addresses: Addresses) -> tuple[npt.NDArray[np.int64], PriorRow]:
-    """Return a frame's inputs where replicas or lines have readings of their own: a row of addresses for each variable.
+    """Return the inputs of a frame in which replicas or lines have their own readings.
 
     Returns:
-        The sensors' inputs, -1 for a missing one, and the row of the prior's table.
+        The inputs of the sensors, -1 for a missing one, and the row of the prior's table.
 
     Raises:
         FrameInputError: There are too few or too many variables, or a row has another length than expected.
@@ -97,7 +97,7 @@ def _row(deployment: Deployment, variable: Variable, given: int | list[int] | No
         array = np.array(given, dtype=np.int64)
     except OverflowError:
         raise FrameInputError(
-            f"The reading of {variable.name} has an address beyond all that a machine has"
+            f"The reading of {variable.name} has an address that exceeds every machine"
         ) from None
     expected = math.prod(shape)
     if array.size != expected or (array.ndim == 0 and shape):
@@ -110,7 +110,7 @@ def _row(deployment: Deployment, variable: Variable, given: int | list[int] | No
 
 
 def encode_boards(boards: Sequence[BoardResult]) -> msgspec.Raw:
-    """Return the boards' part of a `FrameResult`, which the master forwards without decoding it."""
+    """Return the boards' part of a `FrameResult`, which the master forwards undecoded."""
     return msgspec.Raw(_encoder.encode(boards))
 
 
@@ -132,6 +132,6 @@ def result_record(number: int, output: FrameOutput) -> FrameResult:
 
 
 def frame_failed(number: int, error: BoardError) -> FrameFailed:
-    """Return a board's error as the record of a frame that failed."""
+    """Return the error of a board as the record of a failed frame."""
     reason = FailureReason.AWAY if isinstance(error, BoardAwayError) else FailureReason.FAILED
     return FrameFailed(number, error.board, exit_code_of(error), str(error), reason)

@@ -1,4 +1,4 @@
-"""Emulated boards as processes: one alone, or a mini-cluster forked from a process that has loaded the kernels."""
+"""Processes of emulated boards: a single one, or a mini-cluster forked from a process with loaded kernels."""
 
 import contextlib
 import os
@@ -37,7 +37,8 @@ def serve_one(
 ) -> int:
     """Serve one board in this process until a signal, and return the signal's number.
 
-    `directory` is the folder of its status socket, if it has one; `on_ready` is called once both its sockets listen.
+    `directory` is the folder of its status socket, if any; `on_ready` is called when both its sockets are
+    listening.
     """
     stop = StopSignal()
     ended_by: list[int] = []
@@ -70,16 +71,16 @@ def serve_one(
 
 
 class _Arrivals:
-    """Detects the last of several processes to arrive: each takes a byte from a pipe, and only the last finds it empty."""
+    """Detection of the last of several processes: each takes a byte from a pipe, and the last empties it."""
 
     def __init__(self, count: int) -> None:
         self._left, write = os.pipe()
         os.set_blocking(self._left, False)
         os.write(write, bytes(count - 1))
-        self._kept_open = write  # else an empty pipe would be at its end
+        self._kept_open = write  # otherwise reading an empty pipe would return end of file
 
     def is_last(self) -> bool:
-        """Arrive, and return whether this is the last process, or one that arrives again after it."""
+        """Arrive, and return whether this is the last process, or a later one."""
         try:
             os.read(self._left, 1)
         except BlockingIOError:
@@ -88,34 +89,32 @@ class _Arrivals:
 
 
 def _check_free(endpoint: Endpoint) -> None:
-    """Refuse an endpoint at which another process listens: later on, a socket there is taken for our own."""
+    """Raise an error if another process listens at an endpoint; later, a socket there counts as ours."""
     for each in (endpoint, endpoint.programming):
         with socket.socket(socket.AF_UNIX) as probe, contextlib.suppress(OSError):
             probe.settimeout(1)
             probe.connect(each.path)
-            raise SettingsError(
-                f"another process listens at {each}; end it, or give --directory another folder"
-            )
+            raise SettingsError(f"another process listens at {each}; stop it, or give another --directory")
 
 
 class BoardProcesses:
-    """Boards 0 to n-1, each a process forked from this one."""
+    """Boards 0 to n-1, each in a process forked from this one."""
 
     def __init__(self, directory: Path, count: int, restarts: int, run_directory: Path | None) -> None:
         self._endpoints = [endpoint_in(directory, f"board{at}") for at in range(count)]
         self._restarts = restarts
         self._run_directory = run_directory
-        self._reports = PARENT_VARIABLE not in os.environ  # a master watches its boards itself
+        self._reports = PARENT_VARIABLE not in os.environ  # a master monitors its boards itself
         self._arrivals = _Arrivals(count)
         self._started: dict[int, int] = {}
         self._starts = [0] * count
         self._ends: list[float] = []
 
     def run(self) -> NoReturn:
-        """Keep the boards running until a signal raises here, or a board ends too often (BoardFailedError)."""
+        """Keep the boards running until a signal raises here, or boards exit too often (BoardFailedError)."""
         from machines.kernel import warm_up
 
-        # the children share these pages: four imports of numba would take 1.6 s
+        # children share these pages, because four imports of numba would take 1.6 s
         warm_up()
         for endpoint in self._endpoints:
             _check_free(endpoint)
@@ -153,7 +152,7 @@ class BoardProcesses:
             code = 128 + ended_by if ended_by else 0
         except StoppedError as stopped:
             code = stopped.exit_code
-        except BaseException as error:  # the fork must never run on in its parent's code
+        except BaseException as error:  # the child must never continue in the code of its parent
             code = exit_code_of(error)
             say(f"error: board {at}: {error}")
         finally:
@@ -162,7 +161,7 @@ class BoardProcesses:
             os._exit(code)
 
     def _ready(self, at: int) -> None:
-        """Print that all boards are ready, or that one is back; runs in a board's own process."""
+        """Print that all boards are ready, or that one is back; runs in the process of a board."""
         if not self._arrivals.is_last() or not self._reports:
             return
         if self._starts[at] > 1:
@@ -177,7 +176,9 @@ class BoardProcesses:
         self._ends = [each for each in self._ends if now - each <= RESTARTS_WITHIN] + [now]
         if len(self._ends) > self._restarts:
             often = (
-                f", {len(self._ends)} ends of boards within {RESTARTS_WITHIN:.0f} s" if self._restarts else ""
+                f", {len(self._ends)} exits of boards within {RESTARTS_WITHIN:.0f} s"
+                if self._restarts
+                else ""
             )
             raise BoardFailedError(f"board {at} {how_it_ended(code)}{often}")
         say(f"board {at} {how_it_ended(code)}; restarting it")
@@ -199,14 +200,14 @@ class BoardProcesses:
         for pid in self._started:
             with contextlib.suppress(ProcessLookupError, ChildProcessError):
                 os.kill(pid, signal.SIGKILL)
-                os.waitpid(pid, 0)  # its sockets answer until it is gone
+                os.waitpid(pid, 0)  # its sockets accept connections until it has exited
         for at in range(len(self._endpoints)):
             self._remove_sockets(self._endpoints[at])
         if self._run_directory is not None:
             remove_stale_sockets(self._run_directory)
 
     def _remove_sockets(self, endpoint: Endpoint) -> None:
-        # a killed board leaves its sockets behind
+        # a killed board leaves its socket files behind
         for each in (endpoint, endpoint.programming):
             with contextlib.suppress(OSError):
                 Path(each.path).unlink()

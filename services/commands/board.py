@@ -25,29 +25,29 @@ from terminal.signals import check_signals, stopped_by
 
 app = CommandLine(
     help="Emulate boards of the mini-cluster. They start blank; pcie-app or the loader programs them.\n\n"
-    "`board --listen unix:/tmp/b/board0.sock` is one board; `board --boards 4 --directory /tmp/b` is four, "
-    "each a process of its own."
+    "`board --listen unix:/tmp/b/board0.sock` runs one board; `board --boards 4 --directory /tmp/b` runs four, "
+    "each in its own process."
 )
 
 
 @app.command(help=app.info.help)
 def board(
     listen: options.Listen = None,
-    index: Annotated[int, typer.Option(min=0, help="The board's number, for its messages.")] = 0,
-    boards: Annotated[int | None, typer.Option(min=1, max=64, help="Start this many boards.")] = None,
+    index: Annotated[int, typer.Option(min=0, help="Number of the board, for its messages.")] = 0,
+    boards: Annotated[int | None, typer.Option(min=1, max=64, help="Number of boards to run.")] = None,
     directory: Annotated[
-        Path | None, typer.Option(help="Where their sockets go: board0.sock, board1.sock, ...")
+        Path | None, typer.Option(help="Folder of their sockets: board0.sock, board1.sock, ...")
     ] = None,
-    restarts: Annotated[
-        int, typer.Option(min=0, help="Restarts of boards within 60 s before it gives up.")
-    ] = RESTARTS,
+    restarts: Annotated[int, typer.Option(min=0, help="Maximum number of restarts within 60 s.")] = RESTARTS,
     key_file: options.KeyFile = None,
     tls_cert: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Its certificate (PEM); then it serves tls:// instead of tcp://."),
+        typer.Option(
+            metavar="FILE", help="Certificate of the board (PEM), to serve tls:// instead of tcp://."
+        ),
     ] = None,
     tls_key: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="The certificate's private key (PEM).")
+        Path | None, typer.Option(metavar="FILE", help="Private key of the certificate (PEM).")
     ] = None,
     insecure: options.Insecure = False,
     misbehave: Annotated[
@@ -71,7 +71,7 @@ def board(
             directory.mkdir(mode=0o700, exist_ok=True)
         except OSError as error:
             raise SettingsError(
-                f"--directory {directory} is not a folder and can't be made ({error.strerror}); name one for the boards' sockets"
+                f"--directory {directory} is not a folder and can't be created ({error.strerror}); name one for the boards' sockets"
             ) from None
         if directory.stat().st_mode & 0o077:
             raise SettingsError(
@@ -85,7 +85,7 @@ def board(
     endpoint = _endpoint(listen or "", settings.key_file, tls_cert, tls_key, insecure=insecure)
 
     def on_ready() -> None:
-        if PARENT_VARIABLE not in os.environ:  # a master watches its boards itself
+        if PARENT_VARIABLE not in os.environ:  # a master monitors its boards itself
             say(f"board {index} listens at {endpoint}")
 
     fault = Misbehaviour.parse(misbehave) if misbehave else None
@@ -98,7 +98,7 @@ def board(
 def _endpoint(
     listen: str, key_file: Path | None, certificate: Path | None, key: Path | None, *, insecure: bool
 ) -> Endpoint:
-    """Return where the board listens, with its credentials."""
+    """Return the endpoint of the board, with its credentials."""
     endpoint = endpoint_from(listen, "--listen")
     if not endpoint.host:
         return endpoint
@@ -108,8 +108,8 @@ def _endpoint(
         )
     if key_file is None and not endpoint.is_loopback and not insecure:
         raise SettingsError(
-            f"--listen {listen} lets everybody on that network use this board; give --key-file FILE with a key that its "
-            "hosts have too, or --insecure if that is meant"
+            f"--listen {listen} lets everybody on that network use this board; give --key-file FILE with the key of its "
+            "hosts, or --insecure if that is intended"
         )
     credentials = Credentials(
         key=read_key(key_file) if key_file is not None else b"",
@@ -119,7 +119,7 @@ def _endpoint(
 
 
 def main() -> None:
-    """Run the command and exit at once: unloading the compiled kernels in order takes half a second."""
+    """Run the command and exit at once, because a regular unloading of the kernels takes half a second."""
     try:
         app()
     except SystemExit as end:

@@ -15,7 +15,7 @@ from terminal.signals import run_async
 
 app = CommandLine(
     help="List the rosbridge servers that announce themselves on this network.\n\n`discover`\n\n"
-    "A name that it lists can be used instead of an address: `--uri robot:NAME`."
+    "Use a listed name instead of an address with `--uri robot:NAME`."
 )
 
 
@@ -23,10 +23,10 @@ app = CommandLine(
 def discover(
     timeout: Annotated[
         float,
-        typer.Option(min=0.1, max=60, help="Seconds to wait for answers; nobody says when all have come."),
+        typer.Option(min=0.1, max=60, help="Seconds to wait for answers; the whole time is used."),
     ] = 2.0,
     as_json: Annotated[
-        bool, typer.Option("--json", help="One JSON object a line instead of a table.")
+        bool, typer.Option("--json", help="Print one JSON object per line instead of a table.")
     ] = False,
 ) -> int:
     """List the rosbridge servers that announce themselves on this network."""

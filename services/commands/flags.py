@@ -1,4 +1,4 @@
-"""Flags that several commands share, each with one meaning."""
+"""Flags shared by several commands."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -14,7 +14,7 @@ def _seconds(meaning: str) -> Any:
 
 Deployment = Annotated[
     Path | None,
-    typer.Option("--deployment", "-d", help="Folder that `toolchain build` wrote.", metavar="DIR"),
+    typer.Option("--deployment", "-d", help="Folder written by `toolchain build`.", metavar="DIR"),
 ]
 Uri = Annotated[
     str | None,
@@ -29,7 +29,7 @@ Listen = Annotated[
 ]
 Insecure = Annotated[
     bool,
-    typer.Option(help="Say that an address which others reach, without protection, is meant."),
+    typer.Option(help="Permit an unprotected address that other machines can reach."),
 ]
 KeyFile = Annotated[
     Path | None,
@@ -39,22 +39,24 @@ BoardCa = Annotated[
     Path | None,
     typer.Option(help="Certificates that sign those of boards over TLS (the system's).", metavar="FILE"),
 ]
-RosVersion = Annotated[str | None, typer.Option(help="How stamps and types are written.", metavar="auto|1|2")]
+RosVersion = Annotated[str | None, typer.Option(help="Spelling of stamps and types.", metavar="auto|1|2")]
 Queue = Annotated[
     str | None,
     typer.Option(
-        help="What waits while a frame is computed: latest, or all (in order, 256 deep).",
+        help="Readings that wait while a frame is computed: the latest, or all (in order, at most 256).",
         metavar="latest|all",
     ),
 ]
 Stop = Annotated[
     str | None,
-    typer.Option(help="When boards stop: slices (together) or own (each by itself).", metavar="slices|own"),
+    typer.Option(
+        help="When boards stop: slices (together) or own (each independently).", metavar="slices|own"
+    ),
 ]
 Boards = Annotated[
     str | None,
     typer.Option(
-        help="Boards that already run, comma-separated, in the order of the partitions.",
+        help="Running boards, comma-separated, in the order of the partitions.",
         metavar="ENDPOINT,...",
     ),
 ]
@@ -64,11 +66,11 @@ PeerTimeout = Annotated[float | None, _seconds("Seconds to reach a local process
 BoardTimeout = Annotated[
     float | None, _seconds("Seconds a board may take beyond max_cycles at its speed (5).")
 ]
-StopTimeout = Annotated[float | None, _seconds("Seconds a process has to end (5).")]
+StopTimeout = Annotated[float | None, _seconds("Grace period in seconds for processes to exit (5).")]
 LogLevel = Annotated[
     str | None,
     typer.Option(
-        help="What is logged: info, warning, or debug (a line for every frame).", metavar="info|warning|debug"
+        help="Log level: info, warning, or debug (one line per frame).", metavar="info|warning|debug"
     ),
 ]
-Count = Annotated[int | None, typer.Option("--count", "-n", min=1, help="End after this many.")]
+Count = Annotated[int | None, typer.Option("--count", "-n", min=1, help="Exit after this many.")]

@@ -16,7 +16,7 @@ from terminal.signals import run_async
 
 app = CommandLine(
     help="Serve rosbridge without ROS: topics, services, actions, parameters and rosapi.\n\n`hub --port 9090`\n\n"
-    "On another address than this machine's own it wants TLS and tokens:\n\n"
+    "On a non-loopback address it requires TLS and tokens:\n\n"
     "`hub --host 0.0.0.0 --tls-cert cert.pem --tls-key key.pem --token-file tokens.txt`"
 )
 
@@ -24,39 +24,43 @@ app = CommandLine(
 @app.command(help=app.info.help)
 def hub(
     host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
-    port: Annotated[int, typer.Option(min=0, max=65535, help="Port; 0 takes any free one.")] = 9090,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port; 0 selects a free one.")] = 9090,
     ros_version: Annotated[
-        Literal["1", "2"], typer.Option(help="Which ROS it plays: how types are written, what rosapi says.")
+        Literal["1", "2"], typer.Option(help="Emulated ROS version: spelling of types, answers of rosapi.")
     ] = "1",
     tls_cert: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Its certificate (PEM); then it serves wss://.")
+        Path | None, typer.Option(metavar="FILE", help="Certificate of the hub (PEM), to serve wss://.")
     ] = None,
     tls_key: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="The certificate's private key (PEM).")
+        Path | None, typer.Option(metavar="FILE", help="Private key of the certificate (PEM).")
     ] = None,
     token_file: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Tokens that clients must show, one a line.")
+        Path | None, typer.Option(metavar="FILE", help="Accepted client tokens, one per line.")
     ] = None,
     origin: Annotated[
         list[str] | None,
         typer.Option(
             metavar="ORIGIN",
-            help="Web page that may connect, such as https://robot.example, besides this machine's ('null': pages opened from a file); repeatable.",
+            help="Web page that may connect, such as https://robot.example, in addition to those of this machine ('null': pages opened from a file); repeatable.",
         ),
     ] = None,
     message_bytes: Annotated[
         int,
         typer.Option(
-            min=1 << 10, max=1 << 28, help="Largest message, both ways; a larger one closes its sender."
+            min=1 << 10,
+            max=1 << 28,
+            help="Maximum message size in bytes, both ways; a client that exceeds it is disconnected.",
         ),
     ] = MAX_SIZE,
     announce: Annotated[
         str | None,
-        typer.Option(metavar="NAME", help="Announce it on the network under this name (see `discover`)."),
+        typer.Option(
+            metavar="NAME", help="Announce the hub on the network under this name (see `discover`)."
+        ),
     ] = None,
     insecure: Annotated[
         bool,
-        typer.Option("--insecure", help="Say that another address without TLS and tokens is meant."),
+        typer.Option("--insecure", help="Permit a non-loopback address without TLS and tokens."),
     ] = False,
 ) -> int:
     """Serve rosbridge without ROS."""
@@ -69,7 +73,7 @@ def hub(
             if not there
         )
         raise SettingsError(
-            f"--host {shown(host)} lets everybody on that network publish to your robot; give {missing}, or --insecure if that is meant"
+            f"--host {shown(host)} lets everybody on that network publish to your robot; give {missing}, or --insecure if that is intended"
         )
 
     return run_async(
@@ -87,7 +91,7 @@ def hub(
 def _access_policy(
     certificate: Path | None, key: Path | None, tokens: Path | None, origins: list[str]
 ) -> AccessPolicy:
-    """Return the access rules of the flags."""
+    """Return the access policy according to the flags."""
     if (certificate is None) != (key is None):
         raise SettingsError(
             "TLS needs both the certificate and its key: give --tls-cert FILE and --tls-key FILE"

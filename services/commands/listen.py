@@ -20,7 +20,7 @@ from terminal.signals import run_async
 app = CommandLine(
     help="Print, draw or save the posteriors of a running stack.\n\n"
     "`listen --uri ws://robot:9090 --count 10`\n\n"
-    "With `-d build/boat` cells have values in their units, and the server is the deployment's. `--plot` draws each "
+    "With `-d build/boat`, cells have values in their units, and the server is that of the deployment. `--plot` draws each "
     "posterior in the terminal; `--save posteriors.jsonl` (or .csv, .npz) saves them."
 )
 
@@ -30,17 +30,17 @@ def listen(
     uri: options.Uri = None,
     deployment: options.Deployment = None,
     topic: Annotated[
-        str | None, typer.Option(help="Where the posteriors are (the deployment's, or /BMresults).")
+        str | None, typer.Option(help="Topic of the posteriors (that of the deployment, or /BMresults).")
     ] = None,
     count: options.Count = None,
     as_json: Annotated[
-        bool, typer.Option("--json", help="One JSON object a line, with the whole posterior.")
+        bool, typer.Option("--json", help="Print one JSON object per line, with the whole posterior.")
     ] = False,
     plot: Annotated[bool, typer.Option("--plot", help="Draw each posterior in the terminal.")] = False,
     save: Annotated[
         Path | None,
         typer.Option(
-            help="Save to this file: .jsonl and .csv are appended to, .npz is replaced.", metavar="FILE"
+            help="Save to this file: .jsonl and .csv are appended to, .npz is overwritten.", metavar="FILE"
         ),
     ] = None,
     timeout: Annotated[
@@ -48,7 +48,7 @@ def listen(
         typer.Option(
             min=0.1,
             max=LONGEST_S,
-            help="End after so many seconds without a result; by default they are waited out.",
+            help="Exit after this many seconds without a result; by default, wait.",
         ),
     ] = None,
     first_data_timeout: options.FirstDataTimeout = None,
@@ -57,7 +57,7 @@ def listen(
 ) -> int:
     """Print, draw or save the posteriors of a running stack."""
     if as_json and plot:
-        raise SettingsError("--json and --plot both want the standard output: give one of them")
+        raise SettingsError("--json and --plot both use standard output: give one of them")
     settings = load_settings(
         uri=uri,
         deployment=deployment,

@@ -1,4 +1,4 @@
-"""The command `loader`: programs a board over its own port, without a restart of the host (thesis 3.4, SofLoader)."""
+"""The command `loader`, which programs a board through its programming port (thesis 3.4, SofLoader)."""
 
 from pathlib import Path
 from typing import Annotated
@@ -14,9 +14,9 @@ from terminal.command_line import CommandLine
 from terminal.output import say
 
 app = CommandLine(
-    help="Program a board with an image that `toolchain build` wrote.\n\n"
+    help="Program a board with an image written by `toolchain build`.\n\n"
     "`loader build/boat/boards/board0.bm unix:/tmp/b/board0.sock`\n\n"
-    "It refuses while pcie-app holds the board."
+    "It fails while pcie-app holds the board."
 )
 
 
@@ -28,7 +28,7 @@ def loader(
     key_file: options.KeyFile = None,
     board_ca: options.BoardCa = None,
 ) -> int:
-    """Program a board with an image that `toolchain build` wrote."""
+    """Program a board with an image written by `toolchain build`."""
     end_with_parent()
     settings = load_settings(peer_timeout=peer_timeout, key_file=key_file, board_ca=board_ca)
     image_hash = program(board_endpoint(endpoint, "ENDPOINT", settings), image, timeout=settings.peer_timeout)

@@ -1,4 +1,4 @@
-"""The commands `master`, which runs the stack, and `master reload`, which sends an order to a running one."""
+"""The commands `master`, which runs the stack, and `master reload`, which makes a running one reload."""
 
 from pathlib import Path
 from typing import Annotated
@@ -19,13 +19,13 @@ from terminal.one_line import one_line
 from terminal.signals import run_async
 
 RELOAD_TIME = 600.0
-"""Seconds that `master reload` waits for its answer."""
+"""Seconds that `master reload` waits for the answer."""
 
 app = CommandLine(
     help="Move readings to the boards and posteriors back to the robot.\n\n"
-    "`master --once -d build/boat --uri ws://robot:9090` computes one frame; `master --loop` goes on until Ctrl-C.\n\n"
-    "`master reload -d build/boat2` has a running one take another deployment of the same shape.\n\n"
-    "It starts what is not running (subscriber, publisher, pcie-app, emulated boards) and ends it again. "
+    "`master --once -d build/boat --uri ws://robot:9090` computes one frame; `master --loop` runs until Ctrl-C.\n\n"
+    "`master reload -d build/boat2` makes a running one switch to another deployment of the same shape.\n\n"
+    "It starts and stops subscriber, publisher, pcie-app and emulated boards that are not running yet. "
     "Exit codes: 0 done, 2 usage or deployment, 3 rosbridge, 4 a variable, 5 a board, 6 a process, 130, 143."
 )
 
@@ -33,15 +33,15 @@ app = CommandLine(
 @app.callback(help=app.info.help, invoke_without_command=True)
 def master(
     context: typer.Context,
-    once: Annotated[bool, typer.Option("--once", help="Compute the first complete frame, then end.")] = False,
-    loop: Annotated[bool, typer.Option("--loop", help="Go on until Ctrl-C, or --count.")] = False,
+    once: Annotated[bool, typer.Option("--once", help="Compute the first complete frame and exit.")] = False,
+    loop: Annotated[bool, typer.Option("--loop", help="Run until Ctrl-C, or --count.")] = False,
     count: options.Count = None,
     deployment: options.Deployment = None,
     uri: options.Uri = None,
     connect: Annotated[
         Path | None,
         typer.Option(
-            help="Folder with subscriber.sock, publisher.sock and pcie-app.sock of services that already run."
+            help="Folder with subscriber.sock, publisher.sock and pcie-app.sock of running services."
         ),
     ] = None,
     boards: options.Boards = None,
@@ -59,13 +59,13 @@ def master(
         bool | None,
         typer.Option(
             "--fused",
-            help="Run subscriber, publisher and pcie-app inside this process: fewer hops, nothing else differs.",
+            help="Run subscriber, publisher and pcie-app inside this process: fewer hops, the same results.",
         ),
     ] = None,
     log_level: options.LogLevel = None,
     json: Annotated[bool, typer.Option("--json", help="Print one JSON object per result.")] = False,
     print_config: Annotated[
-        bool, typer.Option("--print-config", help="Print all settings as they are in force, and end.")
+        bool, typer.Option("--print-config", help="Print the resulting settings and exit.")
     ] = False,
 ) -> int:
     """Move readings to the boards and posteriors back to the robot."""
@@ -76,7 +76,7 @@ def master(
     if connect is not None:
         if not connect.is_dir():
             raise SettingsError(
-                f"--connect {connect} is not a folder; name the one with the sockets of the services that run already"
+                f"--connect {connect} is not a folder; name the one with the sockets of the running services"
             )
         for name in ("subscriber", "publisher", "pcie-app"):
             connected[name.replace("-", "_")] = str(endpoint_in(connect, name))
@@ -104,7 +104,7 @@ def master(
     if once == loop:
         raise SettingsError("choose one of --once and --loop")
     if once and count is not None:
-        raise SettingsError("--count belongs to --loop; --once computes one frame")
+        raise SettingsError("--count requires --loop; --once computes one frame")
     loaded = deployment_for(settings)
     return run_async(run_master(settings, loaded, once=once, count=count, json=json))
 
@@ -116,16 +116,16 @@ def reload_(
         Path | None,
         typer.Option(
             "--directory",
-            help="Folder of the master's control socket: BM_CONTROL_DIRECTORY, or BM_RUN_DIRECTORY, of its own.",
+            help="Folder of the master's control socket: its BM_CONTROL_DIRECTORY or BM_RUN_DIRECTORY.",
             metavar="DIR",
         ),
     ] = None,
 ) -> int:
-    """Have a running `master --loop` take another deployment of the same shape, or the same folder as it is now.
+    """Make a running `master --loop` switch to another deployment of the same shape, or reload its folder.
 
-    `toolchain regenerate memories build/boat --model casestudies/boat`, then `master reload -d build/boat`: readings and results go on. If
-    it can't be taken, the run goes on with what it has, and the sentence says why. Exit codes: 0 done, 2 another shape
-    or damaged, 5 a board, 6 not now.
+    `toolchain regenerate memories build/boat --model casestudies/boat`, then `master reload -d build/boat`:
+    readings and results continue. If the switch fails, the run keeps its deployment, and the sentence gives
+    the reason. Exit codes: 0 done, 2 another shape or damaged, 5 a board, 6 not now.
     """
     end_with_parent()
     settings = load_settings(deployment=deployment)

@@ -17,7 +17,7 @@ from terminal.command_line import CommandLine
 
 app = CommandLine(
     help="Drive the boards of a mini-cluster.\n\n"
-    "Alone it reads readings from standard input (what `subscriber --deployment` prints) and prints counts:\n\n"
+    "Alone, it reads the output of `subscriber --deployment` from standard input and prints counts:\n\n"
     "`echo '{\"addresses\": [71, 50, 50, 45, 18, 72]}' | pcie-app -d build/boat --boards unix:/tmp/b/board0.sock,...`\n\n"
     "With `--listen ENDPOINT` it serves a master."
 )

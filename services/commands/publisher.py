@@ -17,7 +17,7 @@ from terminal.signals import run_async
 
 app = CommandLine(
     help="Publish posteriors over rosbridge.\n\n"
-    "Alone it reads results from standard input, one JSON value a line (what `pcie-app` prints, or arrays of probabilities):\n\n"
+    "Alone, it publishes its standard input, one JSON value per line (output of `pcie-app`, or arrays of probabilities):\n\n"
     "`subscriber -d build/boat | pcie-app -d build/boat --boards ... | publisher -d build/boat --uri ws://robot:9090`\n\n"
     "With `--listen ENDPOINT` it serves a master."
 )
@@ -31,7 +31,7 @@ def publisher(
     ros_version: options.RosVersion = None,
     connect_timeout: options.ConnectTimeout = None,
     seen_timeout: Annotated[
-        float | None, typer.Option(help="Seconds until a result is seen on the wire (2).")
+        float | None, typer.Option(help="Seconds until a result must be seen on the wire (2).")
     ] = None,
     insecure: options.Insecure = False,
     log_level: options.LogLevel = None,

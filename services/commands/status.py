@@ -14,8 +14,8 @@ from terminal.signals import run_async
 
 app = CommandLine(
     help="Show the whole stack in one screen: processes, boards and images, last frame, rates, losses by reason.\n\n"
-    "`status` finds the one run of this user; `status --directory DIR` asks the processes with that BM_RUN_DIRECTORY.\n\n"
-    "Exit codes: 0 all is ready, 6 something is not, 2 nothing was found."
+    "`status` finds the only run of this user; `status --directory DIR` selects the processes with that BM_RUN_DIRECTORY.\n\n"
+    "Exit codes: 0 everything is ready, 6 something is not, 2 nothing was found."
 )
 
 
@@ -25,9 +25,9 @@ def status(
         Path | None,
         typer.Option("--directory", help="Folder with the status sockets (BM_RUN_DIRECTORY).", metavar="DIR"),
     ] = None,
-    watch: Annotated[bool, typer.Option("--watch", "-w", help="Go on, every second, until Ctrl-C.")] = False,
+    watch: Annotated[bool, typer.Option("--watch", "-w", help="Refresh every second until Ctrl-C.")] = False,
     json: Annotated[
-        bool, typer.Option("--json", help="Print one JSON object; with --watch one a line.")
+        bool, typer.Option("--json", help="Print one JSON object; with --watch, one per line.")
     ] = False,
 ) -> int:
     """Show the whole stack in one screen."""

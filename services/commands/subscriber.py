@@ -18,10 +18,10 @@ from terminal.signals import run_async
 from toolchain.deployment import Source
 
 app = CommandLine(
-    help="Take variables out of a ROS topic over rosbridge.\n\n"
-    "Alone it prints them, one JSON object a line:\n\n"
+    help="Extract variables from a ROS topic over rosbridge.\n\n"
+    "Alone, it prints them, one JSON object per line:\n\n"
     "`subscriber --uri ws://robot:9090 --topic /boat/sensors --type boat_msgs/Sensors --variables D1,B1`\n\n"
-    "With `--deployment DIR` it prints addresses as `pcie-app` reads them; "
+    "With `--deployment DIR` it prints addresses in the form for `pcie-app`; "
     "with `--listen ENDPOINT` too, it serves a master."
 )
 
@@ -33,7 +33,7 @@ def subscriber(
     topic: Annotated[str | None, typer.Option(help="Topic to subscribe to (without a deployment).")] = None,
     type_: Annotated[str | None, typer.Option("--type", help="Its message type.")] = None,
     variables: Annotated[
-        str, typer.Option(help="Names or paths, comma-separated; none prints whole messages.")
+        str, typer.Option(help="Names or paths, comma-separated; by default, print whole messages.")
     ] = "",
     count: options.Count = None,
     listen: options.Listen = None,
@@ -44,7 +44,7 @@ def subscriber(
     insecure: options.Insecure = False,
     log_level: options.LogLevel = None,
 ) -> int:
-    """Take variables out of a ROS topic over rosbridge."""
+    """Extract variables from a ROS topic over rosbridge."""
     end_with_parent()
     settings = load_settings(
         deployment=deployment,
@@ -58,7 +58,7 @@ def subscriber(
     if settings.deployment is not None and (value := topic or type_ or variables):
         flag = "--topic" if topic else "--type" if type_ else "--variables"
         raise SettingsError(
-            f"{flag} {value} is for use without a deployment; {settings.deployment} has its own: leave one of them out"
+            f"{flag} {value} cannot be combined with a deployment; {settings.deployment} has its own: omit one of them"
         )
     if listen is not None:
         loaded = deployment_for(settings)

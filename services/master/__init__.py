@@ -1,1 +1,1 @@
-"""One run of the master: its peers, the frames between them, and how it takes another deployment."""
+"""A run of the master: its peers, the flow of frames between them, and reloads of the deployment."""

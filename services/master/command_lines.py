@@ -1,4 +1,4 @@
-"""Command lines of the processes that a master starts, so that they use the settings of its run."""
+"""Command lines of the processes that a master starts, with the settings of its run."""
 
 from pathlib import Path
 
@@ -8,7 +8,7 @@ from services.supervision.child import RESTARTS, own_command
 
 
 def boards_command(boards: int, directory: Path, *, once: bool) -> list[str]:
-    """Return the command of the process that starts emulated boards; with `once` it restarts none."""
+    """Return the command that starts the emulated boards; with `once` it does not restart them."""
     restarts = "0" if once else str(RESTARTS)
     return [
         *(*own_command("board"), "--boards", str(boards)),

@@ -1,8 +1,8 @@
-"""Flow of frames through a run: readings wait, boards compute, results are published (thesis 3.3, figure 3.4).
+"""Flow of frames through a run: waiting, computing, publishing (thesis 3.3, figure 3.4).
 
     subscriber ─reading─▶ [waiting] ─frame─▶ pcie-app ─result─▶ publisher ─outcome─▶ counted
 
-While a run reloads, readings for the next deployment wait beside those for the one in force.
+During a reload, readings for the next deployment wait separately from those for the one in force.
 """
 
 import asyncio
@@ -42,7 +42,7 @@ from services.sockets.status import FrameCounts, reasons, seconds_since
 from services.supervision.child import RESTARTS, RESTARTS_WITHIN
 
 MOST_AT_PUBLISHER = 8
-"""Results that the publisher may have unanswered; beyond that frames wait, and `queue` decides which are kept."""
+"""Maximum number of results that the publisher has not acknowledged; after that, frames wait."""
 
 _LOSSES = {
     Outcome.NO_POSTERIOR: LossReason.NO_POSTERIOR,
@@ -68,7 +68,7 @@ class _Computing:
 
 
 class FrameFlow:
-    """The frames of a run, from reading to outcome. A frame is on the boards, at most, at a time."""
+    """The frames of a run, from reading to outcome. At most one frame is on the boards."""
 
     def __init__(
         self,
@@ -81,7 +81,7 @@ class FrameFlow:
         count: int | None,
         show: Callable[[Published], None],
     ) -> None:
-        """Begin with no frame; `once` ends the run with the first one, `count` after so many results."""
+        """Start without frames; `once` ends the run after the first frame, `count` after `count` results."""
         self._settings = settings
         self._in_force = in_force
         self._peers = peers
@@ -106,12 +106,12 @@ class FrameFlow:
         self._failures: deque[float] = deque(maxlen=RESTARTS + 1)
         self.published = 0
         self.has_data = False
-        """Whether a message has come, usable or not."""
+        """Whether a message has arrived, usable or not."""
         self.end: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        """The end of the run: with the error that ends it, or without one."""
+        """Completed at the end of the run, with its error if any."""
 
     def fail(self, error: Exception) -> None:
-        """End the run by an error."""
+        """End the run with an error."""
         if not self.end.done():
             self.end.set_exception(error)
 
@@ -136,12 +136,12 @@ class FrameFlow:
     # --- events at the peers -------------------------------------------------------------------
 
     def ready(self, peer: Peer) -> None:
-        """Send the next frame if a peer was waited for."""
+        """Send the next frame if the run was waiting for a peer."""
         if peer is not self._peers.subscriber:
             self._send_next()
 
     def received(self, peer: Peer, record: AnyRecord) -> None:
-        """Take a record of a reading, a frame or a result."""
+        """Handle a record of a reading, a frame or a result."""
         match record:
             case Reading():
                 self._take_reading(record)
@@ -156,11 +156,11 @@ class FrameFlow:
             case _:
                 where = peer.protocol.where if peer.protocol else peer.role
                 self._log.warning(
-                    f"{where} sent a {type(record).__name__}, which is for another service to send"
+                    f"{where} sent a {type(record).__name__}, which only another service may send"
                 )
 
     def lost(self, peer: Peer) -> None:
-        """Count what a peer had when it went away: the frame that it computed, or the results that it had to publish."""
+        """Count the frame or the results lost with a peer."""
         if peer is self._peers.app and self._computing is not None:
             self._losses[LossReason.WITH_APP] += 1
             if self._follows:
@@ -193,32 +193,32 @@ class FrameFlow:
 
     @property
     def busy_with(self) -> str:
-        """The place where frames are in flight, in words; empty for none."""
+        """Description of the frames in flight; empty if there are none."""
         if self._computing is not None:
             return "a frame on the boards"
         return "results at the publisher" if self._at_publisher else ""
 
     def hold(self) -> None:
-        """Send no frame to the boards."""
+        """Stop sending frames to the boards."""
         self._held = True
 
     def resume(self) -> None:
-        """Send frames to the boards again."""
+        """Resume sending frames to the boards."""
         self._held = False
         self._catching_up = len(self._readings)
         self._send_next()
 
     def expect_next_generation(self) -> None:
-        """Let readings for the next deployment wait, from now on."""
+        """Let readings for the next deployment wait from now on."""
         self._next_readings = WaitingFrames(self._queue)
 
     def drop_next_generation(self) -> None:
-        """Lose the readings for the next deployment."""
+        """Drop the readings for the next deployment."""
         dropped, self._next_readings = self._next_readings, None
         self._lose(dropped)
 
     def adopt_next_generation(self) -> None:
-        """Lose the readings for the former deployment, and use those for the next one."""
+        """Drop the readings for the previous deployment, and use those for the next one."""
         if self._next_readings is not None:
             self._lose(self._readings)
             self._readings, self._next_readings = self._next_readings, None
@@ -246,7 +246,7 @@ class FrameFlow:
         try:
             readings.put(waiting)
         except OverflowedQueueError as error:
-            if ahead or self._held or self._catching_up:  # a reload was the slow part, not the boards
+            if ahead or self._held or self._catching_up:  # a reload caused the delay, not the boards
                 self._losses[LossReason.IN_RELOAD] += 1
             else:
                 self.fail(error)
@@ -271,7 +271,7 @@ class FrameFlow:
         if self._at_publisher >= MOST_AT_PUBLISHER or not self._peers.publisher.ready:
             return
         if self._count is not None and self.published + self._at_publisher >= self._count:
-            return  # until it is known whether those at the publisher are enough
+            return  # until it is known whether the results at the publisher are enough
         waiting = self._readings.get()
         if waiting is None:
             return
@@ -285,7 +285,7 @@ class FrameFlow:
             self._follow(number, bank, waiting)
 
     def _follow(self, number: int, bank: int, waiting: WaitingReading) -> None:
-        """Log a frame that was sent, and have the subscriber log it, which could not know its number before."""
+        """Log a sent frame, and notify the subscriber, which logs it with its number."""
         waited = (time.monotonic_ns() - waiting.arrived) // 1000
         self._log.debug("handed on to pcie-app", frame=number, bank=bank, waited_us=waited)
         subscriber, reading = self._peers.subscriber.protocol, waiting.reading
@@ -316,7 +316,7 @@ class FrameFlow:
         )
         if not self._at_publisher:
             self._published_at = time.monotonic()
-        self._at_publisher += 1  # before it is sent: a publisher in this process answers at once
+        self._at_publisher += 1  # before sending: a publisher in this process answers at once
         if publisher is None or not publisher.send(record):
             self._at_publisher -= 1
             self._losses[LossReason.WITH_PUBLISHER] += 1
@@ -356,12 +356,14 @@ class FrameFlow:
         elif self._once and record.outcome is Outcome.NO_POSTERIOR:
             self.fail(
                 VariableError(
-                    f"frame {record.number} has no posterior: no line of the model counted for its readings; nothing was published"
+                    f"frame {record.number} has no posterior: all counts were 0; nothing was published"
                 )
             )
             return
         elif self._once:
-            self.fail(RosbridgeLostError("rosbridge went away before the result could be published"))
+            self.fail(
+                RosbridgeLostError("the rosbridge connection was lost before the result could be published")
+            )
             return
         else:
             self._losses[_LOSSES[record.outcome]] += 1

@@ -1,6 +1,6 @@
-"""Subscriber, publisher and PCIe application inside the master's process (`master --fused`): fewer hops, same code.
+"""Subscriber, publisher and pcie-app inside the process of the master (`master --fused`).
 
-Their records are passed by calls instead of over local sockets. Boards remain processes, or devices, of their own.
+Records are passed by calls instead of over local sockets. Boards remain separate processes or devices.
 """
 
 import asyncio
@@ -30,13 +30,13 @@ TakeRecord = Callable[[AnyRecord], None]
 
 
 class FusedLink(Link):
-    """A service's link to the master of its own process."""
+    """Link of a service to the master in the same process."""
 
     def __init__(self, to_master: TakeRecord) -> None:
         self._to_master: TakeRecord | None = to_master
 
     async def __aexit__(self, *_: object) -> None:
-        """Pass on no more records."""
+        """Stop passing on records."""
         self._to_master = None
 
     @property
@@ -52,11 +52,11 @@ class FusedLink(Link):
         return True
 
     def serve(self, deployment: Deployment) -> None:
-        """Do nothing: there are no later masters to greet."""
+        """Do nothing, because there are no later masters."""
 
 
 class FusedEnd:
-    """The master's end of a fused link, in place of a local socket's connection."""
+    """The master's end of a fused link, in place of a socket connection."""
 
     def __init__(self, role: str, to_service: TakeRecord) -> None:
         self.where = f"{role} in this process"
@@ -68,13 +68,13 @@ class FusedEnd:
         return True
 
     def close(self) -> None:
-        """Do nothing: the service ends when its task is cancelled."""
+        """Do nothing, because the service ends when its task is cancelled."""
 
 
 class FusedBoards:
-    """The PCIe application in an event loop: a frame is posted, and collected when the last board has answered.
+    """pcie-app in an event loop: a frame is posted, and collected when the last board has answered.
 
-    A thread opens boards, looks for those that are gone, and reloads, which takes long; no frame is posted meanwhile.
+    Slow work (opening boards, recovering them, reloading) runs in a thread; no frame is posted meanwhile.
     """
 
     def __init__(self, boards: DeployedBoards, settings: Settings, link: MakeLink) -> None:
@@ -93,7 +93,7 @@ class FusedBoards:
         """Serve until cancelled.
 
         Raises:
-            PcieShimError: The boards can't be opened, or one came back with another image.
+            PcieShimError: The boards can't be opened, or a board came back with another image.
         """
         async with self._link, status_served(self._run_directory, PCIE_APP, self._progress.status):
             try:
@@ -126,13 +126,13 @@ class FusedBoards:
             self._reloading = self._loop.create_task(self._reload(record))
 
     async def _reload(self, record: Prepare | Switch) -> None:
-        """Read images, or program boards; the master sends no frame meanwhile."""
+        """Read images, or program boards; the master does not send frames meanwhile."""
         boards = self._boards
         answer: Record
         if isinstance(record, Prepare):
             answer = await _in_thread(lambda: boards.generations.prepare(record))
         else:
-            self._unwatch()  # its link is closed, and the next one may have its descriptor
+            self._unwatch()  # its link is closed, and the next link may get the same descriptor
             async with self._one_thread:
                 answer = await _in_thread(lambda: boards.switch(record))
         self._link.send(answer)
@@ -163,7 +163,9 @@ class FusedBoards:
 
     def _collect(self) -> None:
         number = self._number
-        if number is None:  # a board that sends unasked is leaving, which the next frame finds out
+        if (
+            number is None
+        ):  # a board that sends unexpected data is closing its link, which the next frame detects
             self._unwatch()
             return
         try:
@@ -194,9 +196,9 @@ class FusedBoards:
 
 
 async def _in_thread(work: Callable[[], Result]) -> Result:
-    """Do slow work in a thread, which does not delay the end of the run."""
+    """Run slow work in a thread that does not delay the end of the run."""
     done: Future[Result] = Future()
-    done.set_running_or_notify_cancel()  # from now on a cancelled waiter does not cancel it
+    done.set_running_or_notify_cancel()  # from now on, cancelling the waiter does not cancel it
 
     def run() -> None:
         try:
@@ -211,12 +213,12 @@ async def _in_thread(work: Callable[[], Result]) -> Result:
 def fused_services(
     settings: Settings, deployment: Deployment, to_master: Callable[[str], TakeRecord]
 ) -> dict[str, tuple[FusedEnd, Coroutine[Any, Any, int]]]:
-    """Return the three services by role: the master's end of each link, and the coroutine that serves it.
+    """Return the three services by role: the master's end of the link, and the coroutine of the service.
 
-    `to_master` returns the function that takes the records of a role.
+    `to_master` returns the function that receives the records of a role.
 
     Raises:
-        SettingsError: The boards' endpoints are wrong.
+        SettingsError: The endpoints of the boards are invalid.
     """
     ends: dict[str, FusedEnd] = {}
 

@@ -1,4 +1,4 @@
-"""A deployment that is to replace the one in force: read, compared in shape, and copied for the run's children."""
+"""Reading a new deployment, comparing its shape with the one in force, and copying it for the run's children."""
 
 import shutil
 import stat
@@ -12,18 +12,18 @@ from toolchain.deployment.same_shape import differences
 
 _LARGEST_FILE = 1 << 28
 _NAMED = 4
-"""Differences that a refusal names; the rest it counts."""
+"""Maximum number of differences listed in an error; the rest is counted."""
 
 
 def read_new(folder: Path, in_force: Deployment, as_used: Callable[[Deployment], Deployment]) -> Deployment:
-    """Read a deployment of the shape of the one in force; pcie-app checks its images.
+    """Read a deployment of the same shape as the one in force; pcie-app checks its images.
 
-    `as_used` gives a deployment without the fields that this run's flags override.
+    `as_used` returns a deployment without the fields that flags of this run override.
 
     Raises:
-        ToolchainError: It is damaged, of another version, or not there.
-        ShapeError: Fields differ that a run can't change.
-        SettingsError: The folder can't be reached.
+        ToolchainError: It is damaged, of another version, or missing.
+        ShapeError: It differs in fields that a run can't change.
+        SettingsError: The folder is not accessible.
     """
     try:
         loaded = load_deployment(folder, images=False)
@@ -34,19 +34,19 @@ def read_new(folder: Path, in_force: Deployment, as_used: Callable[[Deployment],
         rest = f"; {len(found) - _NAMED} more" if len(found) > _NAMED else ""
         raise ShapeError(
             f"{loaded.path} has another shape: {'; '.join(map(str, found[:_NAMED]))}{rest}. "
-            "A run can change tables, priors, targets and the reading of messages; for this, restart it"
+            "A reload can change tables, priors, targets and the reading of messages; for this, restart the run"
         )
     return loaded
 
 
 def keep(deployment: Deployment, directory: Path, generation: int) -> Path:
-    """Copy the files of a deployment that services read into the run's directory, and return the folder with the copy.
+    """Copy the files that services read into the run directory, and return the folder of the copy.
 
-    A child that is restarted reads the copy, and so is independent of the deployment's own folder.
+    A restarted child reads the copy, so it does not depend on the original folder.
 
     Raises:
-        SettingsError: A file is not there, can't be read, or is not a regular one.
-        NotReloadedError: It can't be copied, or was changed meanwhile.
+        SettingsError: A file is missing, can't be read, or is not a regular file.
+        NotReloadedError: The files can't be copied, or were changed meanwhile.
         ToolchainError: The copy is not a deployment.
     """
     kept = directory / f"{COPY_PREFIX}{generation}"
@@ -63,13 +63,13 @@ def keep(deployment: Deployment, directory: Path, generation: int) -> Path:
             ) from error
     if load_deployment(kept, images=False).hash != deployment.hash:
         raise NotReloadedError(
-            f"{deployment.path} was changed while it was read; reload again when that is done"
+            f"{deployment.path} was changed while it was read; reload again when the change is complete"
         )
     return kept
 
 
 def _check_readable(source: Path) -> None:
-    """Refuse, with a SettingsError, a file that can't be read, or is not a regular one of a deployment's size."""
+    """Raise a SettingsError for a file that can't be read, is not a regular file, or is too large."""
     try:
         found = source.stat()
         if stat.S_ISREG(found.st_mode):  # opening a pipe would wait for a writer
@@ -78,10 +78,10 @@ def _check_readable(source: Path) -> None:
         raise SettingsError(f"{source} can't be read: {error.strerror or error}") from error
     if not stat.S_ISREG(found.st_mode) or found.st_size > _LARGEST_FILE:
         raise SettingsError(
-            f"{source} is not a file of at most {_LARGEST_FILE >> 20} MiB, as those of a deployment are; build it again"
+            f"{source} is not a file of at most {_LARGEST_FILE >> 20} MiB, like those of a deployment; build it again"
         )
 
 
 def forget(directory: Path, generation: int) -> None:
-    """Remove a copy that no child reads any more."""
+    """Remove a copy that children no longer read."""
     shutil.rmtree(directory / f"{COPY_PREFIX}{generation}", ignore_errors=True)

@@ -1,4 +1,4 @@
-"""Peers of the master: subscriber, publisher and pcie-app, started where they do not run, connected, restarted, ended."""
+"""Peers of the master (subscriber, publisher, pcie-app): starting, connecting, restarting and stopping them."""
 
 from __future__ import annotations
 
@@ -50,10 +50,11 @@ if TYPE_CHECKING:
 
 ROLE = "master"
 ANSWER_TIME = 60.0
-"""Seconds that a service may take beyond its own limits, before it counts as stuck."""
+"""Seconds that a service may take beyond its own limits before it counts as stuck."""
 
 COMPILING_TIME = 60.0
-"""Seconds more that the run's own boards may take to listen: without a cache they compile their kernels first."""
+"""Additional seconds for the run's own boards to listen, because without a cache they compile their kernels.
+"""
 
 _CONNECT_EVERY = 0.01
 _WATCH_EVERY = 1.0
@@ -61,7 +62,7 @@ _RECONNECT_TIME = 60.0
 
 
 class Peer:
-    """One service at work for the master: its connection, and its process if the master started it.
+    """A service used by the master: its connection, and its process if the master started it.
 
     A service inside the master's process has no endpoint.
     """
@@ -83,21 +84,21 @@ class Peer:
         self.outdated = False
 
     def cut(self) -> None:
-        """End its process if it is the master's own, else close the connection; both are made again."""
+        """Kill its process if the master started it, otherwise close the connection; either is renewed."""
         if self.child is not None:
             self.child.kill()
         elif self.protocol is not None:
             self.protocol.close()
 
     def answered(self, record: Prepared | Switched | NotReloaded) -> None:
-        """Give its answer to the reload that waits for it."""
+        """Pass its answer to the waiting reload."""
         if self.answer is not None and not self.answer.done():
             self.answer.set_result(record)
 
 
 @dataclass(frozen=True, slots=True)
 class Awaited:
-    """A peer's pending task: in words, since when (monotonic, s), and within how many seconds."""
+    """A pending task of a peer: description, begin (monotonic, s) and limit in seconds."""
 
     what: str
     since: float
@@ -105,16 +106,16 @@ class Awaited:
 
 
 class PeerEvents(Protocol):
-    """Events at the peers, as a run takes them."""
+    """Receiver of the events of peers."""
 
     def ready(self, peer: Peer) -> None:
-        """Take note that a peer has what it needs."""
+        """Handle that a peer is ready."""
 
     def received(self, peer: Peer, record: AnyRecord) -> None:
-        """Take a record of a reading, a frame or a result."""
+        """Handle a record of a reading, a frame or a result."""
 
     def lost(self, peer: Peer) -> None:
-        """Take note that a peer is gone, with whatever it had."""
+        """Handle the loss of a peer, with its frame or results."""
 
     def awaited(self, peer: Peer) -> Awaited | None:
         """Return the pending task of a peer that is ready."""
@@ -141,7 +142,7 @@ class Peers:
         self._inside: list[asyncio.Task[None]] = []
         self.board_endpoints: tuple[str, ...] = ()
         self.begun = asyncio.Event()
-        """Set once all peers have been ready."""
+        """Set when all peers have been ready."""
 
     def __iter__(self) -> Iterator[Peer]:
         """Iterate over the three services."""
@@ -186,20 +187,20 @@ class Peers:
         ]
 
     def give(self, flag: str, value: str) -> None:
-        """Start the master's own services with another value of a flag from now on."""
+        """From now on, start the master's own services with another value of a flag."""
         for peer in self:
             if peer.child is not None:
                 peer.child.give(flag, value)
 
     def renew(self, peer: Peer, sentence: str) -> None:
-        """Restart or reconnect a service, after a warning; the master's own uses the deployment in force then."""
+        """Restart or reconnect a service, after a warning; a restarted one uses the deployment in force."""
         self._log.warning(sentence)
         peer.cut()
 
     # --- starting and ending -------------------------------------------------------------------
 
     def prepare(self) -> None:
-        """Find out which peers run already, and how to start the others; a SettingsError for settings that contradict."""
+        """Determine which peers are running, and how to start the others, or raise a SettingsError."""
         settings, deployment = self._settings, self._in_force.deployment
         given = {
             "subscriber": settings.subscriber,
@@ -210,11 +211,11 @@ class Peers:
             self._private = PrivateDirectory()
         directory = self.directory
         if settings.boards or any(board.endpoint for board in deployment.boards):
-            board_endpoints(settings, deployment)  # a wrong list is refused before anything starts
+            board_endpoints(settings, deployment)  # check the list before anything starts
         role = next((role for role, text in given.items() if text), None)
         if settings.fused and role is not None:
             raise SettingsError(
-                f"--fused runs subscriber, publisher and pcie-app in the master's own process; take --connect or --{role} away"
+                f"--fused runs subscriber, publisher and pcie-app in the process of the master; omit --connect or --{role}"
             )
         self.board_endpoints = settings.boards
         endpoints = [board.endpoint for board in deployment.boards]
@@ -228,7 +229,7 @@ class Peers:
             self._by_role[role] = Peer(role, None, None) if settings.fused else self._peer(role, text)
 
     def _peer(self, role: str, text: str) -> Peer:
-        """Return a service that runs at an endpoint, or without one a child to be started."""
+        """Return a service running at an endpoint, or without an endpoint a child to start."""
         if text or self.directory is None:
             return Peer(role, endpoint_from(text, f"--{role}"), None)
         endpoint = endpoint_in(self.directory, role)
@@ -237,17 +238,17 @@ class Peers:
             endpoint,
             self._settings.model_copy(update={"boards": self.board_endpoints}),
             compiling_time=self._compiling_time,
-            reprogram=self._boards is not None,  # nobody else can have programmed the run's own boards
+            reprogram=self._boards is not None,  # only this run can have programmed its own boards
         )
         return Peer(role, endpoint, Child(role, command, directory=self.directory))
 
     @property
     def _compiling_time(self) -> float:
-        """Seconds more that boards may take to listen. The death of the run's own is noticed at once."""
+        """Additional seconds for boards to listen. The exit of the run's own boards is detected at once."""
         return 0.0 if self._boards is None else COMPILING_TIME
 
     async def start(self, events: PeerEvents) -> None:
-        """Start peers that do not run, connect to all, and bring back lost ones from then on."""
+        """Start peers that are not running, connect to all, and restore lost ones from then on."""
         self._events = events
         if self._boards is not None:
             await self._boards.start()
@@ -271,11 +272,11 @@ class Peers:
                 self._events.fail(error)
 
         task = asyncio.ensure_future(guarded())
-        task.add_done_callback(lambda _: work.close())  # one that ends before it began has not awaited it
+        task.add_done_callback(lambda _: work.close())  # a task cancelled before it begins never awaits it
         (self._inside if inside else self._tasks).append(task)
 
     def _start_inside(self) -> None:
-        """With `--fused`, run each service as a task of this process."""
+        """With `--fused`, run each service as a task in this process."""
         from services.master.fused import fused_services
 
         settings = self._settings.model_copy(
@@ -296,14 +297,14 @@ class Peers:
             self._begin_task(service, inside=True)
 
     async def leave(self) -> None:
-        """Bring no peer back any more; services in this process have a grace period to end."""
+        """Stop restoring peers, and give services in this process a grace period to end."""
         for task in (*self._tasks, *self._inside):
             task.cancel()
         if self._inside:
             await asyncio.wait(self._inside, timeout=self._settings.stop_timeout)
 
     async def end(self) -> None:
-        """End the processes that were started, and remove the private folder."""
+        """Stop the started processes, and remove the private directory."""
         children = [peer.child for peer in self if peer.child is not None]
         if self._boards is not None:
             children.append(self._boards)
@@ -332,7 +333,7 @@ class Peers:
     async def _keep(self, peer: Peer) -> None:
         first = True
         while True:
-            # the end of a process of the master's own is noticed: while it lives it is slow, on a busy computer
+            # the exit of the master's own process is detected, so while it is alive it is only slow
             limit = _RECONNECT_TIME if peer.child is not None or not first else 0.0
             await self._connect(peer, max(limit, self._settings.peer_timeout))
             first = False
@@ -372,7 +373,7 @@ class Peers:
                     hint = (
                         "is it running?"
                         if child is None
-                        else "it was started, and is not there yet: is the computer too busy?"
+                        else "it was started but is not listening yet: is the computer overloaded?"
                     )
                     raise ChildDiedError(
                         f"no {peer.role} answers at {peer.where} within {limit:g} s ({error.strerror or error}); {hint}"
@@ -383,7 +384,7 @@ class Peers:
                 return
 
     async def _watch(self, peer: Peer) -> None:
-        """Wait until the connection is closed; a peer that is there but does not answer in time is cut off."""
+        """Wait until the connection is closed; disconnect a peer that does not answer in time."""
         while not peer.closed.is_set():
             awaited = self._awaited(peer)
             left = _WATCH_EVERY
@@ -408,7 +409,7 @@ class Peers:
     def _awaited(self, peer: Peer) -> Awaited | None:
         settings = self._settings
         if not peer.greeted:
-            # pcie-app greets when the boards are open
+            # pcie-app sends its hello when the boards are open
             opening = self._compiling_time if peer.role == "pcie-app" else 0.0
             return Awaited("greet", peer.since, settings.peer_timeout + opening)
         if not peer.ready:
@@ -418,14 +419,16 @@ class Peers:
         return self._events.awaited(peer)
 
     async def _bring_back(self, peer: Peer) -> None:
-        """After a lost connection: restart the process, or raise the reason why the run is over."""
+        """Restart the process after a lost connection, or raise the error that ends the run."""
         if isinstance(peer.reason, StackError):
             raise peer.reason
         child = peer.child
         if child is None:
             if self._once:
                 raise ChildDiedError(f"{peer.role} at {peer.where} closed the connection")
-            if not peer.missed:  # a killed process may accept one more connection before its socket is gone
+            if (
+                not peer.missed
+            ):  # a killed process may accept one more connection before its socket disappears
                 self._log.warning(f"{peer.role} at {peer.where} is gone; waiting for it")
             peer.missed = True
             return
@@ -460,7 +463,7 @@ class Peers:
             self._dispatch(peer, record)
         except OtherPeerError:
             raise
-        except Exception as error:  # a closed standard output, or a bug: the connection is not to blame
+        except Exception as error:  # a closed standard output, or a bug: not an error of the connection
             self._events.fail(error)
 
     def _dispatch(self, peer: Peer, record: AnyRecord) -> None:
@@ -497,7 +500,7 @@ class Peers:
     def _ready(self, peer: Peer, record: Ready) -> None:
         peer.ready = True
         self._log.info(f"{peer.role}: {record.sentence}")
-        # the publisher advertises before the subscriber subscribes: there is no result without a topic
+        # the publisher must advertise before the subscriber subscribes, because results need a topic
         if self.begun.is_set():
             self._begin(peer)
         elif not self.not_ready:

@@ -1,4 +1,4 @@
-"""Reloads of a run's deployment, so that every frame is computed by one deployment, whole.
+"""Reloads of the deployment of a run, in which every frame is computed entirely by one deployment.
 
 readings of the old one ──▶ finished ──┐
 readings of the new one ──▶ wait ······┴─ boards get the new tables ──▶ computed
@@ -22,15 +22,15 @@ from services.sockets.records import LossReason, NotReloaded, Prepare, Switch, S
 from toolchain.deployment import Deployment
 
 _DRAIN_TIME = 30.0
-"""Seconds that the frames in flight may take, once a reload waits for them."""
+"""Seconds that a reload waits for the frames in flight."""
 
 _DRAIN_EVERY = 0.01
 _PROGRAM_TIME = 30.0
-"""Seconds that programming one board may take in a reload, at most."""
+"""Maximum time in seconds to program one board in a reload."""
 
 
 class Reloads:
-    """Changes a run's deployment, one reload at a time."""
+    """Reloads of a run, one at a time."""
 
     def __init__(
         self, settings: Settings, in_force: InForce, peers: Peers, flow: FrameFlow, log: FilteringBoundLogger
@@ -46,35 +46,35 @@ class Reloads:
         """Reload; return a sentence about it.
 
         Raises:
-            StackError, ToolchainError: The reason why the run keeps the deployment that it had.
+            StackError, ToolchainError: The reason why the run keeps its deployment.
         """
         if self._one_at_a_time.locked():
-            raise NotReloadedError("another reload is under way; try again when it is done")
+            raise NotReloadedError("another reload is in progress; try again when it has finished")
         folder = Path(order.folder or self._in_force.folder)
         async with self._one_at_a_time:
             try:
                 sentence = await self._reload(folder)
             except Exception as error:
                 hash_ = self._in_force.deployment.hash[:12]
-                self._log.warning(f"not reloaded: {error}; deployment {hash_} goes on")
+                self._log.warning(f"not reloaded: {error}; deployment {hash_} stays in force")
                 raise
             self._log.info(sentence)
             return sentence
 
     async def _reload(self, folder: Path) -> str:
-        """Have all services read the new deployment, drain the frames of the old one, and switch.
+        """Let all services read the new deployment, drain the frames of the old one, and switch.
 
-        The subscriber switches first: its readings wait in the flow from then on. The boards follow when no frame is
-        in flight; after that there is no way back, and the publisher follows.
+        The subscriber switches first; from then on its readings wait in the flow. The boards follow when no
+        frame is in flight. After that the reload cannot be undone, and the publisher follows.
         """
         waiting = self._peers.not_ready
         if waiting or not self._peers.begun.is_set():
             raise NotReloadedError(
-                f"the run is not ready: it waits for {' and '.join(waiting) or 'its processes'}; try again when it has begun"
+                f"the run is not ready: it waits for {' and '.join(waiting) or 'its processes'}; try again when it has started"
             )
         if not folder.is_absolute():
             raise SettingsError(
-                f"the folder {folder} is not absolute, and the master may run in another folder; give the whole path"
+                f"the folder {folder} is not absolute, and the master may run in another folder; give an absolute path"
             )
         started = time.monotonic()
         lost_before = self._lost
@@ -94,10 +94,10 @@ class Reloads:
             await self._drain()
             self._flow.hold()
             if app.child is not None:
-                app.child.give("--reprogram")  # if it is restarted in between, boards hold either image
+                app.child.give("--reprogram")  # if it is restarted meanwhile, boards hold either image
             boards = len(new.boards) * max(_PROGRAM_TIME, self._settings.peer_timeout)
             await self._ask(app, Switch(number), limit + boards)
-        except asyncio.CancelledError:  # the run ends: there are no services left to go back
+        except asyncio.CancelledError:  # the run ends, so services need not switch back
             self._flow.drop_next_generation()
             raise
         except Exception:
@@ -126,14 +126,14 @@ class Reloads:
         kept: Path | None = None,
         folder: Path | None = None,
     ) -> None:
-        """Have a service prepare or switch.
+        """Let a service prepare or switch.
 
         Raises:
-            NotReloadedError: It is not there, ended, or did not answer in time (then it is ended).
-            ReportedError: It could not, in its own words.
+            NotReloadedError: It is not connected, exited, or did not answer in time (then it is killed).
+            ReportedError: It failed, with its own sentence.
         """
         if peer.protocol is None or not peer.ready:
-            raise NotReloadedError(f"{peer.role} is not there now; try again when it is back")
+            raise NotReloadedError(f"{peer.role} is not available now; try again when it is back")
         peer.answer = asyncio.get_running_loop().create_future()
         try:
             if not peer.protocol.send(record):
@@ -147,14 +147,14 @@ class Reloads:
         finally:
             peer.answer = None
         if isinstance(answer, NotReloaded):
-            # the user has made the folder, and does not know the path of its copy
+            # the user knows the original folder, not the path of its copy
             sentence = answer.sentence.replace(str(kept), str(folder)) if kept else answer.sentence
             raise ReportedError(answer.exit_code, f"{peer.role}: {sentence}")
         if isinstance(answer, Switched):
             peer.generation = answer.generation
 
     async def _drain(self) -> None:
-        """Wait for the frames of the deployment in force; those that still wait for the boards after that are lost.
+        """Wait for the frames of the deployment in force, and drop those that still wait for the boards then.
 
         Raises:
             NotReloadedError: A frame or a result takes too long.
@@ -168,7 +168,7 @@ class Reloads:
             await asyncio.sleep(_DRAIN_EVERY)
 
     async def _go_back(self) -> None:
-        """Have the services that switched already return to the deployment in force."""
+        """Switch services back to the deployment in force."""
         self._flow.drop_next_generation()
         limit = ANSWER_TIME + len(self._in_force.deployment.boards) * _PROGRAM_TIME
         for peer in self._peers:
@@ -177,7 +177,7 @@ class Reloads:
         self._flow.resume()
 
     async def _switch_or_renew(self, peer: Peer, limit: float) -> None:
-        """Have a service use the deployment in force, by a restart if it does not switch."""
+        """Let a service use the deployment in force, and restart it if it does not switch."""
         generation = self._in_force.generation
         if peer.generation != generation and peer.protocol is not None:
             try:
@@ -186,18 +186,18 @@ class Reloads:
                 self._peers.renew(peer, f"{error}; ending it")
 
     def _adopt(self, new: Deployment, folder: Path, kept: Path) -> None:
-        """Put a deployment in force whose tables the boards have."""
+        """Put the deployment into force whose tables the boards have."""
         self._in_force.replace(new, folder)
         self._peers.give("--deployment", str(kept))
         self._peers.app.generation = self._in_force.generation
         if self._peers.directory is not None:
-            # a child may be reading the last one's just now
+            # a child may still be reading the previous copy
             forget(self._peers.directory, self._in_force.generation - 2)
         self._flow.adopt_next_generation()
         self._flow.resume()
 
     def _as_used(self, deployment: Deployment) -> Deployment:
-        """Return a deployment without the fields that this run's flags override, which may differ in the next one."""
+        """Return a deployment without the fields that flags of this run override, so that these may differ."""
         update: dict[str, Any] = {}
         if self._settings.uri:
             uri = self._settings.uri
@@ -210,27 +210,30 @@ class Reloads:
         return deployment.model_copy(update=update)
 
     async def _keep_copy(self, deployment: Deployment, number: int) -> Path:
-        """Copy a deployment for children; return the folder that they are to read."""
+        """Copy a deployment for children; return the folder for them to read."""
         if self._peers.directory is None or not any(peer.child for peer in self._peers):
             return deployment.directory
         return await asyncio.to_thread(keep, deployment, self._peers.directory, number)
 
     async def keep_first(self) -> None:
-        """Copy the first deployment once the run has begun, so that restarted children read it as it was."""
+        """Copy the first deployment after the start, so that restarted children read it unchanged."""
         await self._peers.begun.wait()
         try:
             kept = await self._keep_copy(self._in_force.deployment, 0)
-        except Exception as error:  # without a copy, they read the folder itself
-            self._log.warning(f"restarted services will read {self._in_force.folder} as it is then: {error}")
+        except Exception as error:  # without a copy, they read the original folder
+            self._log.warning(
+                f"restarted services will read the then current {self._in_force.folder}: {error}"
+            )
             return
         if self._in_force.generation == 0:
             self._peers.give("--deployment", str(kept))
 
 
 def fates(in_flight: int, lost: int, lost_meanwhile: int = 0) -> str:
-    """Return the fates of frames in flight when a reload began, and of readings that came during it, in words.
+    """Return a text about the frames in flight at the start of a reload and the readings lost during it.
 
-    `lost` frames still waited for the boards at the end of the drain; `lost_meanwhile` readings found the queue full.
+    `lost` frames were still waiting for the boards after the drain; `lost_meanwhile` readings did not fit
+    into the queue.
     """
     frames = "1 frame was" if in_flight == 1 else f"{in_flight} frames were"
     text = f"{frames} in flight and finished before"

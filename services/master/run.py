@@ -1,4 +1,4 @@
-"""One run of the master: its peers, the flow of frames between them, its reloads, and its end."""
+"""A run of the master: its peers, the flow of frames between them, reloads, and the end."""
 
 import asyncio
 import contextlib
@@ -25,11 +25,11 @@ from toolchain.deployment import Deployment
 
 _PROGRESS_EVERY = 1.0
 _GRACE_PERIOD = 2.0
-"""Seconds that the subscriber has to report a missing reading itself, in better words."""
+"""Seconds in which the subscriber may report a missing reading itself, with more details."""
 
 
 class Master:
-    """One run: once or in a loop, over a deployment."""
+    """A run with a deployment, once or in a loop."""
 
     def __init__(
         self, settings: Settings, deployment: Deployment, *, once: bool, count: int | None, json: bool
@@ -49,10 +49,10 @@ class Master:
         self._started = time.monotonic()
 
     async def run(self) -> int:
-        """Start missing peers, move frames until the run is over, and end the peers that were started.
+        """Start missing peers, move frames until the end of the run, and stop the peers that were started.
 
         Raises:
-            StackError: The reason why the run ended, with its exit code.
+            StackError: The error that ended the run, with its exit code.
         """
         settings, peers = self._settings, self._peers
         sockets = contextlib.AsyncExitStack()
@@ -105,7 +105,7 @@ class Master:
         )
 
     def summary(self) -> str:
-        """Return the run's results and losses in a sentence."""
+        """Return a sentence about the results and losses of the run."""
         losses = self._flow.losses
         elapsed = time.monotonic() - self._started
         text = f"{self._flow.published} results published in {elapsed:.1f} s"
@@ -115,7 +115,7 @@ class Master:
         return f"{text}; not published: {lost}" if lost else text
 
     def _show(self, record: Published) -> None:
-        """Print a published result where that was asked for."""
+        """Print a published result if requested."""
         if self._json:
             print_json(record, self._in_force)
         elif self._once:
@@ -126,7 +126,7 @@ class Master:
             )
 
     async def _expect_data(self) -> None:
-        """End the run if no message comes in time after its beginning."""
+        """End the run if no message arrives in time after its start."""
         await self._peers.begun.wait()
         limit = self._settings.first_data_timeout
         await asyncio.sleep(limit + _GRACE_PERIOD)

@@ -1,4 +1,4 @@
-"""A listener: receives the posteriors of a stack, and shows and saves them."""
+"""A listener, which receives, shows and saves the posteriors of a stack."""
 
 from typing import Final
 
@@ -16,7 +16,7 @@ from terminal.output import say
 from toolchain.deployment import Deployment
 
 _QUEUE_SIZE: Final = 1024
-"""Frames that may wait for a slow terminal or a slow disk."""
+"""Maximum number of frames that wait for a slow terminal or disk."""
 
 
 async def show_frames(
@@ -30,13 +30,13 @@ async def show_frames(
     show: Show,
     file: ResultFile | None,
 ) -> int:
-    """Show and save frames until `count` posteriors have come.
+    """Show and save frames until `count` posteriors have arrived.
 
     Raises:
-        NoResultError: No frame came in time.
-        BadResultError: The first message is not a master's.
+        NoResultError: No frame arrived in time.
+        BadResultError: The first message does not come from a master.
         SettingsError: The posterior does not fit the deployment, or the file cannot be written.
-        BridgeError: The server is not reachable, or is not a rosbridge server.
+        BridgeError: The server is unreachable, or is not a rosbridge server.
     """
     taken = 0
     silence_reported = False
@@ -84,5 +84,7 @@ async def show_frames(
                 show(one, axes)
         finally:
             if frames.lost:
-                say(f"warning: {frames.lost} were lost: they came faster than they could be shown or saved")
+                say(
+                    f"warning: {frames.lost} were lost: they arrived faster than they could be shown or saved"
+                )
     return 0

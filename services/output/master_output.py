@@ -1,4 +1,4 @@
-"""Results that `master` prints on standard output: a JSON object a line, or one sentence."""
+"""Output of results by `master`: one JSON object per line, or one sentence."""
 
 from services.errors import StackError
 from services.pipeline.generations import InForce
@@ -32,7 +32,7 @@ def print_json(record: Published, in_force: InForce) -> None:
 
 
 def print_sentence(record: Published, in_force: InForce) -> None:
-    """Print a result for people."""
+    """Print a result as a sentence."""
     where = ", ".join(
         f"{label} = {value:g}" for label, value in cell(in_force.deployment, record.best_line).items()
     )

@@ -1,4 +1,4 @@
-"""Posteriors in a file: JSON or CSV lines that are appended, or one NumPy archive that is always complete."""
+"""Files of posteriors: appended JSON or CSV lines, or one NumPy archive that is always complete."""
 
 import contextlib
 import csv
@@ -17,11 +17,11 @@ from services.errors import SettingsError
 from services.output.posterior_picture import Axis
 
 MOST_NUMBERS: Final = 1 << 26
-"""Probabilities that an archive may hold (512 MiB): it is in memory until it is written."""
+"""Maximum number of probabilities in an archive (512 MiB), which is in memory until it is written."""
 _EVERY: Final = 5.0
-"""Seconds after which an archive is rewritten."""
+"""Minimum number of seconds between two writes of an archive."""
 _SHARE: Final = 20
-"""Writing an archive takes at most one in so many parts of the time."""
+"""Writing an archive takes at most this fraction of the time (its inverse)."""
 _NOT_KNOWN: Final = -1
 
 
@@ -29,7 +29,7 @@ class ResultFile(Protocol):
     """A file of posteriors."""
 
     def add(self, frame: FrameOutcome, axes: list[Axis]) -> None:
-        """Save one frame; a SettingsError if the file cannot be written, or holds posteriors of another form."""
+        """Save one frame, or raise a SettingsError for an unwritable file or one with another shape."""
 
     def close(self) -> None:
         """Write everything to the file."""
@@ -44,14 +44,16 @@ def open_result_file(path: Path) -> ResultFile:
     }
     kind = kinds.get(path.suffix)
     if kind is None:
-        raise SettingsError(f"--save {path}: the name must end with {', '.join(kinds)}, which says the form")
+        raise SettingsError(
+            f"--save {path}: the name must end with {', '.join(kinds)}, which selects the format"
+        )
     return kind(path)
 
 
 def record(frame: FrameOutcome, axes: list[Axis]) -> dict[str, Any]:
-    """Return a frame as the JSON object that `--json` prints and a `.jsonl` file holds.
+    """Return a frame as the JSON object for `--json` and `.jsonl` files.
 
-    Indices count from 0; `best_value` and `mean_value` are there if a deployment maps indices to values.
+    Indices count from 0; `best_value` and `mean_value` exist if a deployment maps indices to values.
     """
     if not isinstance(frame, Posterior):
         return {
@@ -83,7 +85,7 @@ def record(frame: FrameOutcome, axes: list[Axis]) -> dict[str, Any]:
 
 
 class _Lines:
-    """A file to which whole lines are appended: an interruption never leaves a part of one."""
+    """A file to which whole lines are appended, so that an interruption never leaves an incomplete line."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -93,7 +95,7 @@ class _Lines:
             if size and os.pread(self._file, 1, size - 1) != b"\n":
                 os.close(self._file)
                 raise SettingsError(
-                    f"--save {path}: its last line has no end, so nothing can be added; give another name"
+                    f"--save {path}: its last line is incomplete, so nothing can be appended; give another name"
                 )
         except OSError as error:
             raise _not_writable(path, error) from error
@@ -108,14 +110,14 @@ class _Lines:
             raise _not_writable(self._path, error) from error
 
     def _take_back(self, written: int) -> None:
-        """Cut off an incomplete line, so that others can be added when there is room, unless another process wrote since."""
+        """Remove an incomplete line, unless another process has written since."""
         with contextlib.suppress(OSError):
             end = os.lseek(self._file, 0, os.SEEK_CUR)
             if written and os.fstat(self._file).st_size == end:
                 os.ftruncate(self._file, end - written)
 
     def close(self) -> None:
-        """Close the file; everything is in it already."""
+        """Close the file, which is complete."""
         os.close(self._file)
 
 
@@ -126,14 +128,14 @@ class _JsonLines(_Lines):
 
 
 class _CsvLines(_Lines):
-    """One row for each posterior: number, times, the most probable cell, and a column for every cell."""
+    """One row per posterior: number, times, the most probable cell, and a column for every cell."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
         self._columns: list[str] | None = None
 
     def add(self, frame: FrameOutcome, axes: list[Axis]) -> None:
-        """Append one row; a frame without a posterior has none."""
+        """Append one row, except for a frame without a posterior."""
         if not isinstance(frame, Posterior):
             return
         columns = [
@@ -176,7 +178,7 @@ class _CsvLines(_Lines):
 
 
 class _Archive:
-    """An archive for `numpy.load`, rewritten every few seconds and at the end, under another name until it is complete."""
+    """An archive for `numpy.load`, replaced by a complete new one every few seconds and at the end."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -185,17 +187,17 @@ class _Archive:
         self._written = 0
         self._next = time.monotonic() + _EVERY
         if not os.access(path.parent, os.W_OK):
-            raise _not_writable(path, FileNotFoundError(2, "no folder there that can be written"))
+            raise _not_writable(path, FileNotFoundError(2, "the folder is not writable"))
 
     def add(self, frame: FrameOutcome, axes: list[Axis]) -> None:
-        """Keep one; a frame without a posterior has none."""
+        """Add one posterior, except for a frame without one."""
         if not isinstance(frame, Posterior):
             return
         if not self._axes:
             self._axes = axes
         elif axes != self._axes:
             raise SettingsError(
-                f"--save {self._path}: a posterior of another form came, which one array cannot hold; .jsonl can"
+                f"--save {self._path}: a posterior of another shape arrived, which does not fit; .jsonl supports it"
             )
         if (len(self._posteriors) + 1) * len(frame.probabilities) > MOST_NUMBERS:
             raise SettingsError(
@@ -209,7 +211,7 @@ class _Archive:
             self._next = ended + max(_EVERY, _SHARE * (ended - begun))
 
     def close(self) -> None:
-        """Write the posteriors that are not in the archive yet."""
+        """Write the posteriors that are not yet in the archive."""
         if self._written == len(self._posteriors):
             return
         import numpy as np

@@ -1,4 +1,4 @@
-"""Frames on standard output: a line, a JSON object or a picture each."""
+"""Output of frames on standard output, as a line, a JSON object or a picture each."""
 
 import contextlib
 import time
@@ -18,12 +18,12 @@ from terminal.output import put_json
 
 _PICTURES_A_SECOND: Final = 10
 _REPLICAS: Final = 4
-"""Replicas that a line shows; a file has all."""
+"""Maximum number of replicas in a line; a file contains all."""
 _WORDS: Final = 7
-"""Lines of a terminal that are kept free for the words beside a picture."""
+"""Number of terminal lines reserved for the text around a picture."""
 
 Show = Callable[[FrameOutcome, list[Axis]], None]
-"""Shows a frame; the axes are those of its posterior."""
+"""Function that shows a frame; the axes are those of its posterior."""
 
 
 def line(frame: FrameOutcome, axes: list[Axis]) -> str:
@@ -52,7 +52,7 @@ def _best(posterior: Posterior, axes: list[Axis]) -> str:
 
 
 def _means(posterior: Posterior, axes: list[Axis]) -> list[str]:
-    """Return the part of a line with the means, or nothing if no axis has one."""
+    """Return the part of a line with the means, or an empty text if no axis has one."""
     numbers = [axis for axis in axes if not axis.has_states]
     mean = posterior.mean() if numbers else {}
     shown = ", ".join(f"{printable(axis.label)} {axis.shown(mean[axis.label])}" for axis in numbers)
@@ -79,7 +79,7 @@ def print_json(frame: FrameOutcome, axes: list[Axis]) -> None:
 
 @contextlib.contextmanager
 def drawing() -> Iterator[Show]:
-    """Draw one picture that changes on a terminal, and one below the other elsewhere."""
+    """Draw one picture that is updated on a terminal, and separate pictures elsewhere."""
     console = Console(highlight=False, markup=False)
     colour = in_colour(console)
     rows = max(console.height - _WORDS, 2) if console.is_terminal else ROWS
@@ -91,7 +91,7 @@ def drawing() -> Iterator[Show]:
         return Group(words, picture(frame, axes, width=console.width, rows=rows, colour=colour))
 
     if not console.is_terminal:
-        yield lambda frame, axes: console.print(drawn(frame, axes), soft_wrap=True)  # a line stays one
+        yield lambda frame, axes: console.print(drawn(frame, axes), soft_wrap=True)  # do not wrap lines
         return
     newest: list[tuple[FrameOutcome, list[Axis]]] = []
     shown = -1.0

@@ -1,4 +1,4 @@
-"""A posterior as text for a terminal: bars over one dimension, a heat map over two, in colour or without."""
+"""Pictures of posteriors in a terminal: bars for one dimension, a heat map for two, with or without colour."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
 ROWS: Final = 32
-"""Lines of a picture at most; finer posteriors are drawn in blocks of cells."""
+"""Maximum number of lines in a picture; finer posteriors are drawn in blocks of cells."""
 WIDTH: Final = 160
-"""Characters across at most, however wide the terminal is."""
+"""Maximum width in characters."""
 _SHADES: Final = " .:-=+*#%@"
 _COLOURS: Final = (
     *((68, 1, 84), (72, 36, 117), (64, 67, 135), (52, 94, 141), (41, 120, 142), (32, 144, 140)),
@@ -30,7 +30,7 @@ _LABEL: Final = 24
 
 @dataclass(frozen=True, slots=True)
 class Axis:
-    """A dimension of a posterior, with the values of its indices if a deployment is known."""
+    """A dimension of a posterior, with the values of its indices if the deployment is known."""
 
     label: str
     size: int
@@ -38,11 +38,11 @@ class Axis:
 
     @property
     def has_states(self) -> bool:
-        """Whether its cells have names instead of values."""
+        """Whether cells have names instead of values."""
         return self.dimension is not None and bool(self.dimension.states)
 
     def value(self, index: float) -> float | str:
-        """Return the value of an index: a number in its unit, a state's name, or the index itself."""
+        """Return the value of an index: a number in its unit, the name of a state, or the index itself."""
         if self.dimension is None:
             return index
         if self.dimension.states:
@@ -56,33 +56,33 @@ class Axis:
 
 
 def axes_of(posterior: Posterior, deployment: Deployment | None) -> list[Axis]:
-    """Return the dimensions of a posterior that came over the wire; a ValueError if they are not the deployment's."""
+    """Return the dimensions of a received posterior; a ValueError if they differ from the deployment's."""
     if deployment is None:
         return [Axis(label, size) for label, size in zip(posterior.labels, posterior.sizes, strict=True)]
     ours = [(dimension.label, dimension.size) for dimension in deployment.result_dimensions]
     theirs = list(zip(posterior.labels, posterior.sizes, strict=True))
     if ours != theirs:
         raise ValueError(
-            f"the posterior that came has {_grid(theirs)}, but the deployment of {deployment.directory} has {_grid(ours)}"
+            f"the received posterior has {_grid(theirs)}, but the deployment of {deployment.directory} has {_grid(ours)}"
         )
     return [Axis(dimension.label, dimension.size, dimension) for dimension in deployment.result_dimensions]
 
 
 def printable(text: str) -> str:
-    """Return text that came over the wire without control characters, and cut."""
+    """Return received text without control characters, and shortened."""
     text = text if len(text) <= _LABEL else text[: _LABEL - 3] + "..."
     return text if text.isprintable() else repr(text)
 
 
 def in_colour(console: Console) -> bool:
-    """Return whether a console shows colours, and the user has not turned them off (NO_COLOR)."""
+    """Return whether a console supports colours and the user has not disabled them (NO_COLOR)."""
     return console.color_system is not None and not console.no_color
 
 
 def picture(posterior: Posterior, axes: list[Axis], *, width: int, colour: bool, rows: int = ROWS) -> Text:
-    """Draw a posterior, coloured or of characters from " " to "@", `width` across and without four of `rows` lines for words.
+    """Draw a posterior in colour or with characters from " " to "@", `width` wide, in `rows` lines with text.
 
-    Of three dimensions or more the two largest are drawn, the others summed out.
+    Of three or more dimensions, the two largest are drawn, and the others are summed out.
     """
     width, rows = min(width, WIDTH), max(min(rows, ROWS), 2)
     if len(axes) == 1:
@@ -124,7 +124,7 @@ def _heat(
     text = Text(no_wrap=True, overflow="crop")
     text.append(f"{printable(down.label):>{margin - 1}}\n")
     last = len(blocks) - 1
-    for row in range(last, -1, -1):  # the first row is below, as on a map
+    for row in range(last, -1, -1):  # the first row is at the bottom, as on a map
         name = ends[1] if row == last else ends[0] if row == 0 else ""
         text.append(f"{name:>{margin - 1}} |")
         for value in blocks[row]:

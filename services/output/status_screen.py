@@ -1,4 +1,4 @@
-"""A stack's status in one screen: the verdict, its processes, their connections, its boards."""
+"""The status of a stack on one screen: readiness, processes, connections and boards."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ if TYPE_CHECKING:
 _WATCH_INTERVAL = 1.0
 _PLAIN_WIDTH = 140
 _SHOWN = 200
-"""Characters of a sentence or name that are shown: another process may answer anything."""
+"""Maximum number of characters shown of a sentence or name, because another process may answer anything."""
 
 
 def plain(text: str) -> str:
-    """Return a text without control characters, cut to a length that fits."""
+    """Return a text without control characters, shortened to fit."""
     kept = "".join(each if each.isprintable() else "?" for each in text[:_SHOWN])
     return kept if len(text) <= _SHOWN else f"{kept}..."
 
 
 def screen(stack: StackStatus) -> RenderableType:
-    """Return one screen with all that is known of a stack."""
+    """Return one screen with the status of a stack."""
     from rich.console import Group
     from rich.text import Text
 
@@ -130,7 +130,7 @@ def _table(*headings: str) -> Table:
 
 
 def _boards_by_number(stack: StackStatus) -> list[BoardStatus]:
-    """Return the boards as pcie-app sees them, with the restarts that they count themselves."""
+    """Return the boards as seen by pcie-app, with the restarts that the boards report."""
     boards: dict[int, BoardStatus] = {}
     for process in stack.processes:
         for board in process.boards:
@@ -170,13 +170,13 @@ def _counts(frames: FrameCounts | None) -> tuple[str, str, str, str, str]:
 
 
 async def show(directory: Path, *, watch: bool, json: bool) -> int:
-    """Print a run's status, once or every second.
+    """Print the status of a run, once or every second.
 
     Returns:
-        0 if all of it is ready, else 6.
+        0 if everything is ready, otherwise 6.
 
     Raises:
-        SettingsError: No process answers, and `watch` does not wait for one.
+        SettingsError: No process answers, and `watch` is false.
     """
     from rich.console import Console
     from rich.live import Live
@@ -211,5 +211,5 @@ async def show(directory: Path, *, watch: bool, json: bool) -> int:
     names = ", ".join(plain(each.name) for each in stack.silent)
     killed = f" (sockets of killed processes: {names})" if names else ""
     raise SettingsError(
-        f"no process of rosbayes answers in {directory}{killed}; is the stack started, with this BM_RUN_DIRECTORY?"
+        f"no rosbayes process answers in {directory}{killed}; is the stack running, with this BM_RUN_DIRECTORY?"
     )

@@ -1,1 +1,1 @@
-"""The processes between a robot and its boards: subscriber, PCIe application, publisher."""
+"""The processes between a robot and its boards: subscriber, pcie-app, publisher."""

@@ -16,7 +16,7 @@ _REPORT_ATTEMPTS = 100
 _REPORT_INTERVAL = 0.02
 
 OnState = Callable[[str, State, str], None]
-"""Called with a server's URI, its connection's new state, and the reason."""
+"""Callback with the URI of a server, the new state of its connection, and the reason."""
 
 
 async def connect_all(
@@ -28,13 +28,13 @@ async def connect_all(
     on_state: OnState | None = None,
     **options: Any,
 ) -> dict[str, Ros]:
-    """Connect to each of several servers once, and return the connections by URI.
+    """Connect to each server once, and return the connections by URI.
 
-    The settings' URI replaces all others. `by_uri` is filled with the connections as they are made, and `options` are those
-    of `connect`.
+    The URI in the settings replaces all others. Connections are added to `by_uri` as they are created;
+    `options` are those of `connect`.
 
     Raises:
-        BridgeError: A server is not reachable, or is not a rosbridge server.
+        BridgeError: A server is unreachable, or is not a rosbridge server.
     """
     by_uri = {} if by_uri is None else by_uri
     for uri in uris:
@@ -52,11 +52,11 @@ async def connect_all(
 
 
 async def report_failure(link: Link, error: BaseException) -> None:
-    """Send the error that ends a service to its master; a bug is not sent but printed by the service itself."""
+    """Send the error that ends a service to its master; a bug is only printed by the service itself."""
     code = exit_code_of(error)
     if code == ExitCode.BUG or not isinstance(error, Exception):
         return
-    for _ in range(_REPORT_ATTEMPTS):  # a master that started with us may still be connecting
+    for _ in range(_REPORT_ATTEMPTS):  # a master that was started with us may still be connecting
         if link.send(Trouble(code, str(error))):
             return
         await asyncio.sleep(_REPORT_INTERVAL)

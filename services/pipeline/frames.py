@@ -1,6 +1,6 @@
-"""Frames: complete readings out of the messages of one or several topics, and the queue in front of the boards.
+"""Assembly of complete readings from the messages of one or several topics, and the queue before the boards.
 
-There is no socket and no clock here: messages go in, complete sets of addresses come out.
+Without sockets and clocks: messages in, complete sets of addresses out.
 """
 
 from collections import Counter, deque
@@ -18,16 +18,16 @@ from toolchain.deployment.address import to_address
 from toolchain.errors import ReadingError
 
 QUEUE_ALL_DEPTH = 256
-"""Frames that wait with `queue = all` before the run ends with an error."""
+"""Maximum number of frames that wait with `queue = all` before the run ends with an error."""
 
 UNPAIRED_WARNING = 8
-"""Messages of every needed topic without a pair after which the stamps are reported as too far apart."""
+"""Number of unpaired messages of every needed topic after which a gap between stamps is reported."""
 
 Item = TypeVar("Item")
 
 
 class _SourceReader:
-    """Reads the variables of one topic, and the prior if it comes from there, out of its messages."""
+    """Reader of the variables, and possibly the prior, in the messages of one topic."""
 
     def __init__(self, deployment: Deployment, source: int) -> None:
         self._deployment = deployment
@@ -57,7 +57,7 @@ class _SourceReader:
             raise field.missing(message)
         if variable.name not in self._arrays:
             return to_address(variable, value)
-        # imported here, since a subscriber of numbers needs no NumPy
+        # imported here, because a subscriber of single numbers does not need NumPy
         from toolchain.deployment.address_array import to_addresses
 
         return to_addresses(self._deployment, variable, value)
@@ -81,7 +81,7 @@ class _SourceReader:
 
 @dataclass(frozen=True, slots=True)
 class StampGap:
-    """Why the messages of all topics make no frame: their stamps differ by more than the tolerance."""
+    """A gap between the stamps of topics that exceeds the tolerance, so that no frames are formed."""
 
     oldest: str
     """The topic whose newest stamp is the oldest."""
@@ -89,11 +89,11 @@ class StampGap:
     apart_s: float
     tolerance_s: float
     without_header: tuple[str, ...]
-    """Topics whose messages have no header, so that their receipt counts."""
+    """Topics whose messages do not have a header, so that their time of receipt is used."""
 
     def __str__(self) -> str:
         bare = " and ".join(self.without_header)
-        receipts = f" ({bare} without a header, so by receipt)" if bare else ""
+        receipts = f" ({bare} without a header, so by time of receipt)" if bare else ""
         return (
             f"messages come on all topics but make no frame: the newest of {self.oldest} is {self.apart_s:.3g} s older than "
             f"that of {self.newest}{receipts}, and the tolerance is {self.tolerance_s:g} s; "
@@ -102,10 +102,10 @@ class StampGap:
 
 
 class FrameAssembler:
-    """Assembles the messages of a deployment's topics to complete readings.
+    """Assembly of complete readings from the messages of a deployment's topics.
 
-    With one topic every message makes a frame. With several, messages are paired by stamp (see `Synchroniser`), and one
-    without a partner is counted in `unpaired`.
+    With one topic, every message is a frame. With several, messages are paired by stamp (see `Synchroniser`),
+    and unpaired ones are counted in `unpaired`.
     """
 
     def __init__(self, deployment: Deployment) -> None:
@@ -119,11 +119,11 @@ class FrameAssembler:
         self._newest: list[tuple[int, bool]] = [(0, True)] * count  # stamp, and whether a header had it
         self._since_pair = [0] * count  # messages
         self.absent: Counter[str] = Counter()
-        """Frames without a topic that was alive, by topic."""
+        """Number of frames without a topic that was alive, by topic."""
 
     @property
     def unpaired(self) -> int:
-        """Number of messages that found no partner."""
+        """Number of messages that remained unpaired."""
         return self._synchroniser.unpaired
 
     @property
@@ -134,7 +134,7 @@ class FrameAssembler:
     def take(
         self, source: int, message: dict[str, Any], received_ns: int, received_tick: int
     ) -> list[Reading]:
-        """Take one message of one source (its index), and return the readings that are complete now.
+        """Add a message of a source (its index), and return the readings that are now complete.
 
         It was received at `received_ns`, Unix time, and `received_tick`, monotonic ns.
 
@@ -183,15 +183,15 @@ class FrameAssembler:
         )
 
     def forget(self) -> None:
-        """Drop the messages that wait for partners, and count them as unpaired."""
+        """Drop the waiting messages, and count them as unpaired."""
         self._synchroniser.forget()
 
     def needs(self, source: int) -> bool:
-        """Whether no frame is complete without a message of this source."""
+        """Return whether a frame needs a message of this source."""
         return self._readers[source].needed
 
     def stamp_gap(self) -> StampGap | None:
-        """Return how far stamps are apart if that is why messages on all needed topics make no frame."""
+        """Return the gap between stamps if it prevents frames although all needed topics have messages."""
         needed = [source for source, reader in enumerate(self._readers) if reader.needed]
         if len(needed) < 2 or any(self._since_pair[source] < UNPAIRED_WARNING for source in needed):
             return None
@@ -207,7 +207,7 @@ class FrameAssembler:
 
 
 class WaitingFrames(Generic[Item]):
-    """The queue of frames in front of the boards: the newest frame, or all in order up to a bound."""
+    """The queue of frames before the boards: the newest frame, or all in order up to a bound."""
 
     def __init__(self, queue: str) -> None:
         self._keep_all = queue == "all"
@@ -215,7 +215,7 @@ class WaitingFrames(Generic[Item]):
         self.passed_over = 0
 
     def put(self, frame: Item) -> None:
-        """Add a frame; an OverflowedQueueError if the queue is full, as with `queue = latest` it never is."""
+        """Add a frame, or raise an OverflowedQueueError if the queue is full (only with `queue = all`)."""
         if self._keep_all:
             if len(self._waiting) >= QUEUE_ALL_DEPTH:
                 raise OverflowedQueueError(

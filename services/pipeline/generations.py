@@ -1,6 +1,7 @@
-"""The deployments that a service holds: the one in force, and the one that is prepared for a reload.
+"""The deployments of a service: the one in force, and the one prepared for a reload.
 
-The master numbers a run's deployments, and sends the current number in its greeting (docs/how-to/operating.md, Another deployment without stopping).
+The master numbers the deployments of a run, and sends the current number in its hello
+(docs/how-to/operating.md, Another deployment without stopping).
 """
 
 from collections.abc import Callable
@@ -17,7 +18,7 @@ Derived = TypeVar("Derived")
 
 
 class Generations(Generic[Derived]):
-    """A service's deployments by number, each with the data that the service derives from it.
+    """Deployments of a service by number, each with the data derived from it.
 
     Attributes:
         number: The generation in force.
@@ -26,10 +27,10 @@ class Generations(Generic[Derived]):
     def __init__(
         self, deployment: Deployment, derive: Callable[[Deployment], Derived], *, images: bool = False
     ) -> None:
-        """Begin with a deployment.
+        """Start with a deployment.
 
-        `derive` returns the service's data for a deployment; an error of it refuses the deployment. With `images` the boards'
-        images are read too.
+        `derive` returns the service's data for a deployment; if it raises an error, the deployment is
+        refused. With `images`, the images of the boards are read too.
         """
         self.number = 0
         self._derive = derive
@@ -47,16 +48,16 @@ class Generations(Generic[Derived]):
         return self._held[self.number][1]
 
     def adopt(self, hello: Hello) -> None:
-        """Take over the number that a master of the same deployment has sent."""
+        """Use the number sent by a master with the same deployment."""
         self._held = {hello.generation: self._held[self.number]}
         self.number = hello.generation
 
     def prepare(self, record: Prepare) -> Prepared | NotReloaded:
-        """Read and check a deployment, keep it beside the one in force, and return the answer for the master."""
+        """Read, check and store a deployment besides the one in force, and return the answer for the master."""
         try:
             loaded = load_deployment(Path(record.folder), images=self._images)
             derived = self._derive(loaded)
-        except Exception as error:  # even a bug must not end the run, which goes on with what it has
+        except Exception as error:  # even a bug must not end the run, which keeps its deployment
             return NotReloaded(record.generation, exit_code_of(error), str(error))
         if loaded.hash != record.deployment_hash:
             return NotReloaded(
@@ -69,7 +70,7 @@ class Generations(Generic[Derived]):
         return Prepared(record.generation)
 
     def switch(self, record: Switch) -> Switched | NotReloaded:
-        """Put a held deployment into force, and return the answer for the master."""
+        """Put a prepared deployment into force, and return the answer for the master."""
         try:
             self.get(record.generation)
         except NotPreparedError as error:
@@ -87,15 +88,15 @@ class Generations(Generic[Derived]):
 
 @dataclass(slots=True)
 class InForce:
-    """A run's deployment in force, as the master knows it; only a reload changes it."""
+    """The deployment in force in a run; only a reload changes it."""
 
     deployment: Deployment
     folder: Path
-    """Its folder, as the user named it."""
+    """Its folder, as named by the user."""
     generation: int = 0
     """Number of reloads so far."""
     former_hash: str = ""
-    """Hash of the deployment before it, which a service that starts during a reload may still have read."""
+    """Hash of the previous deployment, which a service started during a reload may still have read."""
 
     def replace(self, deployment: Deployment, folder: Path) -> None:
         """Put another deployment into force."""

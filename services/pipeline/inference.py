@@ -1,4 +1,4 @@
-"""The posterior that a frame's counts stand for, and the report about the frame."""
+"""Computation of the posterior from the counts of a frame, and the report of the frame."""
 
 from itertools import accumulate
 
@@ -22,14 +22,14 @@ REASON_WORDS = {
 
 
 class Inference:
-    """The posterior that a result's counts stand for.
+    """The posterior for the counts of a result.
 
     Attributes:
         boards: The boards' results.
-        posterior: float64[all lines], the joint posterior; None if no line of any board counted. With replicas
-            float64[replicas * all lines], one posterior after the other, zeros for a replica that has none; None if
-            none has one.
-        totals: The sum of each board's counts.
+        posterior: float64[all lines], the joint posterior; None if all counts are 0. With replicas
+            float64[replicas * all lines], one posterior after the other, with zeros for a replica without
+            one; None if no replica has one.
+        totals: The sum of the counts of each board.
         best: The most probable line of the posterior; -1 without one.
     """
 
@@ -50,7 +50,7 @@ class Inference:
 
     def _infer_replicas(self) -> None:
         boards, replicas = self.boards, len(self.boards[0].replica_cycles)
-        # each board has its lines of every replica
+        # each board has its own lines of every replica
         counts = [np.frombuffer(board.words, dtype="<u4").reshape(replicas, -1) for board in boards]
         self.totals = [int(of_board.sum(dtype=np.uint64)) for of_board in counts]
         joints = [
@@ -74,9 +74,10 @@ def report_of(
     now: tuple[int, int],
     previous_out_ns: int,
 ) -> FrameReport:
-    """Return the report about a frame.
+    """Return the report of a frame.
 
-    `now` is the Unix time and the monotonic time, `previous_out_ns` how long the sending of the previous result took.
+    `now` is the Unix time and the monotonic time, `previous_out_ns` the duration of sending the previous
+    result.
     """
     result = publish.result
     sent_ns, tick = now

@@ -1,7 +1,7 @@
-"""The PCIe application: the only process that drives boards (thesis 3.2, figure 3.3).
+"""pcie-app, the only process that drives boards (thesis 3.2, figure 3.3).
 
-One blocking thread serves the master and all boards: it posts a frame's readings and the start to every board, collects
-the counts, and returns the result.
+One blocking thread serves the master and all boards: it posts the readings and the start of a frame to every
+board, collects the counts, and returns the result.
 """
 
 import selectors
@@ -38,7 +38,7 @@ ROLE = "pcie-app"
 
 
 class Progress:
-    """The boards' work so far: counts for the status, lines for the log."""
+    """Counts of frames for the status, and their log lines."""
 
     def __init__(self, boards: DeployedBoards, log_level: str) -> None:
         self._boards = boards
@@ -51,7 +51,7 @@ class Progress:
         self.ready: Ready | None = None
 
     def computed(self, number: int, output: FrameOutput) -> None:
-        """Count and log a frame that has its result."""
+        """Count and log a computed frame."""
         self._computed += 1
         self._last = (number, time.monotonic_ns(), output)
         if self._logs_frames:
@@ -63,13 +63,13 @@ class Progress:
             )
 
     def status(self) -> ProcessStatus:
-        """Return this process's status; may be called by another thread."""
+        """Return the status of this process; may be called from another thread."""
         number, tick, output = self._last or (0, 0, None)
         gone = next(iter(dict(self._boards.gone).items()), None)
         if self.ready is None:
             why = "waiting for the boards to be opened and programmed"
         elif gone is not None:
-            why = gone[1]  # names the board
+            why = gone[1]  # the sentence names the board
         else:
             why = self.ready.sentence
         return ProcessStatus(
@@ -89,7 +89,7 @@ class Progress:
 
 
 class PcieApp:
-    """Serves one master at a time over a local socket."""
+    """Service for one master at a time over a local socket."""
 
     def __init__(self, boards: DeployedBoards, endpoint: Endpoint, log_level: str = "info") -> None:
         self._boards = boards
@@ -108,8 +108,8 @@ class PcieApp:
         """Serve until a signal raises in this thread.
 
         Raises:
-            PcieShimError: The boards can't be opened, or one came back with another image.
-            OutdatedError: A master runs the folder's present deployment, and this service a former one.
+            PcieShimError: The boards can't be opened, or a board came back with another image.
+            OutdatedError: A master uses the current content of the folder, and this service an earlier one.
         """
         listener = listen(self._endpoint)
         listener.setblocking(False)
@@ -159,7 +159,7 @@ class PcieApp:
             self._drop()
 
     def _report(self, listener: socket.socket, trouble: Trouble) -> None:
-        # a master that started with us may still be connecting
+        # a master that was started with us may still be connecting
         deadline = time.monotonic() + 2
         while not self._greeted and time.monotonic() < deadline:
             self._poll(listener, 0.05)
@@ -208,10 +208,10 @@ class PcieApp:
             case Switch():
                 self._send(self._boards.switch(record))
             case _:
-                pass  # no other record concerns boards
+                pass  # other records do not concern boards
 
     def status(self) -> ProcessStatus:
-        """Return this process's status; called by the status socket's thread."""
+        """Return the status of this process; called from the thread of the status socket."""
         return self._progress.status()
 
     def _compute(self, frame: Frame) -> None:

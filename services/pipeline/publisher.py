@@ -1,4 +1,4 @@
-"""The publisher: publishes results as posteriors on /BMresults (thesis 3.1, Publisher.jar)."""
+"""The publisher, which publishes results as posteriors on /BMresults (thesis 3.1, Publisher.jar)."""
 
 import asyncio
 import time
@@ -37,13 +37,13 @@ from toolchain.deployment import Deployment
 
 
 class Publisher:
-    """Serves a master: publishes each result that it sends."""
+    """Service that publishes the results of a master."""
 
     def __init__(self, settings: Settings, deployment: Deployment, link: MakeLink) -> None:
         self._topics = ResultTopics(settings, deployment)
         self._waiting: asyncio.Queue[Publish] = asyncio.Queue(RESULTS_DEPTH)
         self._once = False
-        self._draining = True  # until the topics are advertised, and then until the queue is empty
+        self._draining = True  # set until the topics are advertised, and then until the queue is empty
         self._link = link(self._take)
         self._generations = Generations(deployment, posterior_layout)
         self._logs_frames = settings.log_level == "debug"
@@ -54,10 +54,10 @@ class Publisher:
         self._last = (0, 0)
 
     def status(self) -> ProcessStatus:
-        """Return this process's status."""
+        """Return the status of this process."""
         why = why_not_connected(self._topics.rosbridges)
         if not why and not self._where:
-            why = "waiting for its topics to be advertised"
+            why = "waiting for the topics to be advertised"
         number, tick = self._last
         outcomes = self._outcomes
         return ProcessStatus(
@@ -84,7 +84,7 @@ class Publisher:
                 self._topics.watch()
         elif isinstance(record, Publish):
             if not (self._once or self._draining or self._topics.must_wait):
-                # the usual case: nothing to wait for, and so no other task to wake
+                # the usual case: nothing to wait for, and no other task to wake
                 self._report(self._topics.publish_now(record))
                 return
             self._draining = True  # results stay in order
@@ -99,14 +99,14 @@ class Publisher:
         elif isinstance(record, Prepare):
             self._link.send(self._generations.prepare(record))
         elif isinstance(record, Switch):
-            # no result is in flight: the master has waited for them
+            # no result is in flight, because the master has waited for them
             answer = self._generations.switch(record)
             self._topics.use(self._generations.deployment, self._generations.number)
             self._link.serve(self._generations.deployment)
             self._link.send(answer)
 
     def _report(self, published: Published) -> None:
-        """Count and log what became of a result, and send it to the master."""
+        """Count and log the outcome of a result, and send it to the master."""
         self._link.send(published)
         self._outcomes[published.outcome] += 1
         if published.outcome is Outcome.PUBLISHED:
@@ -128,7 +128,7 @@ class Publisher:
         )
 
     async def run(self) -> int:
-        """Serve until a signal; a BridgeError if a server is not reachable, or is not a rosbridge server."""
+        """Serve until a signal, or raise a BridgeError if a server is unreachable or not a rosbridge server."""
         async with self._link, status_served(self._run_directory, ROLE, self.status):
             try:
                 async with self._topics.opened(self._state_changed) as where:

@@ -1,4 +1,4 @@
-"""The topics that results are published on, and what becomes of each result."""
+"""The topics on which results are published."""
 
 import asyncio
 import contextlib
@@ -22,11 +22,11 @@ from toolchain.deployment import Deployment
 
 ROLE = "publisher"
 RESULTS_DEPTH = 64
-"""Results that may wait for the rosbridge server; the master keeps fewer than that in flight."""
+"""Maximum number of results that wait for the rosbridge server; the master has fewer in flight."""
 
 
 def same_numbers(received: Any, sent: list[float]) -> bool:
-    """Return whether an array is the one that was sent; some servers lose a double's last bit."""
+    """Return whether an array equals the sent one, except for the last bit, which some servers lose."""
     return (
         isinstance(received, list)
         and len(received) == len(sent)
@@ -38,7 +38,7 @@ def same_numbers(received: Any, sent: list[float]) -> bool:
 
 
 class ResultTopics:
-    """The deployment's output topics on their servers, advertised.
+    """The advertised output topics of a deployment on their servers.
 
     Attributes:
         rosbridges: The connections by URI.
@@ -55,14 +55,14 @@ class ResultTopics:
         self.rosbridges: dict[str, Ros] = {}
 
     def use(self, deployment: Deployment, generation: int) -> None:
-        """Publish results of another deployment from now on, on the same topics."""
+        """From now on, publish results of another deployment on the same topics."""
         self._deployment = deployment
         self._generation = generation
         self._layout = posterior_layout(deployment)
 
     @contextlib.asynccontextmanager
     async def opened(self, on_state: OnState | None = None) -> AsyncIterator[str]:
-        """Connect and advertise, and yield a sentence that names topics and servers, or raise a BridgeError."""
+        """Connect and advertise, and yield a sentence with topics and servers, or raise a BridgeError."""
         settings, deployment = self._settings, self._deployment
         by_uri = self.rosbridges
         async with contextlib.AsyncExitStack() as stack:
@@ -80,7 +80,7 @@ class ResultTopics:
             yield f"publishing on {topics} at {', '.join(by_uri)}"
 
     def served_by(self, uri: str) -> tuple[str, str]:
-        """Return how a sentence names a server's topics and the server; the only server is just `rosbridge`."""
+        """Return the texts for a server's topics and the server; a single server is just `rosbridge`."""
         if len(self.rosbridges) == 1:
             return "", "rosbridge"
         topics = [publication.topic for ros, publication in self._outputs if ros is self.rosbridges.get(uri)]
@@ -108,7 +108,7 @@ class ResultTopics:
 
     @property
     def must_wait(self) -> bool:
-        """Whether no server is connected, or a connected one still has to take earlier messages."""
+        """Whether no server is connected, or earlier messages still wait for one."""
         connected = self._connected()
         return not connected or any(publication.must_wait for publication in connected)
 
@@ -116,9 +116,9 @@ class ResultTopics:
         return [publication for ros, publication in self._outputs if ros.state is State.CONNECTED]
 
     async def publish(self, publish: Publish, *, look: bool) -> Published:
-        """Publish a frame's report and then its posterior, if it has one, once the servers take them.
+        """Publish the report of a frame and then its posterior, if any, when the servers accept them.
 
-        With `look` it waits until the result was seen on the wire, or until the settings' timeout.
+        With `look`, wait until the result is seen on the wire, or until the timeout of the settings.
         """
         inference = Inference(publish.result)
         ready = [publication.ready() for publication in self._connected()]
@@ -134,9 +134,10 @@ class ResultTopics:
         return published
 
     def publish_now(self, publish: Publish, inference: Inference | None = None) -> Published:
-        """Publish a frame's report and its posterior at once, wherever a server takes them, and return the outcome.
+        """Publish the report and the posterior on all servers that accept them now, and return the outcome.
 
-        The report goes to the first output's server. A result is published if it went to at least one output.
+        The report goes to the server of the first output. A result counts as published if it went to at least
+        one output.
         """
         started = time.monotonic_ns()
         inference = inference or Inference(publish.result)
@@ -180,7 +181,7 @@ class ResultTopics:
 
 
 def _sent(publication: Publication, message: dict[str, Any]) -> bool:
-    """Send a message if its server takes it at once, and return whether it does."""
+    """Send a message if its server accepts it at once, and return whether it does."""
     try:
         publication.publish_nowait(message)
     except (DisconnectedError, SlowPeerError):

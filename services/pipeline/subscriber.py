@@ -1,4 +1,4 @@
-"""The subscriber: turns the messages of a deployment's topics into readings (thesis 3.1, Subscriber.jar)."""
+"""The subscriber, which converts messages of a deployment's topics to readings (thesis 3.1, Subscriber.jar)."""
 
 import asyncio
 import contextlib
@@ -43,18 +43,19 @@ from toolchain.deployment import Deployment, Source
 
 ROLE = "subscriber"
 RECEIVED_QUEUE = 64
-"""Messages of a topic that wait to be read."""
+"""Maximum number of messages of a topic that wait to be read."""
 _BURST_PAUSE = 0.02
-"""Seconds of silence that end the backlog which a server sends to a new subscriber."""
+"""Seconds of silence that end the backlog sent to a new subscriber."""
 _BURST_LIMIT = 0.1
 _BACKLOG_LIMIT = min(1 << 18, MAX_RECORD)
-"""Bytes that may wait for the master; beyond them, readings are passed over (queue = latest) and counted."""
+"""Maximum of bytes waiting for the master; then readings are passed over (queue = latest).
+"""
 
 
 async def newest_now(subscription: Subscription, message: Message) -> tuple[Message, int]:
-    """Return the newest of a subscription's first messages, and the number of older ones.
+    """Return the newest of the first messages of a subscription, and the number of older ones.
 
-    ROS 2 servers begin with a backlog from before the subscription, the oldest message first, in one burst.
+    ROS 2 servers first send a backlog from before the subscription in one burst, the oldest message first.
     """
     older = 0
     with contextlib.suppress(TimeoutError):
@@ -67,7 +68,7 @@ async def newest_now(subscription: Subscription, message: Message) -> tuple[Mess
 
 
 class Subscriber:
-    """Serves a master: readings of a deployment's topics, as addresses of the machine's columns."""
+    """Service that sends readings of a deployment's topics to a master, as addresses of columns."""
 
     def __init__(self, settings: Settings, deployment: Deployment, link: MakeLink) -> None:
         self._settings = settings
@@ -107,7 +108,7 @@ class Subscriber:
             self._once = record.once
             self._begun.set()
         elif isinstance(record, Notice) and self._logs_frames:
-            # a frame has its number from the master, once it is neither passed over nor unusable
+            # the master numbers a frame when it is neither passed over nor unusable
             self._log.debug(record.sentence)
         elif isinstance(record, Hello):
             self._generations.adopt(record)
@@ -117,7 +118,7 @@ class Subscriber:
             self._link.send(self._switch(record))
 
     def _switch(self, record: Switch) -> Switched | NotReloaded:
-        self._assembler.forget()  # messages that wait for partners were read by the former deployment
+        self._assembler.forget()  # waiting messages were read according to the previous deployment
         unpaired = self._unpaired
         answer = self._generations.switch(record)
         self._unpaired_before_reload = unpaired - self._assembler.unpaired
@@ -125,11 +126,11 @@ class Subscriber:
         return answer
 
     def status(self) -> ProcessStatus:
-        """Return this process's status."""
+        """Return the status of this process."""
         why = why_not_connected(self._rosbridges)
         age = seconds_since(self._last_tick)
         limit = self._settings.ready_timeout
-        # without a run no readings are due, and the master may be waiting for us to be ready
+        # without a run no readings are expected, and the master may be waiting for us to be ready
         if not why and self._begun.is_set() and self._link.has_master and (age is None or age > limit):
             topics = " and ".join(source.topic for source in self._deployment.sources)
             since = "yet" if age is None else f"for {age:.0f} s"
@@ -161,7 +162,7 @@ class Subscriber:
             self._link.notice("warning", f"rosbridge at {uri} is gone ({reason}); waiting for it")
             if self._once and self._link.has_master and self._lost is not None and not self._lost.done():
                 self._lost.set_exception(
-                    RosbridgeLostError(f"rosbridge at {uri} went away before a reading came ({reason})")
+                    RosbridgeLostError(f"rosbridge at {uri} was lost before a reading arrived ({reason})")
                 )
         elif state is State.CONNECTED and self._begun.is_set():
             self._link.notice("info", f"rosbridge at {uri} is connected again")
@@ -170,8 +171,8 @@ class Subscriber:
         """Serve until a signal.
 
         Raises:
-            BridgeError: A server is not reachable, or a topic brings no message in time.
-            RosbridgeLostError: A run of one frame lost its server.
+            BridgeError: A server is unreachable, or no message of a topic arrives in time.
+            RosbridgeLostError: A run with `--once` lost its server.
         """
         settings = self._settings
         sources = self._deployment.sources
@@ -274,4 +275,4 @@ class Subscriber:
         if self._link.send(record):
             self._completed += 1
             self._passed_over_sent, self._unpaired_sent = passed_over, unpaired
-            self._once = False  # its reading is sent: a later failure must not end a service that goes on
+            self._once = False  # the reading has been sent: a later failure must not end the service

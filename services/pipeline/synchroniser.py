@@ -1,9 +1,11 @@
-"""The synchroniser: messages of several topics become sets of one instant, by their stamps.
+"""The synchroniser, which pairs messages of several topics by their stamps.
 
-There is no clock here: every call brings the time. Messages of one topic must be added in the order in which they were sent;
-between topics any order gives the same sets, as long as delays differ by less than the tolerance.
+It does not read a clock: every call passes the time. Messages of one topic must be added in the order in
+which they were sent; between topics, any order gives the same sets if delays differ by less than the
+tolerance.
 
-A topic's period is the median of its last intervals. A topic is *alive* until it was silent for `ALIVE_PERIODS` of its periods.
+The period of a topic is the median of its last intervals. A topic is *alive* until it is silent for
+`ALIVE_PERIODS` of its periods.
 """
 
 import statistics
@@ -13,11 +15,11 @@ from dataclasses import dataclass, field
 from typing import Final, Generic, TypeVar
 
 DEPTH: Final = 64
-"""Messages of a topic that wait for those of the others."""
+"""Maximum number of messages of a topic that wait for the other topics."""
 ALIVE_PERIODS: Final = 4
 _INTERVALS: Final = 8
 _UNKNOWN_PERIOD_NS: Final = 1_000_000_000
-"""Assumed of a topic until its second message."""
+"""Assumed period of a topic before its second message."""
 
 Item = TypeVar("Item")
 
@@ -33,7 +35,7 @@ class Stamped(Generic[Item]):
 
 @dataclass(slots=True)
 class _Topic(Generic[Item]):
-    """One topic: its messages without partners, the oldest first, and its rhythm."""
+    """A topic: its unpaired messages, the oldest first, and its last intervals."""
 
     needed: bool
     waiting: deque[Stamped[Item]] = field(default_factory=deque)
@@ -47,38 +49,39 @@ class _Topic(Generic[Item]):
         return int(statistics.median(self.intervals)) if self.intervals else None
 
     def is_alive(self, tick: int, begun: int) -> bool:
-        """Return whether a message can be expected; until it is heard, silence counts from `begun`."""
+        """Return whether a message can be expected; before the first one, silence counts from `begun`."""
         silence = tick - (begun if self.heard is None else self.heard)
         return silence <= ALIVE_PERIODS * (self.period or _UNKNOWN_PERIOD_NS)
 
     def nearest(self, stamp: int, reach: int) -> Stamped[Item] | None:
-        """Return the waiting message nearest to a stamp and within reach of it."""
+        """Return the waiting message nearest to a stamp, within `reach`."""
         near = min(self.waiting, key=lambda each: abs(each.stamp - stamp), default=None)
         return near if near is not None and abs(near.stamp - stamp) <= reach else None
 
     def may_bring(self, stamp: int, reach: int) -> bool:
-        """Return whether its next message may lie within reach of a stamp, as far as its rhythm tells."""
+        """Return whether the next message may be within `reach` of a stamp, according to the period."""
         if self.newest is None:
             return True
         return self.newest < stamp and self.newest + (self.period or 0) < stamp + reach
 
 
 class Synchroniser(Generic[Item]):
-    """Finds sets of messages within a tolerance of each other.
+    """Search for sets of messages within a tolerance of each other.
 
-    Each set has a *pivot*: the newest among the oldest waiting messages of the needed topics, or the oldest waiting message
-    of all if none is needed. Every other topic adds its message nearest to the pivot. A needed topic's lies within the
-    tolerance; another topic's also has to be nearer to this pivot than to the next one of the pivot's topic. A set waits for a
-    message that would be nearer, for the tolerance at most, as long as its topic is alive. Each message is used once.
+    Each set has a *pivot*: the newest among the oldest waiting messages of the needed topics, or the oldest
+    waiting message of all if none is needed. Every other topic adds its message nearest to the pivot. The
+    message of a needed topic must be within the tolerance; that of another topic must also be nearer to this
+    pivot than to the next message of the pivot's topic. While its topic is alive, a set waits for a nearer
+    message, for at most the tolerance. Each message is used once.
 
     Attributes:
-        unpaired: messages that found no partner.
-        deadline: tick at which `take_set` has to be called again, or None.
+        unpaired: number of messages that remained unpaired.
+        deadline: tick at which `take_set` must be called again, or None.
         absent: the topics that were alive and not in the last set.
     """
 
     def __init__(self, needed: Sequence[bool], tolerance_ns: int) -> None:
-        """Start without messages; `needed` says of each topic whether no set is complete without it."""
+        """Start without messages; `needed` tells for each topic whether every set needs it."""
         self.unpaired = 0
         self.deadline: int | None = None
         self.absent: list[int] = []
@@ -86,7 +89,7 @@ class Synchroniser(Generic[Item]):
         self._tolerance = tolerance_ns
         self._begun: int | None = None
         self._done = -1
-        """Stamp up to which messages are too late to begin a set, if no topic is needed."""
+        """Stamp up to which messages are too late for a new set, if no topic is needed."""
 
     def add(self, at: int, stamp: int, tick: int, item: Item) -> None:
         """Add a message of the topic with index `at`."""
@@ -124,7 +127,7 @@ class Synchroniser(Generic[Item]):
         self.deadline = None
 
     def _begin_again(self) -> None:
-        """Forget the stamps of all topics: a bag or a simulation begins again."""
+        """Forget the stamps of all topics, because a bag or a simulation has restarted."""
         self.forget()
         self._done = -1
         for topic in self._topics:
@@ -161,7 +164,8 @@ class Synchroniser(Generic[Item]):
                 reach = abs(near.stamp - pivot.stamp)
             if topic.is_alive(tick, self._begun or 0) and topic.may_bring(pivot.stamp, reach):
                 expected.append(other)
-        # The first message of each needed topic completed the set; a nearer one that came later does not prolong the wait.
+        # The first message of each needed topic completed the set; a nearer, later one does not prolong the
+        # wait.
         complete = max((topic.waiting[0].tick for topic in self._topics if topic.needed), default=pivot.tick)
         if expected and tick < complete + self._tolerance:
             self.deadline = complete + self._tolerance

@@ -1,4 +1,4 @@
-"""Readings delivered in time: a frame assembler with the event loop's clock."""
+"""A frame assembler with the clock of the event loop."""
 
 import asyncio
 import time
@@ -11,7 +11,7 @@ from toolchain.deployment import Deployment
 
 
 class TimedFrames(FrameAssembler):
-    """Delivers each reading as soon as its last message has come, or its topics need not be waited for any longer."""
+    """Delivery of each reading when it is complete, or when the wait for optional topics is over."""
 
     def __init__(self, deployment: Deployment, deliver: Callable[[Reading], None]) -> None:
         """Start without messages; `deliver` is called with each reading."""
@@ -21,7 +21,7 @@ class TimedFrames(FrameAssembler):
         self._timer_deadline: int | None = None
 
     def add(self, source: int, message: Message) -> None:
-        """Take one message of a source, and deliver the readings that it completes.
+        """Add a message of a source, and deliver the readings that it completes.
 
         Raises:
             VariableError: A variable is missing or unusable; the sentence names topic and variable.
@@ -29,7 +29,7 @@ class TimedFrames(FrameAssembler):
         self._deliver_all(self.take(source, message.msg, message.received_ns, message.received_monotonic_ns))
 
     def forget(self) -> None:
-        """Drop the messages that wait for partners, and count them as unpaired."""
+        """Drop the waiting messages, and count them as unpaired."""
         super().forget()
         self._set_timer()
 

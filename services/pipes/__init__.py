@@ -1,1 +1,1 @@
-"""Pipe mode of subscriber, pcie-app and publisher: without a master, one JSON value a line from and to standard streams."""
+"""Pipe mode of subscriber, pcie-app and publisher: JSON lines on standard streams, without a master."""

@@ -1,4 +1,4 @@
-"""Lines of standard input, bounded in length and decoded once; `terminal.output.put_json` writes those of standard output."""
+"""Lines of standard input, bounded in length (`terminal.output.put_json` writes lines of standard output)."""
 
 import asyncio
 import os
@@ -12,11 +12,11 @@ import msgspec
 from services.errors import InputLineError, SettingsError
 
 LINE_LIMIT = 1 << 24
-"""Length of the longest line on standard input, in bytes."""
+"""Maximum length of a line on standard input, in bytes."""
 
 
 def require_pipe(command: str, values: str) -> None:
-    """Refuse, with a SettingsError, to wait for lines that somebody would have to type."""
+    """Raise a SettingsError if standard input is a terminal."""
     if sys.stdin.isatty():
         raise SettingsError(
             f"{command} reads {values} from standard input, which is a terminal: pipe them in, or use --listen ({command} --help)"
@@ -24,7 +24,7 @@ def require_pipe(command: str, values: str) -> None:
 
 
 def blocking_lines() -> Iterator[tuple[int, bytes]]:
-    """Yield the lines of standard input with their numbers, without blank ones; an InputLineError for too long a line."""
+    """Yield non-blank lines of standard input with their numbers, or raise an InputLineError for a long one."""
     number = 0
     while line := sys.stdin.buffer.readline(LINE_LIMIT + 1):
         number += 1
@@ -35,9 +35,9 @@ def blocking_lines() -> Iterator[tuple[int, bytes]]:
 
 
 async def lines() -> AsyncIterator[tuple[int, bytes]]:
-    """Yield the same lines as `blocking_lines` without blocking the loop, so that a signal ends the wait for the next one."""
+    """Yield the lines of `blocking_lines` without blocking the loop, so that a signal ends the wait."""
     kind = os.fstat(sys.stdin.fileno()).st_mode
-    if not (stat.S_ISFIFO(kind) or stat.S_ISSOCK(kind)):  # the loop can only watch pipes; files never block
+    if not (stat.S_ISFIFO(kind) or stat.S_ISSOCK(kind)):  # the loop supports only pipes; files never block
         for each in blocking_lines():
             yield each
         return
@@ -59,12 +59,12 @@ async def lines() -> AsyncIterator[tuple[int, bytes]]:
 
 def _too_long(number: int) -> InputLineError:
     return InputLineError(
-        f"line {number} of standard input is longer than {LINE_LIMIT} bytes; expected one JSON value a line"
+        f"line {number} of standard input is longer than {LINE_LIMIT} bytes; expected one JSON value per line"
     )
 
 
 def decoded(line: bytes, number: int, kind: Any, expected: str) -> Any:
-    """Return a line's JSON value of a type for `msgspec`, or raise an InputLineError with its number and `expected`."""
+    """Return the JSON value of a line, or raise an InputLineError with its number and `expected`."""
     try:
         return msgspec.json.decode(line, type=kind)
     except (msgspec.MsgspecError, RecursionError) as error:

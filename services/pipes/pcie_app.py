@@ -1,4 +1,4 @@
-"""`pcie-app` without a master: computes the readings of standard input and prints their counts."""
+"""`pcie-app` without a master, which computes the readings of standard input and prints counts."""
 
 from typing import Annotated, Any
 
@@ -16,7 +16,7 @@ from terminal.output import put_json, say
 
 
 class LineReading(msgspec.Struct):
-    """A reading as `subscriber --deployment` prints it."""
+    """A reading as printed by `subscriber --deployment`."""
 
     addresses: Addresses
     stamp_ns: int | None = None
@@ -32,10 +32,10 @@ def reading_from_line(line: bytes, number: int) -> LineReading:
 
 
 def compute_lines(boards: DeployedBoards, banks: int) -> int:
-    """Compute the readings that come on standard input; frames take the boards' `banks` of generators in turn.
+    """Compute the readings of standard input; frames use the `banks` of the boards in turn.
 
     Raises:
-        InputLineError: A line is not a reading, or not one for this deployment.
+        InputLineError: A line is not a reading for this deployment.
         BoardError: A board failed.
     """
     say(boards.open())

@@ -1,4 +1,4 @@
-"""`publisher` without a master: publishes the results of standard input."""
+"""`publisher` without a master, which publishes the results of standard input."""
 
 import time
 from collections import Counter
@@ -41,12 +41,12 @@ _Line = _LineResult | list[Annotated[float, msgspec.Meta(ge=0)]]  # JSON has no 
 def result_from_line(
     line: bytes, number: int, count: int, replicas: int = 1
 ) -> tuple[FrameResult, int | None] | list[float]:
-    """Return the value of one line: a result of `pcie-app` with its reading's stamp, or an array of probabilities.
+    """Return the value of a line: a result of `pcie-app` with the stamp of its reading, or probabilities.
 
     A result of this deployment has `count` counts or probabilities.
 
     Raises:
-        InputLineError: It is neither.
+        InputLineError: The line is neither.
     """
     where = f"line {number} of standard input"
     expected = f"a result of pcie-app or an array of {count} probabilities"
@@ -79,11 +79,11 @@ def result_from_line(
 
 
 async def publish_lines(settings: Settings, deployment: Deployment) -> int:
-    """Publish the results that come on standard input, until it ends.
+    """Publish the results of standard input until it ends.
 
     Raises:
         InputLineError: A line is not a result of this deployment.
-        BridgeError: A server is not reachable.
+        BridgeError: A server is unreachable.
     """
     topics = ResultTopics(settings, deployment)
     machine = deployment.machine

@@ -1,4 +1,4 @@
-"""`subscriber` without a master: prints variables, or addresses."""
+"""`subscriber` without a master, which prints variables or addresses."""
 
 import asyncio
 import contextlib
@@ -16,11 +16,11 @@ from toolchain.deployment import Deployment, Source
 
 
 async def print_variables(settings: Settings, source: Source, names: list[str], count: int | None) -> int:
-    """Print the named variables of each message of a topic; without names, whole messages.
+    """Print the named variables in each message of a topic, or whole messages without names.
 
     Raises:
         NoMessageError: No message came in time.
-        BridgeError: A message has no such variable, or the server is not reachable.
+        BridgeError: A message does not have a variable, or the server is unreachable.
     """
     fields = [Field(name) for name in names]
     async with connect(

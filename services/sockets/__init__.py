@@ -1,1 +1,1 @@
-"""Local sockets of the processes, and the records that cross them."""
+"""Local sockets of the processes, and the records on them."""

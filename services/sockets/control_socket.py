@@ -1,7 +1,8 @@
-"""Control socket of a running master: one JSON line with an order in, one JSON object with the answer out.
+"""Control socket of a running master: a JSON line with an order in, a JSON object with the answer out.
 
-`master.control.sock` belongs to its user alone (0600), in the folder that BM_CONTROL_DIRECTORY names, else in the run's.
-Orders are bounded in size, time and number; anything else gets one sentence, and the connection is closed.
+`master.control.sock` is accessible only to its user (0600), in BM_CONTROL_DIRECTORY or in the run directory.
+Orders are bounded in size, time and number; others are answered with one sentence, and the connection is
+closed.
 """
 
 import asyncio
@@ -19,36 +20,36 @@ from terminal.errors import ExitCode, exit_code_of
 from terminal.output import say
 
 ORDER_LIMIT = 1 << 14
-"""Bytes of the longest order: a folder's path of 4096 characters, each escaped, fits."""
+"""Maximum size of an order in bytes, with room for a path of 4096 escaped characters."""
 
 ORDER_TIME = 5.0
-"""Seconds that a client has to send its order."""
+"""Seconds in which a client must send its order."""
 
 CLIENTS = 8
-"""Connections at a time; more are refused."""
+"""Maximum number of concurrent connections; more are refused."""
 
 ANSWER_LIMIT = 1 << 20
 
 
 class ReloadOrder(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="order", tag="reload"):
-    """An order to use the deployment in this folder; empty for the folder of the one in force."""
+    """An order to use the deployment in this folder; empty for the folder in force."""
 
     folder: str = ""
 
 
 class Answer(msgspec.Struct, frozen=True):
-    """The result of an order: an exit code for the command that gave it, and a sentence."""
+    """The result of an order: an exit code for the command, and a sentence."""
 
     exit_code: int
     sentence: str
 
 
 Execute = Callable[[ReloadOrder], Awaitable[str]]
-"""Executes an order, and returns a sentence about it."""
+"""Function that executes an order and returns a sentence about it."""
 
 
 def control_socket(directory: Path, name: str = "master") -> Path:
-    """Return the path of a process's control socket."""
+    """Return the path of the control socket of a process."""
     return directory.absolute() / f"{name}{CONTROL_SUFFIX}"
 
 
@@ -58,7 +59,7 @@ def order_of(line: bytes) -> ReloadOrder:
         return msgspec.json.decode(line, type=ReloadOrder)
     except (msgspec.MsgspecError, RecursionError) as error:
         raise ControlError(
-            f'that is not an order ({error}); expected {{"order": "reload", "folder": "/path"}} and a line\'s end'
+            f'this is not an order ({error}); expected {{"order": "reload", "folder": "/path"}} and a line\'s end'
         ) from error
 
 
@@ -69,12 +70,12 @@ async def _order(reader: asyncio.StreamReader) -> ReloadOrder:
     except TimeoutError as error:
         raise ControlError(f"no order came within {ORDER_TIME:g} s") from error
     except ValueError as error:
-        raise ControlError(f"an order has {ORDER_LIMIT} bytes at most") from error
+        raise ControlError(f"an order has at most {ORDER_LIMIT} bytes") from error
     return order_of(line)
 
 
 class _Clients:
-    """Connected clients: each has its task, which ends with the run."""
+    """Connected clients, each with a task that ends with the run."""
 
     def __init__(self, execute: Execute) -> None:
         self._execute = execute
@@ -88,7 +89,7 @@ class _Clients:
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, *, full: bool) -> None:
         try:
             if full:
-                answer = Answer(ExitCode.CHILD, f"{CLIENTS} others give orders now; try again later")
+                answer = Answer(ExitCode.CHILD, f"{CLIENTS} other clients are connected now; try again later")
             else:
                 answer = await self._answer(reader)
             with contextlib.suppress(OSError, TimeoutError):
@@ -108,7 +109,7 @@ class _Clients:
             return Answer(ExitCode.USAGE, str(error))
         try:
             return Answer(ExitCode.DONE, await self._execute(order))
-        except Exception as error:  # the client gets the error, and the run goes on
+        except Exception as error:  # the client gets the error, and the run continues
             return Answer(exit_code_of(error), str(error) or type(error).__name__)
 
     async def end(self) -> None:
@@ -119,15 +120,15 @@ class _Clients:
 
 @contextlib.asynccontextmanager
 async def control_served(directory: Path | None, execute: Execute) -> AsyncIterator[None]:
-    """Take orders in the running loop while the context lasts; nothing happens without a directory.
+    """Accept orders in the running loop within the context; do nothing without a directory.
 
-    A socket that can't be opened is a warning: it must not end a robot's run.
+    A socket that can't be opened only causes a warning, because it must not end a robot's run.
     """
     endpoint = Endpoint(path="" if directory is None else str(control_socket(directory)))
     try:
         listener = listen(endpoint) if endpoint.path else None
     except PcieShimError as error:
-        say(f"master: warning: it takes no orders: {error}")
+        say(f"master: warning: it cannot be reloaded: {error}")
         listener = None
     if listener is None:
         yield
@@ -143,10 +144,10 @@ async def control_served(directory: Path | None, execute: Execute) -> AsyncItera
 
 
 async def give_order(path: Path, order: ReloadOrder, *, timeout: float) -> str:
-    """Give a running master an order; return its sentence.
+    """Send an order to a running master; return its sentence.
 
     Raises:
-        ControlError: No master takes orders there, or the answer is not one.
+        ControlError: No master listens there, or the answer is malformed.
         NotReloadedError: No answer in time.
         ReportedError: The master refused, with its own sentence and exit code.
     """
@@ -161,19 +162,19 @@ async def give_order(path: Path, order: ReloadOrder, *, timeout: float) -> str:
                 writer.close()
     except TimeoutError as error:
         raise NotReloadedError(
-            f"the master at {path} did not answer within {timeout:g} s; `status` says which deployment is in force"
+            f"the master at {path} did not answer within {timeout:g} s; `status` shows the deployment in force"
         ) from error
     except OSError as error:
         raise ControlError(
-            f"no master takes orders at {path} ({error.strerror or error}); is a master --loop running, with this BM_CONTROL_DIRECTORY or BM_RUN_DIRECTORY?"
+            f"no master listens at {path} ({error.strerror or error}); is a master --loop running, with this BM_CONTROL_DIRECTORY or BM_RUN_DIRECTORY?"
         ) from error
     if not data:
-        raise NotReloadedError(f"the master at {path} ended before it was done")
+        raise NotReloadedError(f"the master at {path} exited before it had finished")
     try:
         answer = msgspec.json.decode(data, type=Answer)
     except (msgspec.MsgspecError, RecursionError) as error:
         raise ControlError(
-            f"the answer at {path} is not one of a master of this version ({error})"
+            f"the answer at {path} does not come from a master of this version ({error})"
         ) from error
     if answer.exit_code:
         raise ReportedError(answer.exit_code, answer.sentence)

@@ -1,7 +1,7 @@
 """Local sockets between services: length-prefixed MessagePack records, and the handshake.
 
-A frame is four bytes of length (little-endian) and that many bytes of MessagePack. The core does no I/O; there is an
-asyncio wrapper and a blocking one around it.
+A frame is four bytes of length (little-endian) and that many bytes of MessagePack. The core does not perform
+I/O; it has an asyncio wrapper and a blocking one.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from services.errors import LocalSocketError, OtherPeerError
 from services.sockets.records import VERSION, AnyRecord, Hello, Record
 
 MAX_RECORD = 4 * 1024 * 1024
-"""Bytes of the largest record: 64 boards of 4096 counts fit with room to spare."""
+"""Maximum size of a record in bytes, with ample room for 64 boards of 4096 counts."""
 
 _LENGTH = struct.Struct("<I")
 _encoder = msgspec.msgpack.Encoder()
@@ -32,13 +32,13 @@ def encode_record(record: Record) -> bytes:
     body = _encoder.encode(record)
     if len(body) > MAX_RECORD:
         raise LocalSocketError(
-            f"a {type(record).__name__} record has {len(body)} bytes, more than the {MAX_RECORD} that a local socket takes"
+            f"a {type(record).__name__} record has {len(body)} bytes, more than the maximum of {MAX_RECORD}"
         )
     return _LENGTH.pack(len(body)) + body
 
 
 class RecordSplitter:
-    """Bytes in, records out; an incomplete record is kept until its rest has come."""
+    """Decoder of bytes into records; an incomplete record is stored until the rest has arrived."""
 
     def __init__(self, peer: str) -> None:
         self._peer = peer
@@ -54,17 +54,17 @@ class RecordSplitter:
             (length,) = _LENGTH.unpack_from(pending, at)
             if length > MAX_RECORD:
                 raise LocalSocketError(
-                    f"{self._peer} announced a record of {length} bytes; {MAX_RECORD} is the limit, so it is not a service of rosbayes"
+                    f"{self._peer} announced a record of {length} bytes; the maximum is {MAX_RECORD}, so it is not a rosbayes service"
                 )
             end = at + _LENGTH.size + length
             if len(pending) < end:
                 break
             try:
-                # a copy: parts of a record that stay encoded keep their buffer
+                # a copy, because undecoded parts of a record reference their buffer
                 records.append(_decoder.decode(bytes(memoryview(pending)[at + _LENGTH.size : end])))
             except (msgspec.MsgspecError, RecursionError) as error:
                 raise LocalSocketError(
-                    f"{self._peer} sent bytes that are not a record of rosbayes ({error})"
+                    f"{self._peer} sent bytes that are not a rosbayes record ({error})"
                 ) from error
             at = end
         del pending[:at]
@@ -72,12 +72,12 @@ class RecordSplitter:
 
 
 def own_hello(role: str, deployment_hash: str, generation: int = 0) -> Hello:
-    """Return the greeting of this process; a master's has the generation of the deployment in its run."""
+    """Return the hello of this process; that of a master contains the generation of its deployment."""
     return Hello(role=role, version=VERSION, deployment_hash=deployment_hash, generation=generation)
 
 
 def check_hello(record: AnyRecord, expected_role: str, deployment_hash: str, where: str) -> None:
-    """Refuse, with an OtherPeerError, a peer of another role, version or deployment."""
+    """Raise an OtherPeerError for a peer of another role, version or deployment."""
     if not isinstance(record, Hello):
         raise OtherPeerError(
             f"{where}: the peer did not greet (a {type(record).__name__} came first); is it a {expected_role}?"
@@ -98,7 +98,7 @@ def check_hello(record: AnyRecord, expected_role: str, deployment_hash: str, whe
 
 
 class RecordProtocol(asyncio.Protocol):
-    """One local connection under asyncio: records go to a callback, without a task in between."""
+    """A local connection in asyncio; records go to a callback, without a task in between."""
 
     def __init__(
         self,
@@ -116,7 +116,7 @@ class RecordProtocol(asyncio.Protocol):
         self._failure: Exception | None = None
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Take note that the socket is open (asyncio)."""
+        """Handle the opened socket (asyncio)."""
         # uvloop's transports are not subclasses of asyncio's, but behave alike
         self._transport = cast("asyncio.Transport", transport)
         sock = transport.get_extra_info("socket")
@@ -125,7 +125,7 @@ class RecordProtocol(asyncio.Protocol):
         self._on_open(self)
 
     def data_received(self, data: bytes) -> None:
-        """Take bytes (asyncio)."""
+        """Handle received bytes (asyncio)."""
         try:
             for record in self._splitter.feed(data):
                 self._on_record(self, record)
@@ -134,13 +134,13 @@ class RecordProtocol(asyncio.Protocol):
             self.close()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Take note that the socket is closed (asyncio)."""
+        """Handle the closed socket (asyncio)."""
         self._transport = None
         self._on_close(self, self._failure or exc)
 
     @property
     def backlog(self) -> int:
-        """Bytes written that the peer has not taken yet."""
+        """Number of written bytes that the peer has not read yet."""
         return 0 if self._transport is None else self._transport.get_write_buffer_size()
 
     def send(self, record: Record) -> bool:
@@ -151,13 +151,13 @@ class RecordProtocol(asyncio.Protocol):
         return True
 
     def close(self) -> None:
-        """Close the connection once everything written is sent."""
+        """Close the connection after sending everything written."""
         if self._transport is not None:
             self._transport.close()
 
 
 async def open_connection(endpoint: Endpoint, make: Callable[[], RecordProtocol]) -> RecordProtocol:
-    """Connect once, or raise the socket's own OSError."""
+    """Connect once, or raise the OSError of the socket."""
     loop = asyncio.get_running_loop()
     if endpoint.path:
         _, protocol = await loop.create_unix_connection(make, endpoint.path)
@@ -167,7 +167,7 @@ async def open_connection(endpoint: Endpoint, make: Callable[[], RecordProtocol]
 
 
 class BlockingRecordSocket:
-    """The same connection for a process with one blocking thread."""
+    """A local connection for a process with one blocking thread."""
 
     def __init__(self, sock: socket.socket, where: str, *, send_timeout: float = 10.0) -> None:
         self._sock = sock
@@ -198,7 +198,7 @@ class BlockingRecordSocket:
         return self._splitter.feed(data) if data else None
 
     def send(self, record: Record) -> bool:
-        """Write a record whole; return False if the peer is gone or has not read for `send_timeout` seconds."""
+        """Write a whole record; return False if the peer is gone or has not read for `send_timeout` seconds."""
         left = memoryview(encode_record(record))
         deadline = time.monotonic() + self._send_timeout
         while left:

@@ -1,7 +1,7 @@
-"""Records that cross the local sockets between the services.
+"""Records between the services.
 
-Every record is a MessagePack array whose first element is its tag. Times called `*_ns` are Unix
-time; those called `*_tick` are the machine's monotonic clock, comparable between its processes.
+Every record is a MessagePack array whose first element is its tag. Fields `*_ns` are Unix times; fields
+`*_tick` are times of the machine's monotonic clock, comparable between its processes.
 """
 
 from enum import StrEnum
@@ -10,16 +10,16 @@ from importlib.metadata import version
 import msgspec
 
 VERSION = version("rosbayes")
-"""Version that every greeting carries: both sides of a local socket have the same."""
+"""Version in every hello, which must be the same on both sides of a local socket."""
 
 
 class LossReason(StrEnum):
-    """Reason why a reading has no result, or not everywhere, as `status` shows it."""
+    """Reason why a reading has no result, or not on all topics, as shown by `status`."""
 
     PASSED_OVER = "passed over"
-    """A newer reading took its place (`queue = latest`)."""
+    """Replaced by a newer reading (`queue = latest`)."""
     UNPAIRED = "unpaired"
-    """No message came on another topic within the tolerance."""
+    """No message arrived on another topic within the tolerance."""
     UNUSABLE = "with an unusable variable"
     FAILED = "failed on a board"
     WITH_APP = "lost with pcie-app"
@@ -28,15 +28,15 @@ class LossReason(StrEnum):
     NO_POSTERIOR = "no posterior"
     ROSBRIDGE_AWAY = "rosbridge away"
     SOME_TOPICS = "on some topics only"
-    """Published, but not on the topics of a server that was away."""
+    """Published, but not on the topics of a disconnected server."""
 
 
 class Outcome(StrEnum):
-    """Fate of a result at the publisher."""
+    """Outcome of a result at the publisher."""
 
     PUBLISHED = "published"
     NO_POSTERIOR = "no posterior"
-    """No line of the model counted."""
+    """All counts were 0."""
     ROSBRIDGE_AWAY = "rosbridge away"
 
 
@@ -50,13 +50,14 @@ class FailureReason(StrEnum):
 
 
 class Record(msgspec.Struct, array_like=True, frozen=True):
-    """Root of all records."""
+    """Base class of all records."""
 
 
 class Hello(Record, tag="hello", frozen=True):
     """First record in each direction: the sender's role, version and deployment.
 
-    `generation` comes from the master: how often the run has changed its deployment. The service continues from there.
+    `generation` comes from the master: the number of deployment changes in the run, from which the service
+    continues.
     """
 
     role: str
@@ -66,21 +67,21 @@ class Hello(Record, tag="hello", frozen=True):
 
 
 class Begin(Record, tag="begin", frozen=True):
-    """Master to a service: begin. With `once` the run ends after its first frame."""
+    """Master to a service: start of the run. With `once`, it ends after its first frame."""
 
     once: bool
 
 
 class Ready(Record, tag="ready", frozen=True):
-    """A service to the master: it has what it needs (a connection, an advertised topic, programmed boards)."""
+    """A service to the master: it is ready (connected, advertised, or boards programmed)."""
 
     sentence: str
 
 
 class Notice(Record, tag="notice", frozen=True):
-    """A service to the master: a message for the user that does not end the run.
+    """A service to the master: a message for the user; the run continues.
 
-    With `--log-level debug` the master sends one per frame to the subscriber, with the frame's number.
+    With `--log-level debug`, the master sends one per frame to the subscriber, with the number of the frame.
     """
 
     level: str
@@ -88,23 +89,26 @@ class Notice(Record, tag="notice", frozen=True):
 
 
 class Trouble(Record, tag="trouble", frozen=True):
-    """A service to the master: it can't go on, and why."""
+    """A service to the master: it cannot continue, and the reason."""
 
     exit_code: int
     sentence: str
 
 
 Addresses = list[int | list[int] | None]
-"""Addresses of a frame's readings, in the order of the variables: one, None for a missing one, or, where replicas or lines
-have readings of their own, a flat list (row by row, -1 for a missing one)."""
+"""Addresses of a frame's readings, in the order of the variables; None for a missing reading.
+
+If replicas or lines have their own readings, each is a flat list (row by row, -1 for a missing one).
+"""
 
 
 class Reading(Record, tag="reading", frozen=True):
     """Subscriber to master: one complete set of addresses, with the newest stamp or receipt.
 
-    `prior_codes` is a written prior, two bytes per line (and replica); empty for the machine's own. `passed_over` counts
-    the readings that the subscriber lost since the last one it sent, `unpaired` the messages without a partner on other
-    topics. `generation` is that of the deployment by which the addresses were computed: boards need tables of the same.
+    `prior_codes` is a written prior, two bytes per line (and replica); empty for the prior of the machine.
+    `passed_over` is the number of readings that the subscriber dropped since the last one it sent, `unpaired`
+    the number of unpaired messages. `generation` is that of the deployment for which the addresses were
+    computed; the boards must have the same.
     """
 
     stamp_ns: int
@@ -119,14 +123,14 @@ class Reading(Record, tag="reading", frozen=True):
 
 
 class Unusable(Record, tag="unusable", frozen=True):
-    """Subscriber to master: a message that can't become a frame. Equal causes have equal `cause`."""
+    """Subscriber to master: an unusable message. Equal causes have equal `cause`."""
 
     cause: str
     sentence: str
 
 
 class Frame(Record, tag="frame", frozen=True):
-    """Master to pcie-app: compute this. `number` rises from 1 per master."""
+    """Master to pcie-app: compute this frame. `number` increases from 1 for each master."""
 
     number: int
     addresses: Addresses
@@ -135,7 +139,7 @@ class Frame(Record, tag="frame", frozen=True):
 
 
 class FrameResult(Record, tag="result", frozen=True):
-    """pcie-app to master: the boards' results, and where the time went.
+    """pcie-app to master: the results of the boards, and durations.
 
     `boards` is a list of `pcie_shim.host.frame.BoardResult`, which only its sender and the publisher read.
     """
@@ -149,7 +153,7 @@ class FrameResult(Record, tag="result", frozen=True):
 
 
 class FrameFailed(Record, tag="failed", frozen=True):
-    """pcie-app to master: a frame that the boards did not finish."""
+    """pcie-app to master: a failed frame."""
 
     number: int
     board: int
@@ -170,7 +174,7 @@ class Publish(Record, tag="publish", frozen=True):
 
 
 class Published(Record, tag="published", frozen=True):
-    """Publisher to master: the fate of a result.
+    """Publisher to master: the outcome of a result.
 
     `seen` is whether it was seen on the wire (None if that was not checked). `best_line` has `best_probability`;
     `total_ns` is the time from the reading's receipt to the result's sending. `missed` counts the outputs, of several,
@@ -188,7 +192,7 @@ class Published(Record, tag="published", frozen=True):
 
 
 class Prepare(Record, tag="prepare", frozen=True):
-    """Master to a service: read and check this deployment, and keep it ready; nothing changes yet."""
+    """Master to a service: read and check this deployment without using it yet."""
 
     generation: int
     folder: str
@@ -202,19 +206,19 @@ class Prepared(Record, tag="prepared", frozen=True):
 
 
 class Switch(Record, tag="switch", frozen=True):
-    """Master to a service: work by the deployment of this generation from now on (or again)."""
+    """Master to a service: use the deployment of this generation from now on (or again)."""
 
     generation: int
 
 
 class Switched(Record, tag="switched", frozen=True):
-    """A service to the master: all that it sends from now on is of this generation."""
+    """A service to the master: everything that it sends from now on belongs to this generation."""
 
     generation: int
 
 
 class NotReloaded(Record, tag="not reloaded", frozen=True):
-    """A service to the master: it could not prepare or switch, and keeps the deployment that it had."""
+    """A service to the master: it failed to prepare or switch, and keeps its deployment."""
 
     generation: int
     exit_code: int

@@ -1,4 +1,4 @@
-"""A service's side of a local socket: it listens, and serves one master at a time."""
+"""The service side of a local socket, which listens and serves one master at a time."""
 
 import asyncio
 import socket
@@ -18,11 +18,11 @@ from toolchain.deployment import Deployment, load_deployment
 from toolchain.errors import ToolchainError
 
 GREETING_TIME = 5.0
-"""Seconds that a client has to greet, before another may connect."""
+"""Seconds in which a client must send its hello before another may connect."""
 
 
 class Link(Protocol):
-    """A service's connection to its master: over a local socket, or inside the same process."""
+    """The connection of a service to its master: over a local socket, or inside the same process."""
 
     @property
     def has_master(self) -> bool:
@@ -56,14 +56,15 @@ class Link(Protocol):
 
 
 MakeLink = Callable[[Callable[[AnyRecord], None]], Link]
-"""Makes a service's link, given a function that takes the master's records, its greeting first."""
+"""Function that creates a service's link, given a function for the master's records, its hello first.
+"""
 
 
 class MasterLink(Link):
-    """Listens for a master, greets it, and passes its records on.
+    """Link over a local socket that listens for a master and passes its records on.
 
-    A second master is refused; when a master goes, the next may come. A service ends by an error when its folder has
-    changed since its start and a master asks for the new deployment.
+    A second master is refused until the first has disconnected. If the folder of the service has changed
+    since its start and a master requires the new deployment, the service ends with an error.
     """
 
     def __init__(
@@ -100,7 +101,7 @@ class MasterLink(Link):
         """Stop listening, and remove the socket.
 
         Raises:
-            OutdatedError: A master asked for the folder's new deployment.
+            OutdatedError: A master requires the new deployment in the folder.
         """
         if self._server is not None:
             self._server.close()
@@ -114,7 +115,7 @@ class MasterLink(Link):
 
     def _open(self, protocol: RecordProtocol) -> None:
         if self._master is not None:
-            return  # it is refused when it greets: a record sent before might never be read
+            return  # refuse it after its hello, because a record sent before might never be read
         self._master = protocol
         self._greeted = False
         protocol.send(own_hello(self._role, self._deployment.hash))
@@ -177,12 +178,12 @@ class MasterLink(Link):
 
 
 def listening(endpoint: Endpoint, role: str, deployment: Deployment) -> MakeLink:
-    """Return what makes a link over a local socket that the service listens on."""
+    """Return the function that creates a link over a local socket at this endpoint."""
     return lambda on_record: MasterLink(endpoint, role, deployment, on_record)
 
 
 def outdated(deployment: Deployment, refused: AnyRecord) -> OutdatedError | None:
-    """Return why a service that refused a greeting has to be restarted; None where that would not help."""
+    """Return the error if a restart would give a service the deployment that it refused; otherwise None."""
     if not isinstance(refused, Hello) or refused.deployment_hash == deployment.hash:
         return None
     try:
@@ -193,12 +194,12 @@ def outdated(deployment: Deployment, refused: AnyRecord) -> OutdatedError | None
         return None
     return OutdatedError(
         f"{deployment.directory} was changed since this was started, from deployment {deployment.hash[:12]} to {there[:12]}, "
-        "and a master asks for the new one; restart this service"
+        "and a master requires the new one; restart this service"
     )
 
 
 def endpoint_from(text: str, flag: str) -> Endpoint:
-    """Return the endpoint that a user gave, or raise a SettingsError."""
+    """Return the endpoint given by a user, or raise a SettingsError."""
     try:
         return parse_endpoint(text)
     except PcieShimError as error:
@@ -206,21 +207,21 @@ def endpoint_from(text: str, flag: str) -> Endpoint:
 
 
 def deployment_for(settings: Settings, *, images: bool = False) -> Deployment:
-    """Return the deployment that the settings name.
+    """Return the deployment in the settings.
 
     Raises:
-        SettingsError: None is named.
-        ToolchainError: It is damaged, of another version, or not there.
+        SettingsError: The settings do not name a deployment.
+        ToolchainError: It is damaged, of another version, or missing.
     """
     if settings.deployment is None:
         raise SettingsError(
-            "no deployment was given: use --deployment DIR (or BM_DEPLOYMENT), with a folder that `toolchain build` wrote"
+            "no deployment was given: use --deployment DIR (or BM_DEPLOYMENT), with a folder written by `toolchain build`"
         )
     return load_deployment(settings.deployment, images=images)
 
 
 def board_endpoints(settings: Settings, deployment: Deployment) -> list[Endpoint]:
-    """Return where the boards are: the settings' list, else the deployment's own endpoints.
+    """Return the endpoints of the boards: those in the settings, otherwise those of the deployment.
 
     Raises:
         SettingsError: A board has no endpoint, or there are too few or too many.
@@ -263,12 +264,12 @@ def own_endpoint(text: str, *, insecure: bool) -> Endpoint:
     """Return the endpoint at which a service serves its master.
 
     Raises:
-        SettingsError: It is not an endpoint, or others on the network could reach it.
+        SettingsError: It is not an endpoint, or other machines could reach it.
     """
     endpoint = endpoint_from(text, "--listen")
     if endpoint.host and not insecure and not endpoint.is_loopback:
         raise SettingsError(
-            f"--listen {text} lets everybody on that network order frames and read results; "
-            "use unix:PATH or a loopback address, or give --insecure if that is meant"
+            f"--listen {text} lets everybody on that network compute frames and read results; "
+            "use unix:PATH or a loopback address, or give --insecure if that is intended"
         )
     return endpoint

@@ -1,4 +1,4 @@
-"""All processes of a run: found by their status sockets, and asked for their status at once."""
+"""The processes of a run, found by their status sockets and queried in parallel."""
 
 import asyncio
 import os
@@ -14,19 +14,19 @@ from services.supervision.private_directory import DIRECTORY_PREFIX
 from terminal.health import SUFFIX, NoHealthError
 
 ANSWER_TIME = 1.0
-"""Seconds that all processes together have to answer."""
+"""Seconds in which all processes must answer."""
 _ORDER = ("hub", "master", "subscriber", "publisher", "pcie-app")
 
 
 class SilentProcess(msgspec.Struct, frozen=True):
-    """A process that has a status socket, or is a master's peer, but did not answer."""
+    """A process with a status socket, or a peer of the master, that did not answer."""
 
     name: str
     why: str
 
 
 class StackStatus(msgspec.Struct, frozen=True, kw_only=True):
-    """All processes of one run; `why` has a sentence for each that is not ready."""
+    """All processes of a run; `why` contains a sentence for each one that is not ready."""
 
     directory: str
     ready: bool
@@ -36,7 +36,7 @@ class StackStatus(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def run_directories() -> list[Path]:
-    """Return the private directories of this user's runs, alive or dead, by name."""
+    """Return the private directories of the user's runs, alive or dead, sorted by name."""
     places = {Path(tempfile.gettempdir())}
     if runtime := os.environ.get("XDG_RUNTIME_DIR"):
         places.add(Path(runtime))
@@ -46,7 +46,7 @@ def run_directories() -> list[Path]:
 
 
 def _is_own_directory(path: Path) -> bool:
-    """Return whether it is this user's directory; a run may end meanwhile, and others' may be closed to us."""
+    """Return whether a directory belongs to this user, even if it disappears or is inaccessible."""
     try:
         return path.is_dir() and path.stat().st_uid == os.getuid()
     except OSError:
@@ -66,7 +66,7 @@ def _ask(path: Path) -> ProcessStatus | SilentProcess:
 
 
 def _sort_key(name: str) -> tuple[int, int, str]:
-    """Return the sort key of a process: the known ones in the order of a frame's way, then boards by number."""
+    """Return the sort key of a process: services in the order of a frame's path, then boards by number."""
     if name in _ORDER:
         return _ORDER.index(name), 0, name
     digits = name.removeprefix("board")
@@ -74,7 +74,7 @@ def _sort_key(name: str) -> tuple[int, int, str]:
 
 
 async def ask_stack(directory: Path) -> StackStatus:
-    """Return the status of the processes in a run directory, asked in parallel, within about a second."""
+    """Return the status of the processes in a run directory, queried in parallel, within about a second."""
     paths = _status_sockets(directory)
     loop = asyncio.get_running_loop()
     with ThreadPoolExecutor(max(1, len(paths))) as pool:
@@ -102,7 +102,7 @@ async def ask_stack(directory: Path) -> StackStatus:
 
 
 async def find_run() -> Path:
-    """Return the private directory of this user's only run that is alive; a SettingsError unless there is one."""
+    """Return the private directory of the user's only living run, or raise a SettingsError."""
     found = run_directories()
     stacks = [await ask_stack(path) for path in found]
     alive = [path for path, stack in zip(found, stacks, strict=True) if stack.processes]

@@ -1,6 +1,6 @@
-"""Status of a process: its records, shown on its status socket (`terminal.health`) and read from there.
+"""Status of a process: its records, reported on and read from its status socket (`terminal.health`).
 
-The work on frames does not wait for it: it counts, and everything else happens when a status is asked for.
+Processing of frames only updates counters; everything else happens when a status is requested.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from services.supervision.parent import leave_private_directory
 from terminal.health import health_served, health_thread, not_ours, read_status
 
 if TYPE_CHECKING:
-    # boards and pcie-app start without the bridge
+    # boards and pcie-app start without importing the bridge
     from bridge.client import Ros
 
 _SAMPLES = 6
-"""Samples a second apart: a rate is over the last five seconds."""
+"""Number of samples, one per second: a rate covers the last five seconds."""
 
 
 class ConnectionStatus(msgspec.Struct, frozen=True):
@@ -37,14 +37,14 @@ class ConnectionStatus(msgspec.Struct, frozen=True):
 
 
 class FrameCounts(msgspec.Struct, frozen=True, kw_only=True):
-    """Frames as one process sees them.
+    """Counts of frames in one process.
 
     `received` and `completed` are messages and complete readings (subscriber), requested and computed frames
-    (pcie-app), requested and published results (publisher), readings and published results (master). `lost` counts
-    the others by `LossReason`. `last_number` is that of the last completed one (None: none yet, or the subscriber,
-    which does not know numbers), `last_age_s` the seconds since. `rate` is completed ones per second, lately.
-    `without` counts the readings that lack a topic which may be missing and was alive, by topic (subscriber).
-    All counts start from zero when a process is restarted.
+    (pcie-app), requested and published results (publisher), readings and published results (master). `lost`
+    counts the others by `LossReason`. `last_number` is that of the last completed one (None before the first
+    one, and in the subscriber, which does not know numbers), `last_age_s` its age in seconds. `rate` is the
+    recent number of completed ones per second. `without` counts the readings that lack a topic which may be
+    missing and was alive, by topic (subscriber). All counts start from zero when a process is restarted.
     """
 
     received: int
@@ -57,7 +57,7 @@ class FrameCounts(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class BoardStatus(msgspec.Struct, frozen=True, kw_only=True):
-    """A board: `state` is starting, blank, programmed, or gone (as pcie-app sees it)."""
+    """A board: `state` is starting, blank, programmed, or gone (as seen by pcie-app)."""
 
     index: int
     endpoint: str
@@ -69,7 +69,7 @@ class BoardStatus(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class PeerStatus(msgspec.Struct, frozen=True, kw_only=True):
-    """A process that the master works with; `pid` is 0 for one that it did not start."""
+    """A peer of the master; `pid` is 0 if the master did not start it."""
 
     name: str
     endpoint: str
@@ -79,7 +79,7 @@ class PeerStatus(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class HubStatus(msgspec.Struct, frozen=True):
-    """Numbers of clients, topics and services at the hub."""
+    """Numbers of clients, topics and services of the hub."""
 
     clients: int
     topics: int
@@ -87,10 +87,10 @@ class HubStatus(msgspec.Struct, frozen=True):
 
 
 class ProcessStatus(msgspec.Struct, frozen=True, kw_only=True):
-    """A process. `why` says the cause while it is not ready, and its state when it is.
+    """A process. `why` gives the cause while it is not ready, and its state when it is.
 
-    `deployment` is the hash of the one in force, `generation` how often that has changed since the run began, and
-    `folder` where the master has read it.
+    `deployment` is the hash of the deployment in force, `generation` the number of changes since the start of
+    the run, and `folder` the folder from which the master has read it.
     """
 
     ready: bool
@@ -111,11 +111,11 @@ class ProcessStatus(msgspec.Struct, frozen=True, kw_only=True):
 
 Reason = TypeVar("Reason", bound=str)
 GetStatus = Callable[[], ProcessStatus]
-"""Returns what a process knows; its identity and its rate are filled in here."""
+"""Function that returns the status of a process; identity and rate are added here."""
 
 
 def seconds_since(tick: int) -> float | None:
-    """Return the age of a monotonic time in ns; None for 0, which means never."""
+    """Return the age in seconds of a monotonic time in ns; None for 0, which means never."""
     return (time.monotonic_ns() - tick) / 1e9 if tick else None
 
 
@@ -125,7 +125,7 @@ def connections(rosbridges: Mapping[str, Ros]) -> list[ConnectionStatus]:
 
 
 def why_not_connected(rosbridges: Mapping[str, Ros]) -> str:
-    """Return the sentence for a process that waits for a rosbridge server; empty when all are connected."""
+    """Return the sentence for a process that waits for a rosbridge server; empty if all are connected."""
     if not rosbridges:
         return "waiting for the rosbridge server"
     for uri, ros in rosbridges.items():
@@ -141,7 +141,7 @@ def reasons(counts: Mapping[Reason, int]) -> dict[str, int]:
 
 
 class _Answerer:
-    """Makes the JSON object: what the process knows, its identity, and its rate from samples."""
+    """Source of the JSON object: status of the process, identity, and rate from samples."""
 
     def __init__(self, name: str, get_status: GetStatus) -> None:
         self._name = name
@@ -176,13 +176,13 @@ class _Answerer:
 def _check(directory: Path | None) -> None:
     if directory is not None and not directory.is_dir():
         raise SettingsError(
-            f"BM_RUN_DIRECTORY: {directory} is not a folder; make it, or name one that exists"
+            f"BM_RUN_DIRECTORY: {directory} is not a folder; create it, or name an existing one"
         )
 
 
 @contextlib.asynccontextmanager
 async def status_served(directory: Path | None, name: str, get_status: GetStatus) -> AsyncIterator[None]:
-    """Answer in the running loop while the context lasts; nothing happens without a directory, which must exist."""
+    """Answer in the running loop within the context; do nothing without a directory, which must exist."""
     _check(directory)
     answerer = _Answerer(name, get_status)
     async with health_served(directory, name, answerer.answer, answerer.sample):
@@ -191,7 +191,7 @@ async def status_served(directory: Path | None, name: str, get_status: GetStatus
 
 @contextlib.contextmanager
 def status_thread(directory: Path | None, name: str, get_status: GetStatus) -> Iterator[None]:
-    """Answer from a thread while the context lasts, for a process with one blocking thread."""
+    """Answer from a thread within the context, for a process with one blocking thread."""
     _check(directory)
     answerer = _Answerer(name, get_status)
     try:

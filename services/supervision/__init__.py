@@ -1,1 +1,1 @@
-"""Processes of a run: started together, watched, and ended together, however the run ends."""
+"""Supervision of processes: starting, monitoring and stopping them together."""

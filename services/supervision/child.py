@@ -1,4 +1,4 @@
-"""Child processes: started, watched, restarted, and ended together."""
+"""Child processes: starting, monitoring, restarting and stopping."""
 
 import asyncio
 import contextlib
@@ -28,7 +28,7 @@ _KEPT_ERRORS = 20
 
 
 def own_command(name: str) -> list[str]:
-    """Return how to start one of our commands in this same environment; a path stands for itself."""
+    """Return the command line of one of our commands in this environment; a path is used unchanged."""
     if "/" in name:
         return [name]
     beside = Path(sys.executable).with_name(name)
@@ -36,7 +36,7 @@ def own_command(name: str) -> list[str]:
 
 
 def how_it_ended(code: int | None) -> str:
-    """Return a process's exit code in words: the signal that killed it, or the code itself."""
+    """Return a text for an exit code: the signal that killed the process, or the code itself."""
     if code is not None and code < 0:
         try:
             return f"was killed by {signal.Signals(-code).name}"
@@ -46,7 +46,7 @@ def how_it_ended(code: int | None) -> str:
 
 
 class Child:
-    """A process that belongs to this one. Its errors (lines `error: ...`) are kept, other lines are passed on."""
+    """A child process. Its errors (lines `error: ...`) are stored, and other lines are forwarded."""
 
     def __init__(self, name: str, command: list[str], *, directory: Path | None = None) -> None:
         self.name = name
@@ -60,7 +60,7 @@ class Child:
         self.restarts = 0
 
     async def start(self) -> None:
-        """Start the process, in a session of its own so that a terminal's Ctrl-C reaches the parent alone.
+        """Start the process in its own session, so that Ctrl-C in a terminal reaches only the parent.
 
         Raises:
             StackError: The command is not installed.
@@ -72,7 +72,7 @@ class Child:
                 environment[RUN_DIRECTORY_VARIABLE] = str(self._directory)
         self.close()
         self._errors.clear()
-        # a pipe of our own, because processes forked by the child may hold it open beyond the child's end
+        # our own pipe, because processes forked by the child may keep it open after its exit
         self._stderr, write_end = os.pipe()
         os.set_blocking(self._stderr, False)
         try:
@@ -94,7 +94,7 @@ class Child:
 
     @property
     def pid(self) -> int:
-        """The process number; 0 before the first start."""
+        """The process id; 0 before the first start."""
         return self._process.pid if self._process else 0
 
     @property
@@ -108,7 +108,7 @@ class Child:
         return self._process is not None and self._process.returncode is None
 
     def give(self, flag: str, value: str | None = None) -> None:
-        """Start the process with another value of a flag from now on, or with a flag that takes none."""
+        """From now on, start the process with another value of a flag, or with a flag without a value."""
         if flag not in self._command:
             self._command = [*self._command, flag, *([] if value is None else [value])]
         elif value is not None:
@@ -116,31 +116,31 @@ class Child:
             self._command = [*self._command[:at], value, *self._command[at + 1 :]]
 
     async def ended(self) -> None:
-        """Wait until the process has ended; its lines are passed on by then."""
+        """Wait until the process has exited and its lines have been forwarded."""
         if self._process is not None:
             await self._process.wait()
             self._relay()
 
     def failure(self) -> StackError:
-        """Return the end of the process as an error, with its own sentence and exit code where it left them."""
+        """Return the exit of the process as an error, with its own sentence and exit code if it gave any."""
         code = self.exit_code
         if self._errors:
             return ReportedError(code if code and code > 0 else ExitCode.CHILD, self._errors[-1])
         return ReportedError(ExitCode.CHILD, f"{self.name} {how_it_ended(code)}")
 
     def may_restart(self) -> bool:
-        """Count a restart; return whether there were few enough within the last minute."""
+        """Count a restart; return whether the limit per minute permits it."""
         now = time.monotonic()
         self.restarts += 1
         self._restarts.append(now)
         return sum(1 for at in self._restarts if now - at <= RESTARTS_WITHIN) <= RESTARTS
 
     def terminate(self) -> None:
-        """Ask the process to end."""
+        """Send SIGTERM to the process."""
         self._send(signal.SIGTERM)
 
     def kill(self) -> None:
-        """Have the kernel end the process."""
+        """Kill the process."""
         self._send(signal.SIGKILL)
 
     def _send(self, number: signal.Signals) -> None:
@@ -149,14 +149,14 @@ class Child:
                 self._process.send_signal(number)
 
     def close(self) -> None:
-        """Stop reading the standard error of a process that has ended."""
+        """Stop reading the standard error of an exited process."""
         if self._stderr is not None:
             asyncio.get_running_loop().remove_reader(self._stderr)
             os.close(self._stderr)
             self._stderr, self._pending = None, b""
 
     def _relay(self) -> None:
-        """Pass on the lines that have come, but keep the sentences of errors."""
+        """Forward the received lines, but store the sentences of errors."""
         while self._stderr is not None:
             try:
                 data = os.read(self._stderr, 1 << 16)
@@ -181,10 +181,10 @@ class Child:
 
 
 async def end_all(children: Iterable[Child], stop_timeout: float) -> list[str]:
-    """End children within `stop_timeout` seconds, the stubborn ones by SIGKILL.
+    """Stop children within `stop_timeout` seconds, and kill those that are left.
 
     Returns:
-        The names of those that had to be killed.
+        The names of the killed ones.
     """
     children = list(children)
     running = [child for child in children if child.is_running]

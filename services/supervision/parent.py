@@ -1,4 +1,4 @@
-"""The end of a child: with its parent, however that ends, and without leaving files behind."""
+"""Exit of a child together with its parent, without leaving files behind."""
 
 import atexit
 import contextlib
@@ -14,7 +14,7 @@ from terminal.ending import PARENT_VARIABLE
 from terminal.signals import stopped_by
 
 DIRECTORY_VARIABLE = "ROSBAYES_DIRECTORY"
-"""Environment variable with the run's private directory, which the last process to end removes."""
+"""Environment variable with the private directory of the run, which the last process to exit removes."""
 
 _PR_SET_PDEATHSIG = 1
 _DYING_TIME = 5.0
@@ -22,14 +22,14 @@ _DYING_TIME = 5.0
 
 
 def ask_for_end_with_parent() -> None:
-    """Have the kernel send this process SIGTERM when its parent ends; an exec does not undo it."""
+    """Make the kernel send SIGTERM to this process when its parent exits; this survives an exec."""
     ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
 
 
 def end_with_parent() -> None:
-    """In a child: end when the parent ends, even by SIGKILL, and remove the run's directory at the end.
+    """In a child: exit with the parent, even after SIGKILL, and then remove the run directory.
 
-    Do nothing in a process that has no parent of ours.
+    Does nothing in a process without a rosbayes parent.
 
     Raises:
         StoppedError: The parent has already ended.
@@ -39,15 +39,16 @@ def end_with_parent() -> None:
         return
     atexit.register(leave_private_directory)
     ask_for_end_with_parent()
-    # the parent may have ended before the kernel was asked
+    # the parent may have exited before the request to the kernel
     if os.getppid() != int(parent):
         raise stopped_by(signal.SIGTERM)
 
 
 def leave_private_directory() -> None:
-    """In a child that ends: remove the run's private directory if its master is gone, or if it is empty.
+    """In an exiting child: remove the private directory if its master is gone, or if it is empty.
 
-    Every child does so, and the last one finds no sockets of others. Do nothing in a process that has no parent of ours.
+    Every child does so, and the last one finds no sockets of others. Does nothing in a process without a
+    rosbayes parent.
     """
     name = os.environ.get(DIRECTORY_VARIABLE)
     if not name:
@@ -65,7 +66,7 @@ def leave_private_directory() -> None:
 
 
 def _is_dying(process: str) -> bool:
-    """Return whether a killed process still has threads: until they end it keeps its locks and sockets."""
+    """Return whether a killed process still has threads, until whose end it keeps its locks and sockets."""
     try:
         zombie = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
         return zombie and len(list(Path(f"/proc/{process}/task").iterdir())) > 1

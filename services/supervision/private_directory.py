@@ -17,7 +17,7 @@ CONTROL_SUFFIX = ".control.sock"
 
 DIRECTORY_PREFIX = "rosbayes-"
 COPY_PREFIX = "deployment-"
-"""Start of the names of the folders that hold copies of deployments (`services.master.new_deployment`)."""
+"""Prefix of the folders with copies of deployments (`services.master.new_deployment`)."""
 
 _DIRECTORY_NAME = re.compile(DIRECTORY_PREFIX + "[a-z0-9_]{8}")
 _COPY_NAME = re.compile(COPY_PREFIX + "[0-9]+")
@@ -25,17 +25,18 @@ _MOST_ORPHANS = 100
 
 
 class PrivateDirectory:
-    """A directory that only this user can enter, and that stays locked as long as its master lives.
+    """A directory that only this user can enter, and that remains locked while its master is alive.
 
-    The kernel releases the lock when the master ends, even by SIGKILL, so that other processes recognise an orphan.
+    The kernel releases the lock when the master exits, even by SIGKILL, so other processes can recognise an
+    orphan.
     """
 
     def __init__(self) -> None:
-        """Make and lock a directory, after removing those that killed masters left; a StackError if there is no place."""
+        """Create and lock a directory, after removing orphans; a StackError if that is impossible."""
         remove_orphans()
         while True:
             self.path = make_private_directory()
-            # until it is locked, another master that starts may take it for an orphan
+            # before it is locked, another starting master may consider it an orphan
             with contextlib.suppress(FileNotFoundError):
                 self._lock = os.open(self.path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
                 fcntl.flock(self._lock, fcntl.LOCK_EX)
@@ -50,28 +51,28 @@ class PrivateDirectory:
 
 
 def _parent() -> Path:
-    """Return the folder in which this user's runs have their private directories."""
+    """Return the folder of the private directories of this user's runs."""
     runtime = os.environ.get("XDG_RUNTIME_DIR", "")
-    # its specification has relative paths ignored; a long one leaves no room for the names of sockets
+    # the specification requires ignoring relative paths; a long path leaves no room for socket names
     usable = Path(runtime).is_absolute() and len(os.fsencode(runtime)) < 40
     return Path(runtime if usable and os.access(f"{runtime}/.", os.W_OK | os.X_OK) else tempfile.gettempdir())
 
 
 def make_private_directory() -> Path:
-    """Make a directory that only this user can enter (0700); a StackError if there is no place for it."""
+    """Create a directory that only this user can enter (0700), or raise a StackError."""
     try:
         return Path(tempfile.mkdtemp(prefix=DIRECTORY_PREFIX, dir=_parent()))
     except OSError as error:
         raise StackError(
-            f"can't make a private directory for the local sockets: {error.strerror or error}; set TMPDIR to a writable folder"
+            f"can't create a private directory for the local sockets: {error.strerror or error}; set TMPDIR to a writable folder"
         ) from error
 
 
 def remove_orphans() -> None:
     """Remove private directories orphaned by killed masters.
 
-    An orphan has the right name, belongs to this user alone, is locked by no master, and holds nothing but sockets and
-    copies of deployments. Links are not followed.
+    An orphan has the right name, belongs only to this user, is not locked by a master, and contains only
+    sockets and copies of deployments. Links are not followed.
     """
     with contextlib.suppress(OSError):
         found = [each for each in _parent().iterdir() if _DIRECTORY_NAME.fullmatch(each.name)]
@@ -103,7 +104,7 @@ def _remove_if_orphaned(directory: Path) -> None:
 
 
 def has_master(directory: Path) -> bool:
-    """Return whether the master of a private directory lives, or the directory is gone."""
+    """Return whether the master of a private directory is alive, or the directory is gone."""
     try:
         handle = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     except OSError:
