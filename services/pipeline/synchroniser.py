@@ -62,7 +62,8 @@ class _Topic(Generic[Item]):
         """Return whether the next message may be within `reach` of a stamp, according to the period."""
         if self.newest is None:
             return True
-        return self.newest < stamp and self.newest + (self.period or 0) < stamp + reach
+        # the shortest interval: lost messages make the others longer
+        return self.newest < stamp and self.newest + min(self.intervals, default=0) < stamp + reach
 
 
 class Synchroniser(Generic[Item]):
