@@ -93,6 +93,10 @@ class Ros:
         """Number of completed reconnections."""
         return self._session.reconnections
 
+    def reconnect_now(self) -> None:
+        """Try at once to reach a server that is away, for example because another program has reached it."""
+        self._session.reconnect_now()
+
     @property
     def last_error(self) -> str:
         """Reason of the lost connection, or of the last failed attempt to reconnect; empty if there is none."""

@@ -37,7 +37,7 @@ from bridge.errors import (
 
 FIRST_DELAY: Final = 0.1
 """First and maximum delay in seconds before an attempt to reconnect."""
-MAX_DELAY: Final = 5.0
+MAX_DELAY: Final = 2.0
 ATTEMPT_TIMEOUT: Final = 5.0
 """Timeout in seconds of one attempt to reconnect."""
 STEADY: Final = 5.0
@@ -165,6 +165,7 @@ class Session:
         self._connected_at = 0.0
         self._delay = FIRST_DELAY
         self._reconnecting: asyncio.Task[None] | None = None  # the last one, done or not
+        self._pause: asyncio.Future[None] | None = None
         self._retry_timer: asyncio.TimerHandle | None = None
         self._next_look = SILENCE
         self._looking: asyncio.Task[None] | None = None
@@ -252,10 +253,20 @@ class Session:
         self._reconnecting = asyncio.get_running_loop().create_task(self._reconnect())
         self._set_state(State.RECONNECTING, reason)
 
+    def reconnect_now(self) -> None:
+        """Do not wait before the next attempt to reconnect, if the connection is lost."""
+        self._delay = FIRST_DELAY
+        if self._pause is not None:
+            self._pause.cancel()
+
     async def _reconnect(self) -> None:
         while True:
             # Up to a fifth earlier, so that the clients of a server do not all reconnect at once.
-            await asyncio.sleep(self._delay * random.uniform(0.8, 1.0))
+            self._pause = asyncio.ensure_future(asyncio.sleep(self._delay * random.uniform(0.8, 1.0)))
+            try:
+                await asyncio.wait([self._pause])
+            finally:
+                self._pause.cancel()
             self._delay = min(2 * self._delay, MAX_DELAY)
             try:
                 await self._connect(min(self._limits.connect_timeout, ATTEMPT_TIMEOUT))

@@ -237,6 +237,9 @@ class FrameFlow:
         self._received += 1
         self._losses[LossReason.PASSED_OVER] += reading.passed_over
         self._losses[LossReason.UNPAIRED] += reading.unpaired
+        if self._peers.publisher.away and not self._once:
+            self._losses[LossReason.ROSBRIDGE_AWAY] += 1  # nobody could get its result
+            return
         waiting = WaitingReading(reading, time.monotonic_ns())
         ahead = reading.generation - self._in_force.generation
         readings = {0: self._readings, 1: self._next_readings}.get(ahead)

@@ -34,6 +34,7 @@ from services.sockets.records import (
     NotReloaded,
     Prepared,
     Ready,
+    Rosbridge,
     Switched,
     Trouble,
 )
@@ -75,6 +76,8 @@ class Peer:
         self.protocol: RecordProtocol | FusedEnd | None = None
         self.greeted = False
         self.ready = False
+        self.away = False
+        """Whether it has lost its rosbridge servers."""
         self.closed = asyncio.Event()
         self.reason: Exception | None = None
         self.since = 0.0
@@ -338,7 +341,7 @@ class Peers:
             await self._connect(peer, max(limit, self._settings.peer_timeout))
             first = False
             await self._watch(peer)
-            peer.protocol, peer.ready, peer.outdated = None, False, False
+            peer.protocol, peer.ready, peer.outdated, peer.away = None, False, False, False
             if peer.answer is not None and not peer.answer.done():
                 peer.answer.set_exception(NotReloadedError(f"{peer.role} ended meanwhile"))
             self._events.lost(peer)
@@ -475,6 +478,8 @@ class Peers:
             self._greet(peer, record)
         elif isinstance(record, Ready):
             self._ready(peer, record)
+        elif isinstance(record, Rosbridge):
+            self._rosbridge(peer, record)
         elif isinstance(record, Notice):
             (self._log.warning if record.level == "warning" else self._log.info)(record.sentence)
         elif isinstance(record, Prepared | Switched | NotReloaded):
@@ -508,6 +513,14 @@ class Peers:
             for each in self:
                 self._begin(each)
         self._events.ready(peer)
+
+    def _rosbridge(self, peer: Peer, record: Rosbridge) -> None:
+        peer.away = not record.connected
+        if record.connected:
+            for other in self:
+                if other is not peer and other.away and other.protocol is not None:
+                    other.protocol.send(record)
+            self._events.ready(peer)
 
     def _begin(self, peer: Peer) -> None:
         if peer is not self.app and peer.protocol is not None:

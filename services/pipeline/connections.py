@@ -2,7 +2,7 @@
 
 import asyncio
 import contextlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from typing import Any
 
@@ -49,6 +49,12 @@ async def connect_all(
                 )
             )
     return by_uri
+
+
+def reconnect_now(rosbridges: Mapping[str, Ros]) -> None:
+    """Try at once to reach the servers that are away: another service has reached one."""
+    for ros in rosbridges.values():
+        ros.reconnect_now()
 
 
 async def report_failure(link: Link, error: BaseException) -> None:

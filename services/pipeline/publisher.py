@@ -7,7 +7,7 @@ from collections import Counter
 from bridge.client import State
 from bridge.errors import BridgeError
 from posteriors.posterior import posterior_layout
-from services.pipeline.connections import report_failure
+from services.pipeline.connections import reconnect_now, report_failure
 from services.pipeline.generations import Generations
 from services.pipeline.result_topics import RESULTS_DEPTH, ROLE, ResultTopics
 from services.settings import Settings
@@ -20,6 +20,7 @@ from services.sockets.records import (
     Publish,
     Published,
     Ready,
+    Rosbridge,
     Switch,
 )
 from services.sockets.serving import MakeLink
@@ -93,6 +94,8 @@ class Publisher:
             except asyncio.QueueFull:
                 self._outcomes[Outcome.ROSBRIDGE_AWAY] += 1
                 self._link.send(Published(record.result.number, Outcome.ROSBRIDGE_AWAY, None, -1, 0.0, 0, 0))
+        elif isinstance(record, Rosbridge):
+            reconnect_now(self._topics.rosbridges)
         elif isinstance(record, Hello):
             self._generations.adopt(record)
             self._topics.use(self._generations.deployment, record.generation)
@@ -120,12 +123,14 @@ class Publisher:
             )
 
     def _state_changed(self, uri: str, state: State, reason: str) -> None:
-        if state is not State.RECONNECTING:
-            return
         topics, rosbridge = self._topics.served_by(uri)
-        self._link.notice(
-            "warning", f"{rosbridge} is gone ({reason}); results{topics} are lost until it is back"
-        )
+        if state is State.RECONNECTING:
+            sentence = f"{rosbridge} is gone ({reason}); results{topics} are lost until it is back"
+            self._link.notice("warning", sentence)
+        elif state is State.CONNECTED and self._where:
+            self._link.notice("info", f"{rosbridge} is back for results{topics}")
+        if self._where:
+            self._link.keep(Rosbridge(self._topics.is_connected))
 
     async def run(self) -> int:
         """Serve until a signal, or raise a BridgeError if a server is unreachable or not a rosbridge server."""

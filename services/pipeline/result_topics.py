@@ -107,6 +107,11 @@ class ResultTopics:
         return False
 
     @property
+    def is_connected(self) -> bool:
+        """Whether any server is connected."""
+        return bool(self._connected())
+
+    @property
     def must_wait(self) -> bool:
         """Whether no server is connected, or earlier messages still wait for one."""
         connected = self._connected()

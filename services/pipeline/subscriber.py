@@ -9,7 +9,7 @@ import msgspec
 from bridge.client import Message, Ros, State, Subscription
 from bridge.errors import BridgeError, NoMessageError
 from services.errors import RosbridgeLostError, VariableError
-from services.pipeline.connections import connect_all, report_failure
+from services.pipeline.connections import connect_all, reconnect_now, report_failure
 from services.pipeline.generations import Generations
 from services.pipeline.timed_frames import TimedFrames
 from services.settings import Settings
@@ -24,6 +24,7 @@ from services.sockets.records import (
     Prepare,
     Reading,
     Ready,
+    Rosbridge,
     Switch,
     Switched,
     Unusable,
@@ -110,6 +111,8 @@ class Subscriber:
         elif isinstance(record, Notice) and self._logs_frames:
             # the master numbers a frame when it is neither passed over nor unusable
             self._log.debug(record.sentence)
+        elif isinstance(record, Rosbridge):
+            reconnect_now(self._rosbridges)
         elif isinstance(record, Hello):
             self._generations.adopt(record)
         elif isinstance(record, Prepare):
@@ -158,6 +161,8 @@ class Subscriber:
         )
 
     def _state_changed(self, uri: str, state: State, reason: str) -> None:
+        if self._begun.is_set():
+            self._link.keep(Rosbridge(state is State.CONNECTED))
         if state is State.RECONNECTING:
             self._link.notice("warning", f"rosbridge at {uri} is gone ({reason}); waiting for it")
             if self._once and self._link.has_master and self._lost is not None and not self._lost.done():

@@ -78,6 +78,15 @@ class Ready(Record, tag="ready", frozen=True):
     sentence: str
 
 
+class Rosbridge(Record, tag="rosbridge", frozen=True):
+    """Subscriber or publisher to the master: whether it has a rosbridge server now.
+
+    The master passes the return of a server on to the other, which then does not wait to try again.
+    """
+
+    connected: bool
+
+
 class Notice(Record, tag="notice", frozen=True):
     """A service to the master: a message for the user; the run continues.
 
@@ -229,6 +238,7 @@ AnyRecord = (
     Hello
     | Begin
     | Ready
+    | Rosbridge
     | Notice
     | Trouble
     | Reading

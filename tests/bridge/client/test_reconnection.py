@@ -100,19 +100,19 @@ async def test_nothing_is_published_into_the_void(fake, ros):
     await fake.wait_for_op("publish", topic="/new")
 
 
-async def test_the_waits_double_up_to_five_seconds(delays):
-    assert (FIRST_DELAY, MAX_DELAY) == (0.1, 5.0)
+async def test_the_waits_double_up_to_two_seconds(delays):
+    assert (FIRST_DELAY, MAX_DELAY) == (0.1, 2.0)
     async with FakeRosbridge() as fake, connect(fake.uri) as ros:
         await fake.vanish()
         while len(delays) < 12:
             await asyncio.get_running_loop().run_in_executor(None, time.sleep, 0.01)
         for number, delay in enumerate(delays):
-            longest = min(0.1 * 2**number, 5.0)
+            longest = min(0.1 * 2**number, MAX_DELAY)
             assert 0.8 * longest <= delay <= longest
         assert "refused" in ros.last_error
 
 
-@pytest.mark.parametrize(("steady", "longest"), [(600.0, 3.2), (0.0, 0.1)])
+@pytest.mark.parametrize(("steady", "longest"), [(600.0, 2.0), (0.0, 0.1)])
 async def test_only_a_steady_connection_resets_the_back_off(fake, ros, delays, monkeypatch, steady, longest):
     monkeypatch.setattr("bridge.client.session.STEADY", steady)
     for number in range(6):

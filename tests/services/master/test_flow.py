@@ -25,6 +25,7 @@ from services.sockets.records import (
     Prepared,
     Publish,
     Published,
+    Rosbridge,
     Unusable,
 )
 from services.supervision.child import RESTARTS
@@ -101,6 +102,20 @@ async def test_frames_wait_for_a_publisher_that_does_not_answer(run):
     run.flow.ready(run.peers.app)
     assert len(run.app.frames) == MOST_AT_PUBLISHER + 2
     assert run.flow.in_flight == 1
+
+
+async def test_no_frame_is_computed_whose_result_nobody_could_get(run):
+    for service in (run.publisher, run.subscriber):
+        run.take(service, Rosbridge(connected=False))
+    run.read(3)
+    assert (run.app.frames, run.flow.in_flight) == ([], 0)
+    assert run.lost == {LossReason.ROSBRIDGE_AWAY: 3}
+    run.take(run.subscriber, Rosbridge(connected=True))
+    assert run.publisher.records == [Rosbridge(connected=True)]  # so that it tries at once
+    run.take(run.publisher, Rosbridge(connected=True))
+    assert run.subscriber.records == []
+    run.read(1)
+    assert run.app.frames == [1]
 
 
 async def test_frames_wait_for_peers_that_are_not_ready(run):

@@ -1,6 +1,7 @@
 """Results: in order, and to several servers, one of which may be away."""
 
 import asyncio
+import contextlib
 from contextlib import asynccontextmanager
 
 import numpy as np
@@ -11,7 +12,7 @@ from services.boards.frames import encode_boards
 from services.pipeline.publisher import Publisher
 from services.pipeline.result_topics import ResultTopics
 from services.settings import Settings
-from services.sockets.records import FrameResult, Outcome, Publish, Published
+from services.sockets.records import FrameResult, Notice, Outcome, Publish, Published, Ready, Rosbridge
 from tests.fake_rosbridge import FakeRosbridge
 from toolchain.deployment import Output
 
@@ -88,6 +89,26 @@ async def test_results_stay_in_order_while_the_queue_drains(boat, link):
     assert topics.published == [1, 2, 3, 4, 5]
     assert publisher.status().frames.completed == 5
     running.cancel()
+
+
+async def test_the_master_learns_that_no_server_is_there_and_that_one_is_back(boat, link):
+    async with FakeRosbridge() as fake:
+        publisher = Publisher(Settings(uri=fake.uri), boat, link.make)
+        running = asyncio.create_task(publisher.run())
+        while not any(isinstance(each, Ready) for each in link.sent):
+            await asyncio.sleep(0.01)
+        ros = publisher._topics.rosbridges[fake.uri]
+        ros._session._delay = 600.0  # unless the master says that one is back
+        await gone(publisher._topics, fake)
+        await fake.come_back()
+        assert [each.connected for each in link.sent if isinstance(each, Rosbridge)] == [False]
+        link.take(Rosbridge(connected=True))  # the subscriber has reached it
+        await ros.wait_for_state(State.CONNECTED, 30)
+        assert [each.connected for each in link.sent if isinstance(each, Rosbridge)] == [False, True]
+        assert [each.level for each in link.sent if isinstance(each, Notice)] == ["warning", "info"]
+        running.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await running
 
 
 async def test_results_go_on_where_a_server_is(boat):
