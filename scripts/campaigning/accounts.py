@@ -1,0 +1,83 @@
+"""Accounts: every reading that reached the stack has a result, or is in a counter with a reason."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+
+from scripts.campaigning.observer import Fault, Finding, Reading
+
+WITH_PUBLISHER = "lost with the publisher"
+"""These may have arrived: the publisher was killed before it could say so."""
+NOT_LOST = "on some topics only"
+
+
+@dataclass(frozen=True, slots=True)
+class Counters:
+    """The master's counters."""
+
+    received: int = 0
+    completed: int = 0
+    lost: Mapping[str, int] = field(default_factory=dict)
+
+    def since(self, former: Counters) -> Counters:
+        """Return what has been added since an earlier look at the same master."""
+        lost = {reason: count - former.lost.get(reason, 0) for reason, count in self.lost.items()}
+        return Counters(
+            self.received - former.received,
+            self.completed - former.completed,
+            {reason: count for reason, count in lost.items() if count},
+        )
+
+    @property
+    def losses(self) -> int:
+        """Readings without a result."""
+        return sum(count for reason, count in self.lost.items() if reason != NOT_LOST)
+
+
+@dataclass(frozen=True, slots=True)
+class Excuses:
+    """What a fault may lose where no counter of the stack can know of it.
+
+    Attributes:
+        readings: Readings on their way to the master (a killed subscriber or master, a cut connection).
+        results: Results on their way from the publisher.
+        since: When the fault began (seconds); readings from shortly before it on are excused.
+        until: When the stack had recovered.
+    """
+
+    readings: bool = False
+    results: bool = False
+    since: float = 0.0
+    until: float = 0.0
+
+
+IN_FLIGHT = 1.0
+"""Seconds that a reading may have been on its way when a fault began."""
+
+
+def judge(added: Counters, readings: Iterable[Reading], excuses: Excuses, now: float) -> list[Finding]:
+    """Compare what the master counted with the readings of the same time, when nothing is in flight."""
+    findings = []
+    given = [each for each in readings if each.forwarded]
+    arrived = sum(each.arrived is not None for each in given)
+    doubtful = added.lost.get(WITH_PUBLISHER, 0)
+    excusable = [
+        each
+        for each in given
+        if each.arrived is None and excuses.since - IN_FLIGHT <= each.published <= excuses.until
+    ]
+    figures = f"{len(given)} readings, {arrived} results; counted: {added}"
+    uncounted = len(given) - added.completed - added.losses
+    if uncounted > (len(excusable) if excuses.readings else 0):
+        findings.append(Finding(Fault.UNCOUNTED, f"{uncounted} readings: {figures}", now))
+    if uncounted < 0:
+        findings.append(Finding(Fault.MISCOUNTED, f"{-uncounted} too many: {figures}", now))
+    astray = added.completed - arrived
+    if astray > (len(excusable) if excuses.results else 0):
+        findings.append(
+            Finding(Fault.UNCOUNTED, f"{astray} results are counted as published: {figures}", now)
+        )
+    if -astray > doubtful:
+        findings.append(Finding(Fault.MISCOUNTED, f"{-astray} results nobody counted: {figures}", now))
+    return findings

@@ -1,0 +1,25 @@
+"""The campaign's model: a place on a line of 16, seen by two small sensors.
+
+Readings are addresses already (whole numbers from 0), so that the observer needs no code of the stack to know them.
+"""
+
+import numpy as np
+
+from toolchain.models import Known, Model, interval
+
+CELLS = 16
+VALUES = {"near": 7, "far": 5}
+
+
+def model(slope: float = 1.0) -> Model:
+    """Return the model; `slope` tells the tables of two deployments of the same shape apart."""
+    place = interval("x", 0.0, 16.0, cells=CELLS)
+    x = np.arange(CELLS)
+    known = []
+    for name, values in VALUES.items():
+        peak = np.arange(values)[:, np.newaxis] * (CELLS - 1) / (values - 1)
+        table = np.exp(-slope * np.abs(x - peak) / 4) + 0.01
+        known.append(
+            Known(name=name, table=table / table.sum(axis=0), on_missing="missing", on_range="clamp")
+        )
+    return Model(name=f"campaign{slope:g}", searched=(place,), known=tuple(known))

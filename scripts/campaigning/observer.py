@@ -1,0 +1,258 @@
+"""The observer, which judges each result of the stack. It shares no code with the services, and has no socket or clock.
+
+It is told which readings were published and which of them reached the stack, when a fault was on, and what arrived on
+`/bm/frame` and `/BMresults`. It says what was wrong; counters are judged when nothing is in flight (`accounts.py`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any
+
+from scripts.campaigning.expected import BANKS, BOARDS, LINES, Addresses, Outcome
+
+OLDEST = 5.0
+"""Seconds after which a result is too late, outside a fault."""
+SETTLING = 5.0
+"""Seconds that a fault may delay results beyond its end."""
+REMEMBERED = 2000
+"""Settled readings by which a repeated result is recognised."""
+LAYOUT = {"dim": [{"label": "x", "size": LINES, "stride": LINES}], "data_offset": 0}
+
+
+class Fault(StrEnum):
+    """A kind of wrong behaviour."""
+
+    MALFORMED = "malformed"
+    """The message does not have the form that the page about topics describes."""
+    WRONG = "wrong"
+    """The posterior is not the right one for its reading, or the report describes another frame."""
+    UNKNOWN = "unknown reading"
+    """The report names a reading that nobody has published."""
+    DUPLICATE = "duplicate"
+    OUT_OF_ORDER = "out of order"
+    LATE = "late"
+    UNREPORTED = "without a report"
+    """A result that no report announced."""
+    WITHOUT_RESULT = "announced only"
+    """A report that announced a result which did not follow, although nothing cut the connection."""
+    UNCOUNTED = "lost without being counted"
+    MISCOUNTED = "counted, but not lost"
+    SLOW = "slow recovery"
+    ENDED = "ended"
+    """A process ended that should not have."""
+    GROWTH = "growth"
+    """A process holds more and more memory or descriptors."""
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """Something wrong, and when (seconds of the campaign's clock)."""
+
+    fault: Fault
+    sentence: str
+    at: float
+
+
+@dataclass(slots=True)
+class Reading:
+    """A published reading: its place in the order, what it is, when it was published, and its result's arrival."""
+
+    index: int
+    addresses: Addresses | None
+    published: float
+    forwarded: bool = False
+    arrived: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class _Announced:
+    """What a report said about the result that follows it."""
+
+    stamp: int
+    number: int
+    outcome: Outcome | None
+    reading: Reading | None
+
+
+class Observer:
+    """Judges results in the order of their arrival.
+
+    Attributes:
+        findings: Everything wrong so far.
+        tally: Numbers of readings, results and unusable readings.
+    """
+
+    def __init__(self, expected: Callable[[str, Addresses, int], Outcome], deployment: str) -> None:
+        """Take the function that knows the right outcome of addresses on a bank by a deployment, and the first deployment."""
+        self._expected = expected
+        self._deployments = {0: {deployment}}
+        self._readings: dict[int, Reading] = {}
+        self._taken = 0
+        self._announced: _Announced | None = None
+        self._last_number = 0
+        self._last_index = -1
+        self._last_generation = 0
+        self._fault_since: float | None = None
+        self._fault_until = -math.inf
+        self.slowness = 1.0
+        self.findings: list[Finding] = []
+        self.tally: Counter[str] = Counter()
+
+    # --- told by the campaign ------------------------------------------------------------------
+
+    def published(self, stamp: int, addresses: Addresses | None, now: float) -> None:
+        """Take note of a reading, named by its stamp in ns; `addresses` is None for one that cannot be used."""
+        assert stamp not in self._readings
+        self._readings[stamp] = Reading(self.tally["readings"], addresses, now)
+        self.tally["readings"] += 1
+
+    def forwarded(self, stamp: int) -> None:
+        """Take note that a reading's bytes have all been given to the stack."""
+        if (reading := self._readings.get(stamp)) is not None:
+            reading.forwarded = True
+
+    def master_started(self, deployment: str) -> None:
+        """Take note of a new master: numbers and generations begin again."""
+        self._deployments = {0: {deployment}}
+        self._last_number = self._last_generation = 0
+        self._announced = None
+
+    def reloaded(self, generation: int, *deployments: str) -> None:
+        """Take note of the deployment of a generation; several if a fault has hidden which it is."""
+        self._deployments[generation] = set(deployments)
+
+    def fault(self, now: float) -> None:
+        """Take note of the beginning of a fault."""
+        self._fault_since = now
+
+    def calm(self, now: float) -> None:
+        """Take note of the end of a fault."""
+        self._fault_since, self._fault_until = None, now
+
+    def reconnected(self) -> None:
+        """Take note that messages to the observer itself may have been lost."""
+        self._announced = None
+
+    def seen(self, stamp: int) -> bool:
+        """Return whether the result of a reading has arrived."""
+        return stamp in self._readings and self._readings[stamp].arrived is not None
+
+    def take_readings(self) -> list[Reading]:
+        """Return the readings since the last call, and forget those of long ago."""
+        taken = [each for each in self._readings.values() if each.index >= self._taken]
+        self._taken = self.tally["readings"]
+        oldest = self._taken - len(taken) - REMEMBERED
+        self._readings = {stamp: each for stamp, each in self._readings.items() if each.index >= oldest}
+        return taken
+
+    # --- what arrived --------------------------------------------------------------------------
+
+    def report(self, message: Any, now: float) -> None:
+        """Judge a message of `/bm/frame`."""
+        if self._announced is not None and self._fault_since is None and now > self._fault_until + SETTLING:
+            self._find(Fault.WITHOUT_RESULT, f"frame {self._announced.number} has no result", now)
+        self._announced = None
+        try:
+            self._announced = self._read_report(message, now)
+        except (KeyError, TypeError, ValueError, IndexError) as error:
+            self._find(Fault.MALFORMED, f"/bm/frame: {error!r}", now)
+
+    def result(self, message: Any, now: float) -> None:
+        """Judge a message of `/BMresults`, which belongs to the report before it."""
+        self.tally["results"] += 1
+        announced, self._announced = self._announced, None
+        if announced is None:
+            self._find(Fault.UNREPORTED, "a result without a report", now)
+            return
+        try:
+            data = self._data(message)
+        except (KeyError, TypeError, ValueError) as error:
+            self._find(Fault.MALFORMED, f"/BMresults of frame {announced.number}: {error!r}", now)
+            return
+        if announced.outcome is not None and data != announced.outcome.posterior:
+            self._find(Fault.WRONG, f"posterior of frame {announced.number}: {data}", now)
+        if announced.reading is not None:
+            self._arrived(announced, announced.reading, now)
+
+    def _find(self, fault: Fault, sentence: str, now: float) -> None:
+        self.findings.append(Finding(fault, sentence, now))
+
+    def _arrived(self, announced: _Announced, reading: Reading, now: float) -> None:
+        if reading.arrived is not None:
+            self._find(Fault.DUPLICATE, f"frame {announced.number}: reading {reading.index} again", now)
+            return
+        reading.arrived = now
+        if reading.index <= self._last_index:
+            sentence = f"frame {announced.number}: reading {reading.index} after {self._last_index}"
+            self._find(Fault.OUT_OF_ORDER, sentence, now)
+        self._last_index = max(self._last_index, reading.index)
+        age = now - max(reading.published, self._fault_until)
+        if self._fault_since is None and age > OLDEST * self.slowness:
+            self._find(Fault.LATE, f"frame {announced.number}: {age:.1f} s after its reading", now)
+
+    def _data(self, message: Any) -> tuple[float, ...]:
+        layout = message["layout"]
+        if layout != LAYOUT:
+            raise ValueError(f"the layout is {layout}")
+        data = message["data"]
+        if len(data) != LINES or not all(type(each) in {float, int} for each in data):
+            raise ValueError(f"the data are {data}")
+        if not all(0.0 <= each <= 1.0 for each in data) or not math.isclose(math.fsum(data), 1.0):
+            raise ValueError(f"these are not probabilities: {data}")
+        return tuple(data)
+
+    def _read_report(self, message: Any, now: float) -> _Announced | None:
+        stamp = message["header"]["stamp"]
+        stamp_ns = (stamp.get("secs", 0) or stamp.get("sec", 0)) * 10**9
+        stamp_ns += stamp.get("nsecs", 0) or stamp.get("nanosec", 0)
+        first, *others = message["status"]
+        values = {pair["key"]: pair["value"] for pair in first["values"]}
+        number, generation = int(values["number"]), int(values["generation"])
+        if number <= self._last_number:
+            fault = Fault.DUPLICATE if number == self._last_number else Fault.OUT_OF_ORDER
+            self._find(fault, f"frame {number} after frame {self._last_number}", now)
+        self._last_number = max(number, self._last_number)
+        reading = self._readings.get(stamp_ns)
+        if reading is None or reading.addresses is None:
+            self._find(Fault.UNKNOWN, f"frame {number} names a reading of {stamp_ns} ns", now)
+            return _Announced(stamp_ns, number, None, None)
+        deployment = self._deployment(first["hardware_id"], generation, number, now)
+        outcome = self._expected(deployment, reading.addresses, number % BANKS)
+        if values["published"] != "true" or first["level"] != 0:
+            self._find(Fault.WRONG, f"frame {number} is said to have no posterior", now)
+            return None
+        said = [self._board(each) for each in others]
+        right = [(f"board{at}", b.cycles, b.total, b.reason) for at, b in enumerate(outcome.boards)]
+        whole = (max(b.cycles for b in outcome.boards), sum(b.total for b in outcome.boards))
+        if said != right or len(said) != BOARDS:
+            self._find(Fault.WRONG, f"frame {number}: boards {said}, expected {right}", now)
+        if (int(values["cycles"]), int(values["counts_total"])) != whole:
+            self._find(Fault.WRONG, f"frame {number}: its sums are not those of its boards", now)
+        return _Announced(stamp_ns, number, outcome, reading)
+
+    def _deployment(self, said: str, generation: int, number: int, now: float) -> str:
+        known = self._deployments.get(generation)
+        if generation < self._last_generation:
+            self._find(Fault.OUT_OF_ORDER, f"frame {number} is of the former generation {generation}", now)
+        self._last_generation = max(generation, self._last_generation)
+        if known is None:
+            self._deployments[generation] = known = {said}
+        if said not in known:
+            self._find(
+                Fault.WRONG, f"frame {number} of generation {generation}: {said}, expected {known}", now
+            )
+            return min(known)
+        self._deployments[generation] = {said}
+        return said
+
+    @staticmethod
+    def _board(status: Any) -> tuple[str, int, int, str]:
+        values = {pair["key"]: pair["value"] for pair in status["values"]}
+        if values["reason"] != status["message"]:
+            raise ValueError(f"reason {values['reason']} and message {status['message']}")
+        return status["hardware_id"], int(values["cycles"]), int(values["counts_total"]), values["reason"]
