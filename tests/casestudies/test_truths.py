@@ -48,27 +48,17 @@ def test_frames_without_a_posterior_have_a_truth_too(frames, without):
     assert [i.posterior is None for i in heard] == [n in without for n in range(1, frames + 1)]
 
 
-def test_a_late_truth_is_waited_for():
+def test_a_late_truth_is_waited_for_until_a_newer_one_or_the_next_frame_comes():
     truths = Truths()
     truths.add_truth(truth(1))
     assert truths.add_frame(frame(2)) == []
     assert truths.waits
     assert told(truths.add_truth(truth(2))) == [(2, 2)]
-
-
-def test_a_newer_truth_ends_the_waiting():
-    truths = Truths()
-    truths.add_truth(truth(1))
-    truths.add_frame(frame(2))
-    assert told(truths.add_truth(truth(3))) == [(2, None)]
-
-
-def test_the_next_frame_ends_the_waiting():
-    truths = Truths()
-    truths.add_truth(truth(1))
-    truths.add_frame(frame(2))
-    assert told(truths.add_frame(frame(3))) == [(2, None)]
-    assert told(truths.flush()) == [(3, None)]
+    truths.add_frame(frame(3))
+    assert told(truths.add_truth(truth(4))) == [(3, None)]
+    truths.add_frame(frame(5))
+    assert told(truths.add_frame(frame(6))) == [(5, None)]
+    assert told(truths.flush()) == [(6, None)]
     assert truths.flush() == []
 
 
@@ -79,20 +69,14 @@ def test_a_result_without_a_report_has_no_truth():
     assert instance.truth is None
 
 
-def test_an_older_truth_serves_within_the_tolerance():
-    truths = Truths(tolerance_ns=50)
+@pytest.mark.parametrize(("tolerance_ns", "served"), [(50, True), (39, False)])
+def test_an_older_truth_serves_within_the_tolerance(tolerance_ns, served):
+    truths = Truths(tolerance_ns=tolerance_ns)
     truths.add_truth(truth(1, stamp=960))
     truths.add_frame(frame(1, stamp=1000))
     (instance,) = truths.add_truth(truth(2, stamp=1030))
-    assert told([instance]) == [(1, 1)]
-    assert instance.truth_age_ns == 40
-
-
-def test_a_truth_older_than_the_tolerance_does_not_serve():
-    truths = Truths(tolerance_ns=39)
-    truths.add_truth(truth(1, stamp=960))
-    truths.add_frame(frame(1, stamp=1000))
-    assert told(truths.add_truth(truth(2, stamp=1030))) == [(1, None)]
+    assert told([instance]) == [(1, 1 if served else None)]
+    assert instance.truth_age_ns == (40 if served else 0)
 
 
 def test_memory_is_bounded():

@@ -104,14 +104,10 @@ class TestFarApart:
         chosen = far_apart([*middle, *corners])
         assert [i.report.number for i in chosen] == [0, 20, 21, 22]
 
-    def test_those_with_a_truth_first(self):
-        assert [i.report.number for i in far_apart([instance(1, truth=False), instance(2)])] == [2]
-
-    def test_without_any_truth_they_are_spread_over_time(self):
-        chosen = far_apart([instance(n, truth=False) for n in range(10)])
-        assert [i.report.number for i in chosen][::3] == [0, 9]
-
-    def test_frames_without_a_posterior_are_not_chosen(self):
+    def test_frames_without_a_truth_are_spread_over_time_and_those_without_a_posterior_not_chosen(self):
+        blind = [instance(n, truth=False) for n in range(10)]
+        assert [i.report.number for i in far_apart([*blind, instance(10)])] == [10]
+        assert [i.report.number for i in far_apart(blind)][::3] == [0, 9]
         assert far_apart([Instance(heard=FrameReport(stamp_ns=1, heard_ns=1, outcome=""))]) == ()
 
     def test_equal_places_are_not_chosen_twice(self):
