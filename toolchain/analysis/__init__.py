@@ -1,1 +1,1 @@
-"""Predictions for a machine before it is built: accuracy, cycles, resources, energy, and sweeps over many."""
+"""Predictions for machines before they are built: accuracy, cycles, resources, energy, and sweeps."""

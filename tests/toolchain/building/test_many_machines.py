@@ -311,7 +311,7 @@ def test_a_device_gets_as_many_boards_as_the_register_map_needs():
     parameters = replace(parameters, replicas=200, prob_bits=2, counter_bits=2)
     count, why = boards_needed(parameters, device)
     assert count == 2
-    assert "room for 20 lines a board" in why
+    assert " 20 lines " in why
     with pytest.raises(BuildError, match="not even one line of 256 replicas fits the register map"):
         boards_needed(replace(parameters, replicas=256, sensor_bits=(3,) * 40), device)
 

@@ -1,1 +1,1 @@
-"""Exact and statistical measurement of a machine's posteriors on readings."""
+"""Measurement of the accuracy of a machine's posteriors on readings."""

@@ -1,4 +1,4 @@
-"""Emulation of a deployment's boards in this process, stopped as the host stops them."""
+"""Emulation of a deployment's boards in this process, with the host's stop rule."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -15,7 +15,7 @@ from toolchain.deployment import Stop
 from toolchain.errors import BuildError
 
 Inputs: TypeAlias = "tuple[int, ...] | NDArray[np.int64]"
-"""Inputs of a frame: an address per column, or int64[sensors, all lines] where lines have readings of their own."""
+"""Inputs of a frame: an address per column, or int64[sensors, all lines] if lines have their own readings."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -28,17 +28,17 @@ class FrameRun:
 
     @property
     def length(self) -> int:
-        """Cycles of the frame: those of the board that ran longest."""
+        """Cycles of the longest-running board."""
         return max(self.cycles)
 
     @property
     def posterior(self) -> NDArray[np.float64] | None:
-        """float64[all lines] with the sum 1, or None where nothing was counted."""
+        """float64[all lines] with the sum 1, or None if all counts are 0."""
         return joint_posterior(self.counts, self.cycles)
 
 
 class EmulatedBoards:
-    """Boards of one machine, its lines split over them; a BuildError if the target does not fit the counters."""
+    """Boards with the lines of one machine; a BuildError if the target does not fit the counters."""
 
     def __init__(
         self, machines: Sequence[BM1Machine], *, target_count: int, max_cycles: int, stop: Stop
@@ -55,7 +55,8 @@ class EmulatedBoards:
         self.target_count = target_count
         self.max_cycles = max_cycles
         self.stop = stop
-        # Counters that never stop a run of a given length; the target is what stops a frame, so its bits are the same.
+        # Counters that never stop a run of a given length. Frames are stopped by the target, so their results
+        # do not change.
         self._kernels = [make_kernel(_wide(machine)) for machine in machines]
 
     @property
@@ -69,7 +70,7 @@ class EmulatedBoards:
         return sum(machine.parameters.lines for machine in self.machines)
 
     def run(self, addresses: Inputs, prior_address: int, bank: int) -> FrameRun:
-        """Run a frame as the host does: in slices that end at 256 * 2^k until a board overflows, or each board alone."""
+        """Run a frame like the host: in slices of 256 * 2^k until a board overflows, or each board alone."""
         end = first_slice(self.target_count) if self.stop is Stop.SLICES else 0
         if end >= self.max_cycles:
             end = 0
@@ -91,7 +92,7 @@ class EmulatedBoards:
         return self._shown()
 
     def run_for(self, addresses: Inputs, prior_address: int, bank: int, cycles: int) -> FrameRun:
-        """Run every board that can count for this many cycles, whatever it counts."""
+        """Run every board that can count for this many cycles, regardless of its counts."""
         start = Start(
             addresses=(),
             prior_address=prior_address,
@@ -117,7 +118,7 @@ class EmulatedBoards:
 
 
 def inputs_of_boards(inputs: Inputs, machines: Sequence[BM1Machine]) -> list[Inputs]:
-    """Return each board's part of a frame's inputs: all of them, or those of its lines."""
+    """Return the inputs of a frame for each board: all of them, or those of its lines."""
     if isinstance(inputs, tuple):
         return [inputs] * len(machines)
     ends = np.cumsum([machine.parameters.lines for machine in machines]).tolist()
@@ -127,12 +128,12 @@ def inputs_of_boards(inputs: Inputs, machines: Sequence[BM1Machine]) -> list[Inp
 
 
 def one_replica(machine: BM1Machine) -> BM1Machine:
-    """Return one of a board's replicas as a machine by itself, which counts the same."""
+    """Return one replica of a board as a single machine, which has the same counts."""
     return replace(machine, parameters=replace(machine.parameters, replicas=1))
 
 
 def joined(machines: Sequence[BM1Machine]) -> BM1Machine:
-    """Return the whole machine that boards are parts of."""
+    """Return the whole machine of which the boards are parts."""
     first = machines[0]
     return BM1Machine(
         replace(first.parameters, lines=sum(machine.parameters.lines for machine in machines)),

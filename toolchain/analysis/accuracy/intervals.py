@@ -1,4 +1,4 @@
-"""Confidence intervals of figures over frames."""
+"""Confidence intervals of statistics over frames."""
 
 import math
 from collections.abc import Callable
@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 
 RESAMPLES: Final = 1000
 LEVEL: Final = 0.95
-"""Of every confidence interval."""
+"""Level of all confidence intervals."""
 
 _NORMAL_95: Final = 1.959964
 
 
 @dataclass(frozen=True, slots=True)
 class Interval:
-    """A figure and its 95 % confidence interval."""
+    """A value and its 95 % confidence interval."""
 
     value: float
     low: float
@@ -42,7 +42,7 @@ def bootstrap_rows(rows: NDArray[np.float64], statistic: Callable[[NDArray[np.fl
 
 
 def share_of_frames(share: float, frames: int) -> Interval:
-    """Return a share of frames with its Wilson interval, which also holds where all frames agree."""
+    """Return a share of frames with its Wilson interval, which is valid even if all frames agree."""
     square = _NORMAL_95**2 / frames
     middle = (share + square / 2) / (1 + square)
     half = _NORMAL_95 / (1 + square) * math.sqrt(share * (1 - share) / frames + square / (4 * frames))

@@ -1,8 +1,8 @@
-"""Accuracy of a machine's posteriors against exact inference, with the loss by quantising apart.
+"""Accuracy of a machine's posteriors compared with exact inference, separating the quantisation loss.
 
-Three posteriors of each frame are compared: of the model (float64), of the codes (float64 on what quantising left),
-and of the machine (counts). The codes against the model show the loss by quantising, the machine against its codes the loss by
-sampling.
+Three posteriors of each frame are compared: of the model (float64), of the codes (float64), and of the
+machine (counts). Codes compared with the model show the quantisation loss, the machine compared with its
+codes the sampling loss.
 """
 
 import math
@@ -24,7 +24,7 @@ from toolchain.models.fusion import exact_posterior, fuse
 from toolchain.models.model import Model
 
 EXPECTED_COUNT: Final = 5.0
-"""z-scores are taken of lines that are expected to count at least so often: below, a count is not near normal."""
+"""Minimum expected count of lines with z-scores, because lower counts are not approximately normal."""
 
 _TIE: Final = 1e-9
 
@@ -35,7 +35,7 @@ class Difference:
 
     Attributes:
         total_variation: Half the sum of absolute differences, 0 to 1.
-        kl_bits: KL(ours || theirs) in bits. (The other way round it is infinite wherever a count is 0.)
+        kl_bits: KL(ours || theirs) in bits. (KL(theirs || ours) is infinite if a count is 0.)
         map_agreement: Share of frames in which the most probable line is the same.
     """
 
@@ -46,15 +46,15 @@ class Difference:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ZScores:
-    """Counts of runs of a fixed length against equation 2.1: (n - c p) / sqrt(c p (1 - p)).
+    """Counts of runs of a fixed length compared with equation 2.1: (n - c p) / sqrt(c p (1 - p)).
 
     Attributes:
         cycles: The length c.
         counts: Number of counts.
-        draws: Independent draws of random numbers behind the counts, on which the intervals rest: the banks.
-        rms: Root mean square: 1 for independent bits, 1.6 where the variance is 2.6 times as large.
-        mean: 0 where they are unbiased.
-        beyond_three: Share beyond 3 either way; 0.0027 of normal ones.
+        draws: Number of independent draws of random numbers for the intervals: the banks.
+        rms: Root mean square: 1 for independent bits, 1.6 if the variance is 2.6 times as large.
+        mean: 0 if the counts are unbiased.
+        beyond_three: Share beyond -3 or 3; 0.0027 for a normal distribution.
     """
 
     cycles: int
@@ -67,7 +67,7 @@ class ZScores:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Cycles:
-    """Cycles of the board that runs longest, over frames and banks."""
+    """Cycles of the longest-running board, over frames and banks."""
 
     median: Interval
     percentile_95: Interval
@@ -80,15 +80,15 @@ class Accuracy:
 
     Attributes:
         frames: Number of frames.
-        posteriors: Number of posteriors: one a frame, or one for each replica of a frame.
-        banks: Sets of seeds that each was run with.
+        posteriors: Number of posteriors: one per frame, or one per replica of a frame.
+        banks: Number of seed sets with which each was run.
         impossible: Share of posteriors for which no line can count, although the model has one (or always, without a model).
-        without: Share of runs without a posterior, also where nothing was counted in time.
-        overflow: Share of runs that a full counter ended.
+        without: Share of runs without a posterior, including those whose counts remained 0.
+        overflow: Share of runs that ended with an overflow.
         machine: The machine against the model; None without a model.
         quantising: Exact inference on the codes against the model; None without a model.
         sampling: The machine against exact inference on its codes.
-        z: Counts against equation 2.1; None where no line counts often enough.
+        z: Counts compared with equation 2.1; None if no line counts often enough.
         cycles: Cycles of a frame.
     """
 
@@ -138,9 +138,10 @@ def measure(
 ) -> Accuracy:
     """Run a machine on readings and compare its posteriors with exact inference.
 
-    A replica counts to the bit what a machine by itself counts with the same bank, so one machine is run for all of them:
-    so many of the readings, one after the other, are one frame, which ends with the last of them. Without a `model` only
-    the codes are known; readings that are impossible in it are left out. `advance` is called after every reading.
+    A replica has the same counts as a single machine with the same bank, so one machine is run for all of
+    them: successive readings, one per replica, form a frame, which ends with the last of them. Without a
+    `model`, only the codes are known. Readings that are impossible in the model are omitted. `advance` is
+    called after every reading.
 
     Raises:
         BuildError: Fewer readings than replicas.
@@ -148,7 +149,7 @@ def measure(
     """
     if len(readings) < replicas:
         raise BuildError(
-            f"a frame of {replicas} replicas takes {replicas} readings, and there are {len(readings)} ({readings.source})"
+            f"a frame of {replicas} replicas needs {replicas} readings, but there are {len(readings)} ({readings.source})"
         )
     parameters = boards.parameters
     banks = max(1, min(banks, parameters.rng_banks if parameters.rng_reset is RngReset.BANK else banks))
@@ -171,7 +172,7 @@ def measure(
 
 @dataclass(slots=True)
 class _Results:
-    """Results of the readings that were run so far; `lengths` are by frame, and in it by replica."""
+    """Results of the readings so far; `lengths` by frame and replica."""
 
     boards: EmulatedBoards
     readings: Readings
@@ -188,7 +189,7 @@ class _Results:
     overflow: int = 0
 
     def add(self, place: int, frame: int, exact: NDArray[np.float64] | None) -> None:
-        """Run the reading at a place with every bank; `exact` is the model's posterior, where there is a model."""
+        """Run the reading at an index with every bank; `exact` is the posterior of the model, if any."""
         boards, banks = self.boards, self.banks
         inputs, prior_row = self.readings.of_machine(place, boards.machines[0])
         likelihood = np.concatenate(
@@ -219,7 +220,7 @@ class _Results:
 
     def summary(self) -> Accuracy:
         lengths = np.array([np.max(each, axis=0) for each in self.lengths.values()])
-        # a count's z-score is taken from the cycles of single replicas
+        # the z-score of a count uses the cycles of single replicas
         by_themselves = np.array([length for each in self.lengths.values() for length in each])
         runs = self.posteriors * self.banks
         z = None
@@ -274,7 +275,7 @@ def _z_scores(
     weights: list[NDArray[np.float64]],
     cycles: int,
 ) -> ZScores | None:
-    # Frames with the same bank share all random numbers: a bank is one draw, however many frames use it.
+    # Frames with the same bank share all random numbers, so a bank is one draw for all of them.
     free = boards.parameters.rng_reset is RngReset.FREE
     drawn: dict[int, NDArray[np.float64]] = {}
     beyond = 0

@@ -21,7 +21,7 @@ from toolchain.models.model import Known, Model, PriorSelect
 
 MISSING: Final = -1
 MOST_FRAMES: Final = 100_000
-"""All frames are in memory at once, each with a row of every column's table."""
+"""Maximum number of frames, because all are in memory with a row of every column's table."""
 
 _WEIGHT_STEPS: Final = 500
 
@@ -32,12 +32,12 @@ class Readings:
 
     Attributes:
         source: Their origin, a clause.
-        addresses: int64[frames, sensors], in the columns' order; `MISSING` for a missing reading. Where lines have
-            readings of their own int64[frames, sensors, lines].
-        prior_addresses: int64[frames], the row of the prior; `MISSING` where none is selected.
+        addresses: int64[frames, sensors], in the order of the columns; `MISSING` for a missing reading. If
+            lines have their own readings, int64[frames, sensors, lines].
+        prior_addresses: int64[frames], the row of the prior; `MISSING` if none is selected.
         codes: uint16[frames, sensors, lines], the codes of these readings' likelihoods, for a machine with
             `sensor_mode = threshold`; None for other machines.
-        lines: int64[frames], the true line of each; None where it is not known.
+        lines: int64[frames], the true line of each; None if unknown.
     """
 
     source: str
@@ -50,7 +50,7 @@ class Readings:
         return len(self.addresses)
 
     def of_model(self, frame: int) -> tuple[tuple[int | NDArray[np.int64] | None, ...], int | None]:
-        """Return a frame as `toolchain.models.fusion.exact_posterior` takes it."""
+        """Return a frame in the form for `toolchain.models.fusion.exact_posterior`."""
         row = int(self.prior_addresses[frame])
         addresses: tuple[int | NDArray[np.int64] | None, ...]
         if self.addresses.ndim > 2:
@@ -59,9 +59,10 @@ class Readings:
         return addresses, None if row == MISSING else row
 
     def of_machine(self, frame: int, machine: BM1Machine) -> tuple[Inputs, int]:
-        """Return a frame as a machine takes it: a missing reading is its column's top address.
+        """Return a frame in the form for a machine: a missing reading is the top address of its column.
 
-        Where lines have readings of their own, those of all lines are returned, whichever of them the machine has.
+        If lines have their own readings, those of all lines are returned, even if the machine has only some
+        of them.
         """
         parameters = machine.parameters
         row = int(self.prior_addresses[frame])
@@ -86,11 +87,11 @@ def check_frames(frames: int) -> None:
 def check_columns(recording: Path | None, columns: Sequence[str] | None) -> None:
     """Refuse, with a BuildError, columns of a recording where there is none."""
     if recording is None and columns:
-        raise BuildError(f"--reading {columns[0]} is a column of a recording; add --readings FILE")
+        raise BuildError(f"--reading {columns[0]} refers to a recording; add --readings FILE")
 
 
 def sample_readings(model: Model, frames: int, *, seed: int, source: str = "") -> Readings:
-    """Draw a line from the prior, or from one of equally probable selections, then every reading given that line."""
+    """Draw a line from the prior, or from an equally probable selection, then its readings."""
     check_frames(frames)
     random = np.random.default_rng(seed)
     rows = np.full(frames, MISSING, dtype=np.int64)
@@ -113,16 +114,17 @@ def sample_readings(model: Model, frames: int, *, seed: int, source: str = "") -
 def readings_of_lines(
     drawn: Readings, model: Model, machine: BM1Machine, *, scale: Scale, seed: int
 ) -> Readings:
-    """Return readings that were drawn from a model as a machine's whose lines have readings of their own.
+    """Return drawn readings in the form for a machine whose lines have their own readings.
 
-    The true line's cell reads the drawn value. The model does not define the others' readings; they are drawn from the mean
-    of all lines. A machine with sensor_mode `threshold` gets their likelihoods, as codes.
+    The cell of the true line reads the drawn value. The model does not define the readings of the other
+    lines, which are drawn from the mean of all lines. With sensor_mode `threshold`, the likelihoods are
+    returned as codes.
 
     Raises:
-        BuildError: The readings were not drawn, so that their true line is not known.
+        BuildError: The readings were not drawn, so their true line is unknown.
     """
     if drawn.lines is None:
-        raise BuildError("only readings that were drawn know their true line")
+        raise BuildError("the true line is known only for drawn readings")
     frames = len(drawn)
     shape = (frames, len(model.known), model.lines)
     random = np.random.default_rng((seed, 1))
@@ -144,10 +146,10 @@ def readings_of_lines(
 def model_of_codes(
     name: str, searched: Sequence[Dimension], variables: Sequence[Variable], machine: BM1Machine
 ) -> Model:
-    """Return a model that quantises to a whole machine's codes, to draw readings from where the original is not at hand.
+    """Return a model that quantises to the codes of a machine, for drawing readings without the original.
 
-    Each row of a table was divided by its maximum before it was quantised; the factors are found again as those
-    with which every line's column sums to 1, as nearly as possible (expectation maximisation).
+    Each row of a table was divided by its maximum before quantising. The factors are estimated so that the
+    column of every line sums to 1 as nearly as possible (expectation maximisation).
     """
     width = machine.parameters.prob_bits
     known = []
@@ -170,7 +172,7 @@ def model_of_codes(
 
 
 def _conditional(codes: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Scale rows so that columns sum to about 1, then make them do so; a column of zeros becomes uniform."""
+    """Scale rows so that columns sum to about 1, then normalise them; a column of zeros becomes uniform."""
     codes = np.where(codes.sum(axis=0) > 0, codes, 1.0)
     served = codes.sum(axis=1) > 0
     weights = served / max(int(served.sum()), 1)
@@ -188,7 +190,7 @@ def _distribution(ratios: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _normalised(distribution: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return a distribution that sums to 1 exactly; a model's do within 1e-6."""
+    """Return a distribution that sums to 1 exactly, from one of a model, which does so within 1e-6."""
     exact: NDArray[np.float64] = distribution / distribution.sum()
     return exact
 
@@ -203,12 +205,12 @@ def recorded_readings(
 ) -> Readings:
     """Return at most `frames` readings of a recording (CSV, MCAP or bag), spread over its length.
 
-    `given` are NAME=COLUMNs of variables whose column is not called like them, `*` for the same in both; in a bag another
-    topic's message may be `tolerance_s` from a row.
+    `given` are NAME=COLUMNs of variables whose column has another name, with `*` for the same text in both;
+    in a bag, messages of other topics may be `tolerance_s` apart from a row.
 
     Raises:
-        ModelError: No such recording or column, or no row that the machine takes.
-        BuildError: A name that no variable has, no frames, or too many.
+        ModelError: The recording or a column does not exist, or no row fits the machine.
+        BuildError: An unknown variable, no frames, or too many.
     """
     check_frames(frames)
     columns = reading_columns([variable.name for variable in variables], given)
@@ -233,13 +235,13 @@ def recorded_readings(
     sensors = [at for at, variable in enumerate(variables) if variable.kind == "sensor"]
     selects = [at for at, variable in enumerate(variables) if variable.kind == "prior_select"]
     prior = addresses[:, selects[0]] if selects else np.full(len(rows), MISSING, dtype=np.int64)
-    left_out = f", {refused} more that it refuses ({first})" if refused else ""
+    left_out = f", without {refused} that do not fit ({first})" if refused else ""
     source = f"{len(rows)} of {recording.rows} rows of {path.name}{left_out}"
     return Readings(source, addresses[:, sensors], prior)
 
 
 def reading_columns(names: Sequence[str], given: Sequence[str], flag: str = "--reading") -> dict[str, str]:
-    """Return each variable's column, all by their own names without a pattern; a BuildError if one fits none."""
+    """Return the column of each variable, by default its name; a BuildError for a pattern without a match."""
     if not given:
         return {name: name for name in names}
     columns: dict[str, str] = {}

@@ -1,1 +1,1 @@
-"""Sweeps over a model's possible machines, and the thesis's claims as experiments."""
+"""Sweeps over the possible machines of a model, and the thesis's claims as experiments."""

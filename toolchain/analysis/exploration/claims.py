@@ -1,8 +1,8 @@
-"""The thesis's claims as experiments: what cycles depend on (2.1.2, 4.3), and the effect of flipped bits (2.1.1).
+"""The thesis's claims as experiments: the number of cycles (2.1.2, 4.3), and flipped bits (2.1.1).
 
-The model is a boat among any number of beacons, so that lines, sensors and counters can be varied one by one. Bits are
-flipped in copies of a machine's tables, random numbers and streams, in a machine of this module that runs as the
-reference does; the kernels know nothing of faults.
+The model is a boat among any number of beacons, so that lines, sensors and counters can be varied one at a
+time. Bits are flipped in the tables, random numbers and streams of a machine in this module, which runs like
+the reference; the kernels do not support faults.
 """
 
 import json
@@ -28,11 +28,11 @@ from toolchain.models.model import Model, cell_centres, interval
 _Word = TypeVar("_Word", np.uint16, np.uint32)
 
 SIDE: Final = 100.0
-"""Of the square in which the boat is, in metres."""
+"""Side of the square in which the boat is, in metres."""
 SIGMA: Final = 12.0
-"""Of a distance, in metres: more than a cell of the coarsest grid, or the grid would decide how well a line fits."""
+"""Sigma of a distance in metres: more than a cell of the coarsest grid, so that the grid has no influence."""
 STEP: Final = 2.0
-"""Metres between two distances of a sensor."""
+"""Resolution of a distance in metres."""
 CODE_BITS: Final = 8
 GRIDS: Final = (8, 12, 16, 24, 32, 48, 64)
 SENSORS: Final = (1, 2, 3, 4, 6, 8, 10, 12)
@@ -40,7 +40,7 @@ TARGETS: Final = (15, 31, 63, 127, 255, 511, 1023, 2047, 4095)
 RATES: Final = (0.0, 1e-5, 1e-4, 1e-3, 1e-2, 0.03, 0.1)
 MAX_CYCLES: Final = 2**20
 FAULT_FRAMES: Final = 100
-"""Frames at each rate of flipped bits, at most: they run cycle by cycle."""
+"""Maximum number of frames at each rate of flipped bits, because they run cycle by cycle."""
 
 _MIDDLE_SENSORS: Final = 4
 _MIDDLE_GRID: Final = 16
@@ -94,12 +94,12 @@ class Claims:
 
 
 def beacons(grid: int = _MIDDLE_GRID, sensors: int = _MIDDLE_SENSORS) -> Model:
-    """Return the model: where a boat is on a grid, from its distances to beacons around the square."""
+    """Return the model: the position of a boat on a grid, given its distances to beacons around the square."""
     rows, columns = interval("y", 0, SIDE, cells=grid), interval("x", 0, SIDE, cells=grid)
     y, x = cell_centres(rows, columns)
     turn = np.arange(sensors) * (
         2 * np.pi * 0.381966
-    )  # the golden angle: any number of them is spread evenly
+    )  # the golden angle: any number of beacons is spread evenly
     places = SIDE / 2 * (1 + 1.2 * np.stack([np.cos(turn), np.sin(turn)]))
     known = tuple(
         normal(f"D{at + 1}", mean=np.hypot(x - bx, y - by), sigma=SIGMA, values=80, step=STEP, bits=7)
@@ -142,7 +142,7 @@ def run_claims(*, frames: int, seed: int, advance: Callable[[str], None] = lambd
 
 
 def experiments() -> int:
-    """Return how many times `run_claims` calls `advance`."""
+    """Return the number of calls of `advance` by `run_claims`."""
     return len(GRIDS) + len(SENSORS) + len(TARGETS) + len(KINDS) * len(RATES)
 
 
@@ -183,8 +183,8 @@ class FaultyMachine:
     ) -> tuple[NDArray[np.int64], int]:
         """Run a frame of codes, uint16[columns, lines], and return the counts, int64[lines], and its cycles.
 
-        A cell's bit of a cycle is flipped with probability `stream_rate`, and a bit of a random number, which a whole
-        column compares with, with `number_rate`.
+        The bit of a cell in a cycle is flipped with probability `stream_rate`, and a bit of a random number,
+        which a whole column uses, with `number_rate`.
         """
         ones = self._machine.parameters.ones_code
         width = self._machine.parameters.prob_bits
@@ -233,7 +233,7 @@ class Frame:
 
 
 class Faults:
-    """Ways of computing a posterior while bits are flipped; each returns None where there is none left."""
+    """Ways to compute a posterior while bits are flipped; each returns None if there is none."""
 
     def __init__(self, machine: BM1Machine, *, seed: int) -> None:
         self._machine = FaultyMachine(machine, seed=seed)
@@ -245,11 +245,11 @@ class Faults:
         self._random = np.random.default_rng([seed, 1])
 
     def streams(self, frame: Frame, rate: float) -> NDArray[np.float64] | None:
-        """Flip a cell's bit of a cycle."""
+        """Flip the bit of a cell in a cycle."""
         return self._counted(frame, frame.codes, stream_rate=rate)
 
     def numbers(self, frame: Frame, rate: float) -> NDArray[np.float64] | None:
-        """Flip a bit of a random number, with which a whole column compares."""
+        """Flip a bit of a random number, which a whole column uses."""
         return self._counted(frame, frame.codes, number_rate=rate)
 
     def tables(self, frame: Frame, rate: float) -> NDArray[np.float64] | None:
@@ -278,7 +278,7 @@ class Faults:
                 product = _flipped(words, 32, rate, self._random).view(np.float32)
             weights = np.clip(product.astype(np.float64), 0.0, None)
             posterior: NDArray[np.float64] = weights / weights.sum()
-        # an infinite or undefined posterior says nothing
+        # an infinite or undefined posterior is meaningless
         return posterior if np.isfinite(posterior).all() else None
 
     def _counted(
@@ -303,7 +303,7 @@ KINDS: Final[dict[str, Callable[[Faults, Frame, float], NDArray[np.float64] | No
     "8-bit fixed point": Faults.fixed_point,
     "32-bit floating point": Faults.floating_point,
 }
-"""The ways that are compared, by their names in the picture."""
+"""The compared ways, by their names in the picture."""
 
 
 def frames_of(model: Model, machine: BM1Machine, readings: Readings) -> list[Frame]:

@@ -1,4 +1,4 @@
-"""Pictures of sweeps and claims; matplotlib is loaded only when one is drawn."""
+"""Pictures of sweeps and claims; matplotlib is imported only when one is drawn."""
 
 from collections.abc import Sequence
 from importlib.util import find_spec
@@ -14,14 +14,14 @@ _COLOURS: Final = ("#4477aa", "#ee6677", "#228833", "#ccbb44", "#66ccee", "#aa33
 _MARKERS: Final = "osD^v<>P"
 _SUFFIXES: Final = (".png", ".svg", ".pdf")
 _KINDS_INSIDE: Final = 5
-"""A longer legend would cover points, so it stands beside the picture."""
+"""Maximum length of a legend inside the picture, where a longer one would cover points."""
 
 
 def check_pictures_possible(path: Path | None = None) -> None:
-    """Refuse, with a BuildError and before a long run, a picture that can't be drawn or written."""
+    """Raise a BuildError, before a long run, for a picture that can't be drawn or written."""
     if find_spec("matplotlib") is None:
         raise BuildError(
-            "a plot needs matplotlib, which is not installed: run pip install matplotlib, or leave out --plot"
+            "a plot needs matplotlib, which is not installed: run pip install matplotlib, or omit --plot"
         )
     if path is None:
         return
@@ -40,7 +40,7 @@ def check_pictures_possible(path: Path | None = None) -> None:
 
 
 def draw_sweep(path: Path, name: str, points: Sequence[Point], front: Sequence[Point]) -> None:
-    """Draw accuracy against cycles, a point's size being its ALMs, and the Pareto front."""
+    """Draw accuracy against cycles, with ALMs as the size of points, and the Pareto front."""
     shown = [point for point in points if point.total_variation is not None]
     largest = max((point.alms or 0.0 for point in shown), default=0.0) or 1.0
     several = any(point.replicas > 1 for point in points)
@@ -94,7 +94,7 @@ def _label(kind: tuple[str, int, str, str]) -> str:
 
 
 def draw_claims(path: Path, claims: Claims) -> None:
-    """Draw the thesis's claims, a panel each."""
+    """Draw the thesis's claims, one panel each."""
     figure = _figure((11.0, 7.4))
     panels = figure.subplots(2, 2)
     for axes, series, title, label in (
@@ -152,7 +152,7 @@ def _figure(size: tuple[float, float]) -> Any:
 
 
 def _save(figure: Any, path: Path) -> None:
-    """Write a picture; without matplotlib's version in it, so that it changes only where the drawing does."""
+    """Write a picture without matplotlib's version, so that the file changes only with the drawing."""
     try:
         figure.savefig(path, dpi=_DPI, metadata={"Software": None} if path.suffix == ".png" else None)
     except (OSError, ValueError) as reason:

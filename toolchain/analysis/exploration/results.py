@@ -1,4 +1,4 @@
-"""Results of a sweep: a point for each machine, a line each in a file, and their Pareto front."""
+"""Results of a sweep: one point per machine, stored as a line in a file, and their Pareto front."""
 
 import math
 import os
@@ -18,11 +18,11 @@ _BEGIN: Final = b'{"key":"'
 
 
 class Point(BaseModel):
-    """One machine of a sweep, measured: a line of the results' file.
+    """The measurement of one machine in a sweep: a line of the results file.
 
     Attributes:
-        key: SHA-256 of everything that its figures depend on.
-        total_variation: Against the model, mean over frames; None where no frame had a posterior.
+        key: SHA-256 of everything on which the results depend.
+        total_variation: Compared with the model, mean over frames; None if no frame had a posterior.
         total_variation_low: Its 95 % interval's ends.
         total_variation_high: Its 95 % interval's ends.
         quantising: The same of exact inference on the codes.
@@ -30,9 +30,9 @@ class Point(BaseModel):
         map_agreement: Share of frames with the same most probable line.
         z_rms: Root mean square of z-scores; 1 is ideal.
         without: Share of runs without a posterior.
-        cycles_median: Cycles of a frame, which is as many posteriors as there are replicas.
+        cycles_median: Cycles of a frame, which computes one posterior per replica.
         cycles_95: Their 95th percentile.
-        alms: Of the largest board; None for generators that no FPGA has.
+        alms: ALMs of the largest board; None for generators that FPGAs do not have.
         blocks: Memory blocks of the largest board.
         fits: Whether that fits the device.
     """
@@ -61,18 +61,18 @@ class Point(BaseModel):
     alms: float | None
     blocks: int | None
     fits: bool | None
-    # files of older sweeps lack these
+    # files of older sweeps do not have these
     sensor_mode: Literal["column", "cell", "threshold"] = "column"
     replicas: int = 1
 
     @property
     def cycles_a_posterior(self) -> float:
-        """Cycles of a frame, shared by its posteriors."""
+        """Cycles of a frame, divided by its number of posteriors."""
         return self.cycles_median / self.replicas
 
 
 class Results:
-    """The results' file: one JSON object a line, appended whole, so that an interrupted sweep goes on where it was."""
+    """The results file with one JSON object per line, from which an interrupted sweep can be resumed."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -81,7 +81,7 @@ class Results:
         if path.exists():
             content = read_bounded(path, MAX_FILE_BYTES, BuildError)
         lines = content.split(b"\n")
-        # A power cut may leave a torn last line: that point is measured again.
+        # A power failure may leave an incomplete last line: that point is measured again.
         torn = lines.pop()
         if torn and not torn.startswith(_BEGIN[: len(torn)]):
             lines.append(torn)
@@ -96,7 +96,7 @@ class Results:
             self.points[point.key] = point
 
     def check_writable(self) -> None:
-        """Refuse, with a BuildError and before a long run, a file that can't be written; make it if it is missing."""
+        """Create the file if it is missing, or raise a BuildError, before a long run, if it can't be written."""
         try:
             os.close(self._opened())
         except OSError as reason:
@@ -128,7 +128,7 @@ class Results:
 
 
 def pareto(points: Sequence[Point]) -> list[Point]:
-    """Return the points that no other dominates in total variation, cycles a posterior, ALMs and runs without a posterior."""
+    """Return the Pareto front of total variation, cycles per posterior, ALMs and runs without a posterior."""
     judged = [(point, figures) for point in points if (figures := _figures(point)) is not None]
     return [
         point

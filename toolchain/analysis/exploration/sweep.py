@@ -1,4 +1,4 @@
-"""Sweeps over a model's possible machines: accuracy against cycles and ALMs, kept point by point in a file."""
+"""Sweeps over the possible machines of a model: accuracy, cycles and ALMs, stored point by point in a file."""
 
 import hashlib
 import itertools
@@ -35,16 +35,16 @@ class Sweep:
 
     Attributes:
         prob_bits: Widths of codes.
-        target_counts: Counts that stop a machine; each with the narrowest counter that holds it.
+        target_counts: Target counts, each with the narrowest sufficient counter.
         rngs: Kinds of generators.
         scales: Scalings before quantising.
-        sensor_modes: Inputs of cells; scale `address` is left out where cells have inputs of their own.
-        replicas: Machines on a board.
+        sensor_modes: Inputs of cells; scale `address` is omitted if cells have their own inputs.
+        replicas: Numbers of machines on a board.
         steps_per_clock: Steps of a generator in a cycle; 0 for as many as give fresh bits.
         partitions: Boards.
         stop: When the boards stop.
-        max_cycles: The cycle at which a machine stops anyway.
-        banks: Sets of seeds that every frame is run with.
+        max_cycles: Maximum number of cycles.
+        banks: Number of seed sets with which every frame is run.
     """
 
     prob_bits: tuple[int, ...]
@@ -60,7 +60,7 @@ class Sweep:
     banks: int
 
     def options(self) -> Iterator[BuildOptions]:
-        """Return the options of every machine, in order; a BuildError if there are none or too many."""
+        """Return the options of every machine in order, or raise a BuildError if there are none or too many."""
         lists = (
             self.sensor_modes,
             self.replicas,
@@ -72,10 +72,10 @@ class Sweep:
         )
         count = math.prod(map(len, lists))
         if not 0 < count <= MAX_POINTS:
-            raise BuildError(f"these lists combine to {count} machines, expected 1 to {MAX_POINTS}")
+            raise BuildError(f"these lists give {count} machines, expected 1 to {MAX_POINTS}")
         for mode, replicas, scale, rng, steps, prob_bits, target in itertools.product(*lists):
             if target < 1:
-                raise BuildError(f"a target count of {target} stops nothing; expected 1 or more")
+                raise BuildError(f"a target count of {target} is too small; expected 1 or more")
             yield BuildOptions(
                 uri="ws://nowhere:9090",  # a sweep has no robot
                 topic="/readings",
@@ -103,7 +103,7 @@ class Task:
 
 
 class Frames:
-    """The readings of a sweep, drawn or recorded; machines with inputs of the same kind get the same ones."""
+    """The readings of a sweep, drawn or recorded; machines with the same sensor mode get the same ones."""
 
     def __init__(
         self, model: Model, frames: int, *, seed: int, recorded: Callable[[int], Readings] | None = None
@@ -116,7 +116,7 @@ class Frames:
         self._fingerprints: dict[tuple[int, bool], str] = {}
 
     def columns(self, replicas: int) -> Readings:
-        """Return readings of whole columns: as many frames, each with one for every replica."""
+        """Return readings of whole columns for all frames, one for each replica."""
         if replicas not in self._base:
             check_frames(self._frames)
             count = self._frames * replicas
@@ -139,9 +139,9 @@ class Frames:
         if self._recorded is not None and options.sensor_mode is not SensorMode.COLUMN:
             raise BuildError(
                 f"a recording's columns are numbers, and with --sensor-modes {options.sensor_mode} readings are arrays, one "
-                "number for each line: leave --readings out, and readings are drawn"
+                "number for each line: omit --readings to draw readings"
             )
-        # other lines' readings are drawn too, with the seed; codes follow from the tables
+        # the readings of other lines are drawn too, with the seed; codes follow from the tables
         of_lines = options.sensor_mode is not SensorMode.COLUMN
         if (options.replicas, of_lines) not in self._fingerprints:
             readings, digest = self.columns(options.replicas), hashlib.sha256()
@@ -182,7 +182,9 @@ def tasks(model: Model, sweep: Sweep, frames: Frames, device: Device) -> list[Ta
             "device": device.name,
         }
         key = hashlib.sha256(json.dumps(words, sort_keys=True).encode()).hexdigest()
-        found.setdefault(key, Task(options, key))  # 0 steps and the number that they are make one machine
+        found.setdefault(
+            key, Task(options, key)
+        )  # 0 steps and the number that this selects are the same machine
     if not found:
         raise BuildError(f"none of these machines can be built: {refused}")
     return list(found.values())
@@ -231,7 +233,7 @@ def run_task(model: Model, task: Task, frames: Frames, device: Device, banks: in
 
 
 def with_resources(model: Model, task: Task, point: Point, device: Device) -> Point:
-    """Return a point with the resources of its largest board, as the present estimator has them."""
+    """Return a point with the current estimate of the resources of its largest board."""
     options = task.options
     if options.rng is RngKind.IDEAL:
         return point
@@ -249,7 +251,7 @@ def run_sweep(
     keep: Callable[[Point], None],
     advance: Callable[[Point], None],
 ) -> None:
-    """Measure the machines that are not kept yet, and keep every point before the next one begins."""
+    """Measure the machines without a stored result, and store every point before the next one begins."""
     for task in found:
         if task.key not in kept:
             point = measured(task)

@@ -1,4 +1,4 @@
-"""A sweep as text: a row for each machine, the Pareto front marked."""
+"""The table of a sweep, with one row per machine and the Pareto front marked."""
 
 from collections.abc import Sequence
 
@@ -6,9 +6,9 @@ from toolchain.analysis.exploration.results import Point
 
 
 def table(points: Sequence[Point], front: Sequence[Point]) -> str:
-    """Return the sweep as text; the Pareto front's points have a star.
+    """Return the sweep as text; points on the Pareto front have a star.
 
-    Sensor modes and replicas are columns only where some differ from readings of columns and single machines.
+    Sensor modes and replicas are columns only if some machines differ from the defaults.
     """
     keys = {point.key for point in front}
     several = any(point.replicas > 1 for point in points)
@@ -38,9 +38,9 @@ def table(points: Sequence[Point], front: Sequence[Point]) -> str:
             + f"{_cell(point.alms, ',.0f'):>7}  {_cell(point.blocks, ','):>6}  "
             f"{'-' if point.fits is None else 'yes' if point.fits else 'no':>4}"
         )
-    cycles = "cycles a posterior" if several else "cycles"
+    cycles = "cycles per posterior" if several else "cycles"
     rows.append(
-        f"* nothing else here is better in one of total variation, {cycles}, ALMs and frames without a posterior, and as good "
+        f"* no other machine is better in one of total variation, {cycles}, ALMs and frames without a posterior, and as good "
         "in the others"
     )
     return "\n".join(rows) + "\n"

@@ -1,4 +1,4 @@
-"""Inspection of a deployment: its losses, accuracy, cycles, resources and energy."""
+"""Inspection of a deployment: losses, accuracy, cycles, resources and energy."""
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -37,27 +37,27 @@ Progress = Callable[[int], AbstractContextManager[Callable[[str], None]]]
 FRAMES: Final = 200
 BANKS: Final = 4
 SLOW_FRAMES: Final = 20
-"""Of machines that run a cycle at a time: one generator a cell, or no LFSRs."""
+"""Number of frames for slow machines: with one generator per cell, or without LFSRs."""
 LEAST_FRAMES: Final = 20
 SLOW_LEAST_FRAMES: Final = 3
-"""Of replicas, each of which has readings of its own in every frame."""
+"""Minimum number of frames of slow machines with replicas."""
 SLOW_BANKS: Final = 1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class InspectOptions:
-    """The readings that a deployment is run on, and the hardware that its costs are estimated for.
+    """The readings for a deployment, and the hardware for the estimate of its costs.
 
     Attributes:
         recording: Recorded readings, or None to draw them.
         columns: `NAME=COLUMN`s of the recording.
-        tolerance_s: In a bag, how far from a row another topic's message may be, seconds.
-        frames: How many frames at most; None for 200, or 20 of a machine that only the slow kernel runs; with replicas
-            for fewer, as each has readings of its own.
-        banks: Sets of seeds that each is run with; None for 4, or 1 of such a machine.
-        seed: Of the readings that are drawn.
-        clock_hz: The boards' clock.
-        device: The boards' FPGA.
+        tolerance_s: Maximum time in seconds between a row and messages of other topics in a bag.
+        frames: Maximum number of frames; None for 200, or 20 if only the slow kernel supports the machine;
+            fewer with replicas.
+        banks: Number of seed sets for each frame; None for 4, or 1 for a slow machine.
+        seed: Seed of drawn readings.
+        clock_hz: Clock frequency of the boards.
+        device: FPGA of the boards.
         pcie: The kind of PCIe controller.
     """
 
@@ -90,7 +90,7 @@ class Inspection:
 def inspect_deployment(
     deployment: Deployment, model: Model | None, options: InspectOptions, progress: Progress
 ) -> Inspection:
-    """Run a deployment's machine on readings, and estimate its costs; a ToolchainError if something does not fit."""
+    """Run the machine of a deployment on readings, and estimate its costs, or raise a ToolchainError."""
     machines = machines_of(deployment)
     whole = joined(machines)
     losses = None if model is None else _losses(deployment, whole, model)
@@ -135,7 +135,7 @@ def inspect_deployment(
 
 
 def machines_of(deployment: Deployment) -> tuple[BM1Machine, ...]:
-    """Return the boards' machines from a deployment's programming files."""
+    """Return the machines in the programming files of a deployment."""
     from pcie_shim.errors import PcieShimError
 
     try:
@@ -145,7 +145,7 @@ def machines_of(deployment: Deployment) -> tuple[BM1Machine, ...]:
 
 
 def _losses(deployment: Deployment, whole: BM1Machine, model: Model) -> tuple[ColumnLoss, ...]:
-    """Return what quantising lost of the model, once its codes are the deployment's."""
+    """Return the quantisation loss of the model, after checking that its codes are those of the deployment."""
     if model.lines == deployment.machine.lines and len(model.known) == whole.parameters.sensors:
         quantised = quantise(
             model,
@@ -157,8 +157,8 @@ def _losses(deployment: Deployment, whole: BM1Machine, model: Model) -> tuple[Co
         if all(np.array_equal(ours, theirs) for ours, theirs in pairs):
             return quantised.losses
     raise BuildError(
-        f"{deployment.directory} was not built from the model {model.name} with these settings, for its codes differ; give "
-        "the same --set and --bits as to the build, or build it again"
+        f"{deployment.directory} was not built from the model {model.name} with these settings: its codes differ; give "
+        "the same --set and --bits as for the build, or build it again"
     )
 
 
@@ -178,7 +178,7 @@ def _readings(
         if mode is not SensorMode.COLUMN:
             raise BuildError(
                 f"--readings {options.recording}: a recording's columns are numbers, and this machine reads arrays of one "
-                "number for each line; leave it out, and readings are drawn"
+                "number per line; omit it to draw readings"
             )
         return recorded_readings(
             options.recording,
@@ -189,10 +189,10 @@ def _readings(
         )
     if model is None and mode is SensorMode.THRESHOLD:
         raise BuildError(
-            "this machine's cells are given their probabilities, so it holds no tables that readings could be drawn from; "
-            "name the model with --model"
+            "the inputs of this machine are probabilities, so it has no tables for drawing readings; give the model "
+            "with --model"
         )
-    source = "the model" if model is not None else "what the codes say of the model"
+    source = "the model" if model is not None else "the codes"
     if model is None:
         model = model_of_codes(deployment.name, deployment.searched, deployment.variables, whole)
     of_each = f" of readings for {replicas} replicas," if replicas > 1 else ""

@@ -1,4 +1,4 @@
-"""Reports of an inspection: sentences and tables, or one JSON object."""
+"""Reports of an inspection, as text or as a JSON object."""
 
 import json
 import math
@@ -13,7 +13,7 @@ from toolchain.building.report import loss_heading, many_sentence
 
 
 def report(found: Inspection) -> str:
-    """Return the inspection in plain sentences and tables."""
+    """Return the inspection as sentences and tables."""
     parts = [
         _machine_part(found),
         _loss_part(found),
@@ -42,7 +42,7 @@ def _machine_part(found: Inspection) -> str:
         ),
         (
             f"Codes of {p.prob_bits} bits (scale = {machine.scale}), counters of {p.counter_bits} "
-            f"bits, {p.rng} {'one a column' if p.shared else 'one a cell'} with {p.steps_per_clock} steps a clock and "
+            f"bits, {p.rng} {'one per column' if p.shared else 'one per cell'} with {p.steps_per_clock} steps per clock and "
             f"{p.rng_banks} bank{'s' if p.rng_banks > 1 else ''}; stops at a count of {machine.target_count} or after "
             f"{machine.max_cycles} cycles, stop = {machine.stop}."
         ),
@@ -93,13 +93,13 @@ def _time_part(found: Inspection) -> str:
         rows.append(f"  {name:6}  {count:10,.0f}  {_unit(count / found.clock_hz, 's'):>10}")
     counted = "posteriors" if found.deployment.machine.replicas > 1 else "frames"
     rows.append(
-        f"  {found.accuracy.overflow:.0%} of runs end by a full counter; without a posterior: {found.accuracy.without:.1%} of "
+        f"  {found.accuracy.overflow:.0%} of runs end with an overflow; without a posterior: {found.accuracy.without:.1%} of "
         f"runs (in {found.accuracy.impossible:.1%} of {counted} no line can count)."
     )
     if found.deployment.machine.replicas > 1:
         replicas = found.deployment.machine.replicas
         rows.append(
-            f"  A frame is {replicas} posteriors and ends with the last of them: {cycles.median.value / replicas:,.1f} cycles a posterior "
+            f"  A frame has {replicas} posteriors and ends with the last of them: {cycles.median.value / replicas:,.1f} cycles per posterior "
             "in the median."
         )
     return "\n".join(rows)
@@ -119,7 +119,7 @@ def _accuracy_part(found: Inspection) -> str:
         if difference is not None:
             rows.append(f"  {name:34}{_difference(difference)}")
     if accuracy.machine is None:
-        rows.append("  Name the model with --model to have the loss by quantising too.")
+        rows.append("  Give the model with --model for the quantisation loss.")
     if accuracy.z is not None:
         z = accuracy.z
         rows.append(
@@ -179,7 +179,7 @@ def _energy_part(found: Inspection) -> str:
     rows = [
         (
             f"Energy of a frame of {median:,.0f} cycles, a toggle-count model, not a measurement: {_unit(dynamic, 'J')} for toggles "
-            f"({found.energy.toggles:,.0f} a cycle on all boards) and {_unit(static, 'J')} for leakage while it runs. It assumes:"
+            f"({found.energy.toggles:,.0f} per cycle on all boards) and {_unit(static, 'J')} for leakage while it runs. It assumes:"
         ),
     ]
     rows += [f"  - {assumption}" for assumption in ASSUMPTIONS]
@@ -219,7 +219,7 @@ def as_json(found: Inspection) -> str:
 
 
 def _unit(value: float, unit: str) -> str:
-    """Return a value with the SI prefix that leaves 1 to 999 before the point."""
+    """Return a value with an SI prefix so that 1 to 999 precede the point."""
     if value <= 0:
         return f"0 {unit}"
     prefixes = ("p", "n", "u", "m", "", "k", "M", "G")

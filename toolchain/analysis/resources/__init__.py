@@ -1,1 +1,1 @@
-"""Estimates of the FPGA resources and the energy that a machine takes."""
+"""Estimates of the FPGA resources and the energy of a machine."""

@@ -1,4 +1,4 @@
-"""The number of boards that a machine needs, by its FPGA's resources and by the register map."""
+"""The number of boards for a machine, according to FPGA resources and the register map."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def boards_needed(
     pcie: Pcie = Pcie.HARD,
     table_length: int = LENGTH,
 ) -> tuple[int, str]:
-    """Return the fewest boards that hold a machine, and the reason as a sentence; a BuildError if no number does."""
+    """Return the minimum number of boards for a machine, and the reason as a sentence, or raise a BuildError."""
 
     def on(lines: int) -> Estimate:
         return estimate(with_lines(parameters, lines), device, pcie=pcie, table_length=table_length)
@@ -55,18 +55,18 @@ def boards_needed(
     if count == 1:
         return 1, f"All {parameters.lines} lines fit one {device.title}: {share}."
     if largest_lines < parameters.lines and on(largest_lines).fits:
-        reason = f"the register map has room for {largest_lines} lines a board"
+        reason = f"the register map has room for {largest_lines} lines per board"
     else:
         reason = f"on one {device.title} {on(parameters.lines).why_not}"
     boards = f"{count} boards" if count > 2 else "two boards"
     return count, (
-        f"{parameters.lines} lines need {boards}: {reason}; {largest} lines a board take {share}. An estimate, not a "
+        f"{parameters.lines} lines need {boards}: {reason}; {largest} lines per board take {share}. An estimate, not a "
         "compilation."
     )
 
 
 def _most_lines(fits: Callable[[int], bool], highest: int) -> int:
-    """Return the most lines that fit, 0 to `highest`, by bisection."""
+    """Return the maximum number of lines that fit, 0 to `highest`, by bisection."""
     low, high = 0, highest + 1
     while high - low > 1:
         middle = (low + high) // 2

@@ -1,4 +1,4 @@
-"""FPGAs that a board can have, with their cells and the share of them that a design can use."""
+"""FPGAs of boards, with their resources and the usable share of them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from toolchain.errors import BuildError
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Device:
-    """An FPGA and its board; a design that takes more than the share `usable` no longer places and routes."""
+    """An FPGA and its board; a design that needs more than the share `usable` cannot be placed and routed."""
 
     name: str
     title: str
@@ -33,7 +33,7 @@ DEVICES: Final = {
         ),
     )
 }
-"""The devices that `--device` knows."""
+"""The devices for `--device`."""
 
 
 def device_named(name: str) -> Device:

@@ -1,7 +1,7 @@
 """Energy of a frame, by a model that counts toggles of nets and states its assumptions.
 
-Nothing here was measured on a board. Toggles follow from the machine's structure and from its codes; a toggle costs the same
-on all nets.
+Nothing here was measured on a board. Toggles follow from the structure of the machine and from its codes; a
+toggle costs the same on all nets.
 """
 
 from __future__ import annotations
@@ -24,39 +24,39 @@ if TYPE_CHECKING:
     from toolchain.analysis.accuracy.readings import Readings
 
 CORE_VOLTAGE: Final = 0.9
-"""Volts, of a Stratix V."""
+"""Core voltage of a Stratix V in volts."""
 NET_CAPACITANCE: Final = 1.2e-12
-"""Farads that a net with its routing is assumed to have."""
+"""Assumed capacitance of a net with its routing, in farads."""
 TOGGLE_J: Final = 0.5 * NET_CAPACITANCE * CORE_VOLTAGE**2
 CLOCK_J: Final = 0.05e-12
-"""Joules that a register's clock is assumed to cost in a cycle."""
+"""Assumed energy for the clock of a register per cycle, in joules."""
 COMPARATOR_ACTIVITY: Final = 0.25
-"""Toggles in a cycle that a look-up table or a carry inside a comparator is assumed to make."""
+"""Assumed toggles per cycle of a look-up table or a carry inside a comparator."""
 STATIC_W: Final = 2.0
-"""Watts that a board's FPGA is assumed to leak."""
+"""Assumed leakage power of an FPGA, in watts."""
 
 ASSUMPTIONS: Final = (
     (
         f"a toggle of a net costs C V^2 / 2 with C = {NET_CAPACITANCE * 1e12:g} pF and V = {CORE_VOLTAGE:g} V, that is "
         f"{TOGGLE_J * 1e12:.2f} pJ"
     ),
-    f"a register's clock costs {CLOCK_J * 1e12:g} pJ a cycle",
+    f"a register's clock costs {CLOCK_J * 1e12:g} pJ per cycle",
     "a random bit toggles every other cycle, at every cell that it reaches",
-    f"nets inside a comparator toggle {COMPARATOR_ACTIVITY:g} times a cycle",
+    f"nets inside a comparator toggle {COMPARATOR_ACTIVITY:g} times per cycle",
     "a cell's bit of probability p toggles 2 p (1 - p) times, a counter twice and its comparison once for each count",
-    f"an FPGA leaks {STATIC_W:g} W; memories and the PCIe link are left out",
+    f"an FPGA leaks {STATIC_W:g} W; memories and the PCIe link are not included",
 )
 _FRAMES: Final = 50
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Energy:
-    """The model's figures for all boards together.
+    """The energy model for all boards together.
 
     Attributes:
-        toggles: Nets that toggle in a cycle.
-        cycle_j: Joules of a cycle, without leakage.
-        static_w: Watts of leakage.
+        toggles: Number of toggles per cycle.
+        cycle_j: Energy per cycle without leakage, in joules.
+        static_w: Leakage power in watts.
     """
 
     toggles: float
@@ -64,12 +64,12 @@ class Energy:
     static_w: float
 
     def frame_j(self, cycles: float, clock_hz: float) -> tuple[float, float]:
-        """Return the joules of a frame: for its toggles, and for leakage while it runs."""
+        """Return the energy of a frame in joules: for toggles, and for leakage."""
         return cycles * self.cycle_j, cycles / clock_hz * self.static_w
 
 
 def energy(machines: Sequence[BM1Machine], readings: Readings) -> Energy:
-    """Return the energy model of all boards' machines; activity is averaged over the first 50 frames of readings."""
+    """Return the energy model for all boards; activity is averaged over the first 50 frames of readings."""
     toggles = clocked = 0.0
     ends = np.cumsum([machine.parameters.lines for machine in machines]).tolist()
     for machine, end in zip(machines, ends, strict=True):
@@ -91,7 +91,7 @@ def energy(machines: Sequence[BM1Machine], readings: Readings) -> Energy:
 
 
 def _stream_toggles(machine: BM1Machine, readings: Readings, lines: slice) -> float:
-    """Toggles of the cells' bits, the lines' ANDs, their counters and what compares those; a mean over frames."""
+    """Toggles of cells, ANDs, counters and their comparators, averaged over frames."""
     width = machine.parameters.prob_bits
     found = []
     for frame in range(min(len(readings), _FRAMES)):

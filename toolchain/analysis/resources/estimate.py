@@ -1,6 +1,6 @@
 """Resources of a BM1 on a board's FPGA: logic, memories and PCIe controller.
 
-Tables are memories, so that their content changes without a new compilation.
+Tables are memories, so that their content can be changed without a new compilation.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ if TYPE_CHECKING:
     from toolchain.analysis.resources.device import Device
 
 SOFT_PCIE_ELEMENTS: Final = (8_000, 30_000)
-"""Logic elements that a PCIe controller made of logic takes, by its configuration (thesis 2.3)."""
+"""Minimum and maximum number of logic elements of a soft PCIe controller (thesis 2.3)."""
 
 ELEMENTS_PER_ALM: Final = 2.65
-"""Logic elements that the vendor counts for an ALM."""
+"""Number of logic elements per ALM according to the vendor."""
 
 
 class Pcie(StrEnum):
@@ -36,7 +36,7 @@ class Pcie(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Estimate:
-    """Resources of a machine on a board's FPGA; `pcie_alms` are the controller's, at least and at most."""
+    """Resources of a machine on an FPGA; `pcie_alms` are the minimum and maximum of the PCIe controller."""
 
     device: Device
     logic: Logic
@@ -46,33 +46,33 @@ class Estimate:
 
     @property
     def alms(self) -> float:
-        """All ALMs: logic, registers that don't fit beside it, tables, and the largest PCIe controller."""
+        """All ALMs: logic, registers that don't fit into its ALMs, tables, and the largest PCIe controller."""
         logic = max(self.logic.alms, self.logic.registers / self.device.registers_per_alm)
         return logic + self.memories.alms + self.pcie_alms[1]
 
     @property
     def alm_share(self) -> float:
-        """Of the device's ALMs."""
+        """Share of the device's ALMs."""
         return self.alms / self.device.alms
 
     @property
     def block_share(self) -> float:
-        """Of the device's memory blocks."""
+        """Share of the device's memory blocks."""
         return self.memories.blocks / self.device.blocks
 
     @property
     def mlab_share(self) -> float:
-        """Of the memory LABs that the device has."""
+        """Share of the device's memory LABs."""
         return self.memories.mlabs * MLAB_ALMS / (self.device.alms * MLAB_SHARE)
 
     @property
     def fits(self) -> bool:
-        """Whether it can be placed and routed."""
+        """Whether the machine can be placed and routed."""
         return self.why_not == ""
 
     @property
     def why_not(self) -> str:
-        """The resource that does not suffice, as a clause; empty where the machine fits."""
+        """The insufficient resource, as a clause; empty if the machine fits."""
         usable = self.device.usable
         if self.memories.blocks > usable * self.device.blocks:
             return f"it takes {self.memories.blocks:,} memory blocks, and there are {self.device.blocks:,}"
@@ -91,7 +91,7 @@ def estimate(
     pcie: Pcie = Pcie.HARD,
     table_length: int = LENGTH,
 ) -> Estimate:
-    """Return the resources that a machine takes of a device; a BuildError for generators or a controller it lacks."""
+    """Return the resources of a machine on a device, or raise a BuildError if it lacks a part."""
     if pcie is Pcie.HARD and not device.hard_pcie:
         raise BuildError(f"{device.title} has no hard PCIe controller; use --soft-pcie")
     soft = tuple(elements / ELEMENTS_PER_ALM for elements in SOFT_PCIE_ELEMENTS)

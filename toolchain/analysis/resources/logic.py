@@ -1,4 +1,4 @@
-"""A machine's logic, counted in the units that the VHDL repeats: cells, counters, generators, words, replicas.
+"""The logic of a machine, counted in units of the VHDL: cells, counters, generators, words, replicas.
 
 A unit's cost in an FPGA is fitted to the synthesis of small machines by GHDL and yosys (`scripts/verify resources
 --calibrate`; docs/how-to/design-space.md); registers are counted from the VHDL.
@@ -30,11 +30,11 @@ _BOARD_REGISTERS: Final = 1032
 _REPLICA_BITS: Final = 5
 """Of bm1_control for a replica: its stop reason, whether it runs and whether it is halted."""
 _FEW_WORDS: Final = 8
-"""So few words become memory LABs, whose output needs registers; those of a memory block are its own."""
+"""Maximum number of words in memory LABs, whose output needs registers, unlike that of a memory block."""
 
 
 class Of(StrEnum):
-    """Units that logic is counted by."""
+    """Units of logic."""
 
     BOARD = "board"
     """bm1_axi, bm_register_block, bm1_guard, and bm1_control of a single machine."""
@@ -47,17 +47,17 @@ class Of(StrEnum):
     STEP = "step"
     """bm1_lfsr: the parity of the taps in one step."""
     PLACE_BIT = "place bit"
-    """bm1_table_player: next place, round the end of the table."""
+    """bm1_table_player: the next index, wrapping at the end of the table."""
     WORD = "word"
-    """bm1_words: address and check of a word that the machine sees."""
+    """bm1_words: address and check of a used word."""
     MEMORY = "memory"
     """bm1_words: initial contents and output of a memory of words."""
     REPLICA = "replica"
-    """bm1_control and bm1_readout, of several: when one stops, why, whether it goes on, and its outcome for the host."""
+    """bm1_control and bm1_readout, with several replicas: stop, reason, resume and outcome of each."""
 
 
 WORST_ERROR: Final = 0.06
-"""The largest relative error of ALUTs and ALMs that `scripts/verify resources` accepts of other machines."""
+"""Maximum relative error of ALUTs and ALMs that `scripts/verify resources` accepts."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +93,7 @@ class Part:
 
     @property
     def aluts(self) -> float:
-        """Look-up tables of all kinds, carry chains among them."""
+        """Look-up tables of all kinds, including carry chains."""
         return sum(count * COSTS[of].aluts for of, count in self.counts.items())
 
     @property
@@ -104,13 +104,13 @@ class Part:
 
 @dataclass(frozen=True, slots=True)
 class Logic:
-    """A machine's logic, memories left out."""
+    """The logic of a machine, without memories."""
 
     parts: tuple[Part, ...]
 
     @property
     def aluts(self) -> float:
-        """Look-up tables, carry chains among them."""
+        """Look-up tables, including carry chains."""
         return sum(part.aluts for part in self.parts)
 
     @property
@@ -125,23 +125,23 @@ class Logic:
 
 
 def state_bits(p: BM1Parameters, table_length: int) -> int:
-    """Return the bits of a generator's state: an LFSR, or a place in the table of random numbers."""
+    """Return the width of a generator's state: an LFSR, or an index in the table of random numbers."""
     return p.rng.lfsr_bits or _index_bits(table_length)
 
 
 def logic_of(parameters: BM1Parameters, *, table_length: int = LENGTH) -> Logic:
-    """Return a machine's logic, its memories left out.
+    """Return the logic of a machine, without memories.
 
     Args:
         parameters: The machine; of one board.
-        table_length: Numbers in the table of random numbers, where one is played.
+        table_length: Length of the table of random numbers, if one is used.
 
     Raises:
-        BuildError: Generators that no FPGA has.
+        BuildError: The generators exist only in emulation.
     """
     p = parameters
     if p.rng is RngKind.IDEAL:
-        raise BuildError("rng = ideal exists emulated only: no FPGA has it; use an LFSR")
+        raise BuildError("rng = ideal exists only in emulation; use an LFSR")
     lines = p.replicas * p.lines
     cells = lines * p.columns
     counters = lines * p.counter_bits
@@ -166,7 +166,7 @@ def logic_of(parameters: BM1Parameters, *, table_length: int = LENGTH) -> Logic:
 
 
 def _generators(p: BM1Parameters, table_length: int) -> Part:
-    """Return the generators, and what loads their seeds (bm1_generators)."""
+    """Return the generators, and the logic that loads their seeds (bm1_generators)."""
     count, width = generators(p), state_bits(p, table_length)
     lfsrs = {Of.STATE_BIT: count * width, Of.STEP: count * p.steps_per_clock}
     counts = lfsrs if p.rng.lfsr_bits else {Of.PLACE_BIT: count * width}
@@ -178,14 +178,14 @@ def _inputs(p: BM1Parameters) -> Part:
     """Return the words that the host writes for a frame (bm1_words): readings, prior addresses of replicas, codes."""
     inputs, results = interface_words(p)
     sensor_bits = sum(p.sensor_bits) * inputs // max(p.sensors, 1)
-    # words, and the bits of them that the machine sees
+    # words, and their used bits
     blocks = [(inputs, sensor_bits)]
     if p.replicas > 1:
         blocks.append((p.replicas, p.replicas * p.prior_bits))
     place_bits = 0
     if p.prior_mode is PriorMode.WRITTEN:
         blocks.append((results, results * p.prob_bits))
-        place_bits = _index_bits(p.lines)  # in the memory of the codes that they hold first
+        place_bits = _index_bits(p.lines)  # in the memory of their initial codes
     # a word has a flag, whether it is too large; a block has two indices, each with a flag, and an output
     registers = sum(
         words + bits + 2 * _index_bits(words) + 2 + (WORD_BITS if words <= _FEW_WORDS else 0)

@@ -1,4 +1,4 @@
-"""Memories of a machine in an FPGA, as the VHDL has them: memory blocks, and memory LABs where those are all taken."""
+"""Memories of a machine in an FPGA, as in the VHDL: memory blocks, then memory LABs."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ if TYPE_CHECKING:
     from toolchain.analysis.resources.device import Device
 
 MLAB_ALMS: Final = 10
-"""ALMs that a memory LAB is made of."""
+"""Number of ALMs of a memory LAB."""
 MLAB_SHAPE: Final = (64, 10)
-"""Its words and their bits, in the deeper of its two shapes."""
+"""Words and bits of a memory LAB, in the deeper of its two shapes."""
 MLAB_SHARE: Final = 0.5
-"""Every other LAB of a Stratix V can be a memory."""
+"""Share of the LABs of a Stratix V that can be memories."""
 
 BLOCK_SHAPES: Final = ((512, 40), (1024, 20), (2048, 10), (4096, 5), (8192, 2), (16384, 1))
-"""Words and their bits that an M20K can be read as."""
+"""Words and bits of an M20K, in its possible shapes."""
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -35,13 +35,13 @@ class _Memory:
 
     @property
     def blocks(self) -> int:
-        """The fewest M20Ks that hold one of them."""
+        """Minimum number of M20Ks for one of them."""
         return min(math.ceil(self.words / deep) * math.ceil(self.width / wide) for deep, wide in BLOCK_SHAPES)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Memories:
-    """The memories that a machine takes; `logic_tables` found no block, and lie in memory LABs."""
+    """The memories of a machine; `logic_tables` did not get a block and are in memory LABs."""
 
     table_bits: int
     blocks: int
@@ -51,9 +51,9 @@ class Memories:
 
 
 def _tables(p: BM1Parameters) -> list[_Memory]:
-    """Return the tables: one for a column that has one address, else one for each cell; a prior of one row has none.
+    """Return the tables: one per column with one address, otherwise one per cell; a one-row prior has none.
 
-    Every replica looks at addresses of its own, so it has tables of its own.
+    Every replica has its own tables, because it uses its own addresses.
     """
     column, cell = (p.lines * p.prob_bits, p.replicas), (p.prob_bits, p.replicas * p.lines)
     tables = [_Memory(1 << p.prior_bits, *column)] if p.prior_bits else []
@@ -80,7 +80,7 @@ def _other_memories(p: BM1Parameters, table_length: int) -> list[_Memory]:
 
 
 def place_memories(parameters: BM1Parameters, device: Device, table_length: int = LENGTH) -> Memories:
-    """Put tables into the memory blocks that other memories leave, the deepest first, and the rest into memory LABs."""
+    """Place tables in the remaining memory blocks, the deepest first, and the rest in memory LABs."""
     tables = _tables(parameters)
     room = math.floor(device.usable * device.blocks)
     blocks = sum(each.count * each.blocks for each in _other_memories(parameters, table_length))
