@@ -1,5 +1,6 @@
 """How a command ends: signals, full disks, too few files."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -37,6 +38,8 @@ def end_of(body, *arguments, stdout=subprocess.DEVNULL):
         stderr=subprocess.PIPE,
         text=True,
         timeout=240,
+        # Unbuffered, Python reports a full disk without a flush at the end.
+        env={name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"},
     )
     return ended.returncode, ended.stderr.splitlines()
 

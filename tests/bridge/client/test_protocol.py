@@ -27,7 +27,6 @@ from bridge.client.protocol.events import (
 from bridge.client.protocol.services import MAX_REQUESTS
 from bridge.codecs import png
 from bridge.errors import (
-    BridgeError,
     EncodeError,
     NameFormError,
     OptionError,
@@ -63,32 +62,28 @@ def test_advertise_publish_unadvertise():
     assert sent(core) == [{"op": "unadvertise", "id": advertise["id"], "topic": "/a"}]
 
 
-@pytest.mark.parametrize("change", [{"type_name": "p/U"}, {"latch": True}, {"qos": Qos(depth=1)}])
-def test_one_topic_advertised_as_two_things_is_refused(change):
-    core = connected()
-    advertisement = core.publications.advertise("/a", "p/T")
-    with pytest.raises(TypeConflictError):
-        core.publications.advertise("a", **{"type_name": "p/T"} | change)
-    assert len(sent(core)) == 1
-    core.publications.unadvertise(advertisement)
-    core.publications.advertise("/a", **{"type_name": "p/T"} | change)
-
-
 @pytest.mark.parametrize(
-    "change",
+    ("wish", "change"),
     [
-        {"type_name": "p/U"},
-        {"delivery": Delivery(compression="cbor")},
-        {"delivery": Delivery(compression="cbor", arrays="numpy")},
+        ("advertise", {"type_name": "p/U"}),
+        ("advertise", {"latch": True}),
+        ("advertise", {"qos": Qos(depth=1)}),
+        ("subscribe", {"type_name": "p/U"}),
+        ("subscribe", {"delivery": Delivery(compression="cbor")}),
+        ("subscribe", {"delivery": Delivery(compression="cbor", arrays="numpy")}),
     ],
 )
-def test_one_topic_subscribed_as_two_things_is_refused(change):
+def test_one_topic_wanted_as_two_things_is_refused(wish, change):
     core = connected()
-    core.subscriptions.subscribe("/a", "p/T")
-    core.subscriptions.subscribe("a", "p/msg/T")
-    core.subscriptions.subscribe("/a")
+    want = core.publications.advertise if wish == "advertise" else core.subscriptions.subscribe
+    forget = core.publications.unadvertise if wish == "advertise" else core.subscriptions.unsubscribe
+    wanted = [want("/a", "p/T"), want("a", "p/msg/T")]
     with pytest.raises(TypeConflictError):
-        core.subscriptions.subscribe("a", **change)
+        want("a", **{"type_name": "p/T"} | change)
+    assert len(sent(core)) == 1
+    for number in wanted:
+        forget(number)
+    want("/a", **{"type_name": "p/T"} | change)
 
 
 def test_a_message_that_cannot_leave_is_named():
@@ -128,29 +123,12 @@ def test_the_form_of_type_names_follows_the_server(version, message_type, servic
 # Subscribing
 
 
-def test_subscribe_and_unsubscribe():
-    core = connected()
-    number = core.subscriptions.subscribe("/a", "p/T", throttle_rate=100, queue_length=3)
-    (subscribe,) = sent(core)
-    assert subscribe == {
-        "op": "subscribe",
-        "id": subscribe["id"],
-        "topic": "/a",
-        "type": "p/T",
-        "throttle_rate": 100,
-        "queue_length": 3,
-    }
-    assert tell(core, op="publish", topic="/a", msg={"d": 1}) == MessageReceived("/a", {"d": 1}, (number,))
-    core.subscriptions.unsubscribe(number)
-    assert sent(core) == [{"op": "unsubscribe", "id": subscribe["id"], "topic": "/a"}]
-    assert tell(core, op="publish", topic="/a", msg={}) is None
-
-
 def test_several_subscriptions_share_one_on_the_wire():
     core = connected()
     slow = core.subscriptions.subscribe("/a", throttle_rate=100, queue_length=2)
     (first,) = sent(core)
-    assert "type" not in first
+    asked = {"topic": "/a", "throttle_rate": 100, "queue_length": 2}
+    assert first == {"op": "subscribe", "id": first["id"], **asked}
     fast = core.subscriptions.subscribe("a", "p/T", throttle_rate=50)
     (second,) = sent(core)
     assert second == first | {"throttle_rate": 50, "type": "p/T"}
@@ -161,13 +139,15 @@ def test_several_subscriptions_share_one_on_the_wire():
         ("a", 0.06, (fast, same)),
         ("/a", 0.11, (slow, fast, same)),
     ):
-        assert tell(core, now, op="publish", topic=topic, msg={}).subscriptions == receivers
+        event = tell(core, now, op="publish", topic=topic, msg={"d": 1})
+        assert event == MessageReceived(topic, {"d": 1}, receivers)
     core.subscriptions.unsubscribe(fast)
     assert sent(core) == []
     core.subscriptions.unsubscribe(same)
     assert sent(core) == [second | {"throttle_rate": 100}]
     core.subscriptions.unsubscribe(slow)
     assert sent(core) == [{"op": "unsubscribe", "id": first["id"], "topic": "/a"}]
+    assert tell(core, op="publish", topic="/a", msg={}) is None
 
 
 @pytest.mark.parametrize("bad", [-1, 0.0, 1.5, True, None, "5"])
@@ -244,15 +224,6 @@ def test_answers_as_servers_give_them(answer, ok, values):
     assert tell(core, op="service_response", id=call, **answer) == CallAnswered(call, ok=ok, values=values)
 
 
-def test_calls_are_bounded():
-    core = connected()
-    calls = [core.calls.send("/s", {}) for _ in range(MAX_CALLS)]
-    with pytest.raises(SlowPeerError, match="/s"):
-        core.calls.send("/s", {})
-    core.calls.forget(calls[0])
-    core.calls.send("/s", {})
-
-
 # Serving
 
 
@@ -294,9 +265,13 @@ def test_what_cannot_be_served_is_refused_on_the_spot():
 # Losing and restoring
 
 
-def test_calls_and_requests_end_with_the_connection():
+def test_calls_are_bounded_and_they_and_requests_end_with_the_connection():
     core = connected()
     core.services.advertise("/s", "p/T")
+    calls = [core.calls.send("/x", {}) for _ in range(MAX_CALLS)]
+    with pytest.raises(SlowPeerError, match="/x"):
+        core.calls.send("/x", {})
+    core.calls.forget(calls[0])
     call = core.calls.send("/x", {})
     request = tell(core, op="call_service", service="/s", id="x")
     core.lost()
@@ -331,9 +306,7 @@ def wrapped(inner: bytes) -> bytes:
     "data",
     [
         b"",
-        b"[]",
         b"42",
-        b"{}",
         b'{"op": 3}',
         b'{"op": "publish"}',
         b'{"op": "publish", "topic": "/a", "msg": 3}',
@@ -347,7 +320,6 @@ def wrapped(inner: bytes) -> bytes:
         b'{"op": "call_service", "service": "/s", "id": []}',
         b'{"op": "nonsense"}',
         b"\x00\xff" * 500,
-        b"\xff",
         b"\xa1",
         cbor2.dumps({"op": "call_service", "service": "/a"}),
         cbor2.dumps({"op": ["publish"]}),
@@ -357,10 +329,8 @@ def wrapped(inner: bytes) -> bytes:
         b'{"op": "fragment", "id": "1", "data": "", "num": 0, "total": 1.0}',
         wrapped(wrapped(b'{"op":"publish","topic":"/a","msg":{}}')),
         wrapped(b"no json"),
-        wrapped(b"[]"),
         wrapped(b'{"op":["fragment"]}'),
         b'{"op":"fragment"}',
-        b'{"op":["fragment"]}',
         b'{"op":{"png":1}}',
         b'{"op":"png"}',
         b'{"op":"png","data":"xx"}',
@@ -485,33 +455,19 @@ class Wishes(RuleBasedStateMachine):
         for topic in self.core.subscriptions.silent():
             self.core.subscriptions.renew(topic)
 
-    @rule(name=st.text(max_size=3), rate=st.sampled_from([-1, 0.5, None]))
-    def want_nonsense(self, name: str, rate: Any) -> None:
-        for attempt in (
-            lambda: self.core.subscriptions.subscribe("/a", throttle_rate=rate),
-            lambda: self.core.publications.advertise(f" {name}", "p/T"),
-            lambda: self.core.publications.advertise("/a", f" {name}"),
-        ):
-            with pytest.raises(BridgeError):
-                attempt()
-
     @rule(topic=st.sampled_from([*TOPICS, "/c"]), step=st.sampled_from([0.0, 0.05, 0.2, 2.0]))
     def message(self, topic: str, step: float) -> None:
         self.now += step
         event = self.core.receive(json.dumps({"op": "publish", "topic": topic, "msg": {}}), self.now)
-        wanting = {n: w for n, w in self.subscriptions.items() if w[0] == absolute(topic)}
-        if event is None:
-            # Only those who want fewer than the server was asked for can be left out.
-            fastest = min((rate for _topic, rate, _length in wanting.values()), default=0)
-            assert not any(rate == fastest for _topic, rate, _length in wanting.values())
-            return
-        assert isinstance(event, MessageReceived)
-        assert set(event.subscriptions) <= set(wanting)
-        assert len(set(event.subscriptions)) == len(event.subscriptions)
-        fastest = min(rate for _topic, rate, _length in wanting.values())
-        for number, (_topic, rate, _length) in wanting.items():
-            if rate == fastest:
-                assert number in event.subscriptions
+        assert event is None or isinstance(event, MessageReceived)
+        received = [] if event is None else list(event.subscriptions)
+        assert len(set(received)) == len(received)
+        wanting = {
+            n: rate for n, (wanted, rate, _length) in self.subscriptions.items() if wanted == absolute(topic)
+        }
+        # Only those who want fewer than the server was asked for can be left out.
+        fastest = {number for number, rate in wanting.items() if rate == min(wanting.values())}
+        assert fastest <= set(received) <= set(wanting)
 
     @invariant()
     def the_server_knows_what_is_wanted(self) -> None:

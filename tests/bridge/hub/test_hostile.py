@@ -166,7 +166,7 @@ async def _flood(raw: RawClient, data: bytes) -> None:
 
 
 async def test_a_flood_of_calls_without_reading_costs_the_connection(quick_sweeps: None) -> None:
-    limits = HubLimits(message_bytes=200_000, client_bytes=200_000, topics=2000)
+    limits = HubLimits(message_bytes=200_000, client_bytes=200_000, topics=2000, stuck_timeout=0.3)
     async with _hub_and_witness(limits) as (port, witness):
         for index in range(1500):  # so that one answer has 50 kB
             await witness.send(op="subscribe", topic=f"/a/long/name/of/a/topic/{index}")

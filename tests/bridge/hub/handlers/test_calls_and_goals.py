@@ -1,0 +1,350 @@
+"""Calls of services and goals of actions: client -> hub -> serving client -> hub -> client, each ended exactly once."""
+
+from typing import Any
+
+import pytest
+
+from bridge.client.protocol.events import GoalStatus
+from tests.bridge.hub.broker_harness import Harness, Peer
+
+ASKS = {"service": "call_service", "action": "send_action_goal"}
+ENDS = {"service": "service_response", "action": "action_result"}
+TYPES = {"service": "a/Work", "action": "a/action/Work"}
+
+
+class Work:
+    """A hub with a client that offers /work, a service or an action, and one that asks for it."""
+
+    def __init__(self, kind: str, *, ros_version: Any = 2, **limits: Any) -> None:
+        self.kind = kind
+        self.hub = Harness(ros_version=ros_version, **limits)
+        self.server, self.client = self.hub.connect(), self.hub.connect()
+        self.offer(self.server)
+
+    @property
+    def offered(self) -> dict[str, Any]:
+        return self.hub.broker.graph.services if self.kind == "service" else self.hub.broker.graph.actions
+
+    @property
+    def pending(self) -> dict[str, Any]:
+        return self.hub.broker._calls.pending if self.kind == "service" else self.hub.broker._actions.goals
+
+    def offer(self, peer: Peer, name: str = "/work") -> None:
+        peer.send(op=f"advertise_{self.kind}", type=TYPES[self.kind], **{self.kind: name})
+
+    def withdraw(self, peer: Peer) -> None:
+        peer.send(op=f"unadvertise_{self.kind}", **{self.kind: "work"})
+
+    def ask(self, identity: Any = "x", peer: Peer | None = None, name: str = "/work", **more: Any) -> None:
+        (peer or self.client).send(op=ASKS[self.kind], id=identity, **{self.kind: name}, **more)
+
+    def asked(self, identity: Any = "x", **more: Any) -> str:
+        """Ask, and return the key of the request at the server."""
+        self.ask(identity, **more)
+        (request,) = self.server.read()
+        return str(request["id"])
+
+    def end(self, key: str, peer: Peer | None = None, **answer: Any) -> None:
+        (peer or self.server).send(op=ENDS[self.kind], id=key, **answer)
+
+    def answer(self, peer: Peer | None = None) -> dict[str, Any]:
+        """Return the one answer that a client got."""
+        (answer,) = (peer or self.client).read()
+        assert answer["op"] == ENDS[self.kind]
+        return answer
+
+    def ended(self, **answer: Any) -> dict[str, Any]:
+        """Ask, end it, and return the answer that the client gets."""
+        self.end(self.asked(), **answer)
+        return self.answer()
+
+
+@pytest.fixture(params=["service", "action"])
+def work(request: pytest.FixtureRequest) -> Work:
+    return Work(request.param)
+
+
+@pytest.fixture
+def action() -> Work:
+    return Work("action")
+
+
+BOTH = pytest.mark.parametrize("kind", ["service", "action"])
+
+
+# --- both
+
+
+@pytest.mark.parametrize("args", [{"a": [1, {"b": None}]}, {}, [1, 2]])
+@pytest.mark.parametrize(("name", "identity"), [("work", {}), ("/work", {"id": 7}), ("/work", {"id": "x"})])
+def test_an_answer_has_the_id_and_the_name_that_were_used(
+    work: Work, args: object, name: str, identity: dict[str, Any]
+) -> None:
+    called = {work.kind: name} | identity
+    work.client.send(op=ASKS[work.kind], args=args, **called)
+    (request,) = work.server.read()
+    assert (request["op"], request[work.kind], request["args"]) == (ASKS[work.kind], "/work", args)
+    assert work.client.read() == []
+    work.end(request["id"], values={"sum": 3}, result=True)
+    status = {"status": GoalStatus.SUCCEEDED} if work.kind == "action" else {}
+    assert work.answer() == {"op": ENDS[work.kind], "values": {"sum": 3}, "result": True, **called, **status}
+    assert not work.pending
+
+
+def test_answers_may_come_in_any_order_and_go_to_whoever_asked(work: Work) -> None:
+    other = work.hub.connect()
+    keys = {peer: work.asked("same", peer=peer) for peer in (work.client, other)}
+    for peer in (other, work.client):
+        work.end(keys[peer], values={"n": keys[peer]}, result=True)
+    assert [work.answer(peer)["values"]["n"] for peer in keys] == list(keys.values())
+
+
+@pytest.mark.parametrize(
+    ("values", "reason"), [("no such thing", "no such thing"), ({"error": 5}, '{"error":5}')]
+)
+def test_a_refusal_is_a_string(work: Work, values: object, reason: str) -> None:
+    answer = work.ended(values=values, result=False)
+    assert (answer["result"], answer["values"]) == (False, reason)
+
+
+@pytest.mark.parametrize("values", ["text", 3, [1]])
+def test_values_that_are_not_an_object_are_a_failure(work: Work, values: object) -> None:
+    assert work.ended(values=values, result=True)["result"] is False
+
+
+@pytest.mark.parametrize(
+    ("kind", "wish"),
+    [
+        ("service", {"timeout": "soon"}),
+        ("action", {"action_type": "a/action/Other"}),
+        ("action", {"action_type": "nonsense"}),
+        ("action", {"feedback": "much"}),
+        *((kind, {"name": "/nowhere"}) for kind in ASKS),
+    ],
+)
+def test_an_impossible_wish_is_answered(kind: str, wish: dict[str, Any]) -> None:
+    work = Work(kind)
+    work.ask(**wish)
+    assert work.server.read() == []
+    answer = work.answer()
+    assert (answer["id"], answer["result"], answer[kind]) == ("x", False, wish.get("name", "/work"))
+    assert isinstance(answer["values"], str)
+    assert answer.get("status") == (GoalStatus.ABORTED if kind == "action" else None)
+
+
+def test_a_server_that_leaves_fails_what_it_works_on_and_leaves_nothing(work: Work) -> None:
+    work.ask()
+    work.ask(peer=work.server)  # a client can ask itself
+    work.server.disconnect()
+    assert work.answer()["result"] is False
+    assert not work.pending
+    assert not work.offered
+    work.ask()
+    assert work.answer()["result"] is False
+
+
+def test_a_client_that_leaves_is_not_answered_and_its_goals_are_cancelled(work: Work) -> None:
+    key = work.asked()
+    work.client.disconnect()
+    cancelled = [{"op": "cancel_action_goal", "id": key, "action": "/work"}]
+    assert work.server.read() == (cancelled if work.kind == "action" else [])
+    work.end(key, values={}, result=True)
+    assert work.server.client.refused == 1
+    work.hub.advance(1000)
+
+
+def test_only_the_server_can_answer_and_only_once(work: Work) -> None:
+    key = work.asked()
+    for peer, number in ((work.hub.connect(), 666), (work.server, 1), (work.server, 2)):
+        work.end(key, peer, values={"n": number}, result=True)
+    assert work.answer()["values"] == {"n": 1}
+
+
+def test_the_newest_offer_counts_and_its_owner_alone_withdraws_it(work: Work) -> None:
+    new = work.hub.connect()
+    key = work.asked("old")
+    work.offer(new)
+    work.ask("new")
+    assert work.server.read() == []
+    (request,) = new.read()
+    work.withdraw(work.server)
+    assert list(work.offered) == ["/work"]
+    work.withdraw(new)
+    assert not work.offered
+    assert (work.server.client.refused, new.client.refused) == (1, 0)
+    for peer, each in ((work.server, key), (new, request["id"])):  # what was begun may still be ended
+        work.end(each, peer, values={}, result=True)
+    assert [answer["id"] for answer in work.client.read()] == ["old", "new"]
+
+
+@BOTH
+def test_what_a_client_waits_for_and_what_a_server_works_on_are_counted(kind: str) -> None:
+    work = Work(kind, calls_per_client=3, goals_per_client=3)
+    second, other = work.hub.connect(), work.hub.connect()
+    work.offer(second, "/second")
+    for number, name in enumerate(["/work", "/second", "/work", "/second"]):  # no server has too many
+        work.ask(number, name=name)
+    assert (work.answer()["id"], len(work.pending)) == (3, 3)
+    keys = [request["id"] for request in work.server.read()]
+    for number in range(2):
+        work.ask(number, peer=other)
+    assert (work.answer(other)["id"], len(work.pending)) == (1, 4)
+    work.end(keys[0], values={}, result=True)
+    work.ask(2, peer=other)
+    assert len(work.server.read()) == 2
+
+
+@BOTH
+def test_offers_are_counted_and_can_be_repeated(kind: str) -> None:
+    work = Work(kind, services_per_client=2)
+    for name in ("/1", "/2", "/3", "/work"):
+        work.offer(work.server, name)
+    assert (list(work.offered), work.server.client.refused) == (["/work", "/1"], 2)
+
+
+@BOTH
+def test_what_is_too_large_fails_and_its_failure_fits(kind: str) -> None:
+    work = Work(kind, message_bytes=400)
+    for answer in ({"values": {"a": "x" * 250}, "result": True}, {"values": "x" * 300, "result": False}):
+        work.end(work.asked("g" * 250), **answer)
+        failed = work.answer()
+        assert (failed["id"], failed["result"]) == ("g" * 250, False)
+        assert len(failed["values"]) <= 50
+    work.ask(name="/" + "x" * 200)
+    assert work.answer()["result"] is False
+    growing = b",".join([b"1e15"] * 50)
+    work.client.send_raw(
+        b'{"op":"%b","%b":"/work","args":[%b]}' % (ASKS[kind].encode(), kind.encode(), growing)
+    )
+    assert work.server.read() == []
+    assert work.answer()["result"] is False
+
+
+# --- calls
+
+
+def test_as_in_ros_1_an_answer_is_passed_on_whatever_its_result() -> None:
+    service = Work("service", ros_version=1)
+    answer = service.ended(values={"sum": 3}, result=False)
+    assert (answer["values"], answer["result"]) == ({"sum": 3}, True)
+    assert service.ended(result=False)["result"] is False
+
+
+def test_a_call_without_an_answer_fails_in_time() -> None:
+    service = Work("service", call_timeout=10)
+    for identifier, timeout in (("long", 0), ("short", 2.5), ("longer", 1000)):
+        service.ask(identifier, timeout=timeout)
+    requests = service.server.read()
+    service.hub.advance(2.4)
+    assert service.client.read() == []
+    service.hub.advance(0.2)
+    answer = service.answer()
+    assert (answer["id"], answer["result"]) == ("short", False)
+    service.hub.advance(8)
+    assert [answer["id"] for answer in service.client.read()] == ["long", "longer"]
+    service.end(requests[0]["id"], values={}, result=True)  # too late
+    assert service.client.read() == []
+    assert service.server.client.refused == 1
+
+
+def test_deadlines_of_answered_calls_do_not_accumulate() -> None:
+    service = Work("service")
+    slow = service.asked("slow")
+    for _ in range(1000):
+        service.ended(values={})
+    assert len(service.hub.broker._calls._deadlines) < 100
+    service.hub.advance(61)
+    assert service.answer()["id"] == "slow"
+    assert slow not in service.pending
+
+
+def test_a_client_that_reads_no_answers_must_be_closed() -> None:
+    hub = Harness(message_bytes=1000, client_bytes=4000)
+    reader, deaf = hub.connect(), hub.connect()
+    for _ in range(100):
+        deaf.send(op="call_service", service="/rosapi/get_time")
+        reader.rosapi("get_time")
+    assert deaf.client in hub.broker.take_ready()
+    assert (bool(deaf.client.close_reason), bool(reader.client.close_reason)) == (True, False)
+
+
+# --- goals
+
+
+@pytest.mark.parametrize("wanted", [True, False])
+def test_feedback_is_sent_only_if_requested(action: Work, wanted: bool) -> None:
+    key = action.asked(feedback=wanted, action_type=TYPES["action"])
+    action.server.send(op="action_feedback", id=key, action="/work", values={"part": 1})
+    feedback = {"op": "action_feedback", "action": "/work", "values": {"part": 1}, "id": "x"}
+    assert action.client.read() == [feedback] * wanted
+
+
+def test_goals_are_cancelled_by_their_server_one_or_all(action: Work) -> None:
+    keys = [action.asked(number) for number in range(3)]
+    action.client.send(op="cancel_action_goal", id=0, action="work")
+    assert action.server.read() == [{"op": "cancel_action_goal", "id": keys[0], "action": "/work"}]
+    action.end(keys[0], values={}, status=GoalStatus.CANCELED, result=True)
+    result = action.answer()
+    assert (result["id"], result["status"], result["result"]) == (0, GoalStatus.CANCELED, True)
+    assert action.client.ask("/work/_action/cancel_goal")["result"] is True
+    assert [(each["op"], each["id"]) for each in action.server.read()] == [
+        ("cancel_action_goal", key) for key in keys[1:]
+    ]
+    assert action.client.ask("/nothing/_action/cancel_goal")["result"] is False
+
+
+@pytest.mark.parametrize(
+    ("answer", "status"),
+    [
+        ({"result": False}, GoalStatus.ABORTED),
+        ({"result": False, "values": "stuck", "status": 5}, GoalStatus.CANCELED),
+        ({"result": False, "values": "stuck", "status": 99}, GoalStatus.ABORTED),
+        ({"result": "yes", "values": "?", "status": True}, GoalStatus.ABORTED),
+    ],
+)
+def test_a_failed_goal_has_a_status_and_a_reason(action: Work, answer: dict[str, Any], status: int) -> None:
+    result = action.ended(**answer)
+    assert (result["result"], result["status"]) == (False, status)
+    assert answer.get("values", "/work") in result["values"]
+
+
+def test_fields_left_out_of_a_result_have_defaults(action: Work) -> None:
+    result = {"values": {}, "status": GoalStatus.SUCCEEDED, "result": True}
+    assert action.ended() == {"op": "action_result", "action": "/work", "id": "x", **result}
+
+
+def test_nobody_tells_or_cancels_the_goals_of_others(action: Work) -> None:
+    stranger = action.hub.connect()
+    key = action.asked()
+    stranger.send(op="action_feedback", id=key, action="/work", values={})
+    stranger.send(op="cancel_action_goal", id="x", action="/work")
+    action.client.send(op="cancel_action_goal", id="x", action="/other")
+    assert (stranger.client.refused, action.client.client.refused) == (2, 1)
+    assert action.client.read() == action.server.read() == []
+
+
+def test_a_client_has_one_goal_of_an_id(action: Work) -> None:
+    action.ask()
+    action.ask()
+    assert action.answer()["result"] is False
+    assert len(action.server.read()) == 1
+
+
+def test_a_slow_client_loses_feedback_but_not_the_result() -> None:
+    action = Work("action", queue_length=3)
+    key = action.asked(feedback=True)
+    for index in range(100):
+        action.server.send(op="action_feedback", id=key, values={"i": index})
+    action.end(key, values={})
+    *feedback, result = action.client.read()
+    assert [operation["values"]["i"] for operation in feedback] == [97, 98, 99]
+    assert result["op"] == "action_result"
+
+
+def test_actions_are_described_also_those_of_actionlibs_topics(action: Work) -> None:
+    assert action.client.rosapi("action_type", action="work") == {"type": TYPES["action"]}
+    for part in ("cancel", "status", "feedback", "result"):
+        action.client.advertise(f"/dock/{part}")
+    assert action.client.rosapi("action_servers") == {"action_servers": ["/work"]}
+    action.client.subscribe("/dock/goal", type="a/B")
+    assert set(action.client.rosapi("action_servers")["action_servers"]) == {"/dock", "/work"}
