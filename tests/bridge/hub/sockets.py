@@ -116,12 +116,12 @@ class RawClient:
             await raw.request()
         return raw
 
-    async def request(self, *headers: str, path: str = "/") -> str:
+    async def request(self, *headers: str, path: str = "/", host: str = "localhost") -> str:
         """Request a WebSocket, and return the status line of the answer."""
         key = base64.b64encode(os.urandom(16)).decode()
         lines = [
             f"GET {path} HTTP/1.1",
-            "Host: localhost",
+            f"Host: {host}",
             "Upgrade: websocket",
             "Connection: Upgrade",
             f"Sec-WebSocket-Key: {key}",
