@@ -14,6 +14,7 @@ from typer.main import get_command
 
 from terminal.ending import outcome
 from terminal.errors import ReaderGoneError
+from terminal.help_page import WIDTH, write_help
 from terminal.logs import escape_last_resort
 from terminal.output import open_standard_streams
 from terminal.signals import raise_on_signals
@@ -30,8 +31,8 @@ class CommandLine(typer.Typer):
         super().__init__(
             cls=_Group,
             pretty_exceptions_enable=False,
-            rich_markup_mode="markdown",
-            context_settings={"help_option_names": ["-h", "--help"]},
+            rich_markup_mode=None,
+            context_settings={"help_option_names": ["-h", "--help"], "max_content_width": WIDTH},
             **settings,
         )
 
@@ -61,13 +62,10 @@ class CommandLine(typer.Typer):
 
 
 class _WithEnd:
-    """Behaviour of commands and groups: `--help` without a placeholder, and our own exit codes."""
+    """Behaviour of commands and groups: our own page of `--help`, and our own exit codes."""
 
-    def get_help_option(self, ctx: Any) -> Any:
-        option = super().get_help_option(ctx)  # type: ignore[misc]  # of typer's class
-        if option is not None:
-            option.metavar = ""
-        return option
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        write_help(self, ctx, formatter)
 
     def invoke(self, ctx: Any) -> Any:
         try:

@@ -44,7 +44,9 @@ def report(error: BaseException) -> int:
     if isinstance(error, SystemExit):
         return error.code if isinstance(error.code, int) else ExitCode.DONE
     if isinstance(error, typer.TyperException):
-        if type(error).__name__ != "NoArgsIsHelpError":  # typer has already printed the help
+        if type(error).__name__ == "NoArgsIsHelpError":
+            print(error.message.rstrip())
+        else:
             say(f"error: {usage_sentence(error)}")
         return ExitCode.USAGE
     if isinstance(error, ReaderGoneError | BrokenPipeError):

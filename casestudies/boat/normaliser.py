@@ -78,11 +78,15 @@ async def serve(uri: str, *, raw_topic: str, sensors_topic: str, array: bool) ->
 app = CommandLine()
 
 
-@app.command(epilog="Example: `boat-normaliser --uri ws://127.0.0.1:9090`")
+@app.command(epilog="`boat-normaliser --uri ws://127.0.0.1:9090`")
 def boat_normaliser(
-    uri: Annotated[str, typer.Option(envvar="BM_URI", help="The rosbridge server.")] = "ws://127.0.0.1:9090",
-    raw_topic: Annotated[str, typer.Option(help="Topic of the raw readings.")] = RAW_TOPIC,
-    sensors_topic: Annotated[str, typer.Option(help="Topic of the normalised readings.")] = SENSORS_TOPIC,
+    uri: Annotated[
+        str, typer.Option(envvar="BM_URI", help="The rosbridge server.", metavar="ws://HOST:PORT")
+    ] = "ws://127.0.0.1:9090",
+    raw_topic: Annotated[str, typer.Option(help="Topic of the raw readings.", metavar="TOPIC")] = RAW_TOPIC,
+    sensors_topic: Annotated[
+        str, typer.Option(help="Topic of the normalised readings.", metavar="TOPIC")
+    ] = SENSORS_TOPIC,
     array: Annotated[
         bool, typer.Option("--array", help="std_msgs/Float64MultiArray in and out instead of boat_msgs.")
     ] = False,

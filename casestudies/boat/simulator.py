@@ -126,14 +126,17 @@ async def simulate(
 app = CommandLine()
 
 
-@app.command(epilog="Example: `boat-simulator --uri ws://127.0.0.1:9090 --seed 7 --rate 10`")
+@app.command(epilog="`boat-simulator --uri ws://127.0.0.1:9090 --seed 7 --rate 10`")
 def boat_simulator(
-    uri: Annotated[str, typer.Option(envvar="BM_URI", help="The rosbridge server.")] = "ws://127.0.0.1:9090",
+    uri: Annotated[
+        str, typer.Option(envvar="BM_URI", help="The rosbridge server.", metavar="ws://HOST:PORT")
+    ] = "ws://127.0.0.1:9090",
     seed: Annotated[
-        int | None, typer.Option(min=0, help="Seed of route and noise; by default one is chosen and printed.")
+        int | None,
+        typer.Option(min=0, help="Seed of route and noise.", show_default="one is chosen and printed"),
     ] = None,
     rate: Annotated[float, typer.Option(min=0.01, max=10_000, help="Readings a second.")] = 10.0,
-    topic: Annotated[str, typer.Option(help="Topic of the raw readings.")] = RAW_TOPIC,
+    topic: Annotated[str, typer.Option(help="Topic of the raw readings.", metavar="TOPIC")] = RAW_TOPIC,
     speed: Annotated[float, typer.Option(min=0.0, help="The boat's speed, in map units per second.")] = 60.0,
     count: Annotated[int | None, typer.Option(min=1, help="End after this many readings.")] = None,
     array: Annotated[

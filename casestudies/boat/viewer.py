@@ -266,14 +266,17 @@ def _results(number: int) -> str:
 app = CommandLine()
 
 
-@app.command(epilog="Example: `boat-viewer --uri ws://127.0.0.1:9090 --count 25 --out out`")
+@app.command(epilog="`boat-viewer --uri ws://127.0.0.1:9090 --count 25 --out out`")
 def boat_viewer(
-    uri: Annotated[str, typer.Option(envvar="BM_URI", help="The rosbridge server.")] = "ws://127.0.0.1:9090",
+    uri: Annotated[
+        str, typer.Option(envvar="BM_URI", help="The rosbridge server.", metavar="ws://HOST:PORT")
+    ] = "ws://127.0.0.1:9090",
     count: Annotated[
         int | None,
         typer.Option(
             min=1,
-            help=f"End after this many results; by default at Ctrl-C, with the last {KEPT} in pictures and numbers.",
+            help="End after this many results.",
+            show_default=f"at Ctrl-C, with the last {KEPT} in pictures and numbers",
         ),
     ] = None,
     out: Annotated[
@@ -285,7 +288,9 @@ def boat_viewer(
     numbers: Annotated[
         Path | None, typer.Option("--json", help="Write the numbers to this file, as one JSON object.")
     ] = None,
-    truth_topic: Annotated[str, typer.Option(help="Topic of the true pose.")] = TRUE_POSE_TOPIC,
+    truth_topic: Annotated[
+        str, typer.Option(help="Topic of the true pose.", metavar="TOPIC")
+    ] = TRUE_POSE_TOPIC,
     truth_tolerance: Annotated[
         float,
         typer.Option(min=0, help="Seconds by which a true pose may be older than the reading."),

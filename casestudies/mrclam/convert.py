@@ -284,7 +284,7 @@ def prefix_of(folder: Path) -> str:
 app = CommandLine()
 
 
-@app.command(epilog="Example: `python -m casestudies.mrclam.convert MRCLAM_Dataset1 -o DATA_DIR`")
+@app.command(epilog="`python -m casestudies.mrclam.convert MRCLAM_Dataset1 -o DATA_DIR`")
 def convert(
     folder: Annotated[
         Path,
@@ -300,7 +300,7 @@ def convert(
     ],
     robot: Annotated[
         list[int] | None,
-        typer.Option(help="A robot's number; repeat for more. By default all.", metavar="NUMBER"),
+        typer.Option(help="A robot's number; repeat for more.", show_default="all", metavar="NUMBER"),
     ] = None,
 ) -> None:
     """Convert a downloaded data set into the case study's CSV files.

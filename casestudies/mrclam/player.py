@@ -203,14 +203,18 @@ def _write_numbers(path: Path, played: Sequence[PlayedFrame]) -> None:
 app = CommandLine()
 
 
-@app.command(epilog="Example: `python -m casestudies.mrclam.player data/ds1_robot3.csv --count 20`")
+@app.command(epilog="`python -m casestudies.mrclam.player data/ds1_robot3.csv --count 20`")
 def player(
     recording: Annotated[
         Path | None, typer.Argument(help="A file like ds1_robot3.csv.", show_default=False)
     ] = None,
-    uri: Annotated[str, typer.Option(envvar="BM_URI", help="The rosbridge server.")] = "ws://127.0.0.1:9090",
-    topic: Annotated[str, typer.Option(help="Topic of the sightings.")] = SIGHTINGS_TOPIC,
-    count: Annotated[int | None, typer.Option(min=1, help="Play this many frames; by default all.")] = None,
+    uri: Annotated[
+        str, typer.Option(envvar="BM_URI", help="The rosbridge server.", metavar="ws://HOST:PORT")
+    ] = "ws://127.0.0.1:9090",
+    topic: Annotated[str, typer.Option(help="Topic of the sightings.", metavar="TOPIC")] = SIGHTINGS_TOPIC,
+    count: Annotated[
+        int | None, typer.Option(min=1, help="Play this many frames.", show_default="all")
+    ] = None,
     first_timeout: Annotated[float, typer.Option(min=0.1, help="Seconds until the first result.")] = 30.0,
     timeout: Annotated[float, typer.Option(min=0.1, help="Seconds until any other result.")] = 10.0,
     numbers: Annotated[

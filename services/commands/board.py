@@ -4,7 +4,7 @@ import os
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
 
@@ -23,6 +23,9 @@ from terminal.ending import PARENT_VARIABLE
 from terminal.output import say
 from terminal.signals import check_signals, stopped_by
 
+_SEVERAL: Final = "Several boards"
+_OVER_TCP: Final = "A board over TCP"
+
 app = CommandLine(
     help="Emulate boards of the mini-cluster. They start blank; pcie-app or the loader programs them.\n\n"
     "`board --listen unix:/tmp/b/board0.sock` runs one board; `board --boards 4 --directory /tmp/b` runs four, "
@@ -34,24 +37,41 @@ app = CommandLine(
 def board(
     listen: options.Listen = None,
     index: Annotated[int, typer.Option(min=0, help="Number of the board, for its messages.")] = 0,
-    boards: Annotated[int | None, typer.Option(min=1, max=64, help="Number of boards to run.")] = None,
-    directory: Annotated[
-        Path | None, typer.Option(help="Folder of their sockets: board0.sock, board1.sock, ...")
+    boards: Annotated[
+        int | None, typer.Option(min=1, max=64, help="Number of boards to run.", rich_help_panel=_SEVERAL)
     ] = None,
-    restarts: Annotated[int, typer.Option(min=0, help="Maximum number of restarts within 60 s.")] = RESTARTS,
+    directory: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder of their sockets: board0.sock, board1.sock, ...",
+            metavar="DIR",
+            rich_help_panel=_SEVERAL,
+        ),
+    ] = None,
+    restarts: Annotated[
+        int,
+        typer.Option(min=0, help="Maximum number of restarts within 60 s.", rich_help_panel=_SEVERAL),
+    ] = RESTARTS,
     key_file: options.KeyFile = None,
     tls_cert: Annotated[
         Path | None,
         typer.Option(
-            metavar="FILE", help="Certificate of the board (PEM), to serve tls:// instead of tcp://."
+            metavar="FILE",
+            help="Certificate of the board (PEM), to serve tls:// instead of tcp://.",
+            rich_help_panel=_OVER_TCP,
         ),
     ] = None,
     tls_key: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Private key of the certificate (PEM).")
+        Path | None,
+        typer.Option(metavar="FILE", help="Private key of the certificate (PEM).", rich_help_panel=_OVER_TCP),
     ] = None,
     insecure: options.Insecure = False,
     misbehave: Annotated[
-        str, typer.Option(help="For tests: one of the misbehaviours listed in docs/reference/boards.md.")
+        str,
+        typer.Option(
+            help="For tests: one of the misbehaviours listed in docs/reference/boards.md.",
+            metavar="KIND[:AFTER[:TIMES]]",
+        ),
     ] = "",
 ) -> int:
     """Emulate boards of the mini-cluster."""

@@ -1,76 +1,127 @@
 """Flags shared by several commands."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
 import typer
 
-from services.settings import LONGEST_S, SHORTEST_S
+from services.settings import ENV_PREFIX, LONGEST_S, SHORTEST_S, Settings
+
+SERVER: Final = "rosbridge"
+BOARDS: Final = "Boards"
+SERVING: Final = "Under a master"
+TIMEOUTS: Final = "Timeouts in seconds"
+"""Groups of flags in `--help`."""
 
 
-def _seconds(meaning: str) -> Any:
-    return typer.Option(min=SHORTEST_S, max=LONGEST_S, help=meaning)
+def setting(name: str, meaning: str, *names: str, otherwise: str = "", **more: Any) -> Any:
+    """Return the flag of a setting, whose default is its `BM_*` variable, or else `otherwise` or that of the class."""
+    default = Settings.model_fields[name].default
+    otherwise = otherwise or str(default or "")
+    variable = f"{ENV_PREFIX}{name.upper()}"
+    return typer.Option(
+        *names, help=meaning, show_default=f"{variable}, or {otherwise}" if otherwise else variable, **more
+    )
 
+
+def seconds(name: str, meaning: str) -> Any:
+    """Return the flag of a timeout."""
+    return setting(name, meaning, min=SHORTEST_S, max=LONGEST_S, rich_help_panel=TIMEOUTS)
+
+
+_DEPLOYMENTS: Final = "the deployment's"
 
 Deployment = Annotated[
     Path | None,
-    typer.Option("--deployment", "-d", help="Folder written by `toolchain build`.", metavar="DIR"),
+    setting("deployment", "Folder written by `toolchain build`.", "--deployment", "-d", metavar="DIR"),
 ]
 Uri = Annotated[
     str | None,
-    typer.Option(help="rosbridge server, instead of the deployment's.", metavar="ws://HOST:PORT|robot:NAME"),
+    setting(
+        "uri",
+        "The rosbridge server.",
+        otherwise=_DEPLOYMENTS,
+        metavar="ws://HOST:PORT|robot:NAME",
+        rich_help_panel=SERVER,
+    ),
 ]
 Listen = Annotated[
     str | None,
     typer.Option(
         help="Serve at this endpoint (a master; a board: its host) instead of standard input and output.",
         metavar="unix:PATH|tcp://HOST:PORT",
+        rich_help_panel=SERVING,
     ),
 ]
 Insecure = Annotated[
     bool,
-    typer.Option(help="Permit an unprotected address that other machines can reach."),
+    typer.Option(
+        help="Permit an unprotected address that other machines can reach.", rich_help_panel=SERVING
+    ),
 ]
 KeyFile = Annotated[
     Path | None,
-    typer.Option(help="Key shared by boards over TCP and their hosts.", metavar="FILE"),
+    setting(
+        "key_file",
+        "Key shared by boards over TCP and their hosts.",
+        metavar="FILE",
+        rich_help_panel=BOARDS,
+    ),
 ]
 BoardCa = Annotated[
     Path | None,
-    typer.Option(help="Certificates that sign those of boards over TLS (the system's).", metavar="FILE"),
+    setting(
+        "board_ca",
+        "Certificates that sign those of boards over TLS.",
+        otherwise="the system's",
+        metavar="FILE",
+        rich_help_panel=BOARDS,
+    ),
 ]
-RosVersion = Annotated[str | None, typer.Option(help="Spelling of stamps and types.", metavar="auto|1|2")]
+RosVersion = Annotated[
+    str | None,
+    setting("ros_version", "Spelling of stamps and types.", metavar="auto|1|2", rich_help_panel=SERVER),
+]
 Queue = Annotated[
     str | None,
-    typer.Option(
-        help="Readings that wait while a frame is computed: the latest, or all (in order, at most 256).",
+    setting(
+        "queue",
+        "Readings that wait while a frame is computed: the latest, or all (in order, at most 256).",
+        otherwise=_DEPLOYMENTS,
         metavar="latest|all",
     ),
 ]
 Stop = Annotated[
     str | None,
-    typer.Option(
-        help="When boards stop: slices (together) or own (each independently).", metavar="slices|own"
+    setting(
+        "stop",
+        "When boards stop: slices (together) or own (each independently).",
+        otherwise=_DEPLOYMENTS,
+        metavar="slices|own",
+        rich_help_panel=BOARDS,
     ),
 ]
 Boards = Annotated[
     str | None,
-    typer.Option(
-        help="Running boards, comma-separated, in the order of the partitions.",
+    setting(
+        "boards",
+        "Running boards, in the order of the partitions.",
+        otherwise=_DEPLOYMENTS,
         metavar="ENDPOINT,...",
+        rich_help_panel=BOARDS,
     ),
 ]
-ConnectTimeout = Annotated[float | None, _seconds("Seconds to reach the rosbridge server (10).")]
-FirstDataTimeout = Annotated[float | None, _seconds("Seconds until the first reading (30).")]
-PeerTimeout = Annotated[float | None, _seconds("Seconds to reach a local process or a board (10).")]
-BoardTimeout = Annotated[
-    float | None, _seconds("Seconds a board may take beyond max_cycles at its speed (5).")
+ConnectTimeout = Annotated[float | None, seconds("connect_timeout", "To reach the rosbridge server.")]
+FirstDataTimeout = Annotated[
+    float | None, seconds("first_data_timeout", "Until the first reading; of listen, the first result.")
 ]
-StopTimeout = Annotated[float | None, _seconds("Grace period in seconds for processes to exit (5).")]
+PeerTimeout = Annotated[float | None, seconds("peer_timeout", "To reach a local process or a board.")]
+BoardTimeout = Annotated[
+    float | None, seconds("board_timeout", "For a board beyond its time for max_cycles.")
+]
+StopTimeout = Annotated[float | None, seconds("stop_timeout", "Grace period for processes to exit.")]
 LogLevel = Annotated[
     str | None,
-    typer.Option(
-        help="Log level: info, warning, or debug (one line per frame).", metavar="info|warning|debug"
-    ),
+    setting("log_level", "Log level; debug logs one line per frame.", metavar="info|warning|debug"),
 ]
 Count = Annotated[int | None, typer.Option("--count", "-n", min=1, help="Exit after this many.")]

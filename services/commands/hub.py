@@ -1,7 +1,7 @@
 """The command `hub`."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal
 
 import typer
 
@@ -14,6 +14,8 @@ from terminal.command_line import CommandLine
 from terminal.one_line import shown
 from terminal.signals import run_async
 
+_ACCESS: Final = "Access"
+
 app = CommandLine(
     help="Serve rosbridge without ROS: topics, services, actions, parameters and rosapi.\n\n`hub --port 9090`\n\n"
     "On a non-loopback address it requires TLS and tokens:\n\n"
@@ -23,25 +25,31 @@ app = CommandLine(
 
 @app.command(help=app.info.help)
 def hub(
-    host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
+    host: Annotated[str, typer.Option(help="Address to listen on.", metavar="ADDRESS")] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port; 0 selects a free one.")] = 9090,
     ros_version: Annotated[
         Literal["1", "2"], typer.Option(help="Emulated ROS version: spelling of types, answers of rosapi.")
     ] = "1",
     tls_cert: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Certificate of the hub (PEM), to serve wss://.")
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Certificate of the hub (PEM), to serve wss://.", rich_help_panel=_ACCESS
+        ),
     ] = None,
     tls_key: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Private key of the certificate (PEM).")
+        Path | None,
+        typer.Option(metavar="FILE", help="Private key of the certificate (PEM).", rich_help_panel=_ACCESS),
     ] = None,
     token_file: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Accepted client tokens, one per line.")
+        Path | None,
+        typer.Option(metavar="FILE", help="Accepted client tokens, one per line.", rich_help_panel=_ACCESS),
     ] = None,
     origin: Annotated[
         list[str] | None,
         typer.Option(
             metavar="ORIGIN",
-            help="Web page that may connect, such as https://robot.example, in addition to those of this machine ('null': pages opened from a file); repeatable.",
+            help="Web page that may connect, such as https://robot.example, in addition to those of this machine ('null': pages opened from a file); repeat for more.",
+            rich_help_panel=_ACCESS,
         ),
     ] = None,
     message_bytes: Annotated[
@@ -60,7 +68,11 @@ def hub(
     ] = None,
     insecure: Annotated[
         bool,
-        typer.Option("--insecure", help="Permit a non-loopback address without TLS and tokens."),
+        typer.Option(
+            "--insecure",
+            help="Permit a non-loopback address without TLS and tokens.",
+            rich_help_panel=_ACCESS,
+        ),
     ] = False,
 ) -> int:
     """Serve rosbridge without ROS."""

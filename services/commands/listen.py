@@ -30,7 +30,13 @@ def listen(
     uri: options.Uri = None,
     deployment: options.Deployment = None,
     topic: Annotated[
-        str | None, typer.Option(help="Topic of the posteriors (that of the deployment, or /BMresults).")
+        str | None,
+        typer.Option(
+            help="Topic of the posteriors.",
+            show_default="the deployment's, or /BMresults",
+            metavar="TOPIC",
+            rich_help_panel=options.SERVER,
+        ),
     ] = None,
     count: options.Count = None,
     as_json: Annotated[
@@ -48,7 +54,9 @@ def listen(
         typer.Option(
             min=0.1,
             max=LONGEST_S,
-            help="Exit after this many seconds without a result; by default, wait.",
+            help="Exit after so long without a result.",
+            show_default="it waits",
+            rich_help_panel=options.TIMEOUTS,
         ),
     ] = None,
     first_data_timeout: options.FirstDataTimeout = None,

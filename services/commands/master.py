@@ -41,7 +41,8 @@ def master(
     connect: Annotated[
         Path | None,
         typer.Option(
-            help="Folder with subscriber.sock, publisher.sock and pcie-app.sock of running services."
+            help="Folder with subscriber.sock, publisher.sock and pcie-app.sock of running services.",
+            metavar="DIR",
         ),
     ] = None,
     boards: options.Boards = None,
@@ -57,9 +58,10 @@ def master(
     board_ca: options.BoardCa = None,
     fused: Annotated[
         bool | None,
-        typer.Option(
+        options.setting(
+            "fused",
+            "Run subscriber, publisher and pcie-app inside this process: fewer hops, the same results.",
             "--fused",
-            help="Run subscriber, publisher and pcie-app inside this process: fewer hops, the same results.",
         ),
     ] = None,
     log_level: options.LogLevel = None,
@@ -114,9 +116,11 @@ def reload_(
     deployment: options.Deployment = None,
     directory: Annotated[
         Path | None,
-        typer.Option(
+        options.setting(
+            "control_directory",
+            "Folder of the master's control socket.",
             "--directory",
-            help="Folder of the master's control socket: its BM_CONTROL_DIRECTORY or BM_RUN_DIRECTORY.",
+            otherwise="BM_RUN_DIRECTORY, or that of this user's run",
             metavar="DIR",
         ),
     ] = None,

@@ -2,8 +2,6 @@
 
 from typing import Annotated
 
-import typer
-
 from services.commands import flags as options
 from services.pipeline.publisher import Publisher
 from services.pipeline.result_topics import ROLE
@@ -31,7 +29,7 @@ def publisher(
     ros_version: options.RosVersion = None,
     connect_timeout: options.ConnectTimeout = None,
     seen_timeout: Annotated[
-        float | None, typer.Option(help="Seconds until a result must be seen on the wire (2).")
+        float | None, options.seconds("seen_timeout", "Until a result must be seen on the wire.")
     ] = None,
     insecure: options.Insecure = False,
     log_level: options.LogLevel = None,

@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from services.commands import flags as options
 from services.errors import SettingsError
 from services.output.status_screen import show
 from services.settings import load_settings
@@ -23,7 +24,13 @@ app = CommandLine(
 def status(
     directory: Annotated[
         Path | None,
-        typer.Option("--directory", help="Folder with the status sockets (BM_RUN_DIRECTORY).", metavar="DIR"),
+        options.setting(
+            "run_directory",
+            "Folder with the status sockets.",
+            "--directory",
+            otherwise="that of this user's run",
+            metavar="DIR",
+        ),
     ] = None,
     watch: Annotated[bool, typer.Option("--watch", "-w", help="Refresh every second until Ctrl-C.")] = False,
     json: Annotated[

@@ -1,6 +1,6 @@
 """The command `subscriber`."""
 
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
 from pydantic import ValidationError
@@ -17,6 +17,8 @@ from terminal.output import say
 from terminal.signals import run_async
 from toolchain.deployment import Source
 
+_WITHOUT_DEPLOYMENT: Final = "Without a deployment"
+
 app = CommandLine(
     help="Extract variables from a ROS topic over rosbridge.\n\n"
     "Alone, it prints them, one JSON object per line:\n\n"
@@ -30,10 +32,23 @@ app = CommandLine(
 def subscriber(
     deployment: options.Deployment = None,
     uri: options.Uri = None,
-    topic: Annotated[str | None, typer.Option(help="Topic to subscribe to (without a deployment).")] = None,
-    type_: Annotated[str | None, typer.Option("--type", help="Its message type.")] = None,
+    topic: Annotated[
+        str | None,
+        typer.Option(help="Topic to subscribe to.", metavar="TOPIC", rich_help_panel=_WITHOUT_DEPLOYMENT),
+    ] = None,
+    type_: Annotated[
+        str | None,
+        typer.Option(
+            "--type", help="Its message type.", metavar="PACKAGE/NAME", rich_help_panel=_WITHOUT_DEPLOYMENT
+        ),
+    ] = None,
     variables: Annotated[
-        str, typer.Option(help="Names or paths, comma-separated; by default, print whole messages.")
+        str,
+        typer.Option(
+            help="Names or paths; without it, print whole messages.",
+            metavar="NAME,...",
+            rich_help_panel=_WITHOUT_DEPLOYMENT,
+        ),
     ] = "",
     count: options.Count = None,
     listen: options.Listen = None,

@@ -38,5 +38,5 @@ def test_a_command_is_a_command_line_whose_timeouts_are_positive(name):
     app = importlib.import_module(name).app
     assert type(app) is CommandLine
     for flag in flags_of(get_command(app)):
-        if flag.name.endswith("_timeout") and flag.name != "seen_timeout":
+        if flag.name.endswith("_timeout"):
             assert flag.type_descriptor.parameter_info.min > 0

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from toolchain.building.options import BuildOptions
-from toolchain.commands.flags import BuildFlags, ModelPath
+from toolchain.commands.flags import MESSAGES, BuildFlags, ModelPath
 from toolchain.deployment import Queue
 
 
@@ -17,32 +17,60 @@ def build(
         Path, typer.Option("--output-dir", "-o", help="Folder of the deployment.", metavar="DIR")
     ],
     flags: BuildFlags,
-    uri: Annotated[str, typer.Option(help="rosbridge server with the readings, ws://host:port.")] = "",
-    topic: Annotated[str, typer.Option(help="Topic with the readings.")] = "",
-    message_type: Annotated[str, typer.Option("--type", help="That topic's type, package/Name.")] = "",
+    uri: Annotated[
+        str,
+        typer.Option(
+            help="rosbridge server with the readings.", metavar="ws://HOST:PORT", rich_help_panel=MESSAGES
+        ),
+    ] = "",
+    topic: Annotated[
+        str, typer.Option(help="Topic with the readings.", metavar="TOPIC", rich_help_panel=MESSAGES)
+    ] = "",
+    message_type: Annotated[
+        str,
+        typer.Option("--type", help="That topic's type.", metavar="PACKAGE/NAME", rich_help_panel=MESSAGES),
+    ] = "",
     sources: Annotated[
         Path | None,
         typer.Option(
             help="Instead of topic and type: a TOML file with several topics, of one server or more.",
             metavar="FILE",
+            rich_help_panel=MESSAGES,
         ),
     ] = None,
-    output: Annotated[str, typer.Option(help="Topic for the posteriors.")] = "/BMresults",
+    output: Annotated[
+        str, typer.Option(help="Topic for the posteriors.", metavar="TOPIC", rich_help_panel=MESSAGES)
+    ] = "/BMresults",
     prior_path: Annotated[
-        str | None, typer.Option(help="Where in the message a written prior is.", metavar="PATH")
+        str | None,
+        typer.Option(
+            help="Where in the message a written prior is.", metavar="PATH", rich_help_panel=MESSAGES
+        ),
     ] = None,
     queue: Annotated[
-        Queue, typer.Option(help="Frames that come too fast: the newest counts, or all in order.")
+        Queue,
+        typer.Option(
+            help="Frames that come too fast: the newest counts, or all in order.", rich_help_panel=MESSAGES
+        ),
     ] = Queue.LATEST,
     tolerance: Annotated[
-        float, typer.Option(help="Seconds within which readings from several topics belong together.")
+        float,
+        typer.Option(
+            help="Within which readings from several topics belong together.",
+            metavar="SECONDS",
+            rich_help_panel=MESSAGES,
+        ),
     ] = 0.05,
 ) -> None:
     """Build a deployment: programming files for the boards, deployment.toml, a report, and a hardware project.
 
-    For example `toolchain build casestudies/boat -o build/boat --partitions 4 --uri ws://localhost:9090
-    --topic /boat/sensors --type boat_msgs/Sensors`, or of a network `toolchain build asia.bif --searched bronc
-    --known smoke,dysp -o build/asia --uri ws://localhost:9090 --topic /patient --type clinic_msgs/Patient`
+    `toolchain build casestudies/boat -o build/boat --partitions 4 --uri ws://localhost:9090
+    --topic /boat/sensors --type boat_msgs/Sensors`
+
+    Of a network:
+
+    `toolchain build asia.bif --searched bronc --known smoke,dysp -o build/asia --uri ws://localhost:9090
+    --topic /patient --type clinic_msgs/Patient`
     """
     from toolchain.building.build import build_date, build_deployment
     from toolchain.building.options import check_options

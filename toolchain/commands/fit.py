@@ -56,7 +56,8 @@ def fit(
         ),
     ] = None,
     tolerance: Annotated[
-        float, typer.Option(help="bags: seconds between a reading and the truth that belongs to it.")
+        float,
+        typer.Option(help="Of bags: between a reading and the truth that belongs to it.", metavar="SECONDS"),
     ] = 0.1,
 ) -> None:
     """Learn a model's tables from recordings with ground truth, and say how much data each rests on.

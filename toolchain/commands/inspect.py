@@ -26,19 +26,22 @@ def inspect(
         ),
     ] = None,
     tolerance: Annotated[
-        float, typer.Option(help="bags: seconds between readings that belong together.")
+        float, typer.Option(help="Of bags: between readings that belong together.", metavar="SECONDS")
     ] = 0.1,
     frames: Annotated[
         int | None,
         typer.Option(
-            help="Frames of readings at most; default 200, or 20 of a machine that is slow to emulate; with replicas fewer."
+            help="Frames of readings at most; with replicas fewer.",
+            show_default="200, or 20 of a machine that is slow to emulate",
         ),
     ] = None,
     banks: Annotated[
         int | None,
-        typer.Option(help="Sets of seeds that each frame is run with; default 4, or 1 of such a machine."),
+        typer.Option(
+            help="Sets of seeds that each frame is run with.", show_default="4, or 1 of such a machine"
+        ),
     ] = None,
-    clock: Annotated[float, typer.Option(help="The boards' clock, hertz.")] = 100e6,
+    clock: Annotated[float, typer.Option(help="The boards' clock.", metavar="HERTZ")] = 100e6,
     soft_pcie: Annotated[
         bool, typer.Option("--soft-pcie", help="PCIe controllers of logic; else the device's own.")
     ] = False,

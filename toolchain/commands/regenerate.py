@@ -75,10 +75,14 @@ def project(directory: Directory) -> None:
 
 def deployment(
     directory: Directory,
-    uri: Annotated[str | None, typer.Option(help="rosbridge server with the readings.")] = None,
-    topic: Annotated[str | None, typer.Option(help="Topic with the readings.")] = None,
-    message_type: Annotated[str | None, typer.Option("--type", help="That topic's type.")] = None,
-    output: Annotated[str | None, typer.Option(help="Topic for the posteriors.")] = None,
+    uri: Annotated[
+        str | None, typer.Option(help="rosbridge server with the readings.", metavar="ws://HOST:PORT")
+    ] = None,
+    topic: Annotated[str | None, typer.Option(help="Topic with the readings.", metavar="TOPIC")] = None,
+    message_type: Annotated[
+        str | None, typer.Option("--type", help="That topic's type.", metavar="PACKAGE/NAME")
+    ] = None,
+    output: Annotated[str | None, typer.Option(help="Topic for the posteriors.", metavar="TOPIC")] = None,
     order: Annotated[
         str | None,
         typer.Option(
