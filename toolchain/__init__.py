@@ -1,1 +1,1 @@
-"""From a model in Python to everything a Bayesian machine needs (thesis 3.4)."""
+"""The toolchain, which builds deployments of Bayesian machines from models (thesis 3.4)."""

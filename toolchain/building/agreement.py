@@ -1,4 +1,4 @@
-"""Agreement of `deployment.toml` with the images that it names."""
+"""Comparison of `deployment.toml` with its images."""
 
 from collections.abc import Sequence
 
@@ -9,12 +9,12 @@ from toolchain.errors import DeploymentError
 
 
 def read_images(deployment: Deployment) -> list[Image]:
-    """Return the boards' images."""
+    """Return the images of the boards."""
     return [read_image(deployment.image_path(board)) for board in range(len(deployment.boards))]
 
 
 def check_agreement(deployment: Deployment, images: Sequence[Image]) -> None:
-    """Refuse, with a DeploymentError, a `deployment.toml` that describes another machine than its images."""
+    """Raise a DeploymentError if `deployment.toml` describes another machine than its images."""
     machine = deployment.machine
     for index, (board, image) in enumerate(zip(deployment.boards, images, strict=True)):
         parameters = image.machine.parameters

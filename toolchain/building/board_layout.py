@@ -1,4 +1,4 @@
-"""The layout of the boards: which lines each one holds, and how many inputs and results its registers have."""
+"""The layout of the boards: the lines of each one, and the numbers of inputs and results in its registers."""
 
 from dataclasses import dataclass, replace
 from typing import Final
@@ -13,23 +13,23 @@ DEFAULT_INTERFACE: Final = (20, 1200)
 """Inputs and results of the thesis's PCIe interface (3.2)."""
 
 _MOST_SEEDS: Final = 1 << 23
-"""Of a board: more would be a memory of gigabytes."""
+"""Maximum number of seeds on a board, because more would need gigabytes."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BoardLayout:
-    """The lines of each board, and the interface that all boards have."""
+    """The lines of each board, and the common interface."""
 
     blocks: tuple[Block, ...]
-    """By board; the first is one of the largest."""
+    """Blocks of lines by board; the first one is one of the largest."""
     interface: tuple[int, int]
     """Inputs and results of the boards' registers."""
     reason: str
-    """A clause that says why the interface is not the default one; empty where it is."""
+    """The reason for an interface that is not the default, as a clause; otherwise empty."""
 
     @property
     def interface_text(self) -> str:
-        """The interface as `deployment.toml` has it."""
+        """The interface as in `deployment.toml`."""
         return _text(self.interface)
 
 
@@ -38,7 +38,7 @@ def board_layout(
 ) -> BoardLayout:
     """Return the layout of a machine's boards, before any table is computed.
 
-    Without an `interface`, its inputs and results are as many as are needed, at least the default.
+    Without an `interface`, it has as many inputs and results as needed, but at least the default numbers.
 
     Raises:
         BuildError: More boards than lines, a machine that is larger than the interface, an interface that is larger than
@@ -80,7 +80,7 @@ def _fits(needed: tuple[int, int], room: tuple[int, int]) -> bool:
 
 
 def _advice(parameters: BM1Parameters, room: tuple[int, int]) -> str:
-    """Return how a machine would fit the register map, after a colon; empty where it can't."""
+    """Return advice on fitting the register map, after a colon; empty if there is none."""
     lines = room[1] // parameters.replicas
     if parameters.sensor_mode is not SensorMode.COLUMN and parameters.sensors:
         lines = min(lines, room[0] // (parameters.replicas * parameters.sensors))
@@ -95,6 +95,6 @@ def _check_seeds(board: BM1Parameters) -> None:
     seeds = board.rng_banks * generators(board)
     if seeds > _MOST_SEEDS and board.rng is not RngKind.IDEAL:
         raise BuildError(
-            f"--rng-banks {board.rng_banks} takes {seeds} seeds a board; use at most {_MOST_SEEDS // generators(board)}"
+            f"--rng-banks {board.rng_banks} needs {seeds} seeds per board; use at most {_MOST_SEEDS // generators(board)}"
             + ("" if board.shared else ", or --shared")
         )

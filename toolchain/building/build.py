@@ -1,4 +1,4 @@
-"""The straight line from a model to a deployment (thesis 3.4).
+"""The path from a model to a deployment (thesis 3.4).
 
 model ──▶ machine_parameters ──▶ quantise ──▶ whole_machine ──▶ board_images ──▶ describe ──▶ files
 └─▶ board_layout (lines and interface of each board, before tables are computed)
@@ -31,9 +31,9 @@ class Built:
     images: tuple[Image, ...]
     """One per board."""
     quantised: Quantised
-    """The codes before they were split over boards, and what was lost."""
+    """The codes before they were divided among boards, and the quantisation loss."""
     interface_reason: str
-    """A clause that says why the boards' interface is not the default one; empty where it is."""
+    """The reason for an interface that is not the default, as a clause; otherwise empty."""
     report: str
     """The content of `report.txt`."""
 
@@ -44,13 +44,14 @@ def build_deployment(model: Model, directory: Path, options: BuildOptions, *, re
     The same model and options give the same bytes. A deployment in the folder is replaced; `remark` ends the report.
 
     Raises:
-        BuildError: The options don't fit each other, the model or the register map, or the folder can't be written.
+        BuildError: The options contradict each other, the model or the register map, or the folder can't be
+            written.
     """
     built = assemble(model, options)
     built = replace(built, report=with_remark(built.report, remark))
     try:
         directory.mkdir(parents=True, exist_ok=True)
-        # a process that reads the folder half-way finds no deployment, not parts of two
+        # a process that reads the folder meanwhile finds no deployment, instead of parts of two
         (directory / FILE_NAME).unlink(missing_ok=True)
     except OSError as reason:
         raise BuildError(
@@ -91,9 +92,10 @@ def assemble(model: Model, options: BuildOptions) -> Built:
 
 
 def build_date(model_file: Path) -> str:
-    """Return the date that a build of this model file carries, ISO 8601 in UTC.
+    """Return the build date for this model file, ISO 8601 in UTC.
 
-    It is `SOURCE_DATE_EPOCH` where that is set, else the file's last change: the same input gives the same bytes.
+    It is `SOURCE_DATE_EPOCH` if set, otherwise the modification time of the file, so the same input gives the
+    same bytes.
 
     Raises:
         BuildError: `SOURCE_DATE_EPOCH` is not a time.

@@ -1,4 +1,4 @@
-"""The images of the boards that a model is built for, and the deployment that names them."""
+"""The images of the boards of a model, and the deployment that describes them."""
 
 import hashlib
 import json
@@ -19,9 +19,9 @@ from toolchain.models.model import Model
 
 
 def model_hash(model: Model, machine: BM1Machine) -> str:
-    """Return the SHA-256 (hexadecimal) of the machine that all boards are parts of, and of its names.
+    """Return the SHA-256 (hexadecimal) of the whole machine and its names.
 
-    It covers codes, not probabilities: these differ in their last bit from one mathematics library to another.
+    It covers codes, not probabilities, whose last bits depend on the mathematics library.
     """
     parameters = machine.parameters
     words = {
@@ -41,7 +41,7 @@ def model_hash(model: Model, machine: BM1Machine) -> str:
 def board_images(
     model: Model, machine: BM1Machine, layout: BoardLayout, build_date: str
 ) -> tuple[Image, ...]:
-    """Return one image per board of the whole model's machine."""
+    """Return one image per board of the whole machine."""
     identity, count = model_hash(model, machine), len(layout.blocks)
     return tuple(
         Image(
@@ -101,7 +101,7 @@ def describe(
 
 
 def _variables(model: Model, options: BuildOptions) -> tuple[Variable, ...]:
-    """Return the known variables; where cells are given codes, a sensor's values are the codes."""
+    """Return the known variables; with `threshold`, the values of a sensor are the codes."""
     variables = model.variables if options.sources is None else options.sources.place(model.variables)
     if options.sensor_mode is not SensorMode.THRESHOLD:
         return tuple(variables)

@@ -1,4 +1,4 @@
-"""The machine of a whole model, before it is split over boards."""
+"""The machine of a whole model, before it is divided among boards."""
 
 from typing import Any, Final
 
@@ -13,16 +13,16 @@ from toolchain.models.model import Model
 from toolchain.outputs.rng_table import random_table
 
 _MOST_CODES: Final = 1 << 30
-"""Of all columns together, 2 bytes each while they are computed."""
+"""Maximum number of codes of all columns, which take 2 bytes each while they are computed."""
 
 MACHINE_KEYS: Final = tuple(
     key for key in MachineSection.model_fields if key in BM1Parameters.__dataclass_fields__ and key != "lines"
 )
-"""The parameters that `[machine]` has under the same names; its lines are those of all boards."""
+"""The parameters with the same names in `[machine]`, whose `lines` are those of all boards."""
 
 
 def machine_options(source: BuildOptions | MachineSection) -> dict[str, Any]:
-    """Return the parameters of a machine that a build's options and `[machine]` have under the same names."""
+    """Return the parameters of a machine with the same names in the build options and in `[machine]`."""
     return {key: getattr(source, key) for key in MACHINE_KEYS if key != "prior_bits"}
 
 
@@ -30,7 +30,7 @@ def machine_parameters(model: Model, options: BuildOptions) -> BM1Parameters:
     """Return the parameters of the whole model's machine; a BuildError if it can't be built."""
     if options.prior_mode is PriorMode.TABLE and options.written_prior is not None:
         flag = "--prior-path" if options.sources is None else options.sources.toml.path
-        raise BuildError(f"{flag} names the place of a written prior: add --prior-mode written")
+        raise BuildError(f"{flag} is for a written prior: add --prior-mode written")
     if options.prior_mode is PriorMode.WRITTEN and model.prior_select is not None:
         raise BuildError(
             f"the prior is selected by {model.prior_select.name}, so it can't be written too: leave "
@@ -54,7 +54,7 @@ def machine_parameters(model: Model, options: BuildOptions) -> BM1Parameters:
 
 
 def whole_machine(parameters: BM1Parameters, quantised: Quantised, options: BuildOptions) -> BM1Machine:
-    """Return the machine that holds all lines of a model; a BuildError if it can't be built."""
+    """Return the machine with all lines of a model, or raise a BuildError."""
     table = options.rng_table
     if table is None and parameters.rng is RngKind.TABLE:
         table = random_table(parameters.prob_bits)

@@ -1,4 +1,4 @@
-"""The options of a build: everything but the model itself (thesis 3.2, 3.4)."""
+"""The options of a build: everything except the model (thesis 3.2, 3.4)."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 _FLAGS: Final = {"tolerance_s": "--tolerance", "path": "--prior-path"}
-"""Flags that are not called like the field."""
+"""Flags with other names than their fields."""
 
 
 class OnMissing(StrEnum):
@@ -37,7 +37,7 @@ class BuildOptions:
     """The options of a build."""
 
     uri: str
-    """The rosbridge server that readings come from."""
+    """The rosbridge server of the readings."""
     topic: str
     """The topic of the readings."""
     type: str
@@ -45,49 +45,52 @@ class BuildOptions:
     output: str = "/BMresults"
     """The topic of the posteriors."""
     partitions: int = 1
-    """The number of boards that the lines are split over."""
+    """The number of boards."""
     interface: tuple[int, int] | None = None
-    """Inputs and results of the boards' registers; None for the thesis's 20 x 1200, or the model's size
-    where that is larger."""
+    """Inputs and results of the boards' registers; None for the thesis's 20 x 1200, or the size of the model
+    if larger.
+    """
     scale: Scale | None = None
-    """The part of a table that is divided by its maximum before quantising; None for addresses where a column
-    shares one, else for whole columns."""
+    """The part of a table that is divided by its maximum before quantising; None for addresses if the lines
+    of a column share them, otherwise for whole columns.
+    """
     prob_bits: int = 8
     """Bits of a code (W)."""
     prior_mode: PriorMode = PriorMode.TABLE
-    """Whether the prior is the images' table, or written by the host."""
+    """Whether the prior is a table in the images or written by the host."""
     prior_path: str | None = None
-    """The place of a written prior in the message, one number for each line; None where it comes from elsewhere."""
+    """The path of a written prior in the message, with one number per line; None if it comes from elsewhere.
+    """
     counter_bits: int = 8
     """Bits of a line's counter."""
     target_count: int | None = None
-    """The count that stops a machine; None for the counters' largest."""
+    """The count that stops a machine; None for the maximum of the counters."""
     max_cycles: int = 2**17
-    """The cycles after which a machine stops anyway."""
+    """Maximum number of cycles."""
     stop: Stop = Stop.SLICES
     """Whether boards stop together after slices, or each at its own overflow."""
     rng: RngKind = RngKind.LFSR32
     """Kind of the random number generators."""
     rng_table: NDArray[np.uint32] | None = None
-    """uint32[length], the numbers that `rng = table` plays; None to make them."""
+    """uint32[length], the random numbers for `rng = table`; None to generate them."""
     shared: bool = True
-    """One generator a column, shared by its lines; else one a cell."""
+    """One generator per column, shared by its lines; otherwise one per cell."""
     steps_per_clock: int = 0
-    """Steps of a generator between two cycles; 0 for as many as give fresh bits."""
+    """Steps of a generator per cycle; 0 for as many as are needed for fresh bits."""
     sensor_mode: SensorMode = SensorMode.COLUMN
-    """The input of a cell: its column's reading, a reading of its own, or its code (`threshold`)."""
+    """The input of a cell: the reading of its column, its own reading, or its own code (`threshold`)."""
     replicas: int = 1
-    """Machines on a board that share its generators."""
+    """Number of machines on a board, which share the generators."""
     rng_banks: int = 16
-    """Sets of seeds."""
+    """Number of seed sets."""
     rng_reset: RngReset = RngReset.BANK
     """Whether a frame restarts the generators."""
     queue: Queue = Queue.LATEST
-    """The treatment of frames that arrive faster than they are computed."""
+    """The readings that wait if they arrive faster than frames are computed."""
     tolerance_s: float = 0.05
-    """The most seconds between readings of several topics that belong together."""
+    """Maximum time in seconds between readings of several topics that belong together."""
     sources: SourcesFile | None = None
-    """Several topics and the variables of each, in place of `uri`, `topic` and `type`; or None."""
+    """Several topics and their variables, in place of `uri`, `topic` and `type`; or None."""
     build_date: str = ""
     """The date of the build, ISO 8601: part of the images' manifests, but not of their hashes."""
 
@@ -100,28 +103,28 @@ class BuildOptions:
 
     @property
     def all_sources(self) -> tuple[Source, ...]:
-        """The sources of readings, as a deployment has them."""
+        """The sources of readings, as in a deployment."""
         if self.sources is not None:
             return self.sources.sources
         return (Source(uri=self.uri, topic=self.topic, type=self.type),)
 
     @property
     def written_prior(self) -> WrittenPrior | None:
-        """The place that a written prior comes from, or None."""
+        """The source of a written prior, or None."""
         if self.sources is not None:
             return self.sources.prior
         return None if self.prior_path is None else WrittenPrior(path=self.prior_path)
 
 
 def check_options(options: BuildOptions) -> None:
-    """Refuse, with a BuildError, wrong or contradicting options before anything is computed."""
+    """Raise a BuildError for wrong or contradictory options, before anything is computed."""
     try:
         Output(topic=options.output), options.all_sources, options.written_prior
     except ValidationError as reason:
         raise refused_option(reason) from None
     if options.sensor_mode is not SensorMode.COLUMN and options.scaling is Scale.ADDRESS:
         raise BuildError(
-            f"--scale address does not go with --sensor-mode {options.sensor_mode}: lines look at different addresses in a "
+            f"--scale address is impossible with --sensor-mode {options.sensor_mode}: lines use different addresses in a "
             "frame, so the factors of addresses would not cancel; use --scale column or none"
         )
     if not 1 <= options.replicas <= REPLICAS_MAX:
@@ -129,7 +132,7 @@ def check_options(options: BuildOptions) -> None:
 
 
 def refused_option(reason: ValidationError) -> BuildError:
-    """Return pydantic's refusal of a field as an error that names the field's flag."""
+    """Return a pydantic error as an error with the flag of the field."""
     detail = reason.errors(include_url=False)[0]
     key = str(detail["loc"][0]) if detail["loc"] else ""
     flag = "--output" if reason.title == "Output" else _FLAGS.get(key, "--" + key.replace("_", "-"))

@@ -1,4 +1,4 @@
-"""The split of a machine's lines over boards, in contiguous blocks (thesis 3.4, 4.2)."""
+"""Partition of the lines of a machine into contiguous blocks, one per board (thesis 3.4, 4.2)."""
 
 from dataclasses import dataclass, replace
 
@@ -25,7 +25,7 @@ def partition_lines(lines: int, count: int) -> tuple[Block, ...]:
     """Return the blocks of `lines` lines on `count` boards, in order; the first `lines` mod `count` are one longer."""
     if not 1 <= count <= lines:
         raise BuildError(
-            f"{lines} lines can't be split over {count} boards: expected 1 to {lines} partitions"
+            f"{lines} lines can't be divided among {count} boards: expected 1 to {lines} partitions"
         )
     shorter, longer = divmod(lines, count)
     return tuple(
@@ -34,7 +34,7 @@ def partition_lines(lines: int, count: int) -> tuple[Block, ...]:
 
 
 def split(machine: BM1Machine, count: int) -> tuple[BM1Machine, ...]:
-    """Return the machines of the boards that a whole machine is split over; a BuildError as for the lines."""
+    """Return the machine of each board of a whole machine; a BuildError as for the lines."""
     return tuple(
         BM1Machine(
             replace(machine.parameters, lines=block.lines),

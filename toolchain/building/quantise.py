@@ -1,7 +1,7 @@
-"""Quantising: probabilities as codes of W bits, after normalising, and what that loses.
+"""Quantising: conversion of probabilities to codes of W bits, after normalising, and its loss.
 
-A factor that is the same for all lines changes nothing in the posterior, so every address (a row of a column's table) is
-divided by its maximum over all lines of all boards. Otherwise a machine would hardly ever count.
+A factor that is the same for all lines does not change the posterior, so every address (a row of a column's
+table) is divided by its maximum over all lines of all boards. Otherwise a machine would rarely count.
 """
 
 import math
@@ -18,10 +18,10 @@ from toolchain.models.conditional import middle_bin
 from toolchain.models.model import Known, Model
 
 _HALVINGS: Final = 12
-"""Halvings of the range of a floor, on a logarithmic scale: finer than the two digits that are reported."""
+"""Number of halvings of the logarithmic range of a floor, for more than the two reported digits."""
 
 _ROUNDING: Final = 1e-12
-"""A divergence in bits below which only float64's rounding is left."""
+"""Divergence in bits below which there are only rounding errors of float64."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -33,16 +33,17 @@ class ColumnLoss:
     bits: int
     """Address bits."""
     values: int
-    """Served addresses."""
+    """Number of supported addresses."""
     mass: float
-    """Share of P(S, K) that lies in cells whose code became 0: how often a reading meets such a cell on the
-    true line."""
+    """Share of P(S, K) in cells whose code became 0: the probability that a reading selects such a cell on
+    the true line.
+    """
     kl_bits: float
-    """Divergence of the column's own posterior from the exact one, KL(Q(S | k) || P(S | k)) in bits, the
-    expectation over k; all lines read the same k. (The other way round it would be infinite wherever a
-    tail became 0.)"""
+    """Divergence of the column's own posterior from the exact one, KL(Q(S | k) || P(S | k)) in bits, averaged
+    over k; all lines read the same k. (KL(P || Q) would be infinite if a tail became 0.)
+    """
     dead_values: int
-    """Served addresses that are possible, but have code 0 on every line."""
+    """Number of possible addresses that have code 0 on every line."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -56,16 +57,18 @@ class VanishedFloor:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Quantised:
-    """A model's codes for all lines, before they are split over boards."""
+    """The codes of a model for all lines, before they are divided among boards."""
 
     prior: NDArray[np.uint16]
-    """uint16[rows, lines]: one row, or one for each address that selects a prior; then the top one is the
-    prior without a selection, and unserved ones hold 0."""
+    """uint16[rows, lines]: one row, or one per address that selects a prior. Then the top one is the prior
+    without a selection, and unsupported ones contain 0.
+    """
     tables: tuple[NDArray[np.uint16], ...]
-    """uint16[2**bits, lines] per known variable; addresses beyond the served ones hold 0, the top one, a
-    missing reading's, all ones. None where cells are given codes."""
+    """uint16[2**bits, lines] per known variable; unsupported addresses contain 0, and the top one, for a
+    missing reading, all-ones codes. Empty with `threshold`.
+    """
     losses: tuple[ColumnLoss, ...]
-    """The prior's and one per known variable."""
+    """The loss of the prior, and one per known variable."""
     floors: tuple[VanishedFloor, ...]
     """Outlier floors that are too low for the codes."""
     warnings: tuple[str, ...]
@@ -79,9 +82,10 @@ def quantise(
     scale: Scale = Scale.ADDRESS,
     sensor_mode: SensorMode = SensorMode.COLUMN,
 ) -> Quantised:
-    """Return the model's codes of `prob_bits` bits (1 to 16, or a ParameterError), and what quantising has lost.
+    """Return the codes of a model with `prob_bits` bits (1 to 16), and the quantisation loss.
 
-    `scale` is the part of a table that is divided by its maximum first; not addresses where cells have their own readings.
+    `scale` is the part of a table that is first divided by its maximum; not addresses if cells have their own
+    readings.
     """
     prior = model.prior_distribution
     prior_codes, prior_loss = _quantised_prior(model, prob_bits, scale)
@@ -131,13 +135,13 @@ def _quantised_prior(model: Model, prob_bits: int, scale: Scale) -> tuple[NDArra
     codes = np.zeros((1 << select.bits, model.lines), dtype=np.uint16)
     codes[: select.values] = served[:-1]
     codes[-1] = served[-1]
-    # the frequency of each row is not known here, so all weigh the same
+    # the frequency of each row is unknown here, so all have the same weight
     loss = _loss("prior", select.bits, select.table / select.values, decode_code(served[:-1], prob_bits))
     return codes, loss
 
 
 def scaled(table: NDArray[np.float64], scale: Scale) -> NDArray[np.float64]:
-    """Return a table divided by its maxima, float64[values, lines] in 0..1; rows of zeros stay as they are."""
+    """Return a table divided by its maxima, float64[values, lines] in 0..1; rows of zeros do not change."""
     if scale is Scale.NONE:
         return table
     largest = table.max(axis=1, keepdims=True) if scale is Scale.ADDRESS else np.asarray(table.max())
@@ -146,7 +150,7 @@ def scaled(table: NDArray[np.float64], scale: Scale) -> NDArray[np.float64]:
 
 
 def _loss(name: str, bits: int, exact: NDArray[np.float64], quantised: NDArray[np.float64]) -> ColumnLoss:
-    """Compare P(S, K) with its quantised form, float64[values, lines], whose rows may have any factors."""
+    """Compare P(S, K) with its quantised form, float64[values, lines], whose rows may have any factor."""
     weight = exact.sum(axis=1)
     remaining = quantised.sum(axis=1)
     alive = (remaining > 0) & (weight > 0)
@@ -168,7 +172,7 @@ def _loss(name: str, bits: int, exact: NDArray[np.float64], quantised: NDArray[n
 def _vanished_floor(
     known: Known, ratios: NDArray[np.float64], vanished: NDArray[np.bool_], prob_bits: int, scale: Scale
 ) -> VanishedFloor:
-    """Describe a floor that is too low for the codes, with a floor or a width that is enough."""
+    """Describe a floor that is too low for the codes, with a sufficient floor or code width."""
     least = float(ratios[vanished].min())
     needed = math.ceil(-math.log2(least) - 1)
     ways = [f"a floor of about {enough:.2g}"] if (enough := _enough_floor(known, prob_bits, scale)) else []
@@ -185,14 +189,14 @@ def _vanished_floor(
 
 
 def _enough_floor(known: Known, prob_bits: int, scale: Scale) -> float:
-    """Return a floor that no code loses, two digits rounded up; 0 where none up to the peak itself does.
+    """Return the lowest sufficient floor, rounded up to two digits; 0 if even the peak is not sufficient.
 
-    A higher floor raises the largest probabilities, too, so the two are not proportional.
+    A higher floor also increases the largest probabilities, so the two are not proportional.
     """
     peak = known.table.max(axis=0)
     if known.normal is not None:
         peak = middle_bin(np.broadcast_to(abs(known.step) / np.asarray(known.normal.sigma), peak.shape))
-    # the table as it would be without a floor, up to a factor a line
+    # the table without a floor, up to a factor per line
     bare = np.maximum(known.table * (1 + known.values * known.floor * peak) - known.floor * peak, 0)
 
     def holds(floor: float) -> bool:

@@ -38,7 +38,7 @@ from toolchain.outputs.output_files import (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DeploymentEdits:
-    """Changes of `deployment.toml`; None leaves a key as it is."""
+    """Changes of `deployment.toml`; None leaves a key unchanged."""
 
     uri: str | None = None
     """The rosbridge server with the readings."""
@@ -49,23 +49,23 @@ class DeploymentEdits:
     output: str | None = None
     """The topic for the posteriors."""
     order: tuple[str, ...] | None = None
-    """All sensors' names in the order in which the columns are to read them."""
+    """Names of all sensors in the order of the columns that read them."""
     paths: tuple[tuple[str, str], ...] = ()
-    """The place of a variable in the message, by its name."""
+    """The path of a variable in the message, by its name."""
     target_count: int | None = None
     """The count that stops a machine."""
     max_cycles: int | None = None
-    """The cycles after which a machine stops anyway."""
+    """Maximum number of cycles."""
     stop: Stop | None = None
     """Whether boards stop together."""
     queue: Queue | None = None
-    """The treatment of frames that arrive too fast."""
+    """The readings that wait if they arrive too fast."""
     tolerance_s: float | None = None
-    """The most seconds between readings of several topics that belong together."""
+    """Maximum time in seconds between readings of several topics that belong together."""
 
 
 def edited(deployment: Deployment, edits: DeploymentEdits) -> Deployment:
-    """Return the deployment with the edits, and its new hash; a BuildError if an edit is wrong."""
+    """Return the deployment with the edits and its new hash, or raise a BuildError for a wrong edit."""
     target = _given(uri=edits.uri, topic=edits.topic, type=edits.type)
     if target and len(deployment.sources) > 1:
         raise BuildError(
@@ -93,9 +93,9 @@ def _given(**values: object) -> dict[str, object]:
 
 
 def _in_order(variables: tuple[Variable, ...], order: tuple[str, ...] | None) -> tuple[Variable, ...]:
-    """Return the variables with the columns reading them in this order.
+    """Return the variables in the order in which the columns read them.
 
-    A column keeps its table and its address rule; its name, source and path change.
+    A column keeps its table and its conversion to addresses; its name, source and path change.
     """
     if order is None:
         return variables
@@ -130,12 +130,12 @@ Changes = list[tuple[str, Change]]
 def regenerate_memories(directory: Path, model: Model | None = None, *, build_date: str = "") -> Changes:
     """Write `bm1_parameters.vhd` and the memories again, from the images, or with new tables from a model.
 
-    With a model, the images (with this date), the report and the hashes of `deployment.toml` follow, and the columns take
-    the model's order; sizes, widths and everything about topics stay as they are.
+    With a model, the images (with this date), the report and the hashes of `deployment.toml` are updated, and
+    the columns get the order of the model; sizes, widths and everything about topics do not change.
 
     Raises:
-        BuildError: The model has become another machine, which needs a new build.
-        DeploymentError: No deployment, or a damaged one.
+        BuildError: The model now needs another machine, and so a new build.
+        DeploymentError: The deployment is missing or damaged.
     """
     deployment = load_deployment(directory)
     images = read_images(deployment)
@@ -148,9 +148,11 @@ def regenerate_memories(directory: Path, model: Model | None = None, *, build_da
     parts = [
         image_files(new, built.images),
         memory_files(new, built.images),
-        # the machine has the same size, so its number of boards has the same reason
+        # the machine has the same size, so the reason for its number of boards is the same
         text_file(REPORT_NAME, with_remark(report, _remark(directory))),
-        text_file(FILE_NAME, deployment_text(new)),  # last: a folder that is half new has the old hashes
+        text_file(
+            FILE_NAME, deployment_text(new)
+        ),  # last, so that a partially written folder has the old hashes
     ]
     return sorted(change for part in parts for change in write_files(directory, part))
 
@@ -162,11 +164,11 @@ def regenerate_project(directory: Path) -> Changes:
 
 
 def regenerate_deployment(directory: Path, edits: DeploymentEdits) -> Changes:
-    """Write `deployment.toml` again, with these edits and those that were made by hand; images stay as they are.
+    """Write `deployment.toml` again, with these edits and manual ones; images do not change.
 
     Raises:
         BuildError: An edit has a wrong value, or does not fit the deployment.
-        DeploymentError: No deployment, a damaged one, or one that doesn't agree with its images any more.
+        DeploymentError: The deployment is missing, damaged, or contradicts its images.
     """
     deployment = edited(load_deployment(directory, edited=True), edits)
     check_agreement(deployment, read_images(deployment))
@@ -195,7 +197,7 @@ def _options(deployment: Deployment, image: Image) -> BuildOptions:
 
 
 def _with_widths(model: Model, deployment: Deployment) -> Model:
-    """Return the model with the deployment's address widths; it must be the same machine otherwise."""
+    """Return the model with the address widths of the deployment; otherwise it must need the same machine."""
     sizes = [(each.label, each.size) for each in model.searched]
     built_sizes = [(each.label, each.size) for each in deployment.searched]
     kinds = {variable.name: variable.kind for variable in model.variables}
@@ -207,10 +209,12 @@ def _with_widths(model: Model, deployment: Deployment) -> Model:
                 "build it again with 'toolchain build'"
             )
     if kinds != built_kinds:
-        raise BuildError("another variable selects the prior now: build it again with 'toolchain build'")
+        raise BuildError("another variable now selects the prior: build it again with 'toolchain build'")
     bits = {variable.name: variable.bits for variable in deployment.variables}
     select = model.prior_select
-    if deployment.machine.sensor_mode is SensorMode.THRESHOLD:  # no memory is that wide: there is none
+    if (
+        deployment.machine.sensor_mode is SensorMode.THRESHOLD
+    ):  # there is no memory whose width must not change
         bits |= {known.name: known.bits for known in model.known}
     try:
         return replace(
@@ -231,7 +235,7 @@ def _listed(values: Sequence[object]) -> str:
 
 
 def _remark(directory: Path) -> str:
-    """Return the remark of the existing report about how the options were chosen, or nothing."""
+    """Return the remark of the existing report about the choice of options, or an empty text."""
     report = directory / REPORT_NAME
     try:
         return remark_of(report.read_text(encoding="utf-8")) if report.is_file() else ""

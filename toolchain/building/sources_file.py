@@ -1,4 +1,4 @@
-"""The file of `--sources`: which variable comes from which topic of which server."""
+"""The file of `--sources`, which assigns variables to topics and servers."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,11 +26,11 @@ class SourceTable(BaseModel):
     type: MessageType
     """The type of its messages."""
     compression: Literal["none", "cbor"] = "none"
-    """The form that the server is asked for: `cbor` pays for messages with long arrays."""
+    """The requested encoding: `cbor` pays off for messages with long arrays."""
     variables: dict[Name, MessagePath] | None = None
-    """Each variable's place in the message, by its name; None for all that no other source has."""
+    """The path of each variable in the message, by its name; None for all variables of no other source."""
     prior: MessagePath | None = None
-    """The place of a written prior in the message, or None."""
+    """The path of a written prior in the message, or None."""
 
 
 class SourcesTables(BaseModel):
@@ -43,7 +43,7 @@ class SourcesTables(BaseModel):
 
 @dataclass(frozen=True, slots=True)
 class SourcesFile:
-    """A sources file that was read."""
+    """The content of a sources file."""
 
     toml: TomlFile
     """The file."""
@@ -52,7 +52,7 @@ class SourcesFile:
 
     @property
     def sources(self) -> tuple[Source, ...]:
-        """The sources as a deployment has them."""
+        """The sources, as in a deployment."""
         return tuple(
             Source(
                 uri=table.uri or "",
@@ -65,7 +65,7 @@ class SourcesFile:
 
     @property
     def prior(self) -> WrittenPrior | None:
-        """The place that a written prior comes from, or None."""
+        """The source of a written prior, or None."""
         return next(
             (
                 WrittenPrior(source=at, path=table.prior)
@@ -76,7 +76,7 @@ class SourcesFile:
         )
 
     def place(self, variables: tuple[Variable, ...]) -> tuple[Variable, ...]:
-        """Return a model's variables, each with its source and its place there; a BuildError if they don't match."""
+        """Return the variables of a model with sources and paths, or raise a BuildError if they don't match."""
         places: dict[str, tuple[int, str]] = {}
         names = [variable.name for variable in variables]
         for at, table in enumerate(self.tables):
@@ -92,8 +92,8 @@ class SourcesFile:
         left = [name for name in names if name not in places]
         if left and rest is None:
             raise BuildError(
-                f"no source has {', '.join(left)}; add them to the variables of a source, or leave 'variables' out of "
-                "one, which then has all that no other has",
+                f"no source has {', '.join(left)}; add them to the variables of a source, or omit 'variables' in "
+                "one, which then has all others",
                 path=self.toml.path,
             )
         if not left and rest is not None and self.tables[rest].prior is None:
@@ -106,7 +106,7 @@ class SourcesFile:
         )
 
     def check(self) -> None:
-        """Refuse, with a BuildError, mistakes that can be seen without a model."""
+        """Raise a BuildError for mistakes that can be found without a model."""
         seen: dict[tuple[str | None, str], int] = {}
         priors = [at for at, table in enumerate(self.tables) if table.prior is not None]
         rests = [at for at, table in enumerate(self.tables) if table.variables is None]
@@ -114,7 +114,7 @@ class SourcesFile:
             if table.uri is None:
                 raise self._refused(at, "it has no uri, and no --uri was given", "topic")
             if not table.variables and table.prior is None and at not in rests:
-                raise self._refused(at, "nothing is read from it: it has neither variables nor a prior")
+                raise self._refused(at, "it has neither variables nor a prior")
             first = seen.setdefault((table.uri, table.topic), at)
             if first != at:
                 why = f"source {first + 1} is the same topic of the same server: merge their variables"

@@ -1,8 +1,7 @@
-"""Checks of a model or a deployment before anything runs, in the model's own names (thesis 3.4).
+"""Checks of a model or a deployment before anything runs, with the names in the model (thesis 3.4).
 
-A model is checked with the options that it would be built with, a deployment with the codes of its images. Findings about
-codes are exact: a reading that is called impossible ends a frame as `impossible` on the machine, and a line that is
-called dead never counts.
+A model is checked with its build options, a deployment with the codes of its images. Findings about codes are
+exact: a frame with an impossible reading ends as `impossible` on the machine, and a dead line never counts.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -32,7 +31,7 @@ from toolchain.outputs.output_files import Change, compare_files, memory_files, 
 
 
 def check_model(model: Model, options: BuildOptions) -> list[Finding]:
-    """Return the findings about a model and the machine that would be built of it, the worst first."""
+    """Return the findings about a model and the machine for it, the worst first."""
     try:
         built = assemble(model, options)
     except ToolchainError as reason:
@@ -53,12 +52,12 @@ def check_deployment(directory: Path) -> list[Finding]:
 
 
 def refusal(reason: Exception, about: str) -> Finding:
-    """Return the finding that a model can't be built, or a deployment not read."""
+    """Return the finding that a model can't be built, or a deployment can't be read."""
     return error(Check.CANNOT_BE_BUILT, about, str(reason).rstrip("."))
 
 
 def _refusals(model: Model, options: BuildOptions, first: ToolchainError) -> list[Finding]:
-    """Return the reasons why a model can't be built; each part is tried by itself, so that no mistake hides another."""
+    """Return the reasons why a model can't be built; parts are checked separately, to find all mistakes."""
     tries: list[tuple[str, Callable[[], object]]] = [
         ("the partitions", lambda: partition_lines(model.lines, options.partitions)),
         ("the machine", lambda: machine_parameters(model, options)),
@@ -100,7 +99,7 @@ def _check(machine: CheckedMachine) -> Iterator[Finding]:
 
 
 def _files(directory: Path, deployment: Deployment, images: Sequence[Image]) -> Iterator[Finding]:
-    """Find files of the hardware project that differ from those that the images imply."""
+    """Find files of the hardware project that differ from the images."""
     words = {
         Change.NEW: "is not there",
         Change.CHANGED: "differs from the images and deployment.toml",

@@ -13,14 +13,14 @@ from toolchain.models.model import Model
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CheckedMachine:
-    """A whole machine to check, whichever boards hold its lines.
+    """A whole machine to check, regardless of its partition.
 
     Attributes:
         deployment: Its variables, lines and limits.
-        board: The first board's machine: parameters and random numbers, alike on all boards.
+        board: The machine of the first board: parameters and random numbers are the same on all boards.
         prior: uint16[rows, lines], over all boards.
         tables: One uint16[2**bits, lines] per column, over all boards.
-        model: The probabilities, where they are known.
+        model: The probabilities, if known.
     """
 
     deployment: Deployment
@@ -31,7 +31,7 @@ class CheckedMachine:
 
     @property
     def parameters(self) -> BM1Parameters:
-        """The first board's parameters; only the lines differ from board to board."""
+        """The parameters of the first board; only the lines differ between boards."""
         return self.board.parameters
 
     @property
@@ -40,7 +40,7 @@ class CheckedMachine:
         return ["the prior", *(variable.name for variable in self.deployment.sensors)]
 
     def served(self, column: int) -> NDArray[np.uint16]:
-        """Return the rows of a column (from 0) that readings address, with the missing reading's if one may be missing."""
+        """Return the rows of a column (from 0) that readings, and permitted missing readings, address."""
         return _served(self.deployment.sensors[column], self.tables[column])
 
     def prior_rows(self) -> NDArray[np.uint16]:

@@ -59,7 +59,7 @@ def line_name(searched: Sequence[Dimension], line: int) -> str:
 
 
 def reading(variable: Variable, address: int) -> str:
-    """Return a value of a variable as a user knows it: `3.5`, `open`, or `a missing reading`."""
+    """Return a value of a variable as text for the user: `3.5`, `open`, or `a missing reading`."""
     if address >= variable.values:
         return "a missing reading"
     if variable.states:
@@ -70,7 +70,7 @@ def reading(variable: Variable, address: int) -> str:
 def _alive(machine: CheckedMachine) -> NDArray[np.bool_]:
     """Return which lines can count for at least some readings: bool[lines]."""
     alive = np.ones(machine.prior.shape[1], dtype=np.bool_)
-    if machine.parameters.prior_mode is PriorMode.TABLE:  # what the host writes is not known here
+    if machine.parameters.prior_mode is PriorMode.TABLE:  # the written prior is unknown here
         alive &= machine.prior_rows().any(axis=0)
     for column in range(len(machine.tables)):
         alive &= machine.served(column).any(axis=0)
@@ -78,14 +78,14 @@ def _alive(machine: CheckedMachine) -> NDArray[np.bool_]:
 
 
 def _lines(machine: CheckedMachine) -> Iterator[Finding]:
-    """Find lines that can never count, whatever is read."""
+    """Find lines that can never count, regardless of the readings."""
     deployment = machine.deployment
     dead = ~_alive(machine)
     if dead.all():
         yield error(
             Check.DEAD_LINES,
             "the machine",
-            "no line can ever count, whatever is read: each has code 0 in the prior or in some whole column",
+            "no line can ever count, regardless of the readings: each has code 0 in the prior or in a whole column",
             _wider(machine),
         )
         return
@@ -105,8 +105,8 @@ def _lines(machine: CheckedMachine) -> Iterator[Finding]:
             yield warning(
                 Check.DEAD_BOARD,
                 f"board {index}",
-                "none of its lines can ever count, whatever is read",
-                "use fewer --partitions, or a model that searches what is possible",
+                "none of its lines can ever count, regardless of the readings",
+                "use fewer --partitions, or a model that searches only possible values",
             )
 
 
@@ -122,7 +122,7 @@ def _dead_prior(machine: CheckedMachine) -> Iterator[Finding]:
         yield note(
             Check.DEAD_LINES,
             "the prior",
-            f"the model says that {_some_lines(deployment, lines)} is never the case, so it never counts",
+            f"the model says that {_some_lines(deployment, lines)} is impossible, so it never counts",
         )
     if (lines := np.flatnonzero(dead & ~meant)).size:
         yield warning(
@@ -138,7 +138,7 @@ def _readings(machine: CheckedMachine) -> Iterator[Finding]:
     deployment, model = machine.deployment, machine.model
     alive = _alive(machine)
     if not alive.any() or machine.parameters.sensor_mode is not SensorMode.COLUMN:
-        return  # where each line has a reading of its own, a value does not concern the other lines
+        return  # if each line has its own reading, a value does not affect the other lines
     rows: list[tuple[Variable, NDArray[np.uint16], NDArray[np.float64] | None]] = [
         (variable, table, None if model is None else model.known[column].table @ model.prior_distribution)
         for column, (variable, table) in enumerate(zip(deployment.sensors, machine.tables, strict=True))
@@ -165,14 +165,14 @@ def _readings(machine: CheckedMachine) -> Iterator[Finding]:
                 variable.name,
                 (
                     f"the model says that {addresses.size} of its {variable.values} values "
-                    f"({_values(variable, addresses)}) never occur; a frame with one gives no posterior"
+                    f"({_values(variable, addresses)}) are impossible; a frame with one gives no posterior"
                 ),
-                "a floor for outliers would let such a reading pass",
+                "an outlier floor would accept such a reading",
             )
 
 
 def _columns(machine: CheckedMachine) -> Iterator[Finding]:
-    """Find columns whose readings change nothing."""
+    """Find columns whose readings have no effect."""
     of_columns = machine.parameters.sensor_mode is SensorMode.COLUMN
     for variable, table in zip(
         machine.deployment.sensors, machine.tables if of_columns else (), strict=of_columns
@@ -182,8 +182,8 @@ def _columns(machine: CheckedMachine) -> Iterator[Finding]:
             yield note(
                 Check.COLUMN_WITHOUT_EFFECT,
                 variable.name,
-                "each of its values has the same code on every line, so its readings change nothing",
-                "leave it out, or use more --prob-bits",
+                "each of its values has the same code on every line, so its readings have no effect",
+                "omit it, or use more --prob-bits",
             )
 
 
@@ -214,7 +214,7 @@ def _some_lines(deployment: Deployment, lines: NDArray[np.int64]) -> str:
 
 
 def _values(variable: Variable, addresses: NDArray[np.int64]) -> str:
-    """Return addresses as values, neighbours as ranges."""
+    """Return addresses as values, with adjacent ones as ranges."""
     ranges: list[list[int]] = []
     for address in addresses.tolist():
         if ranges and address == ranges[-1][1] + 1:

@@ -10,11 +10,11 @@ class Severity(StrEnum):
     """The severity of a finding."""
 
     ERROR = "error"
-    """It can't be built, or computes something wrong."""
+    """The model can't be built, or computes wrong results."""
     WARNING = "warning"
     """Some readings get no posterior or a wrong one, or resources are wasted."""
     NOTE = "note"
-    """It may be intended."""
+    """This may be intended."""
 
 
 class Check(StrEnum):
@@ -43,7 +43,7 @@ class Check(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One finding of a check; `advice` is the change that removes it, empty where none is needed."""
+    """A finding of a check; `advice` suggests a change, and is empty if none is needed."""
 
     severity: Severity
     check: Check

@@ -19,21 +19,21 @@ _RANDOM_SIGMAS: Final = 5
 
 
 def generator_findings(machine: CheckedMachine) -> Iterator[Finding]:
-    """Find numbers that repeat, are shared, or are related from column to column."""
+    """Find random numbers that repeat, are shared, or are related between columns."""
     parameters = machine.parameters
     if parameters.rng is RngKind.IDEAL:
         yield note(
             Check.RNG,
             "rng = ideal",
-            "such generators exist only emulated, so there is no hardware project",
-            "for a board use an LFSR",
+            "these generators exist only in emulation, so there is no hardware project",
+            "use an LFSR for a board",
         )
         return
     if parameters.rng_banks == 1 and parameters.rng_reset is RngReset.BANK:
         yield warning(
             Check.RNG_BANKS,
             "rng_banks = 1",
-            "every frame sees the same random numbers, which leaves an error that averaging frames never removes",
+            "every frame uses the same random numbers, so averaging over frames does not remove their error",
             "use --rng-banks 16, or --rng-reset free",
         )
     width = parameters.rng.lfsr_bits
@@ -48,9 +48,9 @@ def generator_findings(machine: CheckedMachine) -> Iterator[Finding]:
             f"steps_per_clock = {parameters.steps_per_clock}",
             (
                 f"numbers of {parameters.prob_bits} bits share {parameters.prob_bits - parameters.steps_per_clock} bits "
-                "with those of the next cycle: means are right, but counts vary up to 2.6 times as much"
+                "with those of the next cycle: means are correct, but counts vary up to 2.6 times as much"
             ),
-            "leave --steps-per-clock out, unless it is to be the thesis's machine",
+            "omit --steps-per-clock, except for the thesis's machine",
         )
     yield from _relations(machine)
 
@@ -70,14 +70,14 @@ def _period(machine: CheckedMachine, length: int) -> Iterator[Finding]:
             f"rng = {parameters.rng}",
             (
                 f"the random numbers repeat after {period} cycles{shortened}, and a frame may run {limits.max_cycles}: "
-                "the later ones bring nothing new"
+                "later cycles add no information"
             ),
             f"use --max-cycles {period}, or {longer}",
         )
 
 
 def _relations(machine: CheckedMachine) -> Iterator[Finding]:
-    """Find columns whose bits are related by XOR, in some bank; with a generator a cell, in some line."""
+    """Find columns whose bits are related by XOR in a bank or, with one generator per cell, in a line."""
     parameters, names = machine.parameters, machine.names
     seeds = seed_words(machine.board).reshape(-1, parameters.columns)
     found = relations(parameters.rng, seeds, parameters.prob_bits)
@@ -106,13 +106,13 @@ def _relations(machine: CheckedMachine) -> Iterator[Finding]:
                 "independent"
             ),
             "use a wider --rng or fewer --prob-bits"
-            + (f", or --rng-banks {clean}, which leaves these banks out" if clean > 1 else ""),
+            + (f", or --rng-banks {clean}, which excludes these banks" if clean > 1 else ""),
         )
     if found.groups < len(seeds):
         yield note(
             Check.RNG_RELATION,
             f"rng = {parameters.rng}",
-            f"relations were looked for in {found.groups} of {len(seeds)} {what_groups}, to save time",
+            f"relations were searched in {found.groups} of {len(seeds)} {what_groups}, to save time",
         )
 
 
@@ -130,10 +130,10 @@ def _table_numbers(machine: CheckedMachine) -> Iterator[Finding]:
             Check.RNG_TABLE,
             "rng = table",
             (
-                f"code {worst + 1} counts in {below[worst]:.4g} of the cycles instead of {(worst + 1) / codes:.4g}, for "
-                "the numbers are not equally often in the table"
+                f"code {worst + 1} counts in {below[worst]:.4g} of the cycles instead of {(worst + 1) / codes:.4g}, "
+                "because the numbers are not equally frequent in the table"
             ),
-            "use a table with every number equally often, such as the one made without --rng-table",
+            "use a table with equally frequent numbers, such as the one generated without --rng-table",
         )
     starts = seed_words(machine.board).reshape(-1, parameters.columns)
     for group, row in enumerate(starts):
@@ -143,7 +143,7 @@ def _table_numbers(machine: CheckedMachine) -> Iterator[Finding]:
                 yield error(
                     Check.RNG_RELATION,
                     f"{names[one]} and {names[other]}",
-                    f"they play the table from the same place (place {row[one]}, group {group}), so they are the same",
+                    f"they start at the same index of the table (index {row[one]}, group {group}), so they are the same",
                     "use a longer --rng-table",
                 )
                 return
@@ -153,7 +153,7 @@ def _table_numbers(machine: CheckedMachine) -> Iterator[Finding]:
 def _table_correlation(
     machine: CheckedMachine, numbers: NDArray[np.uint32], starts: NDArray[np.uint64]
 ) -> Iterator[Finding]:
-    """Find columns whose numbers correlate; they play the ring at fixed distances."""
+    """Find columns whose numbers correlate; they read the table at fixed distances."""
     length = len(numbers)
     centred = numbers - numbers.mean()
     if not centred.any():
@@ -171,10 +171,10 @@ def _table_correlation(
             Check.RNG_RELATION,
             " and ".join(pair),
             (
-                f"their random numbers correlate by {found[worst]:.2g}; {limit:.2g} and less is what chance does in a "
+                f"their random numbers correlate by {found[worst]:.2g}; up to {limit:.2g} is due to chance in a "
                 f"table of {length}"
             ),
-            "use a table in a more random order, such as the one made without --rng-table",
+            "use a table in a more random order, such as the one generated without --rng-table",
         )
 
 

@@ -1,8 +1,8 @@
 """Relations between the random bits of different columns, which make their AND wrong permanently.
 
-A bit of an LFSR's state is a linear function of the state that it started from. Columns play the same sequence at
-different phases, so bits of two to four columns' numbers may XOR to 0 in every cycle: then the columns are not
-independent, and no number of cycles averages that out.
+A bit of an LFSR's state is a linear function of its initial state. Columns use the same sequence with
+different phases, so bits of the numbers of two to four columns may XOR to 0 in every cycle. Then the columns
+are not independent, and no number of cycles averages this out.
 """
 
 from dataclasses import dataclass
@@ -37,7 +37,7 @@ class Relations:
 
 
 def relations(kind: RngKind, seeds: NDArray[np.uint64], prob_bits: int) -> Relations:
-    """Look for relations of 2, 3 or 4 bits between columns, in as many groups as a few seconds allow.
+    """Search for relations of 2, 3 or 4 bits between columns, in as many groups as a few seconds permit.
 
     `seeds` are uint64[groups, columns]; the columns of a group are those whose bits are ANDed. Of a state `prob_bits` low
     bits are compared with a code.
@@ -58,7 +58,7 @@ def relations(kind: RngKind, seeds: NDArray[np.uint64], prob_bits: int) -> Relat
 def _bit_words(kind: RngKind, seeds: NDArray[np.uint64], prob_bits: int) -> NDArray[np.uint64]:
     """Return each bit's values in the first steps, as many as the state has bits: uint64[groups, bits].
 
-    Two bits with the same word are always the same, since so many steps determine a linear sequence.
+    Two bits with the same word are always the same, because so many steps determine a linear sequence.
     """
     lfsr = LFSR(kind)
     shifts = np.arange(prob_bits, dtype=np.uint64)

@@ -26,12 +26,12 @@ def source_findings(deployment: Deployment) -> Iterator[Finding]:
     if not bare:
         return
     topics = " and ".join(bare)
-    about = f"messages on {topics} have no header, so that they are paired by their receipt"
+    about = f"messages on {topics} have no header, so they are paired by time of receipt"
     if deployment.tolerance_s < _LEAST_TOLERANCE_S:
         yield warning(
             Check.PAIRING,
             topics,
-            f"{about}; with a tolerance of {deployment.tolerance_s:g} s they hardly ever make a frame",
+            f"{about}; with a tolerance of {deployment.tolerance_s:g} s they rarely form a frame",
             "build with a --tolerance of at least the network's delay, or publish types with a header",
         )
     elif len(bare) < len(deployment.sources):

@@ -1,4 +1,4 @@
-"""Findings about variables: the same reading twice, and ranges that don't fit the addresses."""
+"""Findings about variables: readings used twice, and ranges that don't fit the addresses."""
 
 from collections import Counter
 from collections.abc import Iterator
@@ -8,7 +8,7 @@ from toolchain.deployment import Deployment
 
 
 def variable_findings(deployment: Deployment) -> Iterator[Finding]:
-    """Find variables with mistakes, and several that are read from one place."""
+    """Find variables with mistakes, and variables with the same path."""
     yield from _same_readings(deployment)
     yield from _ranges(deployment)
 
@@ -26,8 +26,8 @@ def _same_readings(deployment: Deployment) -> Iterator[Finding]:
             yield warning(
                 Check.SAME_READING,
                 " and ".join(names),
-                f"they are all read from {path}",
-                "give each a path of its own, in the model or with 'toolchain regenerate deployment --path'",
+                f"they all have the path {path}",
+                "give each its own path, in the model or with 'toolchain regenerate deployment --path'",
             )
 
 
@@ -40,7 +40,7 @@ def _ranges(deployment: Deployment) -> Iterator[Finding]:
                 Check.ADDRESS_BITS,
                 variable.name,
                 (
-                    f"its {variable.values} values and the missing reading fit {needed} address bits, and it has "
+                    f"its {variable.values} values and the missing reading fit {needed} address bits, but it has "
                     f"{variable.bits}: its memory is {2 ** (variable.bits - needed)} times as deep as needed"
                 ),
                 f"use --bits {variable.name}={needed}",
@@ -70,5 +70,5 @@ def _ranges(deployment: Deployment) -> Iterator[Finding]:
                 Check.RANGE,
                 variable.name,
                 "a reading out of range is a missing one (on_range), and a missing one is an error (on_missing)",
-                'say on_missing="missing", or on_range="clamp" or "error"',
+                'use on_missing="missing", or on_range="clamp" or "error"',
             )

@@ -1,4 +1,4 @@
-"""The `toolchain build` command: a model from a folder or a network's file becomes a deployment."""
+"""The `toolchain build` command, which builds a deployment from a model or a network file."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -20,49 +20,50 @@ def build(
     uri: Annotated[
         str,
         typer.Option(
-            help="rosbridge server with the readings.", metavar="ws://HOST:PORT", rich_help_panel=MESSAGES
+            help="rosbridge server of the readings.", metavar="ws://HOST:PORT", rich_help_panel=MESSAGES
         ),
     ] = "",
     topic: Annotated[
-        str, typer.Option(help="Topic with the readings.", metavar="TOPIC", rich_help_panel=MESSAGES)
+        str, typer.Option(help="Topic of the readings.", metavar="TOPIC", rich_help_panel=MESSAGES)
     ] = "",
     message_type: Annotated[
         str,
-        typer.Option("--type", help="That topic's type.", metavar="PACKAGE/NAME", rich_help_panel=MESSAGES),
+        typer.Option("--type", help="Type of the topic.", metavar="PACKAGE/NAME", rich_help_panel=MESSAGES),
     ] = "",
     sources: Annotated[
         Path | None,
         typer.Option(
-            help="Instead of topic and type: a TOML file with several topics, of one server or more.",
+            help="Instead of topic and type: a TOML file with several topics on one or more servers.",
             metavar="FILE",
             rich_help_panel=MESSAGES,
         ),
     ] = None,
     output: Annotated[
-        str, typer.Option(help="Topic for the posteriors.", metavar="TOPIC", rich_help_panel=MESSAGES)
+        str, typer.Option(help="Topic of the posteriors.", metavar="TOPIC", rich_help_panel=MESSAGES)
     ] = "/BMresults",
     prior_path: Annotated[
         str | None,
         typer.Option(
-            help="Where in the message a written prior is.", metavar="PATH", rich_help_panel=MESSAGES
+            help="Path of a written prior in the message.", metavar="PATH", rich_help_panel=MESSAGES
         ),
     ] = None,
     queue: Annotated[
         Queue,
         typer.Option(
-            help="Frames that come too fast: the newest counts, or all in order.", rich_help_panel=MESSAGES
+            help="If readings arrive too fast: keep only the latest, or all in order.",
+            rich_help_panel=MESSAGES,
         ),
     ] = Queue.LATEST,
     tolerance: Annotated[
         float,
         typer.Option(
-            help="Within which readings from several topics belong together.",
+            help="Seconds within which readings from several topics belong together.",
             metavar="SECONDS",
             rich_help_panel=MESSAGES,
         ),
     ] = 0.05,
 ) -> None:
-    """Build a deployment: programming files for the boards, deployment.toml, a report, and a hardware project.
+    """Build a deployment: programming files, deployment.toml, a report, and a hardware project.
 
     `toolchain build casestudies/boat -o build/boat --partitions 4 --uri ws://localhost:9090
     --topic /boat/sensors --type boat_msgs/Sensors`
@@ -100,7 +101,7 @@ def build(
 
 
 def _with_sources(options: "BuildOptions", path: Path | None) -> "BuildOptions":
-    """Return the options with the file that assigns variables to topics, where there is one."""
+    """Return the options with the file that assigns variables to topics, if there is one."""
     from toolchain.building.sources_file import read_sources
     from toolchain.errors import BuildError
 
@@ -109,11 +110,11 @@ def _with_sources(options: "BuildOptions", path: Path | None) -> "BuildOptions":
         missing = [flag for flag, value in target.items() if not value]
         if missing:
             raise BuildError(
-                f"{missing[0]} is missing: say where readings come from, with --uri, --topic and --type, or with "
-                "--sources FILE where they come from several topics"
+                f"{missing[0]} is missing: give the source of the readings with --uri, --topic and --type, or with "
+                "--sources FILE for several topics"
             )
         return options
     for flag, value in (*target.items(), ("--prior-path", options.prior_path)):
         if value and flag != "--uri":
-            raise BuildError(f"{flag} {value}: the file of --sources sets that for each topic; leave it out")
+            raise BuildError(f"{flag} {value}: the file of --sources sets that for each topic; omit the flag")
     return replace(options, sources=read_sources(path, options.uri or None))

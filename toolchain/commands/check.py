@@ -1,4 +1,4 @@
-"""The `toolchain check` command: the findings about a model or a deployment, one on each line."""
+"""The `toolchain check` command, which prints findings about a model or a deployment, one per line."""
 
 import json as json_text
 from collections import Counter
@@ -19,17 +19,17 @@ def check(
     path: Annotated[
         Path,
         typer.Argument(
-            help="Folder that holds model.py, a network's file, or a deployment's folder.",
+            help="Folder with model.py, a network file, or the folder of a deployment.",
             metavar="MODEL|DIR",
         ),
     ],
     flags: BuildFlags,
-    json: Annotated[bool, typer.Option("--json", help="One JSON object a line.")] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print one JSON object per line.")] = False,
 ) -> None:
-    """Say what is wrong before anything runs: of a model as it would be built, or of a deployment.
+    """Report mistakes before anything runs: in a model as it would be built, or in a deployment.
 
-    For example `toolchain check casestudies/boat --partitions 4`, or `toolchain check build/boat`. Exit code 2 if there
-    is an error among the findings, else 0.
+    For example `toolchain check casestudies/boat --partitions 4`, or `toolchain check build/boat`. The exit
+    code is 2 if there is an error among the findings, otherwise 0.
     """
     from toolchain.checks.check import check_deployment
     from toolchain.checks.finding import Severity
@@ -41,7 +41,7 @@ def check(
         findings = _of_model(path, flags)
     elif not (path / FILE_NAME).is_file():
         raise BuildError(
-            f"{path} holds neither a model ({case_study.FILE_NAME}) nor a deployment ({FILE_NAME}), and is not a "
+            f"{path} contains neither a model ({case_study.FILE_NAME}) nor a deployment ({FILE_NAME}), and is not a "
             "network's file"
         )
     else:
@@ -72,7 +72,7 @@ def _of_model(path: Path, flags: BuildFlags) -> "list[Finding]":
     from toolchain.checks.check import check_model, refusal
     from toolchain.commands.request import build_options, fit_to_device, read_model, read_named
 
-    # a check needs no target, but a build's options have one
+    # a check does not need a target, but the build options require one
     options = build_options(
         flags, uri="ws://127.0.0.1:9090", topic="/readings", message_type="std_msgs/Float64MultiArray"
     )

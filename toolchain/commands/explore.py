@@ -1,4 +1,4 @@
-"""The `toolchain explore` command: a sweep over a model's machines, or the thesis's claims as experiments."""
+"""The `toolchain explore` command: a sweep over machines for a model, or the thesis's claims as experiments."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -26,34 +26,39 @@ Kind = TypeVar("Kind", bound=StrEnum)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SweepFlags(ModelFlags):
-    """A sweep: lists with commas between their parts are combined, the rest is the same for all machines."""
+    """Flags of a sweep: comma-separated lists are combined, the rest is the same for all machines."""
 
     bits: Bits = None
-    prob_bits: Annotated[str, typer.Option(help="Bits of a code, with commas.", metavar="LIST")] = "4,6,8,10"
+    prob_bits: Annotated[str, typer.Option(help="Bits of a code, comma-separated.", metavar="LIST")] = (
+        "4,6,8,10"
+    )
     targets: Annotated[
-        str, typer.Option(help="Target counts, each in the narrowest counter.", metavar="LIST")
+        str, typer.Option(help="Target counts, each with the narrowest counter.", metavar="LIST")
     ] = "63,255,1023"
     rngs: Annotated[str, typer.Option(help="Generators.", metavar="LIST")] = "lfsr16,lfsr32"
     scales: Annotated[
-        str, typer.Option(help="What is divided by its maximum before quantising.", metavar="LIST")
+        str,
+        typer.Option(
+            help="Part of a table that is divided by its maximum before quantising.", metavar="LIST"
+        ),
     ] = "address,column"
     sensor_modes: Annotated[
         str,
         typer.Option(
-            help="What a cell is given: its column's reading, its own (cell), or its probability (threshold).",
+            help="Input of a cell: the reading of its column, its own (cell), or its probability (threshold).",
             metavar="LIST",
         ),
     ] = "column"
     replicas: Annotated[
-        str, typer.Option(help="Machines on a board, around the same generators.", metavar="LIST")
+        str, typer.Option(help="Numbers of machines on a board, which share the generators.", metavar="LIST")
     ] = "1"
     steps: Annotated[
-        str, typer.Option(help="Steps of a generator in a cycle; 0: fresh bits.", metavar="LIST")
+        str, typer.Option(help="Steps of a generator per cycle; 0: fresh bits.", metavar="LIST")
     ] = "0"
     partitions: Partitions = 1
     stop: StopWhen = Stop.SLICES
     max_cycles: MaxCycles = 2**17
-    banks: Annotated[int, typer.Option(help="Sets of seeds that each frame is run with.")] = 2
+    banks: Annotated[int, typer.Option(help="Number of seed sets for each frame.")] = 2
 
 
 def explore(
@@ -62,14 +67,14 @@ def explore(
     model: Annotated[
         Path | None,
         typer.Argument(
-            help="Folder that holds model.py, or a network: .bif, .xmlbif, .uai, .net.", metavar="[MODEL]"
+            help="Folder with model.py, or a network file: .bif, .xmlbif, .uai, .net.", metavar="[MODEL]"
         ),
     ] = None,
-    frames: Annotated[int, typer.Option(help="Frames of readings at most.")] = 50,
+    frames: Annotated[int, typer.Option(help="Maximum number of frames.")] = 50,
     results: Annotated[
         Path,
         typer.Option(
-            "--output", "-o", help="File of results: kept point by point, and gone on with.", metavar="FILE"
+            "--output", "-o", help="File of results, from which a sweep is resumed.", metavar="FILE"
         ),
     ] = Path("explore.jsonl"),
     plot: Annotated[
@@ -78,19 +83,20 @@ def explore(
     claims: Annotated[
         Path | None,
         typer.Option(
-            help="Instead of a sweep: the thesis's claims as experiments, figures and a picture in this folder.",
+            help="Instead of a sweep: the thesis's claims as experiments, with numbers and a picture in this folder.",
             metavar="DIR",
         ),
     ] = None,
 ) -> None:
-    """Sweep over machines of a model: accuracy against cycles and ALMs, with the Pareto front.
+    """Sweep over machines for a model: accuracy against cycles and ALMs, with the Pareto front.
 
-    For example `toolchain explore casestudies/boat --partitions 4 --prob-bits 6,8 --plot boat.png`; Ctrl-C keeps what is
-    done, and the same command goes on. `toolchain explore --claims out/claims` makes the thesis's claims.
+    For example `toolchain explore casestudies/boat --partitions 4 --prob-bits 6,8 --plot boat.png`; after
+    Ctrl-C, the same command resumes the sweep. `toolchain explore --claims out/claims` tests the thesis's
+    claims.
     """
     if claims is not None:
         if model is not None:
-            raise BuildError(f"--claims has a model of its own: leave {model} out")
+            raise BuildError(f"--claims has its own model: omit {model}")
         _run_claims(claims, frames=frames, seed=readings.seed)
     elif model is None:
         raise BuildError(
@@ -103,7 +109,7 @@ def explore(
 def _run_sweep(
     path: Path, flags: SweepFlags, readings: ReadingFlags, count: int, results: Path, plot: Path | None
 ) -> None:
-    """Sweep, keeping every point in the results' file, and print what there is, also when it is interrupted."""
+    """Run the sweep, store every point in the results file, and print the points, even after an interruption."""
     from toolchain.analysis.accuracy.readings import check_columns
     from toolchain.analysis.exploration.pictures import check_pictures_possible, draw_sweep
     from toolchain.analysis.exploration.results import Results, pareto
@@ -138,7 +144,7 @@ def _run_sweep(
                 lambda point: advance(_name_of(point)),
             )
     finally:
-        # Ctrl-C may come between the writing of a point and the return of that write: the file is what counts.
+        # Ctrl-C may arrive between the write of a point and its return, so read the file.
         kept = Results(results)
         points = [
             with_resources(model, task, kept.points[task.key], device)
@@ -155,7 +161,7 @@ def _run_sweep(
 
 
 def _recorded(model: "Model", flags: ReadingFlags) -> "Callable[[int], Readings] | None":
-    """Return a reader of so many rows of the recording, where there is one."""
+    """Return a function that reads a number of rows of the recording, if there is one."""
     from toolchain.analysis.accuracy.readings import recorded_readings
 
     path = flags.readings
@@ -189,7 +195,7 @@ def _numbers(flag: str, text: str) -> tuple[int, ...]:
         return tuple(dict.fromkeys(int(part) for part in text.split(",")))
     except ValueError:
         raise BuildError(
-            f"{flag} {text}: expected whole numbers with commas between them, such as {flag} 4,8"
+            f"{flag} {text}: expected comma-separated whole numbers, such as {flag} 4,8"
         ) from None
 
 
@@ -219,7 +225,7 @@ def _run_claims(directory: Path, *, frames: int, seed: int) -> None:
     try:
         directory.mkdir(parents=True, exist_ok=True)
     except OSError as reason:
-        raise BuildError(f"{directory} can't be made: {reason.strerror or reason}") from None
+        raise BuildError(f"{directory} can't be created: {reason.strerror or reason}") from None
     check_pictures_possible(picture)
     with progress(experiments()) as advance:
         claims = run_claims(frames=frames, seed=seed, advance=advance)

@@ -1,4 +1,4 @@
-"""Flags that several subcommands share, as dataclasses that a command takes whole (thesis 3.4)."""
+"""Flags shared by several subcommands, as dataclasses that are parameters of commands (thesis 3.4)."""
 
 import functools
 import inspect
@@ -26,29 +26,27 @@ MESSAGES: Final = "Readings and results"
 Bits: TypeAlias = Annotated[
     list[str] | None,
     typer.Option(
-        help="Address bits of a variable's column, or of the prior it selects; repeat for more.",
+        help="Address bits of a variable's column, or of the prior it selects; repeatable.",
         show_default="the model's",
         metavar="NAME=BITS",
         rich_help_panel=MODEL,
     ),
 ]
 MaxCycles: TypeAlias = Annotated[
-    int, typer.Option(help="Cycles after which a machine stops anyway.", rich_help_panel=STOPPING)
+    int, typer.Option(help="Maximum number of cycles.", rich_help_panel=STOPPING)
 ]
 ModelPath: TypeAlias = Annotated[
     Path,
     typer.Argument(
-        help="Folder that holds model.py, or a network: .bif, .xmlbif, .uai, .net.", metavar="MODEL"
+        help="Folder with model.py, or a network file: .bif, .xmlbif, .uai, .net.", metavar="MODEL"
     ),
 ]
-Partitions: TypeAlias = Annotated[
-    int, typer.Option(help="Boards to split the lines over.", rich_help_panel=BOARDS)
-]
+Partitions: TypeAlias = Annotated[int, typer.Option(help="Number of boards.", rich_help_panel=BOARDS)]
 ReadingColumns: TypeAlias = Annotated[
     list[str] | None,
     typer.Option(
         "--reading",
-        help="Where a known variable's readings are; * stands for the same in both; repeat for more.",
+        help="Column of a known variable's readings; * stands for the same text in both; repeatable.",
         show_default="its name",
         metavar="NAME=COLUMN",
     ),
@@ -56,57 +54,59 @@ ReadingColumns: TypeAlias = Annotated[
 Settings: TypeAlias = Annotated[
     list[str] | None,
     typer.Option(
-        "--set", help="A parameter of the model; repeat for more.", metavar="KEY=VALUE", rich_help_panel=MODEL
+        "--set", help="A parameter of the model; repeatable.", metavar="KEY=VALUE", rich_help_panel=MODEL
     ),
 ]
 StopWhen: TypeAlias = Annotated[
     Stop,
     typer.Option(
-        help="slices: all boards soon after the first overflow; own: each at its own.",
+        help="slices: all boards shortly after the first overflow; own: each at its own overflow.",
         rich_help_panel=STOPPING,
     ),
 ]
 TargetCount: TypeAlias = Annotated[
     int | None,
     typer.Option(
-        help="Count that stops a machine.", show_default="the counters' largest", rich_help_panel=STOPPING
+        help="Count that stops a machine.", show_default="the counters' maximum", rich_help_panel=STOPPING
     ),
 ]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ModelFlags:
-    """Flags for reading a model: a case study's parameters, or the question to a network."""
+    """Flags for reading a model: parameters of model.py, or variables of a network."""
 
     settings: Settings = None
     searched: Annotated[
-        str, typer.Option(help="The variables that are searched.", metavar="A,B", rich_help_panel=NETWORK)
+        str, typer.Option(help="Searched variables.", metavar="A,B", rich_help_panel=NETWORK)
     ] = ""
     known: Annotated[
         str,
         typer.Option(
-            help="Those with readings, in the order of the columns.", metavar="A,B", rich_help_panel=NETWORK
+            help="Variables with readings, in the order of the columns.",
+            metavar="A,B",
+            rich_help_panel=NETWORK,
         ),
     ] = ""
     given: Annotated[
         list[str] | None,
         typer.Option(
-            help="What always has this state; repeat for more.", metavar="NAME=STATE", rich_help_panel=NETWORK
+            help="A variable with a fixed state; repeatable.", metavar="NAME=STATE", rich_help_panel=NETWORK
         ),
     ] = None
     prior_select: Annotated[
         str,
         typer.Option(
-            help="The variable with readings that selects the prior.", metavar="NAME", rich_help_panel=NETWORK
+            help="Variable whose readings select the prior.", metavar="NAME", rich_help_panel=NETWORK
         ),
     ] = ""
     on_missing: Annotated[
-        OnMissing, typer.Option(help="What an absent reading is.", rich_help_panel=NETWORK)
+        OnMissing, typer.Option(help="Meaning of an absent reading.", rich_help_panel=NETWORK)
     ] = OnMissing.ERROR
 
     @property
     def question(self) -> list[str]:
-        """The flags with a value that only a network takes."""
+        """The given flags that are only for networks."""
         values = {
             "--searched": self.searched,
             "--known": self.known,
@@ -119,13 +119,13 @@ class ModelFlags:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BuildFlags(ModelFlags):
-    """Flags for turning a model into a machine."""
+    """Flags for building a machine from a model."""
 
     partitions: Partitions = 1
     device: Annotated[
         str | None,
         typer.Option(
-            help="What a board has: as many boards are taken as the lines need, and it says why.",
+            help="FPGA of a board: the build uses as many boards as the lines need, and gives the reason.",
             metavar="proce-v-d8",
             rich_help_panel=BOARDS,
         ),
@@ -142,7 +142,7 @@ class BuildFlags(ModelFlags):
     scale: Annotated[
         Scale | None,
         typer.Option(
-            help="What is divided by its maximum before quantising.",
+            help="Part of a table that is divided by its maximum before quantising.",
             show_default="address; column where cells have readings of their own",
             rich_help_panel=TABLES,
         ),
@@ -164,7 +164,7 @@ class BuildFlags(ModelFlags):
     rng: Annotated[
         RngKind,
         typer.Option(
-            help="Generators: lfsr8, lfsr16, lfsr24 or lfsr32; table: of random numbers; ideal: emulated only.",
+            help="Generators: lfsr8, lfsr16, lfsr24 or lfsr32; table: of random numbers; ideal: only in emulation.",
             metavar="KIND",
             rich_help_panel=RANDOM,
         ),
@@ -172,59 +172,65 @@ class BuildFlags(ModelFlags):
     rng_table: Annotated[
         Path | None,
         typer.Option(
-            help="With --rng table: the random numbers; without, they are made.",
+            help="With --rng table: the random numbers; by default, they are generated.",
             metavar="MIF",
             rich_help_panel=RANDOM,
         ),
     ] = None
-    rng_banks: Annotated[int, typer.Option(help="Sets of seeds, used in turn.", rich_help_panel=RANDOM)] = 16
+    rng_banks: Annotated[
+        int, typer.Option(help="Number of seed sets, used in turn.", rich_help_panel=RANDOM)
+    ] = 16
     rng_reset: Annotated[
         RngReset,
         typer.Option(
-            help="bank: a frame restarts the generators; free: never (the thesis).", rich_help_panel=RANDOM
+            help="bank: each frame restarts the generators; free: never, as in the thesis.",
+            rich_help_panel=RANDOM,
         ),
     ] = RngReset.BANK
     shared: Annotated[
         bool,
         typer.Option(
             "--shared/--per-cell",
-            help="A generator for a whole column, or one for each cell.",
+            help="One generator per column, or one per cell.",
             rich_help_panel=RANDOM,
         ),
     ] = True
     steps_per_clock: Annotated[
         int,
         typer.Option(
-            help="Steps of a generator in a cycle; 1 is the thesis's; 0: as many as give fresh bits.",
+            help="Steps of a generator per cycle; 1 as in the thesis; 0: as many as are needed for fresh bits.",
             rich_help_panel=RANDOM,
         ),
     ] = 0
     sensor_mode: Annotated[
         SensorMode,
         typer.Option(
-            help="What a cell is given: its column's reading, one of its own (cell), or its probability (threshold).",
+            help="Input of a cell: its column's reading, its own reading (cell), or its probability (threshold).",
             rich_help_panel=TABLES,
         ),
     ] = SensorMode.COLUMN
     replicas: Annotated[
         int,
         typer.Option(
-            help="Machines on each board, around the same generators, 1 to 256.", rich_help_panel=BOARDS
+            help="Number of machines on each board, which share the generators, 1 to 256.",
+            rich_help_panel=BOARDS,
         ),
     ] = 1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReadingFlags:
-    """Which readings a machine is tried on."""
+    """Flags for the readings of a machine."""
 
     readings: Annotated[
         Path | None,
-        typer.Option(help="Recorded readings: CSV, MCAP or bag; else they are drawn.", metavar="RECORDING"),
+        typer.Option(
+            help="Recorded readings: CSV, MCAP or bag; by default, readings are drawn.", metavar="RECORDING"
+        ),
     ] = None
     reading: ReadingColumns = None
-    seed: Annotated[int, typer.Option(help="Of the readings that are drawn.", min=0)] = 1
-    device: Annotated[str, typer.Option(help="What the boards have.", metavar="proce-v-d8")] = "proce-v-d8"
+    seed: Annotated[int, typer.Option(help="Seed of drawn readings.", min=0)] = 1
+    device: Annotated[str, typer.Option(help="FPGA of the boards.", metavar="proce-v-d8")] = "proce-v-d8"
 
 
 def add_commands(app: CommandLine, *commands: Callable[..., None]) -> None:
@@ -234,10 +240,10 @@ def add_commands(app: CommandLine, *commands: Callable[..., None]) -> None:
 
 
 def expand_flags(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command one parameter for each field of the dataclasses that it takes.
+    """Replace the dataclass parameters of a command by one parameter per field.
 
-    Typer reads a command's flags from its signature, so the signature is what is expanded. Every field of such a
-    dataclass has a default.
+    Typer reads the flags of a command from its signature, so this changes the signature. Every field of such
+    a dataclass has a default.
     """
     parameters: list[inspect.Parameter] = []
     groups: dict[str, type[Any]] = {}

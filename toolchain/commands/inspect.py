@@ -1,4 +1,4 @@
-"""The `toolchain inspect` command: a deployment explained, with its accuracy, time, resources and energy."""
+"""The `toolchain inspect` command, which explains a deployment: accuracy, time, resources and energy."""
 
 from pathlib import Path
 from typing import Annotated, Final
@@ -20,34 +20,34 @@ def inspect(
     model: Annotated[
         Path | None,
         typer.Option(
-            help="The model that it was built from, folder or network: accuracy is then given beside the model, not "
-            "only beside its codes.",
+            help="The model from which it was built, folder or network file: accuracy is then compared with the "
+            "model, not only with its codes.",
             metavar="MODEL",
         ),
     ] = None,
     tolerance: Annotated[
-        float, typer.Option(help="Of bags: between readings that belong together.", metavar="SECONDS")
+        float,
+        typer.Option(help="bags: maximum time between readings that belong together.", metavar="SECONDS"),
     ] = 0.1,
     frames: Annotated[
         int | None,
         typer.Option(
-            help="Frames of readings at most; with replicas fewer.",
+            help="Maximum number of frames; fewer with replicas.",
             show_default="200, or 20 of a machine that is slow to emulate",
         ),
     ] = None,
     banks: Annotated[
         int | None,
-        typer.Option(
-            help="Sets of seeds that each frame is run with.", show_default="4, or 1 of such a machine"
-        ),
+        typer.Option(help="Number of seed sets for each frame.", show_default="4, or 1 for a slow machine"),
     ] = None,
-    clock: Annotated[float, typer.Option(help="The boards' clock.", metavar="HERTZ")] = 100e6,
+    clock: Annotated[float, typer.Option(help="Clock frequency of the boards.", metavar="HERTZ")] = 100e6,
     soft_pcie: Annotated[
-        bool, typer.Option("--soft-pcie", help="PCIe controllers of logic; else the device's own.")
+        bool,
+        typer.Option("--soft-pcie", help="Use soft PCIe controllers instead of the hard ones of the device."),
     ] = False,
-    json: Annotated[bool, typer.Option("--json", help="One JSON object instead of words.")] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")] = False,
 ) -> None:
-    """Explain a deployment: its machine, what quantising lost, cycles, accuracy, resources and energy.
+    """Explain a deployment: machine, quantisation loss, cycles, accuracy, resources and energy.
 
     For example `toolchain inspect build/boat --model casestudies/boat --clock 100e6`, or over recorded readings
     `toolchain inspect build/mrclam --readings DATA/ds1_robot3.csv --reading 'range_*=range_*_m' --reading

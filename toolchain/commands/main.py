@@ -3,7 +3,7 @@
 from terminal.command_line import CommandLine
 from toolchain.commands import regenerate
 
-# NumPy and what needs it are imported inside these functions, so that --help answers at once.
+# NumPy and modules that need it are imported inside these functions, so that --help is fast.
 from toolchain.commands.build import build
 from toolchain.commands.check import check
 from toolchain.commands.explore import explore
@@ -19,4 +19,4 @@ add_commands(app, build, check, inspect, explore, fit, new)
 
 @app.callback()
 def toolchain() -> None:
-    """From a model, in Python or in a network's file, to everything a Bayesian machine needs."""
+    """Build, check and inspect deployments of Bayesian machines, from models in Python or network files."""

@@ -1,4 +1,4 @@
-"""The `toolchain new` command: a model to start from, made of a template that runs."""
+"""The `toolchain new` command, which creates a runnable model from a template."""
 
 import re
 import shlex
@@ -14,11 +14,11 @@ _FILES: Final = ("model.py", "robot.py")
 
 
 def new(
-    name: Annotated[Path, typer.Argument(help="The folder to make; its last part names the model.")],
+    name: Annotated[Path, typer.Argument(help="Folder to create; its last part is the name of the model.")],
 ) -> None:
-    """Start a model from a template that runs: a robot in a corridor.
+    """Create a model from a runnable template: a robot in a corridor.
 
-    For example `toolchain new mymodel`; it prints how to go on.
+    For example `toolchain new mymodel`; it prints the next steps.
     """
     model = name.name
     if not re.fullmatch(r"[A-Za-z]\w{0,60}", model, re.ASCII):
@@ -27,10 +27,10 @@ def new(
         )
     for file in _FILES:
         if (name / file).exists():
-            raise BuildError(f"{name / file} is there already; choose another name")
+            raise BuildError(f"{name / file} already exists; choose another name")
     if not name.parent.is_dir():
         raise BuildError(
-            f"{name.parent} is not a folder, so {model} can't be made in it; make it first, or correct the path"
+            f"{name.parent} is not a folder, so {model} can't be created in it; create it first, or correct the path"
         )
     try:
         name.mkdir(exist_ok=True)

@@ -1,4 +1,4 @@
-"""A progress bar on standard error, where that is a terminal."""
+"""A progress bar on standard error, if that is a terminal."""
 
 import sys
 from collections.abc import Callable, Iterator
@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 @contextmanager
 def progress(total: int) -> Iterator[Callable[[str], None]]:
-    """Show a bar on a terminal, nothing elsewhere; yield a function to call with words after each step."""
+    """Show a bar on a terminal, nothing elsewhere; yield a function to call with a text after each step."""
     if not sys.stderr.isatty():
         yield lambda _: None
         return

@@ -1,4 +1,4 @@
-"""The `toolchain regenerate` commands (thesis 3.4): one part of a deployment is written again."""
+"""The `toolchain regenerate` commands, which write one part of a deployment again (thesis 3.4)."""
 
 import difflib
 from collections.abc import Sequence
@@ -17,13 +17,13 @@ if TYPE_CHECKING:
 app = CommandLine(no_args_is_help=True)
 
 Directory: TypeAlias = Annotated[
-    Path, typer.Argument(help="Folder of the deployment, which `toolchain build` wrote.", metavar="DIR")
+    Path, typer.Argument(help="Folder of the deployment, written by `toolchain build`.", metavar="DIR")
 ]
 
 
 @app.callback()
 def regenerate() -> None:
-    """Redo one part of a deployment, leave the rest as it is, and say what changed."""
+    """Write one part of a deployment again without changing the rest, and report the changes."""
 
 
 def memories(
@@ -32,15 +32,15 @@ def memories(
     model: Annotated[
         Path | None,
         typer.Option(
-            help="Take the tables from the model as it is now; without it, from the boards' images.",
+            help="Use the tables of the current model; by default, those of the images.",
             metavar="MODEL",
         ),
     ] = None,
 ) -> None:
-    """Write the parameters and memory files again; with --model also the boards' images, for a model with new numbers.
+    """Write the parameters and memory files again; with --model also the images, with new numbers.
 
-    For example `toolchain regenerate memories build/boat --model casestudies/boat`. Everything in deployment.toml that
-    does not concern the tables, such as topics and endpoints, stays as it is.
+    For example `toolchain regenerate memories build/boat --model casestudies/boat`. Everything else in
+    deployment.toml, such as topics and endpoints, does not change.
     """
     from toolchain.building.build import build_date
     from toolchain.building.regenerate import regenerate_memories
@@ -53,9 +53,7 @@ def memories(
         changes = regenerate_memories(directory, read, build_date=build_date(model_file(model)))
         _print_changes(changes, before, _lines(directory))
     elif flags.settings or flags.question:
-        raise BuildError(
-            f"{'--set' if flags.settings else flags.question[0]} belongs to a model: add --model"
-        )
+        raise BuildError(f"{'--set' if flags.settings else flags.question[0]} is for a model: add --model")
     else:
         _print_changes(regenerate_memories(directory))
 
@@ -70,46 +68,46 @@ def project(directory: Directory) -> None:
     changes = regenerate_project(directory)
     _print_changes(changes)
     if not changes:
-        typer.echo("rng = ideal exists only emulated, so there is no project", err=True)
+        typer.echo("rng = ideal exists only in emulation, so there is no project", err=True)
 
 
 def deployment(
     directory: Directory,
     uri: Annotated[
-        str | None, typer.Option(help="rosbridge server with the readings.", metavar="ws://HOST:PORT")
+        str | None, typer.Option(help="rosbridge server of the readings.", metavar="ws://HOST:PORT")
     ] = None,
-    topic: Annotated[str | None, typer.Option(help="Topic with the readings.", metavar="TOPIC")] = None,
+    topic: Annotated[str | None, typer.Option(help="Topic of the readings.", metavar="TOPIC")] = None,
     message_type: Annotated[
         str | None, typer.Option("--type", help="That topic's type.", metavar="PACKAGE/NAME")
     ] = None,
-    output: Annotated[str | None, typer.Option(help="Topic for the posteriors.", metavar="TOPIC")] = None,
+    output: Annotated[str | None, typer.Option(help="Topic of the posteriors.", metavar="TOPIC")] = None,
     order: Annotated[
         str | None,
-        typer.Option(
-            help="The sensors in the order in which columns 1 to N are to read them.", metavar="A,B,C"
-        ),
+        typer.Option(help="The sensors in the order of columns 1 to N.", metavar="A,B,C"),
     ] = None,
     path: Annotated[
         list[str] | None,
-        typer.Option(help="Where in the message a variable is; repeat for more.", metavar="NAME=PATH"),
+        typer.Option(help="Path of a variable in the message; repeatable.", metavar="NAME=PATH"),
     ] = None,
     target_count: TargetCount = None,
-    max_cycles: Annotated[int | None, typer.Option(help="Cycles after which a machine stops anyway.")] = None,
+    max_cycles: Annotated[int | None, typer.Option(help="Maximum number of cycles.")] = None,
     stop: Annotated[
         Stop | None,
-        typer.Option(help="slices: all boards soon after the first overflow; own: each at its own."),
+        typer.Option(
+            help="slices: all boards shortly after the first overflow; own: each at its own overflow."
+        ),
     ] = None,
     queue: Annotated[
-        Queue | None, typer.Option(help="Frames that come too fast: the newest counts, or all in order.")
+        Queue | None, typer.Option(help="If readings arrive too fast: keep only the latest, or all in order.")
     ] = None,
     tolerance: Annotated[
         float | None, typer.Option(help="Seconds within which readings from several topics belong together.")
     ] = None,
 ) -> None:
-    """Write deployment.toml with other topics, or variables in another order; edits by hand are kept.
+    """Write deployment.toml with other topics, or variables in another order; manual edits are kept.
 
-    For example `toolchain regenerate deployment build/boat --order D2,D1,D3,B1,B2,B3` where the first two readings were
-    mixed up. No image, memory or board is touched. Flags that are left out change nothing.
+    For example `toolchain regenerate deployment build/boat --order D2,D1,D3,B1,B2,B3` if the first two
+    readings were swapped. Images, memories and boards are not touched. Omitted flags do not change anything.
     """
     from toolchain.building.regenerate import DeploymentEdits, regenerate_deployment
     from toolchain.flag_values import key_values, names_in
@@ -133,7 +131,7 @@ def deployment(
 
 
 def _lines(directory: Path) -> list[str]:
-    """Return the lines of `deployment.toml`; none where it is missing, which is refused elsewhere."""
+    """Return the lines of `deployment.toml`; none if it is missing, which is an error elsewhere."""
     file = directory / FILE_NAME
     return file.read_text(encoding="utf-8", errors="replace").splitlines() if file.is_file() else []
 

@@ -1,4 +1,4 @@
-"""The model and the build options that a command line asks for."""
+"""The model and the build options of a command line."""
 
 from __future__ import annotations
 
@@ -27,26 +27,26 @@ if TYPE_CHECKING:
 
 
 def model_file(path: Path) -> Path:
-    """Return the file that a model is read from: the network's own, or the folder's `model.py`."""
+    """Return the file of a model: the network file, or the `model.py` of a folder."""
     return path if is_network(path) else model_path(path)
 
 
 def read_model(path: Path, flags: ModelFlags, bits: Iterable[str] | None = None) -> Model:
-    """Return the model of a folder or of a network's file; `bits` are `NAME=BITS`, the address bits of some columns."""
+    """Return the model of a folder or network file; `bits` are `NAME=BITS`, the address bits of columns."""
     settings = key_values(flags.settings or ())
     model = (_network_model if is_network(path) else _case_model)(path, flags, settings)
     return _with_bits(model, key_values(bits or (), "--bits", "range=8"))
 
 
 def build_options(flags: BuildFlags, *, uri: str, topic: str, message_type: str) -> BuildOptions:
-    """Return the options of a build, but for the files that flags name."""
+    """Return the options of a build, without the files named by flags."""
     common = {field.name for field in fields(BuildOptions)} & {field.name for field in fields(flags)}
     values = {name: getattr(flags, name) for name in common - {"interface", "rng_table"}}
     return BuildOptions(uri=uri, topic=topic, type=message_type, **values)
 
 
 def read_named(options: BuildOptions, flags: BuildFlags) -> BuildOptions:
-    """Return the options with the interface and the table of random numbers that flags name."""
+    """Return the options with the interface and the table of random numbers given by flags."""
     if flags.interface is not None:
         try:
             options = replace(options, interface=parse_interface(flags.interface))
@@ -54,13 +54,13 @@ def read_named(options: BuildOptions, flags: BuildFlags) -> BuildOptions:
             raise BuildError(f"--interface: {reason}") from None
     if flags.rng_table is not None:
         if options.rng is not RngKind.TABLE:
-            raise BuildError(f"--rng-table is what --rng table plays, but this is --rng {options.rng}")
+            raise BuildError(f"--rng-table requires --rng table, but this is --rng {options.rng}")
         options = replace(options, rng_table=read_table(flags.rng_table))
     return options
 
 
 def fit_to_device(options: BuildOptions, model: Model, name: str | None) -> tuple[BuildOptions, str]:
-    """Return the options with at least as many boards as the lines need on a device, and the reason as a sentence."""
+    """Return the options with as many boards as the lines need on a device, and the reason as a sentence."""
     if name is None:
         return options, ""
     device = device_named(name)
@@ -98,14 +98,14 @@ def _with_bits(model: Model, bits: dict[str, str]) -> Model:
 
 
 def _network_model(path: Path, flags: ModelFlags, settings: dict[str, str]) -> Model:
-    """Return the model that answers the question to a network's file."""
+    """Return the model for the question to a network file."""
     if settings:
         raise BuildError(
-            f"--set {next(iter(settings))}: a network's file has no parameters; --given NAME=STATE fixes a variable"
+            f"--set {next(iter(settings))}: a network file has no parameters; --given NAME=STATE fixes a variable"
         )
     if not flags.searched:
         raise BuildError(
-            f"{path} is a network: say what is searched and known, such as --searched A --known B,C"
+            f"{path} is a network: give the searched and known variables, such as --searched A --known B,C"
         )
     return (
         read_network(path, on_missing=flags.on_missing.value)
@@ -122,6 +122,6 @@ def _network_model(path: Path, flags: ModelFlags, settings: dict[str, str]) -> M
 def _case_model(path: Path, flags: ModelFlags, settings: dict[str, str]) -> Model:
     if flags.question:
         raise BuildError(
-            f"{flags.question[0]} asks a network's file, but {path} is not one; model.py asks its own question"
+            f"{flags.question[0]} is for a network file, but {path} is not one; model.py contains its own question"
         )
     return load_model(path, settings)

@@ -77,7 +77,7 @@ def test_options_arrive_in_the_deployment_and_in_the_images(tmp_path):
 
 def test_seeds_that_no_memory_holds(tmp_path):
     options = replace(OPTIONS, rng_banks=65536, shared=False)
-    with pytest.raises(BuildError, match="takes 9633792 seeds a board; use at most 57065, or --shared"):
+    with pytest.raises(BuildError, match="9633792 .* 57065, or --shared"):
         build_deployment(model(size=7), tmp_path / "out", options)
     assert not (tmp_path / "out").exists()
 

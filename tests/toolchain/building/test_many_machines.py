@@ -335,5 +335,5 @@ def test_a_frame_of_replicas_is_measured_as_a_board_runs_it(mode):
         lengths.append(kernel.cycles)
     assert measured.cycles.worst == max(lengths)
     assert measured.cycles.median.value == np.median(lengths)
-    with pytest.raises(BuildError, match="a frame of 20 replicas takes 20 readings, and there are 12"):
+    with pytest.raises(BuildError, match="20 replicas.* 12 "):
         measure(boards, readings, of, replicas=20)
