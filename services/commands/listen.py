@@ -54,7 +54,7 @@ def listen(
         typer.Option(
             min=0.1,
             max=LONGEST_S,
-            help="Exit after so long without a result.",
+            help="Exit after this many seconds without a result.",
             show_default="it waits",
             rich_help_panel=options.TIMEOUTS,
         ),

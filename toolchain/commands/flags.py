@@ -143,7 +143,7 @@ class BuildFlags(ModelFlags):
         Scale | None,
         typer.Option(
             help="Part of a table that is divided by its maximum before quantising.",
-            show_default="address; column where cells have readings of their own",
+            show_default="address; column if cells have their own readings",
             rich_help_panel=TABLES,
         ),
     ] = None

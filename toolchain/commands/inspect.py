@@ -33,7 +33,7 @@ def inspect(
         int | None,
         typer.Option(
             help="Maximum number of frames; fewer with replicas.",
-            show_default="200, or 20 of a machine that is slow to emulate",
+            show_default="200, or 20 for a slow machine",
         ),
     ] = None,
     banks: Annotated[
