@@ -11,15 +11,18 @@ def report_connection(uri: str) -> Callable[[str, str], None]:
     """Return a callback for a client's `on_state` that reports each lost and restored connection once."""
     # the client itself logs a warning at each loss
     log_libraries(logging.ERROR, "%(name)s: %(message)s")
-    lost = False
+    missing = ""
 
     def on_state(state: str, reason: str) -> None:
-        nonlocal lost
-        if state == "reconnecting" and not lost:
-            lost = True
+        nonlocal missing
+        if state == "connected" and missing:
+            say(f"rosbridge at {uri} is connected{' again' if missing == 'reconnecting' else ''}")
+            missing = ""
+        elif state == "connecting":
+            missing = state
+            say(f"waiting for rosbridge at {uri} ({reason})")
+        elif state == "reconnecting" and not missing:
+            missing = state
             say(f"warning: rosbridge at {uri} is gone ({reason}); waiting for it")
-        elif state == "connected" and lost:
-            lost = False
-            say(f"rosbridge at {uri} is connected again")
 
     return on_state

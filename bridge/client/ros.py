@@ -330,6 +330,7 @@ def connect(
     uri: str,
     *,
     connect_timeout: float = 10.0,
+    retry: bool = False,
     ros_version: Literal["auto", "1", "2"] = "auto",
     token: str | None = None,
     headers: Mapping[str, str] | None = None,
@@ -346,12 +347,14 @@ def connect(
     """Create a client of a rosbridge server, which `async with` opens and closes.
 
     If the first connection fails, `async with` raises `UnreachableError` or `NotRosbridgeError`. If the
-    connection is lost later, the client reconnects with a back-off from 0.1 s to 5 s, and restores all
+    connection is lost later, the client reconnects with a back-off from 0.1 s to 2 s, and restores all
     advertisements, subscriptions and services.
 
     Args:
         uri: `ws://host:port`, or `wss://` for TLS; the certificate is always verified.
         connect_timeout: Timeout of the first connection in seconds.
+        retry: Whether to repeat the first attempt until `connect_timeout` is over, while nothing answers at the URI;
+            `on_state` is then called with `CONNECTING` and the reason, once.
         ros_version: ROS version of type names on the wire. `auto` uses ROS 1, which ROS 2 servers accept too,
             until `Ros.detect_ros_version` has detected the version.
         token: Sent as `Authorization: Bearer TOKEN`; like all headers it is never logged.
@@ -394,4 +397,4 @@ def connect(
     )
     core = ClientCore(ros_version=configured_version, max_size=max_size, fragment_size=fragment_size)
     parsed = replace(parsed, username=None, password=None)  # the credentials are in the route
-    return Ros(Session(parsed, shown(uri), core, limits, on_state, route=route))
+    return Ros(Session(parsed, shown(uri), core, limits, on_state, route=route, retry=retry))

@@ -33,6 +33,7 @@ from bridge.errors import (
     ServiceError,
     SlowPeerError,
     StateTimeoutError,
+    UnreachableError,
 )
 
 FIRST_DELAY: Final = 0.1
@@ -139,6 +140,7 @@ class Session:
         on_state: StateCallback | None,
         *,
         route: Route,
+        retry: bool = False,
     ) -> None:
         self.uri = shown_uri
         self.core = core
@@ -157,6 +159,7 @@ class Session:
         self.on_closed: set[Callable[[], None]] = set()
         self._parsed_uri = uri
         self._route = route
+        self._retry = retry
         self._blind_since = 0.0
         self._limits = limits
         self._on_state = on_state
@@ -186,10 +189,27 @@ class Session:
             )
         self._entered = True
         try:
-            await self._connect(self._limits.connect_timeout)
+            await self._open(self._limits.connect_timeout)
         except BaseException as error:
             await self.close(str(error))
             raise
+
+    async def _open(self, limit: float) -> None:
+        deadline, delay = time.monotonic() + limit, FIRST_DELAY
+        while True:
+            try:
+                await self._connect(limit)
+            except UnreachableError as error:
+                if not self._retry or time.monotonic() + delay >= deadline:
+                    raise
+                if not self.last_error:
+                    self._set_state(State.CONNECTING, str(error))
+                self.last_error = str(error)
+                await asyncio.sleep(delay)
+                delay = min(2 * delay, MAX_DELAY)
+                limit = deadline - time.monotonic()
+            else:
+                return
 
     async def close(self, reason: str = "closed by this client") -> None:
         """Close the connection after all sent messages, and end everything that waits."""

@@ -59,7 +59,7 @@ async def serve(uri: str, *, raw_topic: str, sensors_topic: str, array: bool) ->
     readiness = Readiness("a reading was normalised")
     async with (
         readiness_served("boat-normaliser", readiness),
-        connect(uri, on_state=report_connection(uri)) as ros,
+        connect(uri, retry=True, on_state=report_connection(uri)) as ros,
     ):
         sensors = LossyPublication(await ros.advertise(sensors_topic, ARRAY_TYPE if array else SENSORS_TYPE))
         raw = ros.subscribe(raw_topic, ARRAY_TYPE if array else RAW_TYPE)

@@ -106,7 +106,7 @@ async def simulate(
     readiness = Readiness("a reading was published")
     async with (
         readiness_served("boat-simulator", readiness),
-        connect(uri, on_state=report_connection(uri)) as ros,
+        connect(uri, retry=True, on_state=report_connection(uri)) as ros,
     ):
         ros_version = await ros.detect_ros_version()
         poses = LossyPublication(await ros.advertise(TRUE_POSE_TOPIC, TRUE_POSE_TYPE))

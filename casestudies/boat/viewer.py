@@ -141,7 +141,7 @@ class Viewer:
         readiness = Readiness("a result was shown")
         async with (
             readiness_served("boat-viewer", readiness),
-            connect(uri, on_state=report_connection(uri)) as ros,
+            connect(uri, retry=True, on_state=report_connection(uri)) as ros,
             listen(ros, truth_topic=truth_topic, truth_tolerance_s=truth_tolerance_s) as listener,
         ):
             say(f"boat-viewer: listening to {uri}")

@@ -99,7 +99,7 @@ async def play(
     from casestudies.listening import listen
 
     played: list[PlayedFrame] = []
-    async with connect(uri, on_state=report_connection(uri)) as ros, listen(ros) as listener:
+    async with connect(uri, retry=True, on_state=report_connection(uri)) as ros, listen(ros) as listener:
         version = await ros.detect_ros_version()
         publication = await ros.advertise(topic, SIGHTINGS_TYPE)
         for frame in frames:

@@ -46,6 +46,7 @@ async def show_frames(
         connect(
             uri,
             connect_timeout=settings.connect_timeout,
+            retry=True,
             ros_version=settings.ros_version,
             on_state=report_connection(uri),
             max_size=MAX_RESULT,

@@ -43,6 +43,7 @@ async def connect_all(
                 connect(
                     used,
                     connect_timeout=settings.connect_timeout,
+                    retry=True,
                     ros_version=settings.ros_version,
                     on_state=None if on_state is None else partial(on_state, used),
                     **options,

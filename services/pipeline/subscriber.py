@@ -169,6 +169,8 @@ class Subscriber:
                 self._lost.set_exception(
                     RosbridgeLostError(f"rosbridge at {uri} was lost before a reading arrived ({reason})")
                 )
+        elif state is State.CONNECTING:
+            self._link.notice("info", f"waiting for rosbridge at {uri} ({reason})")
         elif state is State.CONNECTED and self._begun.is_set():
             self._link.notice("info", f"rosbridge at {uri} is connected again")
 

@@ -119,6 +119,23 @@ async def test_nothing_is_there(unused_tcp_port):
     assert "host name" in await fails("ws://nowhere.invalid:9090", UnreachableError)
 
 
+async def test_a_first_connection_is_tried_until_its_time_is_over(unused_tcp_port):
+    uri, states = f"ws://127.0.0.1:{unused_tcp_port}", []
+    began = time.monotonic()
+    with pytest.raises(UnreachableError):
+        async with connect(uri, retry=True, connect_timeout=0.6):
+            pass
+    assert time.monotonic() - began > 0.3
+    ros = connect(uri, retry=True, connect_timeout=120, on_state=lambda state, _reason: states.append(state))
+    opening = asyncio.create_task(ros.__aenter__())
+    while not states:
+        await asyncio.sleep(0.01)
+    async with FakeRosbridge(port=unused_tcp_port):
+        await opening
+        await ros.__aexit__(None, None, None)
+    assert states == [State.CONNECTING, State.CONNECTED, State.CLOSED]
+
+
 async def test_a_host_that_takes_nothing():
     with socket.socket() as full:
         full.bind(("127.0.0.1", 0))

@@ -1,5 +1,7 @@
 import pytest
 
+from services.sockets.records import Notice
+
 
 class RecordingLink:
     """A service's link to a master that takes everything, and keeps what it was sent."""
@@ -25,6 +27,9 @@ class RecordingLink:
         return True
 
     keep = send
+
+    def notice(self, level, sentence):
+        self.send(Notice(level, sentence))
 
 
 @pytest.fixture
