@@ -8,7 +8,7 @@ import sys
 import time
 from pathlib import Path
 
-from scripts.processes import BOAT_TOPIC, BOAT_TYPE, ROOT, Process, build, run_script
+from scripts.processes import BOAT_TOPIC, BOAT_TYPE, ROOT, Process, Screen, build, run_script
 
 LIMIT = 180.0
 """Seconds after which the demo gives up, whatever it waits for."""
@@ -20,19 +20,26 @@ async def demo(arguments: argparse.Namespace) -> int:
     out: Path = arguments.out
     out.mkdir(parents=True, exist_ok=True)  # noqa: ASYNC240 - nothing else runs yet
     deployment = out / "deployment"
+    screen = Screen()
     processes = {
-        name: Process(name, out / f"{name}.log", shown=name in {"boat-viewer", "master"})
+        name: Process(
+            name, out / f"{name}.log", show=screen.show if name in {"boat-viewer", "master"} else None
+        )
         for name in ("hub", "boat-viewer", "master", "boat-normaliser", "boat-simulator")
     }
     hub, viewer, master, normaliser, simulator = processes.values()
+    saying = asyncio.create_task(screen.say_what_it_waits_for())
     try:
         uri = arguments.uri
+        screen.waits_for = "building the deployment"
         if uri is None:
-            print("starting the hub (the embedded rosbridge server), building the boat's deployment ...")
+            screen.show(
+                "starting the hub (the embedded rosbridge server), building the boat's deployment ..."
+            )
             await hub.start("hub", "--port", "0")
             uri = (await hub.line(r"ws://\S+"))[0]
         else:
-            print(f"using the rosbridge server at {uri}, building the boat's deployment ...")
+            screen.show(f"using the rosbridge server at {uri}, building the boat's deployment ...")
         count = str(arguments.count)
         await viewer.start("boat-viewer", "--uri", uri, "--count", count, "--out", str(out))
         # a real server knows installed message types only, so there the readings travel as plain arrays
@@ -41,14 +48,17 @@ async def demo(arguments: argparse.Namespace) -> int:
         options = ("--set", "array=true") if array else ()
         building = asyncio.create_task(build("boat", deployment, uri, BOAT_TOPIC, type_, *options))
         await asyncio.gather(building, viewer.line("listening"))
+        screen.waits_for = "waiting for results; the boards' first start on a computer compiles their kernels"
         await master.start("master", "--loop", "--count", count, "-d", str(deployment), "--uri", uri)
         await normaliser.start("boat-normaliser", "--uri", uri, *array)
         seed = ["--seed", str(arguments.seed)] if arguments.seed is not None else []
         await simulator.start("boat-simulator", "--uri", uri, "--rate", str(arguments.rate), *seed, *array)
         await master.succeed()
+        screen.waits_for = "drawing the pictures"
         await viewer.succeed()
-        print(f"done in {time.monotonic() - started:.1f} s; pictures are in {out}", flush=True)
+        screen.show(f"done in {time.monotonic() - started:.1f} s; pictures are in {out}")
     finally:
+        saying.cancel()
         await asyncio.gather(*(process.end() for process in reversed(processes.values())))
     return 0
 

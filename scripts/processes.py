@@ -7,6 +7,7 @@ import contextlib
 import re
 import signal
 import sys
+import time
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 
@@ -20,16 +21,18 @@ from terminal.signals import run_async
 from toolchain.errors import ToolchainError
 
 ROOT = Path(__file__).resolve().parent.parent
+SILENCE = 1.5
+"""Seconds without a line on a `Screen`."""
 BOAT_TOPIC, BOAT_TYPE = "/boat/sensors", "boat_msgs/Sensors"
 
 
 class Process:
-    """One process of a script: its lines go to a log, and to the screen if they are meant for it."""
+    """One process of a script: its lines go to a log, and to `show` if they are meant for the screen."""
 
-    def __init__(self, name: str, log: Path, *, shown: bool = False) -> None:
+    def __init__(self, name: str, log: Path, *, show: Callable[[str], None] | None = None) -> None:
         self.name = name
         self._log = log
-        self._shown = shown
+        self._show = show
         self._process: asyncio.subprocess.Process | None = None
         self._reader: asyncio.Task[None] | None = None
         self._lines: list[str] = []
@@ -64,8 +67,8 @@ class Process:
                 self._lines.append(text)
                 self._news.set()
                 # `failure` reports errors, with the path of the log
-                if self._shown and not text.startswith("error: "):
-                    print(text, flush=True)
+                if self._show is not None and not text.startswith("error: "):
+                    self._show(text)
         self._news.set()
 
     async def line(self, pattern: str) -> re.Match[str]:
@@ -122,6 +125,28 @@ class Process:
                 await self._process.wait()
         if self._reader is not None:
             await self._reader
+
+
+class Screen:
+    """The lines of a script, and between them, when nothing else comes, a line that says what it waits for."""
+
+    def __init__(self) -> None:
+        self.waits_for = "starting"
+        """The work in hand, such as "building"."""
+        self._began = time.monotonic()
+        self._newest = self._began
+
+    def show(self, text: str) -> None:
+        """Print a line."""
+        self._newest = time.monotonic()
+        print(text, flush=True)
+
+    async def say_what_it_waits_for(self) -> None:
+        """Print a line after each `SILENCE` seconds without one, until cancelled."""
+        while True:
+            await asyncio.sleep(max(self._newest + SILENCE - time.monotonic(), 0))
+            if time.monotonic() - self._newest >= SILENCE:
+                self.show(f"... {self.waits_for} ({time.monotonic() - self._began:.0f} s)")
 
 
 async def build(case_study: str, deployment: Path, uri: str, topic: str, type_: str, *options: str) -> None:

@@ -1,10 +1,14 @@
-"""Every script says how it is used."""
+"""Every script says how it is used, and none is silent for long while it works."""
 
+import asyncio
 import os
+import shutil
 import subprocess
 from pathlib import Path
 
 import pytest
+
+from scripts import processes
 
 ROOT = Path(__file__).resolve().parent.parent
 SCRIPTS = sorted(path for path in (ROOT / "scripts").iterdir() if path.is_file() and os.access(path, os.X_OK))
@@ -19,3 +23,40 @@ def test_a_script_prints_its_usage(script, tmp_path):
     assert script.name in done.stdout
     assert not done.stderr
     assert not list(tmp_path.iterdir())
+
+
+async def test_a_screen_says_what_it_waits_for_when_nothing_else_comes(capsys, monkeypatch):
+    monkeypatch.setattr(processes, "SILENCE", 0.2)
+    screen = processes.Screen()
+    screen.waits_for = "building"
+    saying = asyncio.create_task(screen.say_what_it_waits_for())
+    for _ in range(4):
+        screen.show("frame")
+        await asyncio.sleep(0.1)
+    assert capsys.readouterr().out == "frame\n" * 4
+    await asyncio.sleep(0.5)
+    saying.cancel()
+    lines = capsys.readouterr().out.splitlines()
+    assert 1 <= len(lines) <= 3
+    assert all("building" in line for line in lines)
+
+
+def test_setting_up_an_environment_shows_that_it_goes_on(tmp_path):
+    (tmp_path / "scripts").mkdir()
+    shutil.copy(ROOT / "scripts" / "environment", tmp_path / "scripts")
+    for name in ("pyproject.toml", "requirements.lock"):
+        shutil.copy(ROOT / name, tmp_path)
+    slow = tmp_path / "python"
+    slow.write_text('#!/bin/sh\ncase "$*" in *"-m venv"*) sleep 2.5; exit 1 ;; esac\n')
+    slow.chmod(0o755)
+    done = subprocess.run(
+        ["bash", "-c", ". scripts/environment run"],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHON": str(slow)},
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == 2
+    assert any(line.startswith("..") for line in done.stderr.splitlines())
