@@ -231,6 +231,9 @@ class Robot:
         self.results: list[dict] = []
         self.frames: list[dict] = []
         self.order: list[str] = []
+        self.paired: list[tuple[dict, dict]] = []
+        """Each result with its report, which comes just before it; the first result may have come without."""
+        self._report: dict | None = None
         self._tasks: list[asyncio.Task] = []
         self._publishing: asyncio.Task | None = None
         self._values: dict = {}
@@ -266,8 +269,14 @@ class Robot:
                 message = json.loads(text)
                 if message.get("op") == "publish":
                     self.order.append(message["topic"])
-                    kept = self.results if message["topic"] == "/BMresults" else self.frames
-                    kept.append(message["msg"])
+                    if message["topic"] == "/bm/frame":
+                        self._report = message["msg"]
+                        self.frames.append(message["msg"])
+                        continue
+                    self.results.append(message["msg"])
+                    if self._report is not None:
+                        self.paired.append((self._report, message["msg"]))
+                    self._report = None
 
     async def publish(self, **values) -> int:
         """Publish a reading; its stamp."""

@@ -19,8 +19,7 @@ from toolchain.deployment import load_deployment
 
 def by_generation(robot):
     """The results, and under which deployment each was computed."""
-    published = [frame for frame in robot.frames if frame["status"][0]["level"] == 0]
-    for frame, result in zip(published, robot.results, strict=False):
+    for frame, result in robot.paired:
         values = {pair["key"]: pair["value"] for pair in frame["status"][0]["values"]}
         yield int(values["generation"]), int(values["number"]), result
 
