@@ -30,8 +30,8 @@ from pcie_shim.host.link import Done, Link, RegisterWrite
 from pcie_shim.register_layout import ALL_ONES, DONE_BLOCK, WORD
 from pcie_shim.register_map import ErrorCode
 
-_TLS_ENDS_S: Final = 1.0
-"""Seconds that the end of this host's previous link may need to pass both ends of a TLS connection."""
+_ENDS_S: Final = 1.0
+"""Seconds by which the end of this host's previous link may reach a board on the network after its next link."""
 _RETRY_S: Final = 0.02
 _CLOSING_CODES: Final = (ErrorCode.STALE, ErrorCode.HELD, ErrorCode.BAD_FRAME)
 
@@ -130,7 +130,7 @@ class SocketLink(Link):
 
     @classmethod
     def _opened(cls, endpoint: Endpoint, timeout: float, connect_timeout: float) -> Self:
-        deadline = time.monotonic() + (_TLS_ENDS_S if endpoint.tls else 0.0)
+        deadline = time.monotonic() + (_ENDS_S if endpoint.host else 0.0)
         while True:
             try:
                 return cls(endpoint, timeout=timeout, connect_timeout=connect_timeout)

@@ -7,6 +7,7 @@ this process ──socket── board process (registers, machine)
 import hashlib
 import socket
 import struct
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -304,6 +305,18 @@ def test_a_blank_board_is_programmed_and_programmed_again(start_board: StartBoar
         assert link.read_block(rm.IMAGE_HASH, 8).hex() == link.greeting.image_hash == second.image_hash
         assert link.read32(rm.CAP_LINES) == 3
         assert link.read32(rm.PROGRAMMED) == 2
+
+
+def test_a_link_over_tcp_waits_for_the_end_of_the_one_before(start_board: StartBoard) -> None:
+    # two connections have no order on a network: the former one's end may come after the next one's beginning
+    board = start_board(tcp_endpoint())
+    former = open_link(board)
+    assert former.read32(rm.ID) == rm.ID_VALUE
+    ending = threading.Timer(0.2, former.close)
+    ending.start()
+    with open_link(board) as link:
+        assert link.read32(rm.ID) == rm.ID_VALUE
+    ending.join()
 
 
 def test_the_loader_is_refused_while_a_host_holds_the_board(start_board: StartBoard) -> None:
