@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
-from scripts.campaigning.observer import Fault, Finding, Reading
+from scripts.campaigning.observer import Finding, Flaw, Reading
 
 WITH_PUBLISHER = "lost with the publisher"
 """These may have arrived: the publisher was killed before it could say so."""
@@ -70,14 +70,12 @@ def judge(added: Counters, readings: Iterable[Reading], excuses: Excuses, now: f
     figures = f"{len(given)} readings, {arrived} results; counted: {added}"
     uncounted = len(given) - added.completed - added.losses
     if uncounted > (len(excusable) if excuses.readings else 0):
-        findings.append(Finding(Fault.UNCOUNTED, f"{uncounted} readings: {figures}", now))
+        findings.append(Finding(Flaw.UNCOUNTED, f"{uncounted} readings: {figures}", now))
     if uncounted < 0:
-        findings.append(Finding(Fault.MISCOUNTED, f"{-uncounted} too many: {figures}", now))
+        findings.append(Finding(Flaw.MISCOUNTED, f"{-uncounted} too many: {figures}", now))
     astray = added.completed - arrived
     if astray > (len(excusable) if excuses.results else 0):
-        findings.append(
-            Finding(Fault.UNCOUNTED, f"{astray} results are counted as published: {figures}", now)
-        )
+        findings.append(Finding(Flaw.UNCOUNTED, f"{astray} results are counted as published: {figures}", now))
     if -astray > doubtful:
-        findings.append(Finding(Fault.MISCOUNTED, f"{-astray} results nobody counted: {figures}", now))
+        findings.append(Finding(Flaw.MISCOUNTED, f"{-astray} results nobody counted: {figures}", now))
     return findings

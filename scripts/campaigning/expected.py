@@ -70,10 +70,9 @@ class Expected:
 
     def __init__(self, folder: Path) -> None:
         """Read the images of the deployment's boards."""
-        self.name = folder.name
-        self._machines: list[BM1Machine] = [
-            read_image(folder / "boards" / f"board{at}.bm").machine for at in range(BOARDS)
-        ]
+        images = [read_image(folder / "boards" / f"board{at}.bm") for at in range(BOARDS)]
+        self.hash = "".join(image.image_hash[:8] for image in images)
+        self._machines: list[BM1Machine] = [image.machine for image in images]
         self.outcome = cache(self._outcome)
 
     def _outcome(self, addresses: Addresses, bank: int) -> Outcome:

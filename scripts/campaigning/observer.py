@@ -24,7 +24,7 @@ REMEMBERED = 2000
 LAYOUT = {"dim": [{"label": "x", "size": LINES, "stride": LINES}], "data_offset": 0}
 
 
-class Fault(StrEnum):
+class Flaw(StrEnum):
     """A kind of wrong behaviour."""
 
     MALFORMED = "malformed"
@@ -53,7 +53,7 @@ class Fault(StrEnum):
 class Finding:
     """Something wrong, and when (seconds of the campaign's clock)."""
 
-    fault: Fault
+    flaw: Flaw
     sentence: str
     at: float
 
@@ -92,7 +92,7 @@ class Observer:
         self._expected = expected
         self._deployments = {0: {deployment}}
         self._readings: dict[int, Reading] = {}
-        self._taken = 0
+        self._settled = 0
         self._announced: _Announced | None = None
         self._last_number = 0
         self._last_index = -1
@@ -142,58 +142,69 @@ class Observer:
         """Return whether the result of a reading has arrived."""
         return stamp in self._readings and self._readings[stamp].arrived is not None
 
-    def take_readings(self) -> list[Reading]:
-        """Return the readings since the last call, and forget those of long ago."""
-        taken = [each for each in self._readings.values() if each.index >= self._taken]
-        self._taken = self.tally["readings"]
-        oldest = self._taken - len(taken) - REMEMBERED
+    def has_result_since(self, index: int) -> bool:
+        """Return whether a result of a reading has arrived whose place in the order is `index` or later."""
+        return self._last_index >= index
+
+    @property
+    def given(self) -> int:
+        """Readings of the unsettled ones that were given to the stack."""
+        return sum(each.forwarded for each in self.pending_readings())
+
+    def pending_readings(self) -> list[Reading]:
+        """Return the readings since the last `settle`."""
+        return [each for each in self._readings.values() if each.index >= self._settled]
+
+    def settle(self) -> None:
+        """Take note that nothing is in flight, and forget the readings of long ago."""
+        oldest = self._settled - REMEMBERED
+        self._settled = self.tally["readings"]
         self._readings = {stamp: each for stamp, each in self._readings.items() if each.index >= oldest}
-        return taken
 
     # --- what arrived --------------------------------------------------------------------------
 
     def report(self, message: Any, now: float) -> None:
         """Judge a message of `/bm/frame`."""
         if self._announced is not None and self._fault_since is None and now > self._fault_until + SETTLING:
-            self._find(Fault.WITHOUT_RESULT, f"frame {self._announced.number} has no result", now)
+            self._find(Flaw.WITHOUT_RESULT, f"frame {self._announced.number} has no result", now)
         self._announced = None
         try:
             self._announced = self._read_report(message, now)
         except (KeyError, TypeError, ValueError, IndexError) as error:
-            self._find(Fault.MALFORMED, f"/bm/frame: {error!r}", now)
+            self._find(Flaw.MALFORMED, f"/bm/frame: {error!r}", now)
 
     def result(self, message: Any, now: float) -> None:
         """Judge a message of `/BMresults`, which belongs to the report before it."""
         self.tally["results"] += 1
         announced, self._announced = self._announced, None
         if announced is None:
-            self._find(Fault.UNREPORTED, "a result without a report", now)
+            self._find(Flaw.UNREPORTED, "a result without a report", now)
             return
         try:
             data = self._data(message)
         except (KeyError, TypeError, ValueError) as error:
-            self._find(Fault.MALFORMED, f"/BMresults of frame {announced.number}: {error!r}", now)
+            self._find(Flaw.MALFORMED, f"/BMresults of frame {announced.number}: {error!r}", now)
             return
         if announced.outcome is not None and data != announced.outcome.posterior:
-            self._find(Fault.WRONG, f"posterior of frame {announced.number}: {data}", now)
+            self._find(Flaw.WRONG, f"posterior of frame {announced.number}: {data}", now)
         if announced.reading is not None:
             self._arrived(announced, announced.reading, now)
 
-    def _find(self, fault: Fault, sentence: str, now: float) -> None:
-        self.findings.append(Finding(fault, sentence, now))
+    def _find(self, flaw: Flaw, sentence: str, now: float) -> None:
+        self.findings.append(Finding(flaw, sentence, now))
 
     def _arrived(self, announced: _Announced, reading: Reading, now: float) -> None:
         if reading.arrived is not None:
-            self._find(Fault.DUPLICATE, f"frame {announced.number}: reading {reading.index} again", now)
+            self._find(Flaw.DUPLICATE, f"frame {announced.number}: reading {reading.index} again", now)
             return
         reading.arrived = now
         if reading.index <= self._last_index:
             sentence = f"frame {announced.number}: reading {reading.index} after {self._last_index}"
-            self._find(Fault.OUT_OF_ORDER, sentence, now)
+            self._find(Flaw.OUT_OF_ORDER, sentence, now)
         self._last_index = max(self._last_index, reading.index)
         age = now - max(reading.published, self._fault_until)
         if self._fault_since is None and age > OLDEST * self.slowness:
-            self._find(Fault.LATE, f"frame {announced.number}: {age:.1f} s after its reading", now)
+            self._find(Flaw.LATE, f"frame {announced.number}: {age:.1f} s after its reading", now)
 
     def _data(self, message: Any) -> tuple[float, ...]:
         layout = message["layout"]
@@ -214,37 +225,37 @@ class Observer:
         values = {pair["key"]: pair["value"] for pair in first["values"]}
         number, generation = int(values["number"]), int(values["generation"])
         if number <= self._last_number:
-            fault = Fault.DUPLICATE if number == self._last_number else Fault.OUT_OF_ORDER
-            self._find(fault, f"frame {number} after frame {self._last_number}", now)
+            flaw = Flaw.DUPLICATE if number == self._last_number else Flaw.OUT_OF_ORDER
+            self._find(flaw, f"frame {number} after frame {self._last_number}", now)
         self._last_number = max(number, self._last_number)
         reading = self._readings.get(stamp_ns)
         if reading is None or reading.addresses is None:
-            self._find(Fault.UNKNOWN, f"frame {number} names a reading of {stamp_ns} ns", now)
+            self._find(Flaw.UNKNOWN, f"frame {number} names a reading of {stamp_ns} ns", now)
             return _Announced(stamp_ns, number, None, None)
         deployment = self._deployment(first["hardware_id"], generation, number, now)
         outcome = self._expected(deployment, reading.addresses, number % BANKS)
         if values["published"] != "true" or first["level"] != 0:
-            self._find(Fault.WRONG, f"frame {number} is said to have no posterior", now)
+            self._find(Flaw.WRONG, f"frame {number} is said to have no posterior", now)
             return None
         said = [self._board(each) for each in others]
         right = [(f"board{at}", b.cycles, b.total, b.reason) for at, b in enumerate(outcome.boards)]
         whole = (max(b.cycles for b in outcome.boards), sum(b.total for b in outcome.boards))
         if said != right or len(said) != BOARDS:
-            self._find(Fault.WRONG, f"frame {number}: boards {said}, expected {right}", now)
+            self._find(Flaw.WRONG, f"frame {number}: boards {said}, expected {right}", now)
         if (int(values["cycles"]), int(values["counts_total"])) != whole:
-            self._find(Fault.WRONG, f"frame {number}: its sums are not those of its boards", now)
+            self._find(Flaw.WRONG, f"frame {number}: its sums are not those of its boards", now)
         return _Announced(stamp_ns, number, outcome, reading)
 
     def _deployment(self, said: str, generation: int, number: int, now: float) -> str:
         known = self._deployments.get(generation)
         if generation < self._last_generation:
-            self._find(Fault.OUT_OF_ORDER, f"frame {number} is of the former generation {generation}", now)
+            self._find(Flaw.OUT_OF_ORDER, f"frame {number} is of the former generation {generation}", now)
         self._last_generation = max(generation, self._last_generation)
         if known is None:
             self._deployments[generation] = known = {said}
         if said not in known:
             self._find(
-                Fault.WRONG, f"frame {number} of generation {generation}: {said}, expected {known}", now
+                Flaw.WRONG, f"frame {number} of generation {generation}: {said}, expected {known}", now
             )
             return min(known)
         self._deployments[generation] = {said}

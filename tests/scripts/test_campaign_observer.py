@@ -6,7 +6,7 @@ import pytest
 
 from scripts.campaigning.accounts import Counters, Excuses, judge
 from scripts.campaigning.expected import BANKS, LINES, BoardOutcome, Outcome, UnusableError, addresses_of
-from scripts.campaigning.observer import OLDEST, Fault, Observer
+from scripts.campaigning.observer import OLDEST, Flaw, Observer
 
 NAMES = ("campaign1", "campaign2")
 
@@ -98,8 +98,8 @@ class Recording:
                 observer.reloaded(what, NAMES[what % 2])
             else:
                 getattr(observer, kind)(copy.deepcopy(what), now)
-        observer.findings += judge(self.counters, observer.take_readings(), self.excuses, 1.0)
-        return {finding.fault for finding in observer.findings}
+        observer.findings += judge(self.counters, observer.pending_readings(), self.excuses, 1.0)
+        return {finding.flaw for finding in observer.findings}
 
 
 def stale(run):
@@ -286,44 +286,44 @@ def former_generation(run):
 
 
 BUGS = {
-    stale: Fault.WRONG,
-    swapped_boards: Fault.WRONG,
-    swapped_board_reports: Fault.WRONG,
-    wrong_reading: Fault.WRONG,
-    wrong_reading_throughout: Fault.WRONG,
-    cycles_off_by_one: Fault.WRONG,
-    slice_too_early: Fault.WRONG,
-    counts_off_by_one: Fault.WRONG,
-    sums_disagree: Fault.WRONG,
-    wrong_reason: Fault.WRONG,
-    board_without_report: Fault.WRONG,
-    duplicated: Fault.DUPLICATE,
-    duplicated_with_another_number: Fault.DUPLICATE,
-    repeated_result: Fault.UNREPORTED,
-    out_of_order: Fault.OUT_OF_ORDER,
-    number_falls: Fault.OUT_OF_ORDER,
-    number_of_another_bank: Fault.WRONG,
-    lost_uncounted: Fault.UNCOUNTED,
-    lost_on_the_way: Fault.UNCOUNTED,
-    counted_twice: Fault.MISCOUNTED,
-    forgotten_result: Fault.MISCOUNTED,
-    late: Fault.LATE,
-    late_after_a_fault: Fault.LATE,
-    wrong_layout: Fault.MALFORMED,
-    wrong_label: Fault.MALFORMED,
-    shorter: Fault.MALFORMED,
-    nan: Fault.MALFORMED,
-    null: Fault.MALFORMED,
-    not_normalised: Fault.MALFORMED,
-    last_bit: Fault.WRONG,
-    unknown_stamp: Fault.UNKNOWN,
-    without_report: Fault.UNREPORTED,
-    without_result: Fault.WITHOUT_RESULT,
-    unfinished_report: Fault.MALFORMED,
-    said_to_have_none: Fault.WRONG,
-    old_tables_after_reload: Fault.WRONG,
-    old_deployment_after_reload: Fault.WRONG,
-    former_generation: Fault.OUT_OF_ORDER,
+    stale: Flaw.WRONG,
+    swapped_boards: Flaw.WRONG,
+    swapped_board_reports: Flaw.WRONG,
+    wrong_reading: Flaw.WRONG,
+    wrong_reading_throughout: Flaw.WRONG,
+    cycles_off_by_one: Flaw.WRONG,
+    slice_too_early: Flaw.WRONG,
+    counts_off_by_one: Flaw.WRONG,
+    sums_disagree: Flaw.WRONG,
+    wrong_reason: Flaw.WRONG,
+    board_without_report: Flaw.WRONG,
+    duplicated: Flaw.DUPLICATE,
+    duplicated_with_another_number: Flaw.DUPLICATE,
+    repeated_result: Flaw.UNREPORTED,
+    out_of_order: Flaw.OUT_OF_ORDER,
+    number_falls: Flaw.OUT_OF_ORDER,
+    number_of_another_bank: Flaw.WRONG,
+    lost_uncounted: Flaw.UNCOUNTED,
+    lost_on_the_way: Flaw.UNCOUNTED,
+    counted_twice: Flaw.MISCOUNTED,
+    forgotten_result: Flaw.MISCOUNTED,
+    late: Flaw.LATE,
+    late_after_a_fault: Flaw.LATE,
+    wrong_layout: Flaw.MALFORMED,
+    wrong_label: Flaw.MALFORMED,
+    shorter: Flaw.MALFORMED,
+    nan: Flaw.MALFORMED,
+    null: Flaw.MALFORMED,
+    not_normalised: Flaw.MALFORMED,
+    last_bit: Flaw.WRONG,
+    unknown_stamp: Flaw.UNKNOWN,
+    without_report: Flaw.UNREPORTED,
+    without_result: Flaw.WITHOUT_RESULT,
+    unfinished_report: Flaw.MALFORMED,
+    said_to_have_none: Flaw.WRONG,
+    old_tables_after_reload: Flaw.WRONG,
+    old_deployment_after_reload: Flaw.WRONG,
+    former_generation: Flaw.OUT_OF_ORDER,
 }
 
 
@@ -358,7 +358,7 @@ def test_a_fault_excuses_only_readings_of_its_time():
     run.events = [(kind, what, now - (5 if not at else 0)) for at, (kind, what, now) in enumerate(run.events)]
     run.counters = Counters(7, 7)
     run.excuses = Excuses(readings=True, results=True, since=0.6, until=0.8)
-    assert run.play() == {Fault.UNCOUNTED}
+    assert run.play() == {Flaw.UNCOUNTED}
 
 
 def test_results_of_a_killed_publisher_may_arrive():

@@ -1,0 +1,207 @@
+"""Faults of a campaign: which there are, what each may cost, and seeded schedules of them."""
+
+from __future__ import annotations
+
+import random
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from enum import StrEnum
+
+from scripts.campaigning.accounts import Excuses
+from scripts.campaigning.stack import BOARD_NAMES, SERVICES, Topology
+
+
+class Kind(StrEnum):
+    """A family of faults, as `--only` names it."""
+
+    SIGNALS = "signals"
+    RELOAD = "reload"
+    ROSBRIDGE = "rosbridge"
+    LINKS = "links"
+    BOARDS = "boards"
+    RESOURCES = "resources"
+    CLOCK = "clock"
+    INPUT = "input"
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """One fault: a kind, what is done, to whom, for how long, and a number whose meaning depends on what is done."""
+
+    kind: str
+    what: str
+    target: str = ""
+    seconds: float = 0.0
+    number: int = 0
+
+    def __str__(self) -> str:
+        parts = [self.what, self.target, f"{self.seconds:.2f} s" if self.seconds else ""]
+        return " ".join(part for part in (*parts, str(self.number or "")) if part)
+
+
+Step = tuple[Fault, ...]
+"""Faults that begin at the same time."""
+BOARD_ENDS = 2
+"""Steps of a round that may fail frames on boards: the fourth failed frame within a minute ends a master by design."""
+ENDS = {"master": 1, "hub": 2, "boards": BOARD_ENDS}
+MOST_ENDS = 2
+"""Times that a round may end a process, or its connection to the master, of each other role."""
+MISBEHAVIOURS = (
+    *("drop", "stall", "short-read", "endless", "wrong-sequence"),
+    *("wrong-crc", "all-ones", "wrong-map", "never-done", "done-twice"),
+)
+_FAILS = {"kill", "corrupt", "repeat", "cut", "finish", "cut-inside", "misbehave"}
+_ENDS_LINK = {"kill", "corrupt", "repeat", "cut", "finish", "cut-inside", "memory"}
+_CUTS_ROSBRIDGE = {"gone", "finish", "nonsense", "cut-inside", "files"}
+
+
+def ended_roles(fault: Fault) -> tuple[str, ...]:
+    """Return the roles that a fault costs one of the ends that the master forgives."""
+    if fault.what == "misbehave" or (fault.target in BOARD_NAMES and fault.what in {*_FAILS, "stop", "hold"}):
+        return ("boards",)
+    return (fault.target,) if fault.what in _ENDS_LINK and fault.target != "rosbridge" else ()
+
+
+def excuses_of(step: Step, topology: Topology) -> Excuses:
+    """Return what a step may lose without the stack's knowledge: what no process of it had when it was cut."""
+    readings = results = False
+    for fault in step:
+        cut = fault.target == "rosbridge" and fault.what in _CUTS_ROSBRIDGE
+        ended = fault.target if fault.what in _ENDS_LINK else ""
+        fused = topology.fused and ended == "master"
+        readings |= cut or fused or ended in {"hub", "master", "subscriber"}
+        results |= cut or fused or ended in {"hub", "master", "publisher"}
+        if fault.what == "files":
+            readings = results = True
+    return Excuses(readings=readings, results=results)
+
+
+class Schedule:
+    """Makes the steps of a round, within the ends that a master forgives."""
+
+    def __init__(self, rng: random.Random, topology: Topology, kinds: list[Kind]) -> None:
+        """Draw from the generator, for a topology, among kinds."""
+        self._rng = rng
+        self._topology = topology
+        services = () if topology.fused else SERVICES
+        self._roles = ("hub", *BOARD_NAMES, *services, "master")
+        self._makers: list[tuple[Kind, Callable[[], Step]]] = [
+            (Kind.SIGNALS, self._kill),
+            (Kind.SIGNALS, self._stop),
+            (Kind.SIGNALS, self._pair),
+            (Kind.RELOAD, self._reload),
+            (Kind.ROSBRIDGE, self._rosbridge),
+            (Kind.ROSBRIDGE, self._rosbridge),
+            (Kind.INPUT, self._input),
+            (Kind.RESOURCES, self._resource),
+        ]
+        if topology.apart:
+            self._makers += [
+                (Kind.LINKS, self._link),
+                (Kind.LINKS, self._link),
+                (Kind.BOARDS, self._misbehave),
+            ]
+        self._makers = [(kind, maker) for kind, maker in self._makers if kind in kinds]
+        if Kind.CLOCK in kinds:
+            self._makers.append((Kind.CLOCK, self._clock))
+
+    def steps(self, count: int) -> list[Step]:
+        """Return the steps of a round: fewer than `count` if no others are forgiven."""
+        steps: list[Step] = []
+        ends: Counter[str] = Counter()
+        for _ in range(20 * count):
+            if len(steps) == count or not self._makers:
+                break
+            step = self._rng.choice(self._makers)[1]()
+            cost = Counter({role for fault in step for role in ended_roles(fault)})
+            if all(ends[role] + cost[role] <= ENDS.get(role, MOST_ENDS) for role in cost):
+                ends += cost
+                steps.append(step)
+        return steps
+
+    def _seconds(self, longest: float) -> float:
+        return round(self._rng.uniform(0.05, longest), 2)
+
+    def _kill(self) -> Step:
+        return (Fault(Kind.SIGNALS, "kill", self._rng.choice(self._roles)),)
+
+    def _stop(self) -> Step:
+        return (Fault(Kind.SIGNALS, "stop", self._rng.choice(self._roles), self._seconds(3)),)
+
+    def _pair(self) -> Step:
+        one, other = self._rng.sample(self._roles, 2)
+        second = self._stop if self._rng.random() < 0.3 else self._kill
+        return (
+            Fault(Kind.SIGNALS, "kill", one),
+            Fault(Kind.SIGNALS, second()[0].what, other, self._seconds(2)),
+        )
+
+    def _reload(self) -> Step:
+        order = Fault(Kind.RELOAD, "reload", "master")
+        others = [self._kill, self._stop, self._rosbridge]
+        if self._topology.apart:
+            others.append(self._link)
+        return (order,) if self._rng.random() < 0.4 else (order, *self._rng.choice(others)())
+
+    def _rosbridge(self) -> Step:
+        what = self._rng.choice(["gone", "hold", "slow", "delay", "nonsense", "cut-inside", "finish"])
+        return (
+            Fault(Kind.ROSBRIDGE, what, "rosbridge", self._seconds(4), self._rng.randrange(len(NONSENSE))),
+        )
+
+    def _link(self) -> Step:
+        names = (*BOARD_NAMES, *(SERVICES if self._topology is Topology.APART else ()))
+        target = self._rng.choice(names)
+        whats = ["delay", "hold", "cut", "finish", "cut-inside", "slow"]
+        if target in BOARD_NAMES:
+            whats += ["corrupt", "repeat"]
+        return (Fault(Kind.LINKS, self._rng.choice(whats), target, self._seconds(1.5), 1),)
+
+    def _misbehave(self) -> Step:
+        kind = self._rng.randrange(len(MISBEHAVIOURS))
+        return (Fault(Kind.BOARDS, "misbehave", self._rng.choice(BOARD_NAMES), 0.5, kind),)
+
+    def _input(self) -> Step:
+        what = self._rng.choice(["burst", "nan", "huge", "unusable", "disorder"])
+        return (Fault(Kind.INPUT, what, "readings", 0.0, 10_000 if what == "burst" else 50),)
+
+    def _resource(self) -> Step:
+        what = self._rng.choice(["files", "memory", "disk"])
+        roles = [role for role in self._roles if role not in BOARD_NAMES]
+        target = "master" if what == "disk" else self._rng.choice(roles)
+        return (Fault(Kind.RESOURCES, what, target, self._seconds(2)),)
+
+    def _clock(self) -> Step:
+        return (Fault(Kind.CLOCK, "clock", "all", 1.0, self._rng.choice([-3600, 3600])),)
+
+
+def _text(payload: bytes, opcode: int = 0x81) -> bytes:
+    size = len(payload)
+    return (
+        bytes([opcode, size]) + payload
+        if size < 126
+        else bytes([opcode, 126]) + size.to_bytes(2, "big") + payload
+    )
+
+
+NONSENSE = (
+    _text(b"hello"),
+    _text(b"[1, 2, 3]"),
+    _text(b"null"),
+    _text(b'{"op": "publish", "topic": "/campaign/readings"}'),
+    _text(b'{"op": "publish", "topic": "/campaign/readings", "msg": {"near": "five", "far": []}}'),
+    _text(b'{"op": "fragment", "id": "x", "data": "aaa", "num": 7, "total": 3}'),
+    _text(b'{"op": "png", "data": "bm90IGEgcGljdHVyZQ=="}'),
+    _text(b"\xa1\x62op\x18", 0x82),
+    _text(b"\xff\xfe not UTF-8"),
+    _text(b'{"op": "publish", ' + b"[" * 5000),
+    b"HTTP/1.1 500 no\r\n\r\n",
+    b"\x81\x7f\xff\xff\xff\xff\xff\xff\xff\xff",
+)
+"""Bytes that a server inserts between its messages; the last ones are not WebSocket frames."""
+
+
+def step_as_json(step: Step) -> list[dict[str, object]]:
+    """Return a step for a file."""
+    return [asdict(fault) for fault in step]

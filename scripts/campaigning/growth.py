@@ -1,0 +1,42 @@
+"""Growth of processes: memory and descriptors against frames."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Iterable
+
+from scripts.campaigning.observer import Finding, Flaw
+from scripts.campaigning.round import RoundResult
+
+FEWEST = 4
+"""Samples of a process below which it says nothing."""
+MOST_DESCRIPTORS = 8
+"""Descriptors that a process may have more than at first, at rest."""
+MOST_KIB = 32 * 1024
+"""Memory that a process may gain after its second sample."""
+
+
+def growth(results: Iterable[RoundResult]) -> tuple[dict[str, tuple[float, float]], list[Finding]]:
+    """Return each role's median slopes per 1000 frames (KiB, descriptors), and processes that grew too much."""
+    slopes: dict[str, list[tuple[float, float]]] = {}
+    findings = []
+    for result in results:
+        for (role, pid), samples in result.resources.items():
+            steady = samples[1:]  # buffers and caches are filled by then
+            if len(samples) < FEWEST:
+                continue
+            frames, memory, descriptors = zip(*steady, strict=True)
+            if frames[-1] == frames[0]:
+                continue
+            lines = [
+                statistics.linear_regression(frames, values).slope * 1000 for values in (memory, descriptors)
+            ]
+            slopes.setdefault(role, []).append((lines[0], lines[1]))
+            if descriptors[-1] - min(descriptors) > MOST_DESCRIPTORS or memory[-1] - memory[0] > MOST_KIB:
+                sentence = f"{role} ({pid}): KiB {list(memory)}, descriptors {list(descriptors)}"
+                findings.append(Finding(Flaw.GROWTH, sentence, 0.0))
+    medians = {
+        role: (statistics.median(each[0] for each in of_role), statistics.median(each[1] for each in of_role))
+        for role, of_role in slopes.items()
+    }
+    return medians, findings

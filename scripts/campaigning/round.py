@@ -1,0 +1,298 @@
+"""One round of a campaign: a stack is started, takes faults one after the other, and is judged after each."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import random
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+from scripts.campaigning.accounts import Counters, Excuses, judge
+from scripts.campaigning.expected import Addresses, Outcome, UnusableError, addresses_of
+from scripts.campaigning.faults import Kind, Step, excuses_of
+from scripts.campaigning.injection import Injector, steppable_clock
+from scripts.campaigning.observer import OLDEST, Finding, Flaw, Observer
+from scripts.campaigning.stack import NotThereError, Stack, Topology
+from scripts.campaigning.wire import REPORTS, Client, now
+
+POOL = ((0, 0), (1, 0), (2, 1), (3, 2), (3, None), (4, 3), (5, 3), (6, 4), (None, 2), (None, None))
+"""Readings of a campaign; few, because the reference kernel is slow."""
+_ANSWER = 0.1
+"""Seconds that the publisher waits for a result before it publishes the next reading."""
+_RECOVERY_LIMIT = 60.0
+_SETTLE_LIMIT = 5.0
+_QUIET = 0.6
+"""Seconds without a change after which nothing is in flight any more."""
+_stamps = count(time.time_ns() // 10**9 * 10**9, 1_000_000)
+
+
+@dataclass(slots=True)
+class Recovery:
+    """How long results took to come back after a step's end, and how slow the machine was then."""
+
+    step: str
+    seconds: float
+    slowness: float
+
+
+@dataclass(slots=True)
+class RoundResult:
+    """What a round found and measured."""
+
+    findings: list[Finding] = field(default_factory=list)
+    frames: int = 0
+    readings: int = 0
+    losses: dict[str, int] = field(default_factory=dict)
+    recoveries: list[Recovery] = field(default_factory=list)
+    resources: dict[tuple[str, int], list[tuple[int, int, int]]] = field(default_factory=dict)
+    """By role and process: frames so far, resident KiB and descriptors."""
+    failed_step: int = -1
+    words: str = ""
+
+
+def slowness() -> float:
+    """Return how many times longer a small process takes than its own CPU time: 1 on an idle machine."""
+    begun = time.monotonic()
+    process = subprocess.Popen([sys.executable, "-S", "-c", "pass"])
+    _, _, usage = os.wait4(process.pid, 0)
+    process.returncode = 0
+    return max(1.0, (time.monotonic() - begun) / max(usage.ru_utime + usage.ru_stime, 0.005))
+
+
+class Round:
+    """Runs steps against one stack."""
+
+    def __init__(
+        self,
+        folder: Path,
+        topology: Topology,
+        deployments: list[Path],
+        expected: Callable[[str, Addresses, int], Outcome],
+        seed: int,
+        *,
+        calm_frames: int,
+    ) -> None:
+        """Take an empty folder, and the frames to be computed between two steps."""
+        rng = random.Random(seed)
+        self._rng = rng
+        self._folder = folder
+        self._deployments = deployments
+        self._calm_frames = calm_frames
+        self.stack = Stack(folder, topology, deployments[0], rng)
+        self.observer = Observer(expected, deployments[0].name)
+        self._injector = Injector(self.stack, folder, publish=self._special, reload=self._reload)
+        self._client = Client(self.stack.hub_port, self._take, self.observer.reconnected)
+        self._result = RoundResult()
+        self._base = Counters()
+        self._master = 0
+        self._news = asyncio.Event()
+        self._paused = False
+        self._driving = True
+        self._last: Addresses = ()
+
+    # --- readings and results ------------------------------------------------------------------
+
+    def _take(self, topic: str, message: Any) -> None:
+        (self.observer.report if topic == REPORTS else self.observer.result)(message, now())
+        self._news.set()
+
+    async def _publish(self, values: dict[str, object], stamp: int) -> bool:
+        try:
+            addresses = addresses_of(values)
+        except UnusableError:
+            addresses = None
+        self.observer.published(stamp, addresses, now())
+        return await self._client.publish(stamp, values)
+
+    def _reading(self) -> dict[str, object]:
+        while (near_far := self._rng.choice(POOL)) == self._last:
+            pass
+        self._last = near_far
+        return dict(zip(("near", "far"), near_far, strict=True))
+
+    async def _drive(self) -> None:
+        """Publish readings, each when the result of the one before is there or late."""
+        while self._driving:
+            if self._paused or not self._client.connected.is_set():
+                await asyncio.sleep(0.01)
+                continue
+            stamp = next(_stamps)
+            await self._publish(self._reading(), stamp)
+            deadline = now() + _ANSWER
+            while not self.observer.seen(stamp) and now() < deadline:
+                await self._some_news(max(0.0, deadline - now()))
+
+    async def _some_news(self, seconds: float = _ANSWER) -> None:
+        """Wait for a message to the observer, for some seconds at most."""
+        self._news.clear()
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(seconds):
+                await self._news.wait()
+
+    async def _special(self, what: str, number: int) -> None:
+        """Publish readings that are unlike others."""
+        stamps = [next(_stamps) for _ in range(number)]
+        if what == "disorder":
+            self._rng.shuffle(stamps)
+        for stamp in stamps:
+            values = self._reading()
+            if what == "nan":
+                values["near"] = float("nan")
+            elif what == "huge":
+                values["near"] = self._rng.choice([1e308, -1e308, 10**30, 7.5, -(10**30)])
+            elif what == "unusable":
+                values["near"] = self._rng.choice(["five", [1, 2], {"x": 1}])
+            await self._publish(values, stamp)
+            if what != "burst":
+                await asyncio.sleep(0.005)
+
+    async def _reload(self) -> None:
+        others = [each for each in self._deployments if each != self.stack.deployment]
+        new, former = self._rng.choice(others), self.stack.deployment
+        generation = await self.stack.reload(new)
+        if generation >= 0:
+            self.observer.reloaded(generation, new.name)
+        else:
+            self.stack.deployment = former
+
+    # --- a round -------------------------------------------------------------------------------
+
+    async def run(self, steps: list[Step]) -> RoundResult:
+        """Run all steps, or up to the first one after which something is wrong."""
+        result, observer = self._result, self.observer
+        if any(fault.kind == Kind.CLOCK for step in steps for fault in step):
+            self.stack.environment = steppable_clock(self._folder)
+        driver = None
+        try:
+            await self.stack.start(observer.forwarded)
+            await self._client.start()
+            driver = asyncio.create_task(self._drive())
+            observer.fault(now())
+            await self._recover("start", judged=False)
+            await self._settle(Excuses(readings=True, results=True, until=now()))
+            await self._calm()
+            steps = [] if observer.findings else steps
+            for number, step in enumerate(steps):
+                await self._take_step(step)
+                if observer.findings:
+                    result.failed_step = number
+                    break
+        except NotThereError as error:
+            observer.findings.append(Finding(Flaw.ENDED, str(error), now()))
+        finally:
+            self._driving = False
+            if driver is not None:
+                driver.cancel()
+                await asyncio.gather(driver, return_exceptions=True)
+            await self._client.end()
+            if observer.findings:
+                result.words = self.stack.last_words()
+            await self.stack.end()
+        result.findings = observer.findings
+        result.frames, result.readings = observer.tally["results"], observer.tally["readings"]
+        return result
+
+    async def _take_step(self, step: Step) -> None:
+        name = " + ".join(map(str, step))
+        begun = now()
+        self.observer.fault(begun)
+        results = await asyncio.gather(
+            *(self._injector.inject(fault) for fault in step), return_exceptions=True
+        )
+        for error in results:
+            if isinstance(error, BaseException):
+                raise error
+        if "master" in await self._injector.restart():
+            self._begin_master()
+        await self._recover(name, judged=True)
+        excuses = replace(excuses_of(step, self.stack.topology), since=begun, until=now())
+        self.observer.calm(now())
+        await self._settle(excuses)
+        await self._calm()
+
+    def _begin_master(self) -> None:
+        self._base = Counters()
+        self.observer.settle()  # the counters of the former master's readings have gone with it
+        self.observer.master_started(self.stack.deployment.name)
+
+    async def _recover(self, name: str, *, judged: bool) -> None:
+        """Wait for a result of a reading that was published from now on."""
+        begun = now()
+        first = self.observer.tally["readings"]
+        slow = [await asyncio.to_thread(slowness)]
+        while not self.observer.has_result_since(first):
+            if now() - begun > _RECOVERY_LIMIT:
+                self._find(Flaw.SLOW, f"no result {_RECOVERY_LIMIT:.0f} s after: {name}")
+                return
+            if self.stack.is_over("master"):
+                words = await self.stack.ended("master")
+                self._find(Flaw.ENDED, f"the master ended after: {name}: {words}")
+                return
+            if now() - begun > len(slow):
+                slow.append(await asyncio.to_thread(slowness))
+            await self._some_news()
+        seconds, factor = now() - begun, max(1.0, sum(slow) / len(slow))
+        self.observer.slowness = factor
+        if judged:
+            self._result.recoveries.append(Recovery(name, seconds, factor))
+            if seconds > OLDEST * factor:
+                self._find(Flaw.SLOW, f"{seconds:.1f} s (machine slower by {factor:.1f}) after: {name}")
+
+    def _find(self, flaw: Flaw, sentence: str) -> None:
+        self.observer.findings.append(Finding(flaw, sentence, now()))
+
+    async def _settle(self, excuses: Excuses) -> None:
+        """Publish nothing until nothing is in flight, and compare the counters with what was published."""
+        self._paused = True
+        try:
+            deadline, changed = now() + _SETTLE_LIMIT + _QUIET, now()
+            last: object = None
+            while True:
+                counters = await self.stack.counters()
+                state = counters, self.observer.tally["results"], self.observer.given
+                if state != last:
+                    last, changed = state, now()
+                if counters is not None:
+                    added = counters.since(self._base)
+                    readings = self.observer.pending_readings()
+                    findings = judge(added, readings, excuses, now())
+                    exact = not judge(added, readings, Excuses(), now())
+                    if (exact and now() - changed > 0.02) or now() - changed > _QUIET or now() > deadline:
+                        break
+                elif now() > deadline:
+                    return  # the master is gone, which is a finding of its own
+                await asyncio.sleep(0.02)
+            self.observer.findings += findings
+            self.observer.settle()
+            self._base = counters
+            for reason, number in added.lost.items():
+                self._result.losses[reason] = self._result.losses.get(reason, 0) + number
+        finally:
+            self._paused = False
+
+    async def _calm(self) -> None:
+        """Compute frames without a fault, and settle strictly."""
+        self.observer.calm(now())
+        wanted = self.observer.tally["results"] + self._calm_frames
+        deadline = now() + _RECOVERY_LIMIT + self._calm_frames * _ANSWER
+        while self.observer.tally["results"] < wanted and now() < deadline and not self.observer.findings:
+            await self._some_news()
+        if self.observer.tally["results"] < wanted and not self.observer.findings:
+            self._find(Flaw.SLOW, f"{self._calm_frames} frames without a fault took too long")
+        await self._settle(Excuses())
+        await self._sample()
+
+    async def _sample(self) -> None:
+        for role in self.stack.roles:
+            pid = await self.stack.pid(role)
+            if pid and (used := self.stack.resources(pid)):
+                samples = self._result.resources.setdefault((role, pid), [])
+                samples.append((self.observer.tally["results"], *used))

@@ -1,0 +1,255 @@
+"""The stack under fault: its processes, the proxies between them, and what they say of themselves."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import os
+import random
+import shutil
+import socket
+import sys
+from collections.abc import Callable
+from enum import StrEnum
+from pathlib import Path
+
+from scripts.campaigning.accounts import Counters
+from scripts.campaigning.expected import BOARDS
+from scripts.campaigning.proxy import Proxy
+from scripts.campaigning.wire import process_status
+from scripts.processes import Process
+
+SERVICES = ("subscriber", "publisher", "pcie-app")
+BOARD_NAMES = tuple(f"board{at}" for at in range(BOARDS))
+START_LIMIT = 120.0
+"""Seconds until a process must be there, on a busy machine."""
+END_LIMIT = 30.0
+
+
+class Topology(StrEnum):
+    """Who starts the processes, and so where proxies stand."""
+
+    OWN = "processes"
+    """The master starts services and boards; a proxy stands between them and rosbridge."""
+    FUSED = "fused"
+    """The services are inside the master; the rest as above."""
+    APART = "apart"
+    """The campaign starts services and boards; proxies stand between all parts."""
+    FUSED_APART = "fused, boards apart"
+
+    @property
+    def fused(self) -> bool:
+        """Whether the services are inside the master."""
+        return self in {Topology.FUSED, Topology.FUSED_APART}
+
+    @property
+    def apart(self) -> bool:
+        """Whether the boards are not the master's own."""
+        return self in {Topology.APART, Topology.FUSED_APART}
+
+
+class NotThereError(Exception):
+    """A process that did not come up in time."""
+
+
+def free_port() -> int:
+    """Return a port that nobody listens on, nor on the next one."""
+    while True:
+        with socket.socket() as probe, socket.socket() as following, contextlib.suppress(OSError):
+            probe.bind(("127.0.0.1", 0))
+            port: int = probe.getsockname()[1]
+            following.bind(("127.0.0.1", port + 1))
+            return port
+
+
+class Stack:
+    """A run of the stack in a folder of its own.
+
+    Attributes:
+        hub_port: Port of the hub itself, for the campaign's own client.
+        links: The proxies by name: `rosbridge`, and where parts are apart each service and board.
+        expected_ends: Roles whose processes have been told to end, or were killed.
+    """
+
+    def __init__(self, folder: Path, topology: Topology, deployment: Path, rng: random.Random) -> None:
+        """Take an empty folder with a short path, and the deployment to begin with."""
+        self._folder = folder
+        self.topology = topology
+        self.deployment = deployment
+        self.environment: dict[str, str] = {}
+        self._parts: dict[str, Process] = {}
+        self._runs = folder / "run"
+        self.hub_port, proxied = free_port(), free_port()
+        self._uri = f"ws://127.0.0.1:{proxied}"
+        self.links = {"rosbridge": Proxy(proxied, self.hub_port, rng)}
+        self._runs.mkdir(mode=0o700, parents=True)
+        (folder / "tmp").mkdir(mode=0o700)
+        for name in SERVICES if topology is Topology.APART else ():
+            self.links[name] = Proxy(str(folder / f"{name}.sock"), str(folder / f"real-{name}.sock"), rng)
+        self._board_ports = {name: (free_port(), free_port()) for name in BOARD_NAMES if topology.apart}
+        for name, (outer, inner) in self._board_ports.items():
+            self.links[name] = Proxy(outer, inner, rng)
+            self.links[f"{name} programming"] = Proxy(outer + 1, inner + 1, rng)
+        self._starts = 0
+
+    @property
+    def own_parts(self) -> tuple[str, ...]:
+        """Roles whose processes the campaign starts, in order."""
+        boards = BOARD_NAMES if self.topology.apart else ()
+        services = SERVICES if self.topology is Topology.APART else ()
+        return ("hub", *boards, *services, "master")
+
+    @property
+    def roles(self) -> tuple[str, ...]:
+        """All roles that are processes in this topology."""
+        services = () if self.topology.fused else SERVICES
+        return ("hub", *BOARD_NAMES, *services, "master")
+
+    async def start(self, on_reading: Callable[[int], None]) -> None:
+        """Start everything; the master may not be ready yet when this returns.
+
+        Raises:
+            NotThereError: The hub or a board does not come up.
+        """
+        self.links["rosbridge"].on_reading = on_reading
+        for link in self.links.values():
+            await link.start()
+        for role in self.own_parts:
+            await self.start_part(role)
+
+    def _command(self, role: str, misbehave: str) -> list[str]:
+        deployment, folder = ["-d", str(self.deployment)], self._folder
+        rosbridge = ["--uri", self._uri, "--connect-timeout", "60", "--ros-version", "1"]
+        outside = [f"tcp://127.0.0.1:{outer}" for outer, _ in self._board_ports.values()]
+        boards = ["--boards", ",".join(outside)]
+        listen = ["--listen", f"unix:{folder}/real-{role}.sock"]
+        if role == "hub":
+            return ["hub", "--port", str(self.hub_port)]
+        if role in BOARD_NAMES:
+            index = ["--index", role.removeprefix("board")]
+            listen = ["--listen", f"tcp://127.0.0.1:{self._board_ports[role][1]}"]
+            return ["board", *listen, *index, *(["--misbehave", misbehave] if misbehave else [])]
+        if role == "pcie-app":
+            return [role, *deployment, *listen, *boards, "--peer-timeout", "60"]
+        if role in SERVICES:
+            return [role, *deployment, *listen, *rosbridge]
+        master = ["master", "--loop", *deployment, *rosbridge, "--peer-timeout", "60", "--board-timeout", "2"]
+        if self.topology is Topology.APART:
+            return [*master, "--connect", str(folder)]
+        fused = ["--fused"] if self.topology.fused else []
+        return [*master, *fused, *(boards if self.topology.apart else [])]
+
+    async def start_part(self, role: str, misbehave: str = "") -> None:
+        """Start a process that the campaign supervises, and wait until a server serves.
+
+        Raises:
+            NotThereError: It does not.
+        """
+        self._starts += 1
+        process = Process(role, self._folder / f"{self._starts:03}-{role}.log")
+        command = self._command(role, misbehave)
+        variables = {"BM_RUN_DIRECTORY": str(self._runs), "TMPDIR": str(self._folder / "tmp")}
+        settings = [f"{name}={value}" for name, value in {**variables, **self.environment}.items()]
+        program = str(Path(sys.executable).with_name(command[0]))
+        await process.start(shutil.which("env") or "env", *settings, program, *command[1:])
+        self._parts[role] = process
+        if role == "hub" or role in BOARD_NAMES:
+            try:
+                async with asyncio.timeout(START_LIMIT):
+                    await process.line(r"ws://\S+" if role == "hub" else "listens at")
+            except Exception as error:
+                raise NotThereError(f"{role} did not come up: {error}") from error
+
+    def is_over(self, role: str) -> bool:
+        """Return whether a process of the campaign's own has ended."""
+        process = self._parts.get(role)
+        if process is None or not process.pid:
+            return True
+        try:
+            return Path(f"/proc/{process.pid}/stat").read_text().rsplit(")", 1)[1].split()[0] == "Z"
+        except OSError:
+            return True
+
+    async def ended(self, role: str) -> str:
+        """Wait for the end of a process of the campaign's own, and return its exit code and last words."""
+        try:
+            async with asyncio.timeout(END_LIMIT):
+                code = await self._parts[role].wait()
+        except TimeoutError:
+            return "it has not ended"
+        return str(self._parts[role].failure(code)) if code else "exit code 0"
+
+    async def forget_run(self) -> None:
+        """Wait until the children of a master that was killed have ended, and remove their status sockets."""
+        left = [role for role in (*SERVICES, *BOARD_NAMES) if role not in self.own_parts]
+        deadline = asyncio.get_running_loop().time() + END_LIMIT
+        while asyncio.get_running_loop().time() < deadline:
+            if not [role for role in left if await self.status(role) is not None]:
+                return
+            await asyncio.sleep(0.05)
+
+    async def pid(self, role: str) -> int:
+        """Return the number of a role's process; 0 if it cannot be found."""
+        if role in self._parts:
+            return 0 if self.is_over(role) else self._parts[role].pid
+        status = await self.status(role)
+        return 0 if status is None else int(str(status["pid"]))
+
+    async def status(self, role: str) -> dict[str, object] | None:
+        """Return what a process says of itself; None if it does not answer."""
+        return await process_status(f"{self._runs}/{role}.status.sock")
+
+    async def counters(self) -> Counters | None:
+        """Return the master's counters; None if it does not answer."""
+        status = await self.status("master")
+        frames = None if status is None else status.get("frames")
+        if not isinstance(frames, dict):
+            return None
+        return Counters(frames["received"], frames["completed"], frames["lost"])
+
+    async def reload(self, deployment: Path) -> int:
+        """Order the master to take another deployment; return the new generation, or -1 if it stays with the old one."""
+        answer = await self._order(deployment)
+        if answer != 0:
+            return -1
+        self.deployment = deployment
+        status = await self.status("master")
+        return -1 if status is None else int(str(status["generation"]))
+
+    async def _order(self, deployment: Path) -> int | None:
+        """Give the order on the master's control socket; return the exit code, or None without an answer."""
+        with contextlib.suppress(OSError, TimeoutError, ValueError):
+            async with asyncio.timeout(END_LIMIT):
+                reader, writer = await asyncio.open_unix_connection(f"{self._runs}/master.control.sock")
+                try:
+                    writer.write(json.dumps({"order": "reload", "folder": str(deployment)}).encode() + b"\n")
+                    answer = json.loads(await reader.read())
+                finally:
+                    writer.close()
+                return int(answer["exit_code"])
+        return None
+
+    def resources(self, pid: int) -> tuple[int, int] | None:
+        """Return a process's resident memory in KiB and its open descriptors; None if it has ended."""
+        try:
+            pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
+            return pages * os.sysconf("SC_PAGE_SIZE") // 1024, len(os.listdir(f"/proc/{pid}/fd"))  # noqa: PTH208
+        except (OSError, IndexError):
+            return None
+
+    def last_words(self) -> str:
+        """Return the last lines of all logs, for a finding."""
+        lines = []
+        for log in sorted(self._folder.glob("*.log")):
+            lines += [f"{log.stem}: {line}" for line in log.read_text(errors="replace").splitlines()[-4:]]
+        return "\n".join(lines)
+
+    async def end(self) -> None:
+        """End everything."""
+        for role in reversed(self.own_parts):
+            if role in self._parts:
+                with contextlib.suppress(ProcessLookupError):
+                    await self._parts[role].end()
+        for link in self.links.values():
+            await link.end()
