@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import math
 import sys
 import time
 from pathlib import Path
@@ -12,6 +13,8 @@ from scripts.processes import BOAT_TOPIC, BOAT_TYPE, ROOT, Process, Screen, buil
 
 LIMIT = 180.0
 """Seconds after which the demo gives up, whatever it waits for."""
+PORT = "9090"
+"""Of the hub of a demo that goes on until Ctrl-C."""
 
 
 async def demo(arguments: argparse.Namespace) -> int:
@@ -36,12 +39,12 @@ async def demo(arguments: argparse.Namespace) -> int:
             screen.show(
                 "starting the hub (the embedded rosbridge server), building the boat's deployment ..."
             )
-            await hub.start("hub", "--port", "0")
+            await hub.start("hub", "--port", PORT if arguments.stay else "0")
             uri = (await hub.line(r"ws://\S+"))[0]
         else:
             screen.show(f"using the rosbridge server at {uri}, building the boat's deployment ...")
-        count = str(arguments.count)
-        await viewer.start("boat-viewer", "--uri", uri, "--count", count, "--out", str(out))
+        count = () if arguments.stay else ("--count", str(arguments.count))
+        await viewer.start("boat-viewer", "--uri", uri, *count, "--out", str(out))
         # a real server knows installed message types only, so there the readings travel as plain arrays
         array = [] if arguments.uri is None else ["--array"]
         type_ = "std_msgs/Float64MultiArray" if array else BOAT_TYPE
@@ -49,7 +52,7 @@ async def demo(arguments: argparse.Namespace) -> int:
         building = asyncio.create_task(build("boat", deployment, uri, BOAT_TOPIC, type_, *options))
         await asyncio.gather(building, viewer.line("listening"))
         screen.waits_for = "waiting for results; the boards' first start on a computer compiles their kernels"
-        await master.start("master", "--loop", "--count", count, "-d", str(deployment), "--uri", uri)
+        await master.start("master", "--loop", *count, "-d", str(deployment), "--uri", uri)
         await normaliser.start("boat-normaliser", "--uri", uri, *array)
         seed = ["--seed", str(arguments.seed)] if arguments.seed is not None else []
         await simulator.start("boat-simulator", "--uri", uri, "--rate", str(arguments.rate), *seed, *array)
@@ -68,6 +71,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="scripts/demo", description="The boat case, end to end.")
     parser.add_argument("--uri", help="a rosbridge server, instead of the embedded hub (ws://HOST:PORT)")
     parser.add_argument("--count", type=int, default=25, help="frames (25)")
+    parser.add_argument(
+        "--stay", action="store_true", help=f"go on until Ctrl-C, with the hub on port {PORT}, for listeners"
+    )
     parser.add_argument("--rate", type=float, default=10.0, help="readings a second (10)")
     parser.add_argument(
         "--seed", type=int, help="of the boat's way and its sensors' noise (a new one each time)"
@@ -77,7 +83,7 @@ def main() -> int:
     if arguments.count < 1:
         parser.error("--count must be 1 or more")
     arguments.out = arguments.out.resolve()
-    return run_script(lambda: demo(arguments), LIMIT)
+    return run_script(lambda: demo(arguments), math.inf if arguments.stay else LIMIT)
 
 
 if __name__ == "__main__":

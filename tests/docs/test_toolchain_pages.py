@@ -103,26 +103,27 @@ def blocks(language):
 
 def test_the_models_page_works_as_printed(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "build").mkdir()
-    for name, language in (("garden.bif", "bif"), ("walks.csv", "csv")):
+    models = tmp_path / "models"
+    for name in ("mymodel", "boiler"):
+        (models / name).mkdir(parents=True)
+    for name, language in (("garden.bif", "bif"), ("mymodel/walks.csv", "csv")):
         (text,) = blocks(language)
-        (tmp_path / "build" / name).write_text(text)
+        (models / name).write_text(text)
     (boiler,) = blocks("python")
-    (tmp_path / "build" / "boiler").mkdir()
-    (tmp_path / "build" / "boiler" / "model.py").write_text(boiler)
+    (models / "boiler" / "model.py").write_text(boiler)
     commands = re.findall(r"^    (toolchain .*)$", MODELS, re.MULTILINE)
     assert len(commands) == 7
     for command in commands:
         result = toolchain(*shlex.split(command)[1:])
         assert result.exit_code == 0, f"{command}\n{result.stderr}"
-    text = (tmp_path / "mymodel" / "model.py").read_text()
+    text = (models / "mymodel" / "model.py").read_text()
     text = text.replace("    return joint.ask(searched=[place], known=[distance, door])\n", "")
     (hook,) = re.findall(r"^    (return with_fit.*)$", MODELS, re.MULTILINE)
     text = text.replace("sigma: float = 0.3) -> Question:", "sigma: float = 0.3, fit: Path | None = None):")
-    (tmp_path / "mymodel" / "model.py").write_text(
+    (models / "mymodel" / "model.py").write_text(
         "from pathlib import Path\nfrom toolchain.learning.fitted import with_fit\n" + text + f"    {hook}\n"
     )
-    fitted = load_model(tmp_path / "mymodel", {"fit": "build/walks.toml"})
+    fitted = load_model(models / "mymodel", {"fit": "models/mymodel/walks.toml"})
     assert fitted.known[0].normal.sigma.max() < 0.2
 
 
