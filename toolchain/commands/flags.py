@@ -172,7 +172,7 @@ class BuildFlags(ModelFlags):
     rng_table: Annotated[
         Path | None,
         typer.Option(
-            help="With --rng table: the random numbers; by default, they are generated.",
+            help="With --rng table: the random numbers; without it, they are generated.",
             metavar="MIF",
             rich_help_panel=RANDOM,
         ),
@@ -225,7 +225,7 @@ class ReadingFlags:
     readings: Annotated[
         Path | None,
         typer.Option(
-            help="Recorded readings: CSV, MCAP or bag; by default, readings are drawn.", metavar="RECORDING"
+            help="Recorded readings: CSV, MCAP or bag; without it, readings are drawn.", metavar="RECORDING"
         ),
     ] = None
     reading: ReadingColumns = None

@@ -32,7 +32,7 @@ def memories(
     model: Annotated[
         Path | None,
         typer.Option(
-            help="Use the tables of the current model; by default, those of the images.",
+            help="Use the tables of the current model; without it, those of the images.",
             metavar="MODEL",
         ),
     ] = None,
