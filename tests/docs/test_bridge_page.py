@@ -6,7 +6,6 @@ import json
 import os
 import re
 import ssl
-import subprocess
 import sys
 from collections.abc import Awaitable, Callable
 from pathlib import Path
@@ -22,6 +21,7 @@ from bridge.client.protocol.services import MAX_REQUESTS
 from bridge.codecs import fragments, json_codec
 from bridge.hub.access import AccessPolicy
 from tests.bridge.hub.sockets import running_hub
+from tests.certificates import issue
 
 GUIDE = Path(__file__).parents[2] / "docs/how-to/bridge.md"
 EXAMPLES = dict(
@@ -143,17 +143,7 @@ async def test_the_goal_of_the_guide(served):
 
 
 async def test_the_door_of_the_guide(tmp_path):
-    certificate, key = tmp_path / "ca.pem", tmp_path / "key.pem"
-    subprocess.run(
-        [
-            *("openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes"),
-            *("-subj", "/CN=localhost", "-addext", "subjectAltName=DNS:localhost", "-days", "2"),
-            *("-keyout", str(key), "-out", str(certificate)),
-        ],
-        check=True,
-        capture_output=True,
-        timeout=240,
-    )
+    certificate, key = issue(tmp_path, "server")
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.load_cert_chain(certificate, key)
     example = EXAMPLES["TLS, tokens, proxies"].replace('"ca.pem"', repr(str(certificate)))

@@ -1,7 +1,6 @@
 """Boards over TCP: a shared key, TLS, and connections that do neither."""
 
 import socket
-import subprocess
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +13,7 @@ from pcie_shim.endpoint import Endpoint, parse_endpoint
 from pcie_shim.errors import CredentialsError, KeyRefusedError, LinkClosedError, LinkError
 from pcie_shim.host.loader import program
 from pcie_shim.host.socket_link import SocketLink
+from tests.certificates import issue
 from tests.pcie_shim.boards import image, machine, tcp_endpoint
 
 KEY = Credentials(key=b"sixteen-letters-at-least")
@@ -23,17 +23,7 @@ PATIENCE = 60.0
 
 @pytest.fixture(scope="module")
 def certificate(tmp_path_factory):
-    """A certificate for 127.0.0.1 and its key."""
-    folder = tmp_path_factory.mktemp("tls")
-    files = folder / "cert.pem", folder / "key.pem"
-    command = "openssl req -x509 -newkey rsa:2048 -nodes -days 1 -subj /CN=board -addext subjectAltName=IP:127.0.0.1"
-    subprocess.run(
-        [*command.split(), "-out", files[0], "-keyout", files[1]],
-        check=True,
-        capture_output=True,
-        timeout=240,
-    )
-    return files
+    return issue(tmp_path_factory.mktemp("tls"), "board")
 
 
 def with_credentials(text: str, credentials: Credentials) -> Endpoint:

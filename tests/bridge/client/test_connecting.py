@@ -5,7 +5,7 @@ import contextlib
 import re
 import socket
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from typing import Any
 
 import pytest
@@ -26,26 +26,9 @@ from tests.fake_rosbridge import FakeRosbridge
 
 @contextlib.asynccontextmanager
 async def tcp_service(
-    *answers: bytes, stays: bool = False, asked: list[bytes] | None = None
+    serve: Callable[[asyncio.StreamReader, asyncio.StreamWriter], Any],
 ) -> AsyncIterator[str]:
-    """A service on a port of this machine that is not a WebSocket server: its URI, as if it were one.
-
-    It reads a request, gives its answers, the last one again and again if it ``stays``, and hangs up otherwise.
-    """
-
-    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        with contextlib.suppress(ConnectionError, asyncio.IncompleteReadError):
-            request = await reader.readuntil(b"\r\n\r\n")
-            if asked is not None:
-                asked.append(request)
-            for answer in answers:
-                writer.write(answer)
-            while stays:
-                await asyncio.sleep(0.01)
-                writer.write(answers[-1])
-                await writer.drain()
-        writer.close()
-
+    """A service on a port of this machine that is not a WebSocket server: its URI, as if it were one."""
     server = await asyncio.start_server(serve, "127.0.0.1", 0)
     try:
         yield f"ws://127.0.0.1:{server.sockets[0].getsockname()[1]}"
@@ -73,7 +56,7 @@ async def test_it_connects_and_closes(fake):
         assert ros.state is State.CONNECTED
         assert ros.uri == fake.uri
     assert ros.state is State.CLOSED
-    with pytest.raises(DisconnectedError, match="connect\\(\\)"):
+    with pytest.raises(DisconnectedError, match=r"connect\(\)"):
         await ros.__aenter__()
     await ros.close()
 
@@ -159,11 +142,7 @@ async def test_a_service_that_greets_before_it_is_asked(monkeypatch):
         await handshake(self, *headers)
 
     monkeypatch.setattr(WebSocket, "handshake", late_handshake)
-    server = await asyncio.start_server(
-        lambda _reader, writer: writer.write(b"220 mail ready\r\n"), "127.0.0.1", 0
-    )
-    async with server:
-        uri = f"ws://127.0.0.1:{server.sockets[0].getsockname()[1]}"
+    async with tcp_service(lambda _reader, writer: writer.write(b"220 mail ready\r\n")) as uri:
         assert "220 mail ready" in await fails(uri, NotRosbridgeError)
 
 
@@ -204,7 +183,20 @@ STREAM = b"HTTP/1.1 200 OK\r\nContent-Type: multipart/x-mixed-replace\r\n\r\n"
 )
 async def test_a_service_that_is_something_else(answers, stays, error, seen):
     asked: list[bytes] = []
-    async with tcp_service(*answers, stays=stays, asked=asked) as uri:
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Give the answers, the last one again and again if it ``stays``, and hang up otherwise."""
+        with contextlib.suppress(ConnectionError, asyncio.IncompleteReadError):
+            asked.append(await reader.readuntil(b"\r\n\r\n"))
+            for answer in answers:
+                writer.write(answer)
+            while stays:
+                await asyncio.sleep(0.01)
+                writer.write(answers[-1])
+                await writer.drain()
+        writer.close()
+
+    async with tcp_service(serve) as uri:
         assert re.search(seen, await fails(uri, error, connect_timeout=2))
     assert b"Upgrade: websocket" in asked[0]
     assert b"Extensions" not in asked[0], "it asks for no compression"
@@ -239,8 +231,8 @@ async def test_cancelling_an_attempt_leaves_nothing_behind():
         gone.set()
         writer.close()
 
-    async with await asyncio.start_server(answer, "127.0.0.1", 0) as server:
-        ros = connect(f"ws://127.0.0.1:{server.sockets[0].getsockname()[1]}")
+    async with tcp_service(answer) as uri:
+        ros = connect(uri)
         attempt = asyncio.create_task(ros.__aenter__())
         await asyncio.sleep(0.1)
         attempt.cancel()

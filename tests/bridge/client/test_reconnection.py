@@ -204,7 +204,8 @@ async def test_a_message_that_is_too_large_ends_the_connection_and_says_so(fake,
     assert (await subscription.next(30)).msg == {"n": 1}
 
 
-async def test_waiting_for_a_state_is_bounded(fake, ros):
+async def test_waiting_for_a_state_is_bounded_and_closing_ends_it_and_the_reconnecting(fake, ros):
+    subscription = ros.subscribe("/a", "p/T")
     await ros.wait_for_state(State.CONNECTED, 1)
     await fake.vanish()
     await ros.wait_for_state(State.RECONNECTING, 30)
@@ -217,22 +218,13 @@ async def test_waiting_for_a_state_is_bounded(fake, ros):
     waiting = asyncio.create_task(ros.wait_for_state(State.CONNECTED, 30))
     await asyncio.sleep(0)
     await ros.close()
-    with pytest.raises(DisconnectedError, match="was closed"):
-        await waiting
-    with pytest.raises(DisconnectedError):
-        await ros.wait_for_state(State.CONNECTED, 30)
-
-
-async def test_closing_while_it_reconnects_ends_it(fake, ros):
-    subscription = ros.subscribe("/a", "p/T")
-    await fake.vanish()
-    await ros.wait_for_state(State.RECONNECTING, 30)
-    await ros.close()
-    assert ros.state is State.CLOSED
+    for late in (waiting, ros.wait_for_state(State.CONNECTED, 30)):
+        with pytest.raises(DisconnectedError, match="closed"):
+            await late
     assert not [task for task in asyncio.all_tasks() if "Session." in repr(task.get_coro())]
     await fake.come_back()
     await asyncio.sleep(0.4)
-    assert fake.connections == 1
+    assert (ros.state, fake.connections) == (State.CLOSED, 1)
     assert [message async for message in subscription] == []
 
 

@@ -9,7 +9,6 @@ import contextlib
 import logging
 import re
 import ssl
-import subprocess
 from collections.abc import AsyncIterator
 from dataclasses import dataclass, field
 from http import HTTPStatus
@@ -23,40 +22,22 @@ from websockets.http11 import Request, Response
 from bridge.client import State, connect
 from bridge.client.route import shown
 from bridge.errors import AccessRefusedError, BridgeError, OptionError, UnreachableError, UriError
+from tests.certificates import issue, openssl
 
 TOKEN = "s3cret-token"
 PATIENCE = 60.0
 
 
-def openssl(*words: str) -> None:
-    subprocess.run(["openssl", *words], check=True, capture_output=True, timeout=240)
-
-
 @pytest.fixture(scope="module")
 def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A CA, a server's certificate for localhost, a client's, and another CA that vouches for nobody."""
+    """A CA, a server's certificate and a client's of it, and another CA that vouches for nobody."""
     folder = tmp_path_factory.mktemp("certificates")
-    key = ("-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes")
-    for ca in ("ca", "other"):
-        openssl(
-            *("req", "-x509", *key, "-subj", f"/CN={ca}", "-days", "2"),
-            *("-keyout", str(folder / f"{ca}.key"), "-out", str(folder / f"{ca}.pem")),
-        )
-    (folder / "names").write_text("subjectAltName=DNS:localhost,IP:127.0.0.1\n")
-    for name in ("server", "client"):
-        request = str(folder / f"{name}.csr")
-        openssl("req", *key, "-subj", f"/CN={name}", "-keyout", str(folder / f"{name}.key"), "-out", request)
-        openssl(
-            *("x509", "-req", "-in", request, "-days", "2", "-extfile", str(folder / "names")),
-            *("-CA", str(folder / "ca.pem"), "-CAkey", str(folder / "ca.key"), "-CAcreateserial"),
-            *("-out", str(folder / f"{name}.pem")),
-        )
+    for name, ca in (("ca", None), ("other", None), ("server", "ca"), ("client", "ca")):
+        issue(folder, name, ca=ca)
     both = (folder / "client.pem").read_text() + (folder / "client.key").read_text()
     (folder / "both.pem").write_text(both)
-    openssl(
-        *("ec", "-in", str(folder / "client.key"), "-aes256", "-passout", "pass:word"),
-        *("-out", str(folder / "locked.key")),
-    )
+    locked = ("-aes256", "-passout", "pass:word", "-out", str(folder / "locked.key"))
+    openssl("ec", "-in", str(folder / "client.key"), *locked)
     return folder
 
 
@@ -157,7 +138,6 @@ TLS = ssl.create_default_context()
         ("ws://localhost:1", {"client_certificate": "x"}, "client_certificate"),
         ("ws://localhost:1", {"tls": TLS}, "tls"),
         ("ws://localhost:1", {"token": ""}, "token must be"),
-        ("ws://localhost:1", {"token": "a b"}, "token must be"),
         ("ws://localhost:1", {"token": "a\r\nX: y"}, "token must be"),
         ("ws://localhost:1", {"token": "\u00e4"}, "token must be"),
         ("ws://u:y@localhost:1", {"token": "x"}, "token and"),
@@ -209,28 +189,19 @@ async def test_credentials_in_the_uri_are_shown_at_the_door_and_nowhere_else(cap
     assert "s3cret" not in caplog.text + said + str(wrong.value)
 
 
-@pytest.mark.parametrize(
-    ("uri", "warned"),
-    [
-        ("ws://robot:9090", True),
-        ("ws://192.168.1.10:9090", True),
-        ("ws://localhost:9090", False),
-        ("ws://[::1]:9090", False),
-        ("ws://127.3.2.1:9090", False),
-        ("wss://robot:9090", False),
-    ],
-)
-def test_a_secret_in_the_clear_is_warned_of(uri, warned, caplog):
-    connect(uri, token=TOKEN)
-    assert ("unencrypted" in caplog.text) == warned
+def test_a_secret_in_the_clear_is_warned_of(caplog):
+    for uri in ("wss://robot:9090", *(f"ws://{host}:9090" for host in ("localhost", "[::1]", "127.3.2.1"))):
+        connect(uri, token=TOKEN)
+    assert not caplog.text
+    for number, uri in enumerate(("ws://robot:9090", "ws://192.168.1.10:9090"), start=1):
+        connect(uri, token=TOKEN)
+        assert caplog.text.count("unencrypted") == number
     assert TOKEN not in caplog.text
 
 
 @pytest.mark.parametrize(
     ("uri", "without"),
     [
-        ("ws://robot:9090", "ws://robot:9090"),
-        ("ws://u:p@robot:9090/x", "ws://robot:9090/x"),
         ("ws://u:p@q@robot:9090/x@y", "ws://robot:9090/x@y"),
         ("wss://robot/?token=abc", "wss://robot/?***"),
         ("wss://robot?a=b@c#d", "wss://robot?***#d"),

@@ -1,7 +1,6 @@
 """Who may come in: tokens, TLS, and what is said to who may not."""
 
 import ssl
-import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,8 @@ from websockets.exceptions import InvalidStatus
 
 from bridge.hub.access import AccessPolicy, is_loopback, read_tokens, tls_context
 from bridge.hub.errors import HubError
-from tests.bridge.hub.sockets import PATIENCE, Client, RawClient, running_hub
+from tests.bridge.hub.sockets import Client, RawClient, running_hub
+from tests.certificates import issue
 
 TOKEN = "correct-horse-battery-staple"
 OTHER = "another.token_of~the-same-hub"
@@ -19,13 +19,7 @@ OTHER = "another.token_of~the-same-hub"
 
 @pytest.fixture(scope="module")
 def certificate(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    folder = tmp_path_factory.mktemp("certificate")
-    files = folder / "cert.pem", folder / "key.pem"
-    command = "openssl req -x509 -newkey rsa:2048 -nodes -days 1 -subj /CN=localhost"
-    names = ["-addext", "subjectAltName=DNS:localhost,IP:127.0.0.1"]
-    outputs = ["-out", str(files[0]), "-keyout", str(files[1])]
-    subprocess.run([*command.split(), *names, *outputs], check=True, capture_output=True, timeout=PATIENCE)
-    return files
+    return issue(tmp_path_factory.mktemp("certificate"), "server")
 
 
 @pytest.mark.parametrize(

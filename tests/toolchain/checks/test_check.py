@@ -44,10 +44,6 @@ def only(findings, check):
     return finding
 
 
-def test_nothing_to_say():
-    assert check_model(model(), OPTIONS) == []
-
-
 # What is said of readings and lines, on the machine
 
 
@@ -165,12 +161,8 @@ def test_lines_that_the_prior_excludes_or_loses():
     assert "s = 1" in lost.what
     written = replace(OPTIONS, prior_mode=PriorMode.WRITTEN)
     assert not found(check_model(model_of(table, prior=prior), written), Check.DEAD_LINES)
-
-
-def test_lines_and_rows_of_a_selected_prior():
-    rows = np.array([[1.0, 0, 0], [0, 1.0, 0]])
-    select = PriorSelect(name="room", table=rows)
-    findings = check_model(model_of(np.full((2, 3), 0.5), prior_select=select), OPTIONS)
+    select = PriorSelect(name="room", table=np.eye(2, 4))
+    findings = check_model(model_of(table, prior_select=select), OPTIONS)
     assert only(findings, Check.DEAD_LINES).severity is Severity.NOTE
     assert "s = 2" in only(findings, Check.DEAD_LINES).what
     assert not found(findings, Check.IMPOSSIBLE_READINGS)
@@ -237,7 +229,7 @@ def test_generators_and_stopping(changes, check, about, numbers):
 def test_what_ends_a_warning_about_generators():
     free = replace(OPTIONS, rng_banks=1, rng_reset=RngReset.FREE)
     short = replace(OPTIONS, rng=RngKind.LFSR16, max_cycles=65535)
-    for options in (free, short, replace(OPTIONS, target_count=200, max_cycles=200)):
+    for options in (OPTIONS, free, short, replace(OPTIONS, target_count=200, max_cycles=200)):
         assert check_model(model(), options) == []
 
 
@@ -363,6 +355,11 @@ def test_files_of_a_deployment(deployment):
     assert (memories.check, memories.about) == (Check.FILES, "bm_arch/Memory_MIFs/board0_prior.mif")
     assert memories.advice == f"use 'toolchain regenerate memories {deployment}'"
     assert project.about == "bm1.tcl"
+    image = deployment / "boards/board0.bm"
+    image.write_bytes(image.read_bytes()[:-1])
+    (finding,) = check_deployment(deployment)
+    assert finding.severity is Severity.ERROR
+    assert "board0.bm" in finding.what
 
 
 def test_comments_are_not_contents(deployment):
@@ -371,14 +368,6 @@ def test_comments_are_not_contents(deployment):
     assert check_deployment(deployment) == []
     path.write_text(path.read_text().replace("LINES             : positive := 10", "LINES : positive := 11"))
     assert len(check_deployment(deployment)) == 1
-
-
-def test_a_damaged_deployment(deployment):
-    image = deployment / "boards/board0.bm"
-    image.write_bytes(image.read_bytes()[:-1])
-    (finding,) = check_deployment(deployment)
-    assert finding.severity is Severity.ERROR
-    assert "board0.bm" in finding.what
 
 
 # The command
@@ -408,12 +397,9 @@ def test_the_command_as_words_or_json(case):
     assert list(finding.values())[:3] == ["error", "cannot-be-built", "the machine"]
 
 
-def test_a_deployment_by_the_command(deployment):
+def test_a_deployment_by_the_command(deployment, tmp_path):
     result = toolchain("check", deployment)
     assert (result.exit_code, result.stdout) == (0, "")
     for flag, value in (("--prob-bits", 8), ("--set", "a=1")):
         assert_refused(toolchain("check", deployment, flag, value), f"{flag} ")
-
-
-def test_neither_model_nor_deployment(tmp_path):
     assert_refused(toolchain("check", tmp_path), tmp_path)
