@@ -72,7 +72,7 @@ async def test_each_posterior_has_its_frames_data():
         assert (heard.lost, heard.without_posterior, heard.announced_only) == (0, 0, 0)
 
 
-async def test_frames_without_a_posterior_are_passed_over_or_told():
+async def test_frames_without_a_posterior_are_passed_over_or_told_and_one_without_a_report_comes_too():
     async with hearing() as (fake, heard):
         await say(fake, 1)
         await say(fake, 2, 0, 0, 0, 1)
@@ -82,10 +82,6 @@ async def test_frames_without_a_posterior_are_passed_over_or_told():
         frame = await heard.next_frame(PATIENCE)
         assert isinstance(frame, FrameReport)
         assert (frame.number, frame.outcome) == (3, "no posterior: impossible")
-
-
-async def test_a_posterior_without_a_report_comes_too():
-    async with hearing() as (fake, heard):
         await fake.publish("/BMresults", result(0, 1, 0, 0))
         posterior = await heard.next(PATIENCE)
         assert (posterior.number, posterior.best()) == (None, {"y": 0, "x": 1})
@@ -158,30 +154,17 @@ async def test_closing_ends_the_iteration_after_what_waits():
         await fake.wait_for_op("unsubscribe", topic="/bm/frame")
 
 
-async def test_closing_the_client_ends_it_too():
-    async with FakeRosbridge() as fake, connect(fake.uri) as ros:
-        heard = posteriors(ros)
-        await fake.wait_for_op("subscribe", topic="/BMresults")
-        reading = asyncio.create_task(heard.next(None))
-        await asyncio.sleep(0)
-        await ros.close()
-        with pytest.raises(DisconnectedError):
-            await asyncio.wait_for(reading, PATIENCE)
-
-
-async def test_two_readers_are_one_too_many():
+async def test_two_readers_are_one_too_many_and_closing_the_client_ends_the_first():
     async with hearing() as (_fake, heard):
-        first = asyncio.create_task(heard.next(PATIENCE))
+        first = asyncio.create_task(heard.next(None))
         await asyncio.sleep(0)
         with pytest.raises(ConcurrentReadError):
             await heard.next(1)
-        first.cancel()
-
-
-async def test_a_queue_needs_room():
-    async with FakeRosbridge() as fake, connect(fake.uri) as ros:
         with pytest.raises(OptionError):
-            posteriors(ros, queue_size=0)
+            posteriors(heard._ros, queue_size=0)
+        await heard._ros.close()
+        with pytest.raises(DisconnectedError):
+            await asyncio.wait_for(first, PATIENCE)
 
 
 class Calling:
@@ -234,9 +217,11 @@ async def test_returning_false_ends_it_and_nothing_or_zero_does_not(calling):
     assert await calling(lambda posterior: 0 if posterior.number == 1 else None, count=2) == 2
 
 
-async def test_the_functions_exceptions_are_raised(calling):
+async def test_the_functions_exceptions_are_raised_and_a_client_may_be_given_instead_of_a_uri(calling):
     with pytest.raises(ZeroDivisionError):
         await calling(lambda posterior: 1 / 0)
+    calling.server = connect(calling.fake.uri, connect_timeout=30)
+    assert await calling(lambda posterior: None, count=1) == 1
 
 
 async def test_silence_ends_it(calling):
@@ -244,11 +229,6 @@ async def test_silence_ends_it(calling):
         await calling(lambda posterior: None, frames=0, first_timeout=0.2)
     with pytest.raises(NoResultError):
         await calling(lambda posterior: None, frames=1, timeout=0.3)
-
-
-async def test_a_client_may_be_given_instead_of_a_uri(calling):
-    calling.server = connect(calling.fake.uri, connect_timeout=30)
-    assert await calling(lambda posterior: None, count=1) == 1
 
 
 async def test_no_server():

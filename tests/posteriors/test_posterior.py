@@ -11,28 +11,27 @@ from posteriors.posterior import read_posterior
 from tests.posteriors.hostile import JSON
 
 
-def posterior_message(data, *sizes):
+def posterior_message(data, *sizes, offset=0):
     dims = [{"label": label, "size": size, "stride": 1} for label, size in zip("yx", sizes, strict=False)]
-    return {"layout": {"dim": dims, "data_offset": 0}, "data": data}
+    return {"layout": {"dim": dims, "data_offset": offset}, "data": data}
 
 
 class TestReading:
-    def test_a_posterior(self):
-        data = (0.5, 0.25, 0.25, 0, 0, 0)
-        expected = Posterior(probabilities=data, labels=("y", "x"), sizes=(2, 3), heard_ns=5)
-        assert read_posterior(posterior_message(list(data), 2, 3), 5) == expected
-
-    def test_a_posterior_without_a_layout(self):
-        posterior = read_posterior({"data": [0.25, 0.75]}, 0)
-        assert (posterior.sizes, posterior.labels, posterior.best()) == ((2,), ("cell",), {"cell": 1})
+    @pytest.mark.parametrize(
+        ("message", "sizes", "probabilities"),
+        [
+            (posterior_message([0.5, 0.25, 0.25, 0, 0, 0], 2, 3), (2, 3), (0.5, 0.25, 0.25, 0, 0, 0)),
+            (posterior_message([9.0, 0.5, 0.5], 1, 2, offset=1), (1, 2), (0.5, 0.5)),
+            ({"data": [0.25, 0.75]}, (2,), (0.25, 0.75)),
+        ],
+    )
+    def test_a_posterior_with_and_without_a_layout(self, message, sizes, probabilities):
+        labels = ("y", "x") if "layout" in message else ("cell",)
+        expected = Posterior(probabilities=probabilities, labels=labels, sizes=sizes, heard_ns=5)
+        assert read_posterior(message, 5) == expected
 
     def test_values_of_any_size_have_a_mean(self):
         assert read_posterior({"data": [0, 0, 0, 4e307, 4e307]}, 0).mean() == {"cell": 3.5}
-
-    def test_a_posterior_behind_an_offset(self):
-        message = posterior_message([9.0, 0.5, 0.5], 1, 2)
-        message["layout"]["data_offset"] = 1
-        assert read_posterior(message, 0).probabilities == (0.5, 0.5)
 
     @pytest.mark.parametrize(
         "message",
@@ -108,18 +107,13 @@ class TestPosterior:
             with pytest.raises(LabelError):
                 posterior.at(cell)
 
-    def test_without_a_report_nothing_is_known_of_its_frame(self):
-        posterior = made([1, 1], ("x",))
-        assert (posterior.number, posterior.stamp_ns, posterior.cycles) == (None, None, None)
-        assert (posterior.latency_us, posterior.rosbridge_out_us) == (None, None)
-        assert posterior.stages == StageTimes()
-
-    def test_times_from_the_reading_and_from_the_sending(self):
+    def test_its_report_tells_its_frame_and_its_times_where_clocks_agree(self):
+        bare = made([1, 1], ("x",))
+        assert (bare.number, bare.stamp_ns, bare.cycles) == (None, None, None)
+        assert (bare.latency_us, bare.rosbridge_out_us, bare.stages) == (None, None, StageTimes())
         posterior = received(9_000, number=3, cycles=7, received_ns=1_000, sent_ns=5_000)
         assert (posterior.latency_us, posterior.rosbridge_out_us) == (8.0, 4.0)
         assert (posterior.number, posterior.stamp_ns, posterior.cycles) == (3, 5, 7)
-
-    def test_clocks_that_disagree_give_no_time(self):
         assert received(9_000, received_ns=10_000).latency_us is None
 
 

@@ -88,25 +88,6 @@ def test_machine_options(case):
     assert read_mif(case.parent / "out/bm_arch/Memory_MIFs/rng_table.mif").words == (1, 7, 7)
 
 
-NETWORK = """
-variable rain { type discrete [ 2 ] { yes, no }; }
-variable sprinkler { type discrete [ 2 ] { on, off }; }
-variable grass { type discrete [ 2 ] { wet, dry }; }
-variable shoes { type discrete [ 2 ] { wet, dry }; }
-probability ( rain ) { table 0.2, 0.8; }
-probability ( sprinkler | rain ) { (yes) 0.01, 0.99; (no) 0.4, 0.6; }
-probability ( grass | sprinkler, rain ) { table 0.99 0.9 0.8 0.0 0.01 0.1 0.2 1.0; }
-probability ( shoes | grass ) { (wet) 0.7, 0.3; (dry) 0.1, 0.9; }
-"""
-
-
-@pytest.fixture
-def network(tmp_path):
-    path = tmp_path / "garden.bif"
-    path.write_text(NETWORK)
-    return path
-
-
 def test_a_network_with_a_question(network):
     result = build(network, "--searched", "rain,sprinkler", "--known", "shoes", "--on-missing", "missing")
     assert result.exit_code == 0, result.stderr
@@ -156,12 +137,8 @@ def test_questions_that_cannot_be_built(network, arguments, named):
 )
 def test_a_wrong_target_is_refused_before_the_model_is_read(case, option, value):
     (case / "model.py").write_text("raise SystemExit('the model was read')")
-    target = list(TARGET)
-    if option in target:
-        target[target.index(option) + 1] = value
-    else:
-        target += [option, value]
-    result = build(case, target=target)
+    target = dict(zip(TARGET[::2], TARGET[1::2], strict=True)) | {option: value}
+    result = build(case, target=[word for pair in target.items() for word in pair])
     assert_refused(result, f"error: {option}: ")
 
 

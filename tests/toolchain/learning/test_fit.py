@@ -45,21 +45,12 @@ def model(fit: Path | None = None):
 def room(cells=16):
     y, x = interval("y", 0, 8, cells=cells), interval("x", 0, 8, cells=cells)
     ys, xs = cell_centres(y, x)
-    return Model(
-        name="room",
-        searched=(y, x),
-        known=(
-            normal("range", mean=np.hypot(xs + 2, ys + 1), sigma=1.0, values=150, step=0.1),
-            wrapped_normal(
-                "bearing",
-                mean=np.arctan2(ys + 1, xs - 3),
-                sigma=0.5,
-                values=180,
-                step=TURN / 180,
-                offset=-np.pi,
-            ),
-        ),
+    distance, angle = np.hypot(xs + 2, ys + 1), np.arctan2(ys + 1, xs - 3)
+    known = (
+        normal("range", mean=distance, sigma=1.0, values=150, step=0.1),
+        wrapped_normal("bearing", mean=angle, sigma=0.5, values=180, step=TURN / 180, offset=-np.pi),
     )
+    return Model(name="room", searched=(y, x), known=known)
 
 
 def simulated(rows, *, sigma=0.2, bias=0.0, outliers=0.2, seed=1):
@@ -67,14 +58,12 @@ def simulated(rows, *, sigma=0.2, bias=0.0, outliers=0.2, seed=1):
     random = np.random.default_rng(seed)
     y, x = random.uniform(0, 8, (2, rows))
     distance = np.hypot(x + 2, y + 1) + bias + random.normal(0, sigma, rows)
-    bearing = (
-        np.arctan2(y + 1, x - 3) + random.normal(0, sigma / 4, rows) + TURN * random.integers(-1, 2, rows)
-    )
+    turns = TURN * random.integers(-1, 2, rows)
+    bearing = np.arctan2(y + 1, x - 3) + random.normal(0, sigma / 4, rows) + turns
     wild = random.random(rows) < outliers
     distance[wild] = random.uniform(0, 15, wild.sum())
     bearing[wild] = random.uniform(-np.pi, np.pi, wild.sum())
-    truth = {"y": y.tolist(), "x": x.tolist()}
-    return truth, {"range": distance.tolist(), "bearing": bearing.tolist()}
+    return {"y": y.tolist(), "x": x.tolist()}, {"range": distance.tolist(), "bearing": bearing.tolist()}
 
 
 def learn(model, truth, readings, **options):
@@ -111,18 +100,16 @@ def test_the_mixture_finds_sigma_and_share(sigma, share, seed):
     assert outliers == pytest.approx(share, abs=0.06)
 
 
-def test_a_pool_shares_sigma_and_each_keeps_its_share():
+def test_a_pool_shares_sigma_and_each_keeps_its_share_and_exact_readings_have_a_sigma():
     random = np.random.default_rng(2)
     few, many = random.normal(0, 0.1, 20), random.normal(0, 0.1, 2000)
     broken = random.uniform(-5, 5, 200)
     _, sigma, shares = mixture([few, many, broken], [10.0] * 3, bias=False, least_sigma=1e-3)
     assert sigma == pytest.approx(0.1, rel=0.1)
-    assert shares[0] < 0.15
-    assert shares[1] < 0.02
-    assert shares[2] > 0.9
-
-
-def test_exact_readings_have_a_sigma_all_the_same():
+    few_wild, many_wild, broken_wild = shares
+    assert few_wild < 0.15
+    assert many_wild < 0.02
+    assert broken_wild > 0.9
     share = pytest.approx(1 / 52, abs=3e-3)
     assert mixture([np.zeros(50)], [1.0], bias=True, least_sigma=0.005) == (0.0, 0.005, [share])
 
@@ -139,20 +126,10 @@ def test_the_spread_inside_a_cell_is_part_of_the_fitted_table():
     fit, _ = learn(model, truth, readings)
     fitted = apply_fit(model, fit)
     assert np.all(fitted.known[0].normal.sigma > 0.9 * 2 / math.sqrt(12))
-
-
-def test_slopes_of_a_bearing_go_the_short_way_round():
-    line = interval("x", -1, 1, cells=4)
-    mean = np.array([3.0, 3.1, -3.1, -3.0])
-    model = Model(
-        name="m",
-        searched=(line,),
-        known=(wrapped_normal("b", mean=mean, sigma=1, values=60, step=TURN / 60),),
-    )
-    gap = TURN - 6.2
-    assert mean_slopes(model, model.known[0])[0] == pytest.approx(
-        [0.1, (0.1 + gap) / 2, (0.1 + gap) / 2, 0.1]
-    )
+    bearing = wrapped_normal("b", mean=np.array([3.0, 3.1, -3.1, -3.0]), sigma=1, values=60, step=TURN / 60)
+    line = Model(name="m", searched=(interval("x", -1, 1, cells=4),), known=(bearing,))
+    over_the_gap = (0.1 + TURN - 6.2) / 2  # the short way round
+    assert mean_slopes(line, bearing)[0] == pytest.approx([0.1, over_the_gap, over_the_gap, 0.1])
 
 
 def test_rows_without_a_truth_are_left_out():
@@ -185,13 +162,6 @@ def test_counts_are_dirichlets(prior):
     assert fitted.states == ("shut", "open")
 
 
-def test_few_readings_leave_what_was_set_by_hand(tmp_path):
-    truth, readings = simulated(LEAST_READINGS - 1)
-    fit, _ = learn(room(), truth, readings)
-    assert fit.file.variables == ()
-    assert np.array_equal(apply_fit(room(), fit).known[0].table, room().known[0].table)
-
-
 def test_a_fit_is_the_same_after_its_file(tmp_path):
     truth, readings = simulated(300)
     fit, _ = learn(room(), truth, readings)
@@ -200,9 +170,11 @@ def test_a_fit_is_the_same_after_its_file(tmp_path):
     fitted = with_fit(room(), tmp_path / "fit.toml")
     for ours, theirs in zip(fitted.known, apply_fit(room(), fit).known, strict=True):
         assert np.array_equal(ours.table, theirs.table)
-    assert with_fit(room(), None).known[0].table is not None
-    finer = with_fit(room(cells=40), tmp_path / "fit.toml")
-    assert finer.lines == 1600
+    assert with_fit(room(cells=40), tmp_path / "fit.toml").lines == 1600
+    few, _ = learn(room(), *simulated(LEAST_READINGS - 1))
+    assert few.file.variables == ()
+    for unfitted in (with_fit(room(), None), apply_fit(room(), few)):  # as it was set by hand
+        assert np.array_equal(unfitted.known[0].table, room().known[0].table)
 
 
 def test_counted_tables_are_the_same_after_their_file_and_so_are_its_bytes(tmp_path):
