@@ -5,7 +5,7 @@ from typing import ClassVar
 
 
 class ToolchainError(Exception):
-    """Root of the toolchain's errors; `str()` is one sentence that says what to do."""
+    """Base class of the toolchain's errors; `str()` is one sentence that tells what to do."""
 
     exit_code: ClassVar[int] = 2
 
@@ -17,7 +17,7 @@ class ToolchainError(Exception):
         line: int | None = None,
         place: tuple[str | int, ...] = (),
     ) -> None:
-        """Put file and line before the sentence; `place` is the key of a configuration file, as `("variable", 2, "bits")`."""
+        """Prefix the sentence with file and line; `place` is a key such as `("variable", 2, "bits")`."""
         where = f"{path}" + ("" if line is None else f", line {line}")
         super().__init__(f"{where}: {sentence}" if where else sentence)
         self.path = path
@@ -26,31 +26,31 @@ class ToolchainError(Exception):
 
 
 class ModelError(ToolchainError):
-    """A model is not one that a BM1 computes: wrong shapes, names, probabilities or parameters."""
+    """A model that a BM1 cannot compute: wrong shapes, names, probabilities or parameters."""
 
 
 class NetworkFileError(ModelError):
-    """A network's file can't be read: damaged, hostile, or of another kind; names the file and the line."""
+    """A network file is damaged, hostile, or of another format; the sentence contains file and line."""
 
 
 class MifError(ToolchainError):
-    """A memory's file can't be read: not a MIF, or words that don't fit; names the file and the line."""
+    """A memory file can't be read: not a MIF, or words that don't fit; the sentence contains file and line."""
 
 
 class BuildError(ToolchainError):
-    """A build cannot be done: options don't fit each other, or a folder can't be written."""
+    """A build is impossible: options contradict each other, or a folder can't be written."""
 
 
 class DeploymentError(ToolchainError):
-    """A deployment is absent, not readable, or not consistent."""
+    """A deployment is missing, unreadable, or inconsistent."""
 
 
 class DeploymentVersionError(DeploymentError):
-    """A deployment has a format that this version doesn't read."""
+    """A deployment has a format that this version does not support."""
 
 
 class DamagedDeploymentError(DeploymentError):
-    """A file of the deployment is not the one that was built: its hash differs."""
+    """A file of the deployment has changed since the build: its hash differs."""
 
 
 class ReadingError(ToolchainError):
@@ -64,8 +64,8 @@ class NotANumberError(ReadingError):
 
 
 class ValueOutOfRangeError(ReadingError):
-    """A number's address is not one that the column serves (`on_range = error`)."""
+    """The address of a number is not supported by the column (`on_range = error`)."""
 
 
 class ReadingMissingError(ReadingError):
-    """A reading is missing where it must not be (`on_missing = error`)."""
+    """A required reading is missing (`on_missing = error`)."""

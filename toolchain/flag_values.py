@@ -1,4 +1,4 @@
-"""The values of flags: KEY=VALUE, or names with commas between them."""
+"""Parsers for values of flags: KEY=VALUE, or comma-separated names."""
 
 from collections.abc import Iterable
 
@@ -6,7 +6,7 @@ from toolchain.errors import BuildError
 
 
 def key_values(settings: Iterable[str], flag: str = "--set", example: str = "width=64") -> dict[str, str]:
-    """Return the values of a flag by key; a BuildError for no `=`, no key or the same key twice."""
+    """Return the values of a flag by key; a BuildError for a missing `=` or key, or a duplicate key."""
     found: dict[str, str] = {}
     for setting in settings:
         key, equals, value = setting.partition("=")
@@ -23,5 +23,5 @@ def names_in(flag: str, text: str) -> list[str]:
     """Return the names in `A,B,C`; a BuildError if one is empty."""
     names = [name.strip() for name in text.split(",")] if text else []
     if not all(names):
-        raise BuildError(f"{flag} {text}: expected names with a comma between them, such as {flag} A,B")
+        raise BuildError(f"{flag} {text}: expected comma-separated names, such as {flag} A,B")
     return names

@@ -1,4 +1,4 @@
-"""The deployment: everything that follows from the model and that the services read."""
+"""The deployment: everything for the services that follows from the model."""
 
 from toolchain.deployment.deployment import FILE_NAME, REPLICA, Deployment, DeploymentFile
 from toolchain.deployment.deployment_hash import deployment_hash

@@ -1,7 +1,6 @@
-"""The rule that makes a reading an address of its column, in plain Python.
+"""The conversion of a reading to an address of its column, in plain Python.
 
-`address = floor((value - offset) / step + 0.5)`, then modulo `period` where there is one, then the range
-check. The subscriber applies it to every frame, the tests to every table.
+`address = floor((value - offset) / step + 0.5)`, then modulo `period` if there is one, then the range check.
 """
 
 import math
@@ -16,11 +15,10 @@ def to_address(variable: Variable, value: object) -> int | None:
     """Return the address of one reading in its variable's column.
 
     Args:
-        variable: Offset, step, period, number of served addresses, and the treatment of a reading out of
-            range or missing.
-        value: The field's value. `None`, for null and for an absent field, NaN and an empty array are missing
-            readings. Booleans are 0 and 1. Strings are never numbers; one that is the name of a state is that
-            state.
+        variable: Offset, step, period, number of supported addresses, and the treatment of readings that are
+            out of range or missing.
+        value: The value of the field. `None` (null or an absent field), NaN and an empty array are missing
+            readings. Booleans are 0 and 1. Strings are never numbers, but may be names of states.
 
     Returns:
         The address, 0 to `variable.values - 1`, or `None` for a missing reading.
@@ -28,8 +26,8 @@ def to_address(variable: Variable, value: object) -> int | None:
     Raises:
         ReadingMissingError: The reading is missing and `on_missing` is `error`.
         NotANumberError: The reading is a string, an object or a non-empty array.
-        ValueOutOfRangeError: The address is not served and `on_range` is `error`, or the reading is
-            infinite where a period leaves no end to clamp it to.
+        ValueOutOfRangeError: The address is not supported and `on_range` is `error`, or the reading is
+            infinite and the variable periodic.
     """
     if value is None:
         return _missing(variable, "is absent or null")
@@ -44,7 +42,7 @@ def to_address(variable: Variable, value: object) -> int | None:
 
     try:
         position = math.floor((value - variable.offset) / variable.step + 0.5)
-    except OverflowError:  # infinite, or an integer beyond a double
+    except OverflowError:  # infinite, or an integer that exceeds a double
         upwards = (value > 0) == (variable.step > 0)
         return _unserved(variable, value, None if variable.period else upwards)
     if variable.period is not None:
@@ -63,7 +61,7 @@ def _missing(variable: Variable, what: str) -> int | None:
 
 
 def _unserved(variable: Variable, value: float, beyond_top: bool | None) -> int | None:
-    """Apply `on_range` at the top or the bottom; `beyond_top` is None where a period leaves no end."""
+    """Apply `on_range` at the top or the bottom; `beyond_top` is None for a periodic variable."""
     if variable.on_range == "missing":
         return _missing(variable, f"is {_shown(value)}, out of range")
     if variable.on_range == "clamp" and beyond_top is not None:
@@ -80,7 +78,7 @@ def _unserved(variable: Variable, value: float, beyond_top: bool | None) -> int 
 def _shown(value: object) -> str:
     try:
         text = repr(value)
-    except ValueError:  # an integer of more digits than Python prints
+    except ValueError:  # an integer with more digits than Python prints
         return "an integer of thousands of digits"
     return text if len(text) <= _SHOWN else text[:_SHOWN] + "..."
 

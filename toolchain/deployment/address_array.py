@@ -1,7 +1,7 @@
-"""Arrays of readings as addresses: one a line, one a replica, or both (thesis 4.4).
+"""Conversion of arrays of readings to addresses: one per line, one per replica, or both (thesis 4.4).
 
-Each number follows the rule of `toolchain.deployment.address`. An array has its rows in order (replica by replica, line by
-line), and a sensor's reading is missing on all lines of a machine or on none.
+Each number is converted as in `toolchain.deployment.address`. Rows are in order (replica after replica, line
+after line), and a reading of a sensor is missing on all lines of a machine or on none.
 """
 
 import base64
@@ -27,22 +27,25 @@ def to_addresses(deployment: Deployment, variable: Variable, value: object) -> l
 
     Args:
         deployment: The source of the shape, `deployment.reading_shape(variable)`.
-        variable: As `toolchain.deployment.address.to_address` takes it.
-        value: The field's value: a flat array, or one of the shape; bytes (`uint8[]`) as bytes or as base64.
-            `None` or an empty array is a missing reading everywhere; null and NaN are missing ones.
+        variable: As for `toolchain.deployment.address.to_address`.
+        value: The value of the field: a flat array, or one with the shape; bytes (`uint8[]`) as bytes or as
+            base64. With `None` or an empty array, all readings are missing; null and NaN are single missing
+            readings.
 
     Returns:
-        As many addresses as the shape has elements, row by row; `MISSING` in all lines of a missing reading. `None` where
-        every reading is missing.
+        One address per element of the shape, row by row; `MISSING` in all lines of a missing reading. `None`
+        if every reading is missing.
 
     Raises:
-        ReadingError: The array has another length, or a reading in it can't be used; names the reading.
+        ReadingError: The array has another length, or contains an unusable reading, which the sentence names.
     """
     machine = deployment.machine
     shape = deployment.reading_shape(variable)
     numbers = _numbers(variable, value, shape)
     if numbers is None:
-        to_address(variable, None if value is None else [])  # refuses it where it must not be missing
+        to_address(
+            variable, None if value is None else []
+        )  # raises an error if the reading must not be missing
         return None
     if machine.sensor_mode is SensorMode.THRESHOLD and variable.kind == "sensor":
         addresses = _codes(variable, numbers, machine.prob_bits, machine.scale)
@@ -57,7 +60,7 @@ def to_addresses(deployment: Deployment, variable: Variable, value: object) -> l
 
 
 def _numbers(variable: Variable, value: object, shape: tuple[int, ...]) -> NDArray[np.float64] | None:
-    """Return the message's array as float64 of this shape, with NaN for null; None where it is empty or absent."""
+    """Return the array as float64 with this shape and NaN for null, or None if it is empty or absent."""
     if value is None:
         return None
     given: Any = value
@@ -99,7 +102,7 @@ def _length(shape: tuple[int, ...]) -> str:
 
 
 def _holds_text(values: list[Any]) -> bool:
-    """Return whether there are strings, which NumPy would read as numbers; deeper arrays have a wrong shape anyway."""
+    """Return whether there are strings, which NumPy would read as numbers."""
     return any(
         isinstance(each, str) or (isinstance(each, list) and any(isinstance(inner, str) for inner in each))
         for each in values
@@ -114,7 +117,7 @@ def _addresses(variable: Variable, numbers: NDArray[np.float64]) -> NDArray[np.i
         served = (places >= 0) & (places < variable.values)
     addresses = np.where(served, places, MISSING).astype(np.int64)
     for at in np.argwhere(~served):
-        # the rest are few, and the rule treats or refuses each of them
+        # the rest are few, and are converted or refused one by one
         place = tuple(at.tolist())
         number = float(numbers[place])
         try:
@@ -145,7 +148,7 @@ def _codes(
 
 
 def _check_missing(variable: Variable, addresses: NDArray[np.int64]) -> None:
-    """Refuse a reading that is missing on some lines only, which would favour these lines."""
+    """Raise an error for a reading that is missing only on some lines, which would favour these lines."""
     missing = addresses == MISSING
     partly = missing.any(axis=-1) & ~missing.all(axis=-1)
     if partly.any():

@@ -87,7 +87,7 @@ class DeploymentFile(Section):
             return
         if self.machine.prior_mode is not PriorMode.WRITTEN:
             raise ValueError(
-                "[prior] is the source of a written prior, but the machine's prior is a table (prior_mode)"
+                "[prior] is for a written prior, but the prior of the machine is a table (prior_mode)"
             )
         if self.prior.source >= len(self.sources):
             raise ValueError(
@@ -102,16 +102,16 @@ class Deployment(DeploymentFile):
 
     @property
     def sensors(self) -> tuple[Variable, ...]:
-        """The variables that are columns of the machine, in the columns' order."""
+        """The variables of the machine's columns, in order."""
         return tuple(variable for variable in self.variables if variable.kind == "sensor")
 
     @property
     def prior_select(self) -> Variable | None:
-        """The variable that selects the prior, or None where the prior is one row."""
+        """The variable that selects the prior, or None if the prior has one row."""
         return next((variable for variable in self.variables if variable.kind == "prior_select"), None)
 
     def machine_addresses(self, addresses: Iterable[int | None]) -> tuple[tuple[int | None, ...], int]:
-        """Return the sensors' addresses in the columns' order, and the prior's row; None is a missing reading."""
+        """Return the addresses of the sensors by column, and the row of the prior; None if missing."""
         sensors: list[int | None] = []
         row = 0
         for variable, address in zip(self.variables, addresses, strict=True):
@@ -123,7 +123,7 @@ class Deployment(DeploymentFile):
 
     @property
     def result_dimensions(self) -> tuple[Dimension, ...]:
-        """The dimensions of a published result: the replicas where there are several, then the searched ones."""
+        """The dimensions of a published result: replicas if there are several, then the searched dimensions."""
         replicas = self.machine.replicas
         if replicas == 1:
             return tuple(self.searched)
@@ -138,7 +138,7 @@ class Deployment(DeploymentFile):
 
     @property
     def path(self) -> Path:
-        """The path of its `deployment.toml`."""
+        """The path of `deployment.toml`."""
         return self.directory / FILE_NAME
 
     def image_path(self, board: int) -> Path:

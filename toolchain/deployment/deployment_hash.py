@@ -1,7 +1,7 @@
-"""The hash that guards a deployment against edits.
+"""The hash that protects a deployment against edits.
 
-It covers everything that follows from the model, but not URIs and endpoints: a deployment stays valid when it is pointed
-at another robot, but not when a rule is edited that its tables were made from.
+It covers everything that follows from the model, but not URIs and endpoints: a deployment remains valid for
+another robot, but not after an edit that contradicts its tables.
 """
 
 import hashlib

@@ -8,7 +8,7 @@ from urllib.parse import urlsplit
 from pydantic import AfterValidator, FailFast, Field
 
 NAME_MAX: Final = 200
-"""Characters of a name."""
+"""Maximum number of characters in a name."""
 
 _TYPE = re.compile(r"[A-Za-z]\w*/(?:msg/)?[A-Za-z]\w*")
 _SHA256 = re.compile(r"[0-9a-f]{64}")
@@ -17,7 +17,7 @@ MESSAGE_PATH = re.compile(r"[A-Za-z_][A-Za-z0-9_]*(?:\.[A-Za-z_][A-Za-z0-9_]*|\[
 
 
 def websocket_uri(uri: str) -> str:
-    """Return a WebSocket's URI, or raise a ValueError."""
+    """Return a WebSocket URI, or raise a ValueError."""
     try:
         is_whole = bool(urlsplit(uri).hostname) and urlsplit(uri).port != 0
     except ValueError:  # a port beyond 65535, half an IPv6 address
@@ -32,7 +32,7 @@ def _topic(topic: str) -> str:
         raise ValueError(f"{topic!r} is not a topic name; expected one like '/boat/sensors'")
     if not topic.startswith("/"):
         raise ValueError(
-            f"{topic!r} has no slash at its beginning; write '/{topic}', which means the same on every server"
+            f"{topic!r} does not begin with a slash; write '/{topic}', which means the same on every server"
         )
     return topic
 
@@ -66,9 +66,9 @@ MessageType = Annotated[
 _A_PATH = "a path in a message; expected one like 'pose.position.x', 'ranges[3]' or a field's name"
 MessagePath = Annotated[str, _matching(MESSAGE_PATH, _A_PATH)]
 PathOrName = Annotated[str, _matching(re.compile(f"(?:{MESSAGE_PATH.pattern})?"), _A_PATH)]
-"""A path, or empty to search the message for the variable's name."""
+"""A path, or an empty text to search the message for the name of the variable."""
 Name = Annotated[str, Field(min_length=1, max_length=NAME_MAX), AfterValidator(_printable)]
-"""One printable line: names come from networks' files, too."""
+"""One printable line, because names also come from network files."""
 Sha256 = Annotated[str, _matching(_SHA256, "a SHA-256 hash; expected 64 hexadecimal digits")]
 Step = Annotated[float, AfterValidator(_not_zero)]
 
@@ -76,18 +76,18 @@ Item = TypeVar("Item")
 # TOML arrays and strings become tuples and enums; their contents stay strict.
 Sequence = Annotated[tuple[Item, ...], Field(strict=False), FailFast()]
 Choice = Annotated[Item, Field(strict=False)]
-# empty states are left out of the file and of its hash
+# empty states are omitted from the file and from its hash
 States = Annotated[tuple[Name, ...], Field(strict=False, exclude_if=lambda states: not states)]
 
 
 def states_fit(name: str, states: tuple[str, ...], size: int) -> None:
-    """Refuse, with a ValueError, a number of state names that is not the number of values."""
+    """Raise a ValueError if the number of state names differs from the number of values."""
     if states and len(states) != size:
         raise ValueError(f"{name} has {size} values, but {len(states)} states are named")
 
 
 def names_differ(kind: str, names: list[str]) -> None:
-    """Refuse, with a ValueError, a name that several entries of one kind share."""
+    """Raise a ValueError if several entries of one kind have the same name."""
     twice = [name for name, count in Counter(names).items() if count > 1]
     if twice:
         raise ValueError(f"[[{kind}]] has {twice[0]!r} twice; names must differ")

@@ -1,4 +1,4 @@
-"""Reading a deployment: `deployment.toml`, its hash and its images, each mistake named with file and line."""
+"""Reading of deployments: `deployment.toml`, its hash and its images; errors give file and line."""
 
 from pathlib import Path
 
@@ -12,26 +12,26 @@ def load_deployment(directory: Path, *, images: bool = True, edited: bool = Fals
     """Read and check a deployment.
 
     Args:
-        directory: The folder that `toolchain build` wrote.
-        images: True to read the boards' images and compare their hashes; a process that drives no boards
-            starts without NumPy if it leaves them out.
-        edited: True to accept a `deployment.toml` that was edited, so that its hash is not that of its content.
+        directory: The folder written by `toolchain build`.
+        images: True to read the images and compare their hashes; without them, a process starts without
+            NumPy.
+        edited: True to accept an edited `deployment.toml`, whose hash does not match its content.
 
     Raises:
         DeploymentError: The deployment is absent, not TOML, or has a wrong key or value (file, line, nearest right name).
         DeploymentVersionError: Another format.
-        DamagedDeploymentError: `deployment.toml` or an image is not the one that was built; names the file and
-            both hashes.
+        DamagedDeploymentError: `deployment.toml` or an image has changed since the build; the sentence
+            contains the file and both hashes.
     """
     directory = Path(directory)
     path = directory / FILE_NAME
     if directory.is_file():
         raise DeploymentError(
-            f"{directory} is a file; give the folder that 'toolchain build' wrote, here perhaps {directory.parent}"
+            f"{directory} is a file; give the folder written by 'toolchain build', here perhaps {directory.parent}"
         )
     if not path.is_file():
         raise DeploymentError(
-            f"{directory} holds no deployment: {path} does not exist; make one with 'toolchain build'"
+            f"{directory} does not contain a deployment: {path} does not exist; create one with 'toolchain build'"
         )
     toml = TomlFile.read(path, DeploymentError)
     version = toml.tables.get("format")
@@ -55,7 +55,7 @@ def load_deployment(directory: Path, *, images: bool = True, edited: bool = Fals
 
 
 def _check_images(deployment: Deployment) -> None:
-    # Here, not above: a subscriber loads a deployment without NumPy.
+    # Here, not above, because a subscriber loads a deployment without NumPy.
     from pcie_shim.errors import DamagedImageError, PcieShimError
     from pcie_shim.programming_file import read_image
 

@@ -1,9 +1,9 @@
-"""Comparison of deployments: whether one can take the place of another in a run.
+"""Comparison of deployments: whether one can replace another in a run.
 
-The shape of a run must stay: it is synthesised into the boards (lines, partitions, widths, generators, registers), or
-processes are connected to it (servers, topics, types). Tables, priors, seeds, stop conditions and the rules from
-readings to addresses may change. A field that is not named below as free must stay, so that a new field is safe by
-default.
+The shape of a run must not change: it is synthesised into the boards (lines, partitions, widths, generators,
+registers), or processes are connected according to it (servers, topics, types). Tables, priors, seeds, stop
+conditions and the conversion of readings to addresses may change. A field that is not listed below as free
+must not change, so that a new field is safe by default.
 """
 
 from __future__ import annotations
@@ -31,21 +31,21 @@ _TABLES: Final = {"sources", "variables", "searched", "machine", "boards", "outp
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """A field that differs and must stay."""
+    """A field that differs but must not change."""
 
     field: str
-    """Its place in `deployment.toml`."""
+    """Its path in `deployment.toml`."""
     before: str
-    """Its value in the deployment that is in force."""
+    """Its value in the deployment in force."""
     after: str
-    """Its value in the new one."""
+    """Its value in the new deployment."""
 
     def __str__(self) -> str:
         return f"{self.field} is {self.before} in the run and {self.after} in the new one"
 
 
 def differences(before: Deployment, after: Deployment) -> list[Difference]:
-    """Return the differences that keep `after` from taking the place of `before`, in the order of `deployment.toml`."""
+    """Return the differences that prevent `after` from replacing `before`, in the order of `deployment.toml`."""
     old, new = dict(_shape(before)), dict(_shape(after))
     fields = [*old, *(field for field in new if field not in old)]
     found = [
@@ -54,7 +54,7 @@ def differences(before: Deployment, after: Deployment) -> list[Difference]:
         if old.get(field) != new.get(field)
     ]
     counts = [difference for difference in found if difference.field.endswith(_COUNTS)]
-    # where a table has other rows, the contents of its rows are left out
+    # if a table has other rows, do not compare their contents
     tables = tuple(
         f"{difference.field.split(']]')[0]}]]" for difference in counts if "]]" in difference.field
     )
@@ -70,7 +70,7 @@ def _shape(deployment: Deployment) -> Iterator[tuple[str, str]]:
     yield "[[variable]] names", _text(sorted(variable.name for variable in deployment.variables))
     for variable in sorted(deployment.variables, key=lambda each: each.name):
         yield from _fields(f"[[variable]] {variable.name} ", variable, _VARIABLE_FREE | {"name", "bits"})
-    # a board has columns; the variable that each one reads may change
+    # columns are fixed; the variable that each one reads may change
     for column, variable in enumerate(deployment.sensors, start=1):
         yield f"[[variable]] bits of column {column}", _text(variable.bits)
     yield from _rows("[[searched]]", deployment.searched, _DIMENSION_FREE)

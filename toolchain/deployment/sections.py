@@ -1,4 +1,4 @@
-"""The sections of `deployment.toml`, each checked by itself (thesis 3.3, 3.4)."""
+"""The sections of `deployment.toml`, each checked separately (thesis 3.3, 3.4)."""
 
 import re
 from enum import StrEnum
@@ -35,7 +35,7 @@ _INTERFACE: Final = re.compile(r"([1-9]\d{0,4})x([1-9]\d{0,5})")
 
 
 class Stop(StrEnum):
-    """The time at which the boards of a partitioned machine stop."""
+    """The stop rule for the boards of a partitioned machine."""
 
     SLICES = "slices"
     """All at the end of the slice in which the first one overflows."""
@@ -44,39 +44,39 @@ class Stop(StrEnum):
 
 
 class Queue(StrEnum):
-    """The treatment of frames that arrive faster than they are computed."""
+    """The readings that wait if they arrive faster than frames are computed."""
 
     LATEST = "latest"
-    """The newest wins; frames that are passed over are counted."""
+    """Only the newest waits; passed-over readings are counted."""
     ALL = "all"
-    """All are computed, in order."""
+    """All wait, in order."""
 
 
 class Scale(StrEnum):
     """The part of a table that is divided by its maximum before quantising."""
 
     ADDRESS = "address"
-    """Every address of a column by itself: the fewest cycles."""
+    """Every address of a column separately, which needs the fewest cycles."""
     COLUMN = "column"
-    """A column's whole table."""
+    """The whole table of a column."""
     NONE = "none"
     """Nothing: the raw probabilities."""
 
 
 class Section(BaseModel):
-    """Base of all sections: strict (`"8"` is not an integer), frozen, and without unknown keys."""
+    """Base class of all sections: strict (`"8"` is not an integer), frozen, and without unknown keys."""
 
     model_config = ConfigDict(
         frozen=True, extra="forbid", strict=True, allow_inf_nan=False, validate_by_name=True
     )
 
     def replace(self, **changes: Any) -> Self:
-        """Return a copy with some fields replaced, checked like a new one: a ValidationError if it is wrong."""
+        """Return a copy with some fields replaced, or raise a ValidationError."""
         return type(self)(**dict(self) | changes)
 
 
 class Source(Section):
-    """`[[source]]`: a topic on a rosbridge server from which readings come."""
+    """`[[source]]`: a topic of readings on a rosbridge server."""
 
     uri: WebSocketUri
     topic: Topic
@@ -87,8 +87,9 @@ class Source(Section):
 class Variable(Section):
     """`[[variable]]`: a known variable, and how its readings become addresses.
 
-    Of kind `sensor` it is a column of the machine; of kind `prior_select` it selects the row of the prior's table
-    (thesis 2.1.2), whose top row, for a missing reading, is the prior without a selection.
+    A variable of kind `sensor` is a column of the machine. A variable of kind `prior_select` selects the row
+    of the prior's table (thesis 2.1.2), whose top row, for a missing reading, is the prior without a
+    selection.
     """
 
     name: Name
@@ -131,12 +132,12 @@ class Dimension(Section):
         return self
 
     def value(self, index: float) -> float:
-        """Return the variable's value at an index: a cell's centre where the index is whole."""
+        """Return the value of the variable at an index: the centre of a cell if the index is whole."""
         return self.offset + index * self.step
 
 
 class MachineSection(Section):
-    """`[machine]`: the BM1's parameters, the registers it is reached through, and when it stops."""
+    """`[machine]`: the parameters of the BM1, its interface, and its stop conditions."""
 
     type: Literal["BM1"] = "BM1"
     lines: int = Field(ge=1)
@@ -179,30 +180,30 @@ class MachineSection(Section):
 
     @property
     def is_plain(self) -> bool:
-        """True for one machine with one reading a column: readings are numbers, and a result is one posterior."""
+        """Whether there is one machine with one reading per column, and so one posterior per result."""
         return self.replicas == 1 and self.sensor_mode is SensorMode.COLUMN
 
     @property
     def results(self) -> int:
-        """The number of probabilities of a frame: one a line, for every replica."""
+        """The number of probabilities of a frame: one per line and replica."""
         return self.replicas * self.lines
 
     @property
     def interface_sensors(self) -> int:
-        """The number of inputs that the boards' registers have room for."""
+        """The number of inputs in the registers of a board."""
         return parse_interface(self.interface)[0]
 
     @property
     def interface_results(self) -> int:
-        """The number of results that the boards' registers have room for."""
+        """The number of results in the registers of a board."""
         return parse_interface(self.interface)[1]
 
 
 class WrittenPrior(Section):
-    """`[prior]`: the source of a written prior, one number for each line, of which only ratios count.
+    """`[prior]`: the source of a written prior, with one number per line; only their ratios matter.
 
-    Without this section a machine with `prior_mode = written` keeps the prior of its images until a host writes
-    another.
+    Without this section, a machine with `prior_mode = written` uses the prior of its images until a host
+    writes another.
     """
 
     source: int = Field(default=0, ge=0)
@@ -229,7 +230,7 @@ class Board(Section):
 
 
 class Output(Section):
-    """`[[output]]`: a topic on which posteriors go out; an empty URI is that of the first source."""
+    """`[[output]]`: a topic of posteriors; an empty URI means that of the first source."""
 
     topic: Topic = "/BMresults"
     type: Literal["std_msgs/Float64MultiArray"] = "std_msgs/Float64MultiArray"
@@ -242,7 +243,7 @@ class Output(Section):
 
 
 def parse_interface(text: str) -> tuple[int, int]:
-    """Return inputs and results of an interface such as `20x1200` (thesis 3.2), or raise a ValueError."""
+    """Return the inputs and results of an interface such as `20x1200` (thesis 3.2), or raise a ValueError."""
     match = _INTERFACE.fullmatch(text)
     if not match:
         raise ValueError(f"{text!r} is not an interface; expected inputs x results, such as '20x1200'")

@@ -1,4 +1,4 @@
-"""Writing `deployment.toml`: the same deployment gives the same bytes."""
+"""Writing of `deployment.toml`: the same deployment gives the same bytes."""
 
 from pathlib import Path
 from typing import Any, Final
@@ -17,7 +17,7 @@ _HEADER: Final = """\
 
 
 def write_deployment(directory: Path, deployment: Deployment) -> Deployment:
-    """Write `deployment.toml` with its hash, whole or not at all, and return what was written."""
+    """Write `deployment.toml` with its hash atomically, and return the written deployment."""
     written = with_hash(deployment.replace(directory=Path(directory)))
     with whole_file(written.path, DeploymentError) as partial:
         partial.write_text(deployment_text(written), encoding="utf-8")

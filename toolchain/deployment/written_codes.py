@@ -1,4 +1,4 @@
-"""The codes of numbers that a frame brings: likelihoods (`sensor_mode = threshold`) and written priors."""
+"""Codes from the numbers in a message: likelihoods (`sensor_mode = threshold`) and written priors."""
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -9,19 +9,19 @@ from toolchain.errors import ReadingError
 
 
 def written_codes(likelihoods: NDArray[np.float64], *, prob_bits: int, scale: Scale) -> NDArray[np.uint16]:
-    """Return the codes of likelihoods that a frame brings, one for each line (`sensor_mode = threshold`).
+    """Return the codes of the likelihoods of a frame, one per line (`sensor_mode = threshold`).
 
     Args:
         likelihoods: float64[..., lines] of one sensor: P(its reading | S = line).
         prob_bits: Bits of a code (W), 1 to 16.
-        scale: `column`: of each row only ratios count, it is divided by its maximum; `none`: they are encoded as they
-            are, up to 1.
+        scale: `column`: each row is divided by its maximum, because only ratios matter; `none`: values up to
+            1 are encoded unchanged.
 
     Returns:
         uint16 codes of the same shape.
 
     Raises:
-        ReadingError: A likelihood is not a probability, or a row is all 0.
+        ReadingError: A likelihood is not a probability, or a whole row is 0.
     """
     if not np.isfinite(likelihoods).all():
         raise ReadingError("a likelihood is not finite")
@@ -35,38 +35,38 @@ def written_codes(likelihoods: NDArray[np.float64], *, prob_bits: int, scale: Sc
             )
         return encode_probability(likelihoods, prob_bits)
     if not (largest > 0).all():
-        raise ReadingError("all lines have 0, so none is possible")
+        raise ReadingError("it is 0 on all lines, so none is possible")
     return encode_probability(likelihoods / largest, prob_bits)
 
 
 def written_prior(prior: ArrayLike, *, lines: int, prob_bits: int, replicas: int = 1) -> NDArray[np.uint16]:
-    """Return the codes of a written prior, uint16[lines]; only ratios of its numbers count.
+    """Return the codes of a written prior, uint16[lines]; only the ratios of its numbers matter.
 
     Args:
-        prior: One number for each line of the machine, such as a posterior of an earlier frame. With replicas, that many
-            numbers serve all of them, and `replicas` times as many are one prior for each, one after the other.
+        prior: One number per line of the machine, such as a posterior of an earlier frame. With replicas,
+            this prior is for all of them, and `replicas` times as many numbers are one prior for each.
         lines: Lines of the machine, over all boards.
         prob_bits: Bits of a code (W), 1 to 16.
         replicas: Machines on a board. With several, uint16[replicas, lines] is returned.
 
     Raises:
-        ReadingError: Another count of numbers, a number that is not a probability, or all of them 0.
+        ReadingError: The number of values is wrong, a value is not a probability, or all values are 0.
     """
     try:
         numbers = np.asarray(prior, dtype=np.float64)
     except (TypeError, ValueError):
-        raise ReadingError("the prior to write is not an array of numbers") from None
+        raise ReadingError("the written prior is not an array of numbers") from None
     if replicas > 1 and numbers.size == replicas * lines:
         numbers = numbers.reshape(replicas, lines)
     elif numbers.shape != (lines,):
         message = (
-            f"the prior to write has shape {numbers.shape}, expected one number for each of {lines} lines"
+            f"the written prior has shape {numbers.shape}, expected one number for each of {lines} lines"
         )
         raise ReadingError(message + (f", or for each of {replicas} replicas" if replicas > 1 else ""))
     largest = numbers.max(axis=-1, keepdims=True)
     if not np.all(np.isfinite(numbers)) or np.any(numbers < 0) or not np.all(largest > 0):
         raise ReadingError(
-            "the prior to write is not a distribution: it holds a negative, infinite or NaN number, or only zeros"
+            "the written prior is not a distribution: it contains a negative, infinite or NaN number, or only zeros"
         )
     codes = encode_probability(numbers / largest, prob_bits)
     return codes if replicas == 1 else np.broadcast_to(codes, (replicas, lines)).copy()

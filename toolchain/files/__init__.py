@@ -1,1 +1,1 @@
-"""Bounded reading of the files that users name."""
+"""Bounded reading and atomic writing of files."""

@@ -1,4 +1,4 @@
-"""Bounded reading of a file that a user names."""
+"""Bounded reading of a file given by a user."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ _PIECE: Final = 1 << 18
 
 
 def open_regular(path: Path, error: type[ToolchainError], most: int | None = None) -> BinaryIO:
-    """Open a regular file for reading: a FIFO or a device could block for ever, or never end.
+    """Open a regular file for reading, because a FIFO or a device could block forever or never end.
 
     Raises:
-        error: The file is absent, can't be read, is not a regular file, or has more than `most` bytes.
+        error: The file is missing, can't be read, is not a regular file, or has more than `most` bytes.
     """
     try:
-        number = os.open(path, os.O_RDONLY | os.O_NONBLOCK)  # without it, opening a FIFO waits for a writer
+        number = os.open(path, os.O_RDONLY | os.O_NONBLOCK)  # otherwise, opening a FIFO waits for a writer
     except OSError as reason:
         raise error(f"{path} can't be read: {reason.strerror or reason}") from None
     state = os.fstat(number)
@@ -28,8 +28,8 @@ def open_regular(path: Path, error: type[ToolchainError], most: int | None = Non
         return os.fdopen(number, "rb")
     os.close(number)
     if not stat.S_ISREG(state.st_mode):
-        raise error(f"{path} is not a regular file, and nothing else is read")
-    raise error(f"{path} has more than {most} bytes, the most that is read")
+        raise error(f"{path} is not a regular file")
+    raise error(f"{path} has more than {most} bytes, the maximum")
 
 
 def read_bounded(path: Path, most: int, error: type[ToolchainError]) -> bytes:
@@ -44,6 +44,6 @@ def read_bounded(path: Path, most: int, error: type[ToolchainError]) -> bytes:
                 size += len(piece)
     except OSError as reason:
         raise error(f"{path} can't be read: {reason.strerror or reason}") from None
-    if size > most:  # it has grown since, or is one of /proc, which say that they are empty
-        raise error(f"{path} has more than {most} bytes, the most that is read")
+    if size > most:  # it has grown, or is a file in /proc, which reports the size 0
+        raise error(f"{path} has more than {most} bytes, the maximum")
     return b"".join(pieces)

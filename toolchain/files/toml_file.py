@@ -1,4 +1,4 @@
-"""Reading of TOML files into pydantic models, each mistake with its file, line and nearest right name."""
+"""Reading of TOML files into pydantic models; errors give file, line and the nearest valid name."""
 
 from __future__ import annotations
 
@@ -22,11 +22,13 @@ if TYPE_CHECKING:
 Model = TypeVar("Model", bound=BaseModel)
 
 _MOST_BYTES: Final = 4 << 20
-"""Of a configuration file; a deployment has a few kilobytes."""
+"""Maximum size of a configuration file in bytes; a deployment has a few kilobytes."""
 _MOST_SIGNS: Final = 100_000
-"""Of `[`, `{` and `=`: tables and keys take a thousand times their bytes; a deployment of 4,096 boards has 30,000."""
+"""Maximum number of `[`, `{` and `=`, because tables and keys need a thousand times their size in memory; a
+deployment of 4,096 boards has 30,000.
+"""
 _MOST_PARTS: Final = 32
-"""Of a dotted key; what is read here has two at most."""
+"""Maximum number of parts of a dotted key; valid files have at most two."""
 _PART: Final = r"""(?:[\w-]++|"(?:[^"\\\n]|\\.)*+"|'[^'\n]*+')"""
 _DEEP_KEY: Final = re.compile(
     rf"(?:^|[{{,\[])[ \t]*+{_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{{_MOST_PARTS},}}+", re.MULTILINE
@@ -38,16 +40,16 @@ _SHOWN: Final = 60
 
 @dataclass(frozen=True, slots=True)
 class TomlFile:
-    """A TOML file that was read."""
+    """The content of a TOML file."""
 
     path: Path
-    """Where it is."""
+    """Its path."""
     error: type[ToolchainError]
-    """The type of the errors that it raises."""
+    """The type of its errors."""
     text: str
-    """Its content, which tells the lines of mistakes."""
+    """Its text, for the lines of mistakes."""
     tables: dict[str, Any]
-    """Its tables, not checked yet."""
+    """Its tables, not yet validated."""
 
     @classmethod
     def read(cls, path: Path, error: type[ToolchainError]) -> Self:
@@ -59,8 +61,10 @@ class TomlFile:
             line = data.count(b"\n", 0, reason.start) + 1
             raise error("not UTF-8 text", path=path, line=line) from None
         if sum(map(text.count, "[{=")) > _MOST_SIGNS:
-            raise error("more tables and keys than any configuration file has", path=path)
-        if deep := _DEEP_KEY.search(text):  # tomllib's memory grows with the square of a key's parts
+            raise error("too many tables and keys for a configuration file", path=path)
+        if deep := _DEEP_KEY.search(
+            text
+        ):  # the memory of tomllib grows with the square of the number of parts
             line = text.count("\n", 0, deep.start()) + 1
             raise error(f"a key has more than {_MOST_PARTS} parts", path=path, line=line)
         try:
@@ -71,12 +75,12 @@ class TomlFile:
             raise error(_PLACE.sub("", str(reason)), path=path, line=line) from None
 
     def validated(self, model: type[Model]) -> Model:
-        """Return the tables as a pydantic model, by its fields' aliases; errors name line and nearest right name."""
+        """Return the tables as a pydantic model, by field aliases; errors give line and nearest valid name."""
         try:
             return model.model_validate(self.tables, by_alias=True, by_name=False)
         except ValidationError as reason:
             details = reason.errors(include_url=False)
-            # an unknown key is usually the misspelling behind a missing one: report that first
+            # an unknown key is often the misspelling of a missing one, so report it first
             first = min(details, key=lambda detail: detail["type"] != "extra_forbidden")
             raise self._wrong_value(model, first) from None
 
@@ -85,7 +89,7 @@ class TomlFile:
         return self.error(sentence, path=self.path, line=self._line_of(place), place=place)
 
     def _line_of(self, place: Sequence[str | int]) -> int | None:
-        """Return the line (from 1) of the key at a place like `("variable", 2, "bits")`, or of what holds it."""
+        """Return the line (from 1) of the key at a place like `("variable", 2, "bits")`, or of its table."""
         table, index, key = _split(place)
         number = -1
         here = not table
@@ -124,7 +128,7 @@ class TomlFile:
             case "literal_error" | "enum":
                 expected = [word.strip("' ") for word in re.split(r",| or ", str(detail["ctx"]["expected"]))]
                 nearest = nearest_name(str(detail["input"]), expected)
-                sentence = f"{key} = {value}{section} is not a value it can have; {nearest}"
+                sentence = f"{key} = {value}{section} is not a valid value; {nearest}"
             case "value_error":
                 subject = f"in [{key}]" if whole_table else f"{key}{section}".lstrip()
                 sentence = ": ".join(part for part in (subject, str(detail["ctx"]["error"])) if part)
@@ -134,7 +138,7 @@ class TomlFile:
 
 
 def _split(place: Sequence[str | int]) -> tuple[str, int | None, str]:
-    """Take a place apart into its table, the number in an array of tables, and the key."""
+    """Split a place into its table, the index in an array of tables, and the key."""
     match list(place):
         case [str(table), int(index), *rest]:
             return table, index, str(rest[0]) if rest else ""
@@ -147,7 +151,7 @@ def _split(place: Sequence[str | int]) -> tuple[str, int | None, str]:
 
 
 def nearest_name(word: str, known: Sequence[str]) -> str:
-    """Return the advice after a wrong name: the nearest right one, or all that there are."""
+    """Return the advice for a wrong name: the nearest valid one, or all valid ones."""
     close = difflib.get_close_matches(word, known, n=1, cutoff=0.5)
     return f"did you mean '{close[0]}'?" if close else f"expected one of {', '.join(known) or 'none'}"
 
@@ -157,7 +161,7 @@ def _keys(model: type[BaseModel]) -> list[str]:
 
 
 def _model_at(model: type[BaseModel], place: Sequence[str | int]) -> type[BaseModel]:
-    """Follow a place through the models' fields to the model whose keys stand there."""
+    """Follow a place through the fields of models to the model at that place."""
     for step in place:
         if isinstance(step, int):
             continue

@@ -1,4 +1,4 @@
-"""Writing of files whole or not at all, so that no reader finds half of one."""
+"""Atomic writing of files, so that readers never see a partial file."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ if TYPE_CHECKING:
 
 @contextmanager
 def whole_file(path: Path, error: type[ToolchainError]) -> Iterator[Path]:
-    """Yield the path of a partial file, which takes the place of the file at the end of the block.
+    """Yield the path of a partial file, which replaces the file at the end of the block.
 
-    A partial file that was removed in the block leaves the file as it is.
+    If the partial file is removed in the block, the file does not change.
     """
     partial = path.with_name(path.name + ".part")
     try:

@@ -1,12 +1,13 @@
-"""Learns a model's tables from recordings with ground truth: normals with an outliers' share, or counts.
+"""Learning of tables from recordings with ground truth: normals with a share of outliers, or counts.
 
-**Normals.** A reading is `mean(S) + bias + noise` with noise N(0, sigma^2), or, for a share of the readings, anything
-uniformly in the variable's range. Bias, sigma and share come from expectation maximisation on the residuals at the true
-place; inside a cell the mean is taken as linear. Sigma and bias may be shared by a pool of variables; the share is
-each variable's own, with one outlier and one good reading in advance (the mode of a Beta(2, 2) prior).
+**Normals.** A reading is `mean(S) + bias + noise` with noise N(0, sigma^2), or, for a share of the readings,
+uniform over the range of the variable. Bias, sigma and share are estimated by expectation maximisation from
+the residuals at the true position; within a cell, the mean is assumed linear. A pool of variables may share
+sigma and bias. Every variable has its own share of outliers, initialised with one outlier and one good
+reading (the mode of a Beta(2, 2) prior).
 
-**Counts.** P(k | s) = (n(k, s) + a q(k | s)) / (n(s) + a): a Dirichlet prior worth `a` readings in every cell, which
-looks like q, the model's own table or a uniform one.
+**Counts.** P(k | s) = (n(k, s) + a q(k | s)) / (n(s) + a): a Dirichlet prior with the weight of `a` readings
+in every cell and the shape q, the table of the model or a uniform one.
 """
 
 import math
@@ -26,53 +27,53 @@ from toolchain.learning.fitted import Fit, FitFile, FittedRecording, FittedVaria
 from toolchain.models.model import Known, Model
 
 LEAST_READINGS: Final = 10
-"""A pool with fewer readings keeps what was set by hand."""
+"""Minimum number of readings of a pool, below which it keeps the values set by hand."""
 
 _ROUNDS: Final = 1000
 _SETTLED: Final = 1e-10
 _LEAST_SIGMA: Final = 0.05
-"""In steps: rounded recordings, or those simulated without noise, have no spread at all."""
+"""Minimum sigma in steps, because rounded recordings, and those simulated without noise, have no variance."""
 _TO_SIGMA: Final = 1.4826
-"""From a normal's median absolute deviation to its sigma."""
+"""Factor from the median absolute deviation of a normal to its sigma."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Truth:
-    """The true place in each row that a model can learn from."""
+    """The true position in each usable row."""
 
     rows: NDArray[np.int64]
-    """int64[n], the recording's rows that have a true value of every searched dimension, inside the grid."""
+    """int64[n], the rows with a true value of every searched dimension inside the grid."""
     lines: NDArray[np.int64]
     """int64[n], the line of each."""
     within: NDArray[np.float64]
-    """float64[dimensions, n], how far from the cell's centre, in cells: -0.5 to 0.5."""
+    """float64[dimensions, n], the offset from the centre of the cell, in cells: -0.5 to 0.5."""
     outside: int
     """The number of other rows."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Support:
-    """The amount of data that a table rests on."""
+    """The amount of data behind a table."""
 
     name: str
     """The variable."""
     readings: int
-    """Its readings, in rows with a truth."""
+    """Number of its readings in rows with a truth."""
     cells: int
-    """Lines of the machine that have at least one of them."""
+    """Number of lines with at least one of them."""
     median: float
     """The median number of readings in such a line."""
     refused: int
-    """Readings that are not values of the variable."""
+    """Number of readings that are not values of the variable."""
 
 
 def locate(model: Model, columns: Mapping[str, Sequence[object]], rows: int) -> Truth:
-    """Return the true place in each of `rows` rows; `columns` are the searched dimensions' true values by label."""
+    """Return the true position in each of `rows` rows; `columns` are the true values by label."""
     places = np.array(
         [[_position(dimension, value) for value in columns[dimension.label]] for dimension in model.searched]
     ).reshape(len(model.searched), rows)
     sizes = np.array([dimension.size for dimension in model.searched])[:, np.newaxis]
-    with np.errstate(invalid="ignore"):  # NaN is not a place
+    with np.errstate(invalid="ignore"):  # NaN is not a position
         cells = np.floor(places + 0.5)
         inside = np.all((cells >= 0) & (cells < sizes), axis=0)
     cells = cells[:, inside].astype(np.int64)
@@ -92,7 +93,7 @@ def fit_model(
     recordings: Sequence[FittedRecording],
     options: FitOptions,
 ) -> tuple[Fit, tuple[Support, ...]]:
-    """Learn from rows with a truth; return the fit, and the amount of data that each table rests on."""
+    """Learn from rows with a truth; return the fit, and the amount of data behind each table."""
     if not len(truth.rows):
         raise ModelError(
             "no row has a true value inside the searched dimensions: is --truth right, and in the model's unit?"
@@ -120,7 +121,7 @@ def fit_model(
 
 
 def _position(dimension: Dimension, value: object) -> float:
-    """Return a true value as a place along a dimension, in cells; NaN where it is not a value."""
+    """Return a true value as a position along a dimension in cells; NaN if it is not a value."""
     if isinstance(value, str) and value in dimension.states:
         return float(dimension.states.index(value))
     if isinstance(value, str) or not isinstance(value, int | float):
@@ -166,10 +167,10 @@ def mixture(
     bias: bool,
     least_sigma: float,
 ) -> tuple[float, float, list[float]]:
-    """Fit one normal and, for each variable, the share of its readings that are uniform instead.
+    """Fit one normal and, for each variable, the share of uniform outliers.
 
-    `residuals` are readings minus expectations, and an outlier lies anywhere in its variable's width. Without `bias` the mean
-    is 0.
+    `residuals` are readings minus expectations; outliers are uniform in the width of their variable. Without
+    `bias`, the mean is 0.
 
     Returns:
         The mean, the standard deviation and the shares.
@@ -203,9 +204,9 @@ def mixture(
 def _residuals(
     model: Model, known: Known, truth: Truth, values: Sequence[object]
 ) -> tuple[NDArray[np.float64], Support]:
-    """Return reading minus expectation at the true place, for every row that has a reading."""
+    """Return reading minus expectation at the true position, for every row with a reading."""
     slopes = mean_slopes(model, known)
-    if known.normal is None:  # mean_slopes has refused it
+    if known.normal is None:  # mean_slopes has checked it
         raise AssertionError
     expected = known.normal.mean[truth.lines] + (slopes[:, truth.lines] * truth.within).sum(axis=0)
     numbers = np.array([_number(values[row]) for row in truth.rows])
@@ -257,7 +258,7 @@ def _support(name: str, lines: NDArray[np.int64], refused: int) -> Support:
 
 
 def _pools(names: Sequence[str], patterns: Sequence[str]) -> list[list[str]]:
-    """Return the variables that share a normal: those of each pattern, and every other one by itself."""
+    """Return the groups of variables that share a normal: those of each pattern, and every other one alone."""
     left = list(names)
     pools = []
     for pattern in patterns:

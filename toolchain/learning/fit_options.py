@@ -8,23 +8,23 @@ class FitMethod(StrEnum):
     """A method of learning."""
 
     NORMALS = "normals"
-    """Sigma, outliers' share and bias of variables that are normal around a known mean."""
+    """Sigma, share of outliers and bias of variables that are normal around a known mean."""
     COUNTS = "counts"
     """Whole tables, by counting."""
 
 
 class FitPrior(StrEnum):
-    """The form of a counted table before any reading."""
+    """The shape of a counted table before any reading."""
 
     MODEL = "model"
-    """The model's own table."""
+    """The table of the model."""
     UNIFORM = "uniform"
-    """Every value as probable as any other."""
+    """All values equally probable."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FitOptions:
-    """The options of a fit, beside the model and the recordings."""
+    """The options of a fit, except the model and the recordings."""
 
     truth: tuple[str, ...]
     """`LABEL=COLUMN` of each searched dimension."""
@@ -33,14 +33,14 @@ class FitOptions:
     method: FitMethod = FitMethod.NORMALS
     """The method of learning."""
     pool: tuple[str, ...] = ()
-    """Patterns of variables that share sigma and bias; each keeps its own outliers' share."""
+    """Patterns of variables that share sigma and bias; each has its own share of outliers."""
     bias: bool = False
     """True to fit a constant error."""
     floor: float = 0.005
-    """The least probability of an outlier, relative to the peak."""
+    """The minimum probability of an outlier, relative to the peak."""
     pseudo_count: float = 1.0
-    """Readings that the Dirichlet prior of a cell is worth."""
+    """Weight of the Dirichlet prior of a cell, in readings."""
     prior: FitPrior = FitPrior.MODEL
-    """The form of that prior."""
+    """Shape of that prior."""
     tolerance_s: float = 0.1
-    """Seconds between a reading in a bag and the truth that belongs to it."""
+    """Maximum time in seconds between a reading in a bag and its truth."""

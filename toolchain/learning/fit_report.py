@@ -1,4 +1,4 @@
-"""A fit from recordings to file, and the report on what each table rests on."""
+"""The path of a fit from recordings to file, and the report on the data behind each table."""
 
 import hashlib
 import math
@@ -32,12 +32,12 @@ def run_fit(
     options: FitOptions,
     checks: Sequence[Path] = (),
 ) -> str:
-    """Learn a model's tables, write them, and return a report; nothing is learnt from `checks`."""
+    """Learn the tables of a model, write them, and return a report; `checks` are not used for learning."""
     _check(options, output)
     for path in checks:
         if any(path.resolve() == other.resolve() for other in recordings):
             raise BuildError(
-                f"{path} is learnt from, so it can't show how good the fit is: leave it out on one side"
+                f"{path} is used for learning, so it can't show how good the fit is: omit it on one side"
             )
     model = load_model(case, key_values(settings))
     truth_columns = _truth_columns(model, options.truth)
@@ -85,7 +85,7 @@ def _check(options: FitOptions, output: Path) -> None:
         raise BuildError(f"-o {output}: the method {options.method} writes a file that ends in {suffix}")
     if not (0 < options.pseudo_count < math.inf):
         raise BuildError(
-            f"--pseudo-count is {options.pseudo_count:g}, expected a number above 0: an empty cell needs a prior"
+            f"--pseudo-count is {options.pseudo_count:g}, expected a number above 0, because an empty cell needs a prior"
         )
     if not 0 <= options.floor < 1:
         raise BuildError(f"--floor is {options.floor:g}, expected a share of the peak from 0")
@@ -102,7 +102,7 @@ def _truth_columns(model: Model, given: Sequence[str]) -> dict[str, str]:
     for label in labels:
         if label not in columns:
             raise BuildError(
-                f"the model searches {label}: say where its true value is with --truth {label}=COLUMN"
+                f"the model searches {label}: give the column of its true value with --truth {label}=COLUMN"
             )
     return columns
 
@@ -122,7 +122,7 @@ def _comparison(
     truth_columns: Mapping[str, str],
     reading_columns: Mapping[str, str],
 ) -> str:
-    """Return the distances of the exact posterior's mean from the truth, before and after the fit."""
+    """Return the distances between the mean of the exact posterior and the truth, before and after the fit."""
     truth = locate(model, _joined([recording], truth_columns), recording.rows)
     readings = _joined([recording], reading_columns)
     if not len(truth.rows):

@@ -1,4 +1,4 @@
-"""Fits as files, `.toml` of normals or `.npz` of counted tables, and models that use them."""
+"""Files of fits, `.toml` for normals or `.npz` for counted tables, and their use in models."""
 
 import json
 import math
@@ -33,7 +33,7 @@ _EPOCH: Final = (1980, 1, 1, 0, 0, 0)
 
 
 class FittedRecording(Section):
-    """A `[[recording]]` that was learnt from."""
+    """A `[[recording]]` used for learning."""
 
     file: str
     sha256: str
@@ -51,7 +51,7 @@ class FittedVariable(Section):
 
 
 class FitFile(Section):
-    """The content of a fit's file, but for counted tables."""
+    """The content of a fit file, except counted tables."""
 
     format: Literal[1] = FORMAT
     method: Literal["normals", "counts"]
@@ -70,21 +70,22 @@ class Fit:
     """Learnt parameters or tables."""
 
     file: FitFile
-    """Method, recordings and the variables' numbers."""
+    """Method, recordings and the numbers of variables."""
     tables: Mapping[str, NDArray[np.float64]]
     """With the method `counts`, P(K | S) of each variable, float64[values, lines]."""
 
 
 def with_fit(model: Model, path: Path | None) -> Model:
-    """Return a model with what was learnt in the place of what was set by hand; the model itself without a path.
+    """Return a model with learnt tables instead of those set by hand, or the unchanged model without a path.
 
-    The fit was made for the model, or for one of another grid whose tables are normals; a ModelError if not.
+    The fit must be for this model, or contain normals for a model with another grid; otherwise a ModelError
+    is raised.
     """
     return model if path is None else apply_fit(model, read_fit(path), str(path))
 
 
 def apply_fit(model: Model, fit: Fit, where: str = "the fit") -> Model:
-    """Return a model with what was learnt; variables that the fit doesn't have stay as they are."""
+    """Return a model with learnt tables; variables that are not in the fit do not change."""
     known = {each.name: each for each in model.known}
     for variable in fit.file.variables:
         if variable.name not in known:
@@ -106,9 +107,9 @@ def apply_fit(model: Model, fit: Fit, where: str = "the fit") -> Model:
 
 
 def cell_spread(model: Model, known: Known) -> NDArray[np.float64]:
-    """Return how much a variable's mean varies inside each line's cell, as a standard deviation: float64[lines].
+    """Return the standard deviation of a variable's mean within the cell of each line: float64[lines].
 
-    A cell is a box in which the searched values are uniform; the mean is taken as linear in it.
+    The searched values are uniform in a cell, and the mean is assumed linear in it.
     """
     slopes = mean_slopes(model, known)
     spread: NDArray[np.float64] = np.sqrt((slopes**2).sum(axis=0) / 12)
@@ -116,10 +117,10 @@ def cell_spread(model: Model, known: Known) -> NDArray[np.float64]:
 
 
 def mean_slopes(model: Model, known: Known) -> NDArray[np.float64]:
-    """Return how a variable's mean changes from cell to cell: float64[dimensions, lines], per cell."""
+    """Return the slopes of a variable's mean: float64[dimensions, lines], per cell."""
     if known.normal is None:
         raise ModelError(
-            f"{known.name} has no mean in the model to be normal around; fit it with --method counts"
+            f"{known.name} is not normal around a mean in the model; fit it with --method counts"
         )
     sizes = tuple(dimension.size for dimension in model.searched)
     mean = known.normal.mean.reshape(sizes)
@@ -139,7 +140,7 @@ def mean_slopes(model: Model, known: Known) -> NDArray[np.float64]:
 
 
 def wrapped(away: NDArray[np.float64], turn: float) -> NDArray[np.float64]:
-    """Return differences on a circle: the shorter way round."""
+    """Return the shorter differences on a circle."""
     shorter: NDArray[np.float64] = (away + turn / 2) % turn - turn / 2
     return shorter
 
@@ -162,7 +163,7 @@ def _with_normal(model: Model, known: Known, fitted: FittedVariable, floor: floa
 
 
 def write_fit(path: Path, fit: Fit) -> None:
-    """Write a fit: TOML of normals, NPZ of counts. The same fit gives the same bytes."""
+    """Write a fit: TOML for normals, NPZ for counts. The same fit gives the same bytes."""
     suffix = ".toml" if fit.file.method == "normals" else ".npz"
     if path.suffix != suffix:
         raise ModelError(f"{path}: the method {fit.file.method} writes a file that ends in {suffix}")
@@ -176,7 +177,7 @@ def write_fit(path: Path, fit: Fit) -> None:
 
 
 def read_fit(path: Path) -> Fit:
-    """Return what `toolchain fit` wrote, or raise a ModelError."""
+    """Return a fit written by `toolchain fit`, or raise a ModelError."""
     if path.suffix == ".npz":
         return _read_tables(path)
     file = TomlFile.read(path, ModelError).validated(FitFile)
@@ -186,7 +187,7 @@ def read_fit(path: Path) -> Fit:
 
 
 def _write_tables(path: Path, content: dict[str, Any], tables: Mapping[str, NDArray[np.float64]]) -> None:
-    """Write an NPZ file; np.savez would put the time of day into it."""
+    """Write an NPZ file without the time of day, which np.savez would include."""
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         entry = zipfile.ZipInfo(_META, _EPOCH)
         archive.writestr(entry, json.dumps(content, indent=1, sort_keys=True), zipfile.ZIP_DEFLATED)
@@ -202,7 +203,7 @@ def _read_tables(path: Path) -> Fit:
     try:
         with open_regular(path, ModelError, MAX_BYTES) as packed, zipfile.ZipFile(packed) as archive:
             if sum(entry.file_size for entry in archive.infolist()) > MAX_BYTES:
-                raise ModelError(f"{path} is larger than {MAX_BYTES} bytes, unpacked; the most that is read")
+                raise ModelError(f"{path} is larger than {MAX_BYTES} bytes, unpacked; this is the maximum")
             content = json.loads(_member(archive, _META, _MAX_META_BYTES))
             file = FitFile.model_validate(content, by_alias=False, by_name=True)
             counted = file.variables if file.method == "counts" else ()
@@ -227,7 +228,7 @@ def _read_tables(path: Path) -> Fit:
             f"{path} was not written by `toolchain fit`, or is damaged: {type(reason).__name__}"
         ) from None
     if file.method != "counts":
-        raise ModelError(f"{path} holds {file.method}, which `toolchain fit` writes as .toml")
+        raise ModelError(f"{path} contains {file.method}, which `toolchain fit` writes as .toml")
     return Fit(file=file, tables=tables)
 
 
@@ -240,7 +241,7 @@ def _member(archive: zipfile.ZipFile, name: str, most: int) -> bytes:
 
 
 def _array(archive: zipfile.ZipFile, name: str) -> NDArray[np.float64]:
-    """Read an array; its header can't make us take more memory than the file has numbers."""
+    """Read an array without allocating more memory than the file has numbers."""
     with archive.open(name) as file:
         if np.lib.format.read_magic(file) != (1, 0):
             raise ValueError(name)

@@ -1,7 +1,8 @@
 """Recorded readings with ground truth, as columns: from CSV files, MCAP files and bags.
 
-A CSV's columns are those of its heading. A bag's are TOPIC:PATH, such as `/scan:ranges[3]`; its rows are the
-messages of the first column's topic, each with the nearest message in time of every other topic.
+The columns of a CSV file are those of its header. Columns of a bag are TOPIC:PATH, such as `/scan:ranges[3]`;
+its rows are the messages on the topic of the first column, each with the nearest message in time on every
+other topic.
 """
 
 import csv
@@ -33,7 +34,7 @@ class Recording:
     rows: int
     """The number of rows."""
     columns: dict[str, list[object]]
-    """By name, one value a row: a number, a word, or None for nothing."""
+    """Values by name, one per row: a number, a text, or None if missing."""
 
 
 def read_recording(path: Path, columns: Sequence[str], *, tolerance_s: float = 0.1) -> Recording:
@@ -41,11 +42,12 @@ def read_recording(path: Path, columns: Sequence[str], *, tolerance_s: float = 0
 
     Args:
         path: A CSV file (`.csv`), or an MCAP file, a ROS 1 bag or a ROS 2 bag's folder.
-        columns: The columns; the first one's topic gives a bag's rows.
-        tolerance_s: In a bag, the most seconds between a row and another topic's message.
+        columns: The columns; in a bag, the topic of the first one defines the rows.
+        tolerance_s: Maximum time in seconds between a row and messages of other topics in a bag.
 
     Raises:
-        ModelError: The recording is absent, damaged, without a column (lists its columns), or longer than `MAX_ROWS`.
+        ModelError: The recording is missing, damaged, lacks a column (the sentence lists its columns), or has
+            more than `MAX_ROWS` rows.
     """
     if not path.exists():
         raise ModelError(f"the recording {path} does not exist")
@@ -87,7 +89,7 @@ def _read_csv(path: Path, columns: Sequence[str]) -> Recording:
 
 
 def _lines(path: Path, file: TextIO) -> Iterator[str]:
-    """Yield the lines of a file, each of bounded length."""
+    """Yield the lines of a file, with bounded length."""
     while line := file.readline(_LONGEST_LINE + 1):
         if len(line) > _LONGEST_LINE:
             raise ModelError(f"{path} is not a CSV file: a line has more than {_LONGEST_LINE} characters")
@@ -96,7 +98,7 @@ def _lines(path: Path, file: TextIO) -> Iterator[str]:
 
 def _check_rows(path: Path, rows: int) -> None:
     if rows > MAX_ROWS:
-        raise ModelError(f"{path} has more than {MAX_ROWS} rows or messages, the most that is read")
+        raise ModelError(f"{path} has more than {MAX_ROWS} rows or messages, the maximum")
 
 
 def _check_topics(path: Path, topics: Sequence[str], there: set[str]) -> None:
@@ -109,9 +111,7 @@ def _place(path: Path, heading: Sequence[str], column: str) -> int:
     if heading.count(column) == 1:
         return heading.index(column)
     if column in heading:
-        message = (
-            f"{path} has the column {column!r} {heading.count(column)} times; give each a name of its own"
-        )
+        message = f"{path} has the column {column!r} {heading.count(column)} times; give each its own name"
     elif not heading:
         message = f"{path} is empty; expected a heading with the columns' names"
     elif len(heading) == 1 and (sign := next((each for each in ";\t|" if each in heading[0]), None)):
@@ -135,7 +135,7 @@ def _cell(text: str) -> object:
 
 
 def _read_bag(path: Path, columns: Sequence[str], tolerance_ns: int) -> Recording:
-    """Read what rosbags reads; the first column's topic gives the rows."""
+    """Read a bag with rosbags; the topic of the first column defines the rows."""
     topics: dict[str, list[str]] = {}
     for column in columns:
         topic, colon, _ = column.partition(":")
@@ -176,7 +176,7 @@ def _messages(path: Path, topics: tuple[str, ...]) -> Iterator[tuple[str, int, A
                 yield connection.topic, stamp, reader.deserialize(raw, connection.msgtype)
     except ModelError:
         raise
-    except Exception as reason:  # rosbags reads many formats, and each fails in its own way
+    except Exception as reason:  # rosbags supports many formats, and each fails in its own way
         text = " ".join(str(reason).split())[:200]
         raise ModelError(
             f"{path} can't be read as a bag, after {count} messages: {text or type(reason).__name__}"
@@ -184,7 +184,7 @@ def _messages(path: Path, topics: tuple[str, ...]) -> Iterator[tuple[str, int, A
 
 
 def _field(message: Any, path: str) -> object:
-    """Return a message's field; None for NaN, an absent value and an index beyond an array."""
+    """Return a field of a message; None for NaN, a missing value, or an index beyond an array."""
     value = message
     for step in path.split("."):
         match = _STEP.fullmatch(step)

@@ -1,7 +1,7 @@
 """Models: searched and known variables, and the exact posterior (thesis 2.1.2, 3.4).
 
-The names that a `model.py` needs can be imported from here; each is loaded on first use, so that a command's `--help`
-needs no NumPy.
+The names for a `model.py` can be imported from here; each is loaded on first use, so that `--help` does not
+need NumPy.
 """
 
 from importlib import import_module
@@ -50,7 +50,7 @@ _HOME_OF: Final = {name: module for module, names in _HOMES.items() for name in 
 
 
 def __getattr__(name: str) -> object:
-    """Return a name of one of the modules here (PEP 562)."""
+    """Return a name from one of the modules of this package (PEP 562)."""
     if name not in _HOME_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module(f"{__name__}.{_HOME_OF[name]}"), name)

@@ -1,4 +1,4 @@
-"""Loads a case study's `model.py` and calls its `model()` with the user's `--set key=value`s."""
+"""Loading of a case study's `model.py`, and the call of its `model()` with the values of `--set`."""
 
 import importlib.util
 import inspect
@@ -24,14 +24,14 @@ def load_model(case: Path, settings: Mapping[str, str]) -> Model:
     """Return the model of a case study's folder.
 
     Args:
-        case: A folder with a `model.py`, or that file itself. It defines `model(...)`, which returns a `toolchain.models.Model` or a
-            `toolchain.models.Question`. Modules beside it can be imported by it.
-        settings: Values for `model()`'s parameters as a user writes them; each is read as the type that the
-            parameter is annotated with (int, float, bool, str, Path, an Enum, a Literal).
+        case: A folder with a `model.py`, or that file itself. It defines `model(...)`, which returns a
+            `toolchain.models.Model` or a `toolchain.models.Question`. It can import modules in its folder.
+        settings: Values for the parameters of `model()` as text; each is converted to the annotated type of
+            its parameter (int, float, bool, str, Path, an Enum, a Literal).
 
     Raises:
-        ModelError: No such folder or file, a parameter that `model()` doesn't have or a value that it can't
-            take, a parameter without a value, an error inside `model.py`, or something else than a Model.
+        ModelError: The folder or file does not exist, a parameter or value is unknown or missing, `model.py`
+            contains an error, or the result is not a Model.
     """
     path = model_path(case)
     if not path.is_file():
@@ -55,14 +55,14 @@ def load_model(case: Path, settings: Mapping[str, str]) -> Model:
 
 
 def model_path(case: Path) -> Path:
-    """Return where a case study's model is: in its folder, or at the very file that was named."""
+    """Return the path of a case study's model: in its folder, or the given file."""
     case = Path(case)
     return case if case.name == FILE_NAME and case.is_file() else case / FILE_NAME
 
 
 @contextmanager
 def _importing_from(folder: Path) -> Iterator[None]:
-    """Let `model.py` import the modules beside it; they come last on the path and so replace nothing."""
+    """Let `model.py` import modules in its folder, which is last on the path so that they hide nothing."""
     sys.path.append(str(folder))
     try:
         yield
@@ -76,7 +76,7 @@ def _model_function(path: Path) -> Callable[..., object]:
         raise ModelError(f"{path} can't be loaded as a Python module")
     module: ModuleType = importlib.util.module_from_spec(spec)
     loader = spec.loader
-    sys.modules[spec.name] = module  # dataclasses and get_type_hints look their module up
+    sys.modules[spec.name] = module  # dataclasses and get_type_hints look up their module
     try:
         _guarded(path, "it", lambda: loader.exec_module(module))
     finally:
@@ -86,13 +86,13 @@ def _model_function(path: Path) -> Callable[..., object]:
         raise ModelError(
             f"{path} does not define model(); expected a function that returns a toolchain.models.Model"
         )
-    return function  # type: ignore[no-any-return]  # what a user's module holds has no type
+    return function  # type: ignore[no-any-return]  # the content of a user's module has no type
 
 
 def _guarded(path: Path, what: str, call: Callable[[], object]) -> object:
-    """Call into the user's file; an exception becomes one sentence with the line that it came from.
+    """Call the user's file; an exception becomes one sentence with its line.
 
-    An error that the file itself raises keeps its words; an error of the toolchain gets the file's line, too.
+    An error raised by the file keeps its text; an error of the toolchain also gets the line of the file.
     """
     try:
         return call()
@@ -115,8 +115,8 @@ def _guarded(path: Path, what: str, call: Callable[[], object]) -> object:
 
 
 def _line(path: Path, frames: traceback.StackSummary) -> int | None:
-    """Return the line of the user's file in which something was raised, or None."""
-    file = path.resolve()  # Python calls it by an absolute path, which may still have a link or `..` in it
+    """Return the line of the user's file in which an exception was raised, or None."""
+    file = path.resolve()  # Python uses an absolute path, which may still contain a link or `..`
     lines = [frame.lineno for frame in frames if Path(frame.filename).resolve() == file]
     return lines[-1] if lines else None
 
@@ -145,12 +145,12 @@ def _arguments(path: Path, function: Callable[..., object], settings: Mapping[st
 
 def _unknown(key: str, known: list[str]) -> str:
     if not known:
-        return f"the model has no parameters, so --set {key} means nothing"
+        return f"the model has no parameters, so --set {key} has no meaning"
     return f"the model has no parameter '{key}'; {nearest_name(key, known)}"
 
 
 def _value(key: str, text: str, wanted: Any) -> object:
-    """Read one value as the type its parameter is annotated with."""
+    """Convert a value to the annotated type of its parameter."""
     if get_origin(wanted) in {Union, UnionType}:
         kinds = [kind for kind in get_args(wanted) if kind is not type(None)]
         wanted = kinds[0] if len(kinds) == 1 else str

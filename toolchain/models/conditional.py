@@ -1,7 +1,7 @@
-"""Conditional distributions P(K | S) by formula: normals over the bins of a reading, wrapped for bearings.
+"""Conditional distributions P(K | S): normals over the bins of a reading, wrapped for bearings.
 
-A reading's address is the bin of half a step around it. Its probability is the Gaussian's integral over the bin, not
-the density at its middle, so that coarse bins stay exact.
+The address of a reading is the bin of half a step around it. Its probability is the integral of the Gaussian
+over the bin, not the density at the centre, so coarse bins are exact too.
 """
 
 import math
@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from toolchain.errors import ModelError
 from toolchain.models.model import Known, Normal, check_table
 
-# Copies of a wrapped normal whose nearest point is further than this many sigma add less than 1e-32.
+# Copies of a wrapped normal that are further away than this many sigma add less than 1e-32.
 _FARTHEST_COPY: Final = 12.0
 # A wrapped normal whose sigma is two turns is uniform to 1e-34, and so is any wider one.
 _UNIFORM: Final = 2.0
@@ -34,21 +34,21 @@ def normal(
     on_missing: Literal["error", "missing"] = "error",
     path: str = "",
 ) -> Known:
-    """Return a known variable that is normal given S; the end bins hold the tails, as clamped readings do.
+    """Return a known variable that is normal given S; the end bins include the tails (clamped readings).
 
     Args:
         name: The variable's name.
-        mean: float64[lines], its mean on every line, in the reading's unit.
-        sigma: Its standard deviation, float64[lines] or one for all, in the reading's unit.
+        mean: float64[lines], the mean on every line, in the unit of the reading.
+        sigma: The standard deviation, float64[lines] or one for all, in the unit of the reading.
         values: The number of bins (addresses).
-        offset: The middle of the first bin.
+        offset: The centre of the first bin.
         step: The width of a bin.
-        bits: Address bits; 0 for the fewest that are enough.
+        bits: Address bits; 0 for the minimum.
         floor: Added to each bin for outliers, relative to the peak of the bin likelihood.
-        outliers: Share of readings that have nothing to do with S, which is spread over all bins.
-        on_range: The meaning of a reading beyond the end bins.
-        on_missing: `missing` where a reading may be missing.
-        path: The variable's place in the message.
+        outliers: Share of readings that do not depend on S, spread over all bins.
+        on_range: Treatment of a reading beyond the end bins.
+        on_missing: `missing` if a reading may be missing.
+        path: Path of the variable in the message.
 
     Raises:
         ModelError: A sigma, step, floor, share or number of values that is not positive.
@@ -99,7 +99,7 @@ def wrapped_normal(
 
 
 def normal_table(name: str, shape: Normal, *, values: int, offset: float, step: float) -> NDArray[np.float64]:
-    """Return P(K | S) of a normal over bins, float64[values, lines]; the end bins hold the tails."""
+    """Return P(K | S) of a normal over bins, float64[values, lines]; the end bins include the tails."""
     mean, sigma = _checked(name, shape, values, step)
     inner = offset + (np.arange(1, values) - 0.5) * step
     edges = np.concatenate(([-np.inf], inner, [np.inf]))[:, np.newaxis]
@@ -119,9 +119,9 @@ def wrapped_normal_table(
     lower = offset + (np.arange(values) - 0.5)[:, np.newaxis] * step - mean
     lower = (lower + turn / 2) % turn - turn / 2
     upper = np.roll(lower, -1, axis=0)
-    over = upper <= lower  # the bin opposite the mean, where the circle was cut open
+    over = upper <= lower  # the bin opposite the mean, where the circle is cut
     table = np.zeros_like(lower)
-    # The bin that was cut open reaches a step beyond half a turn.
+    # The cut bin extends a step beyond half a turn.
     copies = math.ceil((_FARTHEST_COPY * float(np.max(sigma)) + step) / turn - 0.5)
     for copy in range(-max(copies, 0), max(copies, 0) + 1):
         z_lower = (lower + copy * turn) / sigma
@@ -178,7 +178,7 @@ def _mass(
 
 
 def middle_bin(bin_in_sigmas: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the mass of a bin where the mean is at its middle: what a floor is a share of."""
+    """Return the mass of a bin with the mean at its centre, to which a floor is relative."""
     return 1 - 2 * _upper_tail(bin_in_sigmas / 2)
 
 
@@ -187,7 +187,7 @@ def _with_outliers(
 ) -> NDArray[np.float64]:
     """Spread the outliers' share over all bins, add the floor, and normalise every line.
 
-    The floor is a share of a bin's mass where the mean is at its middle.
+    The floor is relative to the mass of a bin with the mean at its centre.
     """
     if shape.outliers:
         table = (1 - shape.outliers) * table + shape.outliers / len(table)

@@ -1,6 +1,7 @@
 """Factors of a joint distribution: tables, normals and functions of one symbol given others, and potentials.
 
-Continuous distributions become tables here: a normal's integral over each value of its symbol, a function's value.
+Continuous distributions become tables: the integral of a normal over each value of its symbol, or the value
+of a function.
 """
 
 import math
@@ -18,7 +19,7 @@ from toolchain.models.model import Normal
 from toolchain.models.symbol import Symbol
 
 Formula: TypeAlias = Callable[..., ArrayLike] | ArrayLike
-"""A function of the given symbols' values, one float64 array each of the same shape; or constant numbers."""
+"""A function of the values of given symbols, as float64 arrays of the same shape; or constant numbers."""
 
 _SUM_TOLERANCE: Final = 1e-6
 
@@ -28,23 +29,24 @@ class Distribution:
     """P(symbol | given) as a table."""
 
     symbol: Symbol
-    """The symbol that it is a distribution of."""
+    """The symbol of the distribution."""
     given: tuple[Symbol, ...]
     """The symbols that it depends on."""
     table: NDArray[np.float64]
     """float64[symbol's size, size of each given], summing to 1 over the first axis."""
     normal: Normal | None = None
-    """The normals that the table was made of, or None; their arrays run over the given symbols' values, the
-    last fastest."""
+    """The normals behind the table, or None; their arrays are indexed by the values of the given symbols, the
+    last one fastest.
+    """
 
     @property
     def scope(self) -> tuple[Symbol, ...]:
-        """The symbols of its table's axes."""
+        """The symbols of the axes of its table."""
         return (self.symbol, *self.given)
 
     @property
     def title(self) -> str:
-        """The distribution as it is written: P(A | B, C)."""
+        """The distribution as text: P(A | B, C)."""
         return _title(self.symbol, self.given)
 
     def __repr__(self) -> str:
@@ -53,10 +55,10 @@ class Distribution:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Potential:
-    """A function of some symbols that is a factor of the joint distribution and no distribution by itself."""
+    """A function of some symbols that is a factor of the joint distribution but not a distribution itself."""
 
     scope: tuple[Symbol, ...]
-    """The symbols of its table's axes."""
+    """The symbols of the axes of its table."""
     table: NDArray[np.float64]
     """float64[size of each symbol], from 0."""
 
@@ -68,7 +70,7 @@ Factor: TypeAlias = Distribution | Potential
 
 
 def table(symbol: Symbol, values: ArrayLike, *, given: Sequence[Symbol] = ()) -> Distribution:
-    """Return P(symbol | given) from its numbers.
+    """Return P(symbol | given) from numbers.
 
     Args:
         symbol: The symbol.
@@ -76,7 +78,7 @@ def table(symbol: Symbol, values: ArrayLike, *, given: Sequence[Symbol] = ()) ->
         given: The symbols that it depends on.
 
     Raises:
-        ModelError: Another shape, a number that is not a probability, or a column that doesn't sum to 1.
+        ModelError: The shape is wrong, a number is not a probability, or a column does not sum to 1.
     """
     given = tuple(given)
     scope = _scope(symbol, given)
@@ -95,7 +97,7 @@ def table(symbol: Symbol, values: ArrayLike, *, given: Sequence[Symbol] = ()) ->
 
 
 def uniform(symbol: Symbol) -> Distribution:
-    """Return the P(symbol) in which every value is as probable as any other."""
+    """Return the uniform P(symbol)."""
     _scope(symbol, ())
     return table(symbol, np.full(symbol.size, 1 / symbol.size))
 
@@ -109,18 +111,19 @@ def conditional_normal(
     floor: float = 0.0,
     outliers: float = 0.0,
 ) -> Distribution:
-    """Return P(symbol | given), normal around a function of the given symbols; wrapped where the symbol's type wraps.
+    """Return P(symbol | given), normal around a function of the given symbols; wrapped if the type wraps.
 
     Args:
-        symbol: An integer or interval symbol; each value gets the normal's integral over its interval.
+        symbol: An integer or interval symbol; each value gets the integral of the normal over its interval.
         given: The symbols that it depends on; none for a plain normal.
         mean: A function of the given symbols' values, or numbers that broadcast to their shape.
         sigma: The standard deviation, likewise.
-        floor: The least probability of a value, relative to the peak.
-        outliers: Share of readings that have nothing to do with the given symbols.
+        floor: The minimum probability of a value, relative to the peak.
+        outliers: Share of readings that do not depend on the given symbols.
 
     Raises:
-        ModelError: A symbol with named values, a mean or sigma of another shape, a sigma that is not positive.
+        ModelError: The symbol has named values, the mean or sigma has another shape, or sigma is not
+            positive.
     """
     given = tuple(given)
     scope = _scope(symbol, given)
@@ -141,15 +144,15 @@ def conditional_normal(
 
 
 def function(symbol: Symbol, given: Sequence[Symbol], value: Formula) -> Distribution:
-    """Return P(symbol | given) of a symbol that is a function of the others: 1 at its value, 0 elsewhere.
+    """Return P(symbol | given) of a symbol that is a function of the given ones: 1 at its value, 0 elsewhere.
 
     Args:
         symbol: The symbol; with `on_range = clamp`, values beyond its ends become the ends.
-        given: The symbols that it is a function of.
-        value: The function, of the given symbols' values as numbers.
+        given: The symbols of which it is a function.
+        value: The function of the given symbols' values as numbers.
 
     Raises:
-        ModelError: The function gives a value that the symbol doesn't have.
+        ModelError: The function returns a value that the symbol does not have.
     """
     given = tuple(given)
     scope = _scope(symbol, given)
@@ -175,14 +178,14 @@ def function(symbol: Symbol, given: Sequence[Symbol], value: Formula) -> Distrib
 
 
 def potential(symbols: Sequence[Symbol], values: ArrayLike) -> Potential:
-    """Return a factor that is not a distribution by itself, such as a Markov network's.
+    """Return a factor that is not a distribution itself, as in a Markov network.
 
     Args:
-        symbols: The symbols that it is a function of.
+        symbols: The symbols of which it is a function.
         values: float64[size of each symbol], from 0.
 
     Raises:
-        ModelError: Another shape, or a number that is negative, infinite or NaN.
+        ModelError: The shape is wrong, or a number is negative, infinite or NaN.
     """
     scope = _scope(symbols[0], tuple(symbols[1:])) if symbols else ()
     title = f"the potential of {', '.join(each.name for each in scope)}"
@@ -209,7 +212,7 @@ def _scope(symbol: Symbol, given: tuple[Symbol, ...]) -> tuple[Symbol, ...]:
 
 
 def _evaluated(title: str, what: str, formula: Formula, given: tuple[Symbol, ...]) -> NDArray[np.float64]:
-    """Return a formula's values over the given symbols', float64[product of their sizes]."""
+    """Return the values of a formula for all values of the given symbols, float64[product of their sizes]."""
     grids = np.meshgrid(*(each.values() for each in given), indexing="ij") if given else []
     values = formula(*grids) if callable(formula) else formula
     sizes = tuple(each.size for each in given)

@@ -1,4 +1,4 @@
-"""Variable elimination: names are summed out of a product of tables, one after the other.
+"""Variable elimination: names are summed out of a product of tables one by one.
 
 Exact, in float64. The next name is always the one whose table is the smallest; a table above the limit is refused.
 """
@@ -27,7 +27,7 @@ class Term:
 
 
 def reduced(term: Term, values: Mapping[str, int]) -> Term:
-    """Return the term with some of its names at the values that they have."""
+    """Return the term with some of its names at fixed values."""
     if not any(name in values for name in term.scope):
         return term
     at = tuple(values.get(name, slice(None)) for name in term.scope)
@@ -35,7 +35,7 @@ def reduced(term: Term, values: Mapping[str, int]) -> Term:
 
 
 def product(terms: Sequence[Term], scope: Sequence[str], sizes: Mapping[str, int]) -> NDArray[np.float64]:
-    """Return the terms' product over all their names, float64[size of each]; a ModelError above the limit."""
+    """Return the product of terms over all their names, float64[size of each]; a ModelError above the limit."""
     _check_size(scope, sizes, "the answer")
     found = np.ones(tuple(sizes[name] for name in scope))
     for term in terms:
@@ -46,10 +46,10 @@ def product(terms: Sequence[Term], scope: Sequence[str], sizes: Mapping[str, int
 
 
 def eliminate(terms: Iterable[Term], names: Iterable[str], sizes: Mapping[str, int]) -> list[Term]:
-    """Return terms whose product is the given terms' product, summed over some names.
+    """Return terms whose product is the product of the given terms, summed over some names.
 
-    Tables are scaled by their maxima on the way, so that long products don't underflow: the result is exact up to a
-    factor. A ModelError for a table on the way that would be larger than the limit.
+    Tables are scaled by their maxima, so that long products don't underflow: the result is exact up to a
+    factor. An intermediate table above the limit raises a ModelError.
     """
     left = dict(enumerate(terms))
     fresh = count(len(left))
@@ -59,7 +59,8 @@ def eliminate(terms: Iterable[Term], names: Iterable[str], sizes: Mapping[str, i
             holding[name].add(number)
     unions = {name: _union(left[number] for number in sorted(holding[name])) for name in holding}
     costs = {name: math.prod(sizes[other] for other in unions[name]) for name in holding}
-    # The name breaks ties: the same question gives the same sums, to the bit. A changed cost is a new entry of the heap.
+    # The name breaks ties, so the same question gives the same sums, bit for bit. A changed cost is a new
+    # entry of the heap.
     cheapest = [(cost, name) for name, cost in costs.items()]
     heapify(cheapest)
     while holding:
@@ -97,6 +98,6 @@ def _check_size(scope: Sequence[str], sizes: Mapping[str, int], what: str) -> No
             f" and {len(scope) - _NAMED} more" if len(scope) > _NAMED else ""
         )
         raise ModelError(
-            f"{what} needs a table of {entries} entries over {names}; the most is {MAX_ENTRIES}: search or know fewer "
-            "variables, or ones that are nearer to each other"
+            f"{what} needs a table of {entries} entries over {names}; the maximum is {MAX_ENTRIES}: use fewer "
+            "searched and known variables, or ones that are closer to each other"
         )

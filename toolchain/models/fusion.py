@@ -1,4 +1,4 @@
-"""Exact naive Bayesian fusion in float64 (equation 2.2): what a machine's posterior is measured against."""
+"""Exact naive Bayesian fusion in float64 (equation 2.2), the reference for the posterior of a machine."""
 
 from collections.abc import Iterable, Sequence
 
@@ -16,15 +16,15 @@ def exact_posterior(
 
     Args:
         model: The model.
-        addresses: One per known variable, in the columns' order; None for a missing reading. Where lines have readings of
-            their own (`sensor_mode = cell`), int64[lines] per variable.
+        addresses: One per known variable, in the order of the columns; None for a missing reading. If lines
+            have their own readings (`sensor_mode = cell`), int64[lines] per variable.
         prior_address: The row of the selected prior; None for the prior without a selection.
 
     Returns:
         float64[lines], summing to 1.
 
     Raises:
-        ModelError: Another number of addresses, an address that is not served, or readings that are
+        ModelError: The number of addresses is wrong, an address is not supported, or the readings are
             impossible on every line.
     """
     if len(addresses) != len(model.known):
@@ -52,7 +52,8 @@ def exact_posterior(
 def fuse(prior: NDArray[np.float64], likelihoods: Iterable[NDArray[np.float64]]) -> NDArray[np.float64]:
     """Return the normalised product of a prior and likelihoods, float64[lines] each, up to factors.
 
-    The product is a sum of logarithms, so that thirty small likelihoods don't underflow; a ModelError if it is 0.
+    The product is a sum of logarithms, so that many small likelihoods don't underflow; a ModelError if it is
+    0.
     """
     with np.errstate(divide="ignore"):  # log 0 = -inf is an impossible line
         logarithm = np.log(prior)

@@ -1,8 +1,8 @@
-"""Joint distributions as products of factors, and questions to them, as in ProBT.
+"""Joint distributions as products of factors, and questions about them, as in ProBT.
 
-A question that has naive fusion's form, P(S) P(k_1 | S) ... P(k_N | S) (equation 2.2), becomes a `Model`, which a BM1
-computes. Symbols that are neither searched nor known are summed out exactly; a question of another form is refused,
-with the path that joins two known symbols.
+A question with the form of naive fusion, P(S) P(k_1 | S) ... P(k_N | S) (equation 2.2), becomes a `Model`,
+which a BM1 computes. Symbols that are neither searched nor known are summed out exactly. A question of
+another form is refused with the path that joins two known symbols.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ _LISTED: Final = 20
 
 @dataclass(frozen=True, eq=False)
 class JointDistribution:
-    """A product of factors: a Bayesian network, or with potentials a Markov network."""
+    """A product of factors: a Bayesian network or, with potentials, a Markov network."""
 
     name: str
-    """The name of a deployment of it."""
+    """The name for deployments."""
     factors: tuple[Factor, ...]
-    """The distributions P(A | B, C) and potentials; every given symbol has a factor, too."""
+    """The distributions P(A | B, C) and potentials; every given symbol also has a factor."""
     symbols: tuple[Symbol, ...] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -88,7 +88,7 @@ class JointDistribution:
         Args:
             searched: The searched symbols, the slowest dimension first: a line of the machine for each combination.
             known: The symbols known in every frame, in the order of the machine's columns.
-            given: Symbols with a fixed value, by name: the value's label or number.
+            given: Symbols with a fixed value, by name: the label or number of the value.
             prior_select: A known symbol that selects the prior instead of being a column (thesis 2.1.2).
 
         Raises:
@@ -108,16 +108,16 @@ class JointDistribution:
         for name in names:
             if names.count(name) > 1:
                 raise ModelError(
-                    f"{self.name}: {name} is in the question twice; it can be searched, known or given"
+                    f"{self.name}: {name} is in the question twice; it can be either searched, known or given"
                 )
         if not question.searched:
-            raise ModelError(f"{self.name}: the question searches nothing")
+            raise ModelError(f"{self.name}: the question does not search anything")
         return question
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Question:
-    """P(searched | known) of a joint distribution; `JointDistribution.ask` makes it."""
+    """P(searched | known) of a joint distribution, created by `JointDistribution.ask`."""
 
     joint: JointDistribution
     """The joint distribution."""
@@ -146,8 +146,8 @@ class Question:
         """Return the model that a BM1 computes.
 
         Raises:
-            ModelError: The question is not naive fusion (names the path that joins two known symbols), is
-                impossible, or needs a table above the limit.
+            ModelError: The question is not naive fusion (the sentence contains the path that joins two known
+                symbols), is impossible, or needs a table above the limit.
         """
         observed = [symbol.name for symbol in self.observed]
         active = [without_idle(factor) for factor in self.joint.factors]
@@ -159,7 +159,10 @@ class Question:
         tables = f"{self.joint.name}: a table of {lines} lines"
         check_size(tables, lines * max(values, default=1), MAX_ENTRIES, ": search fewer variables")
         check_size(
-            f"{tables} for all", lines * sum(values), MAX_MODEL_ENTRIES, ": search or know fewer variables"
+            f"{tables} for all",
+            lines * sum(values),
+            MAX_MODEL_ENTRIES,
+            ": use fewer searched and known variables",
         )
         links = Links(terms, factors, {*searched, *self.given})
         if links.joined(observed):
@@ -178,7 +181,7 @@ class Question:
         return self._fusion(own, product(common, searched, sizes).ravel(), sizes)
 
     def _factors(self, active: Sequence[Factor], observed: Sequence[str]) -> tuple[list[Factor], list[Term]]:
-        """Return the factors that matter for some observed symbols, and their terms at the given values."""
+        """Return the relevant factors for some observed symbols, and their terms at the given values."""
         asked = {symbol.name for symbol in self.searched} | set(observed) | set(self.given)
         factors = relevant(active, asked)
         terms = [
@@ -188,9 +191,10 @@ class Question:
         return factors, terms
 
     def _refusal(self, active: Sequence[Factor], observed: Sequence[str]) -> ModelError:
-        """Return an error with two observed symbols that are not independent, the shortest path between them, and a way out.
+        """Return an error with two dependent observed symbols, the path between them, and advice.
 
-        Where not all are independent, two of them are not, whatever the others do (a property of d-separation).
+        If not all are independent, two of them are not, regardless of the others (a property of
+        d-separation).
         """
         cut = {symbol.name for symbol in self.searched} | set(self.given)
         factors, terms = self._factors(active, observed)
@@ -227,7 +231,7 @@ class Question:
     def _fusion(
         self, own: Mapping[str, Sequence[Term]], weight: NDArray[np.float64], sizes: Mapping[str, int]
     ) -> Model:
-        """Return the model of each observed symbol's terms and the searched symbols' own weight, float64[lines]."""
+        """Return the model from the observed symbols' terms and the searched symbols' weight, float64[lines]."""
         searched = [symbol.name for symbol in self.searched]
         tables = {
             name: product(terms, (name, *searched), sizes).reshape(sizes[name], -1)
@@ -238,9 +242,7 @@ class Question:
         for total in sums.values():
             prior = _scaled(prior * total)
         if not prior.sum() > 0:
-            raise ModelError(
-                f"{self.joint.name}: the given values are impossible together, so there is nothing to search"
-            )
+            raise ModelError(f"{self.joint.name}: the given values are impossible together")
         prior /= prior.sum()
         given_line = {name: _given_line(tables[name], sums[name], prior) for name in tables}
         normals = {symbol.name: self._normal(symbol) for symbol in self.known}
@@ -272,7 +274,7 @@ class Question:
         )
 
     def _normal(self, symbol: Symbol) -> Normal | None:
-        """Return the normals that a known symbol's table was made of, where it depends on searched symbols alone."""
+        """Return the normals behind a known symbol's table, if it depends only on searched symbols."""
         for factor in self.joint.factors:
             if isinstance(factor, Distribution) and factor.symbol == symbol and factor.normal is not None:
                 break
@@ -296,7 +298,7 @@ def _given_line(
 ) -> NDArray[np.float64]:
     """Return P(K | S) from any multiple of it, float64[values, lines].
 
-    An impossible line gets P(K), which changes no other line's codes.
+    An impossible line gets P(K), which does not change the codes of other lines.
     """
     safe = np.where(total > 0, total, 1)
     table: NDArray[np.float64] = together / safe
@@ -321,7 +323,7 @@ def _scaled(weights: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _rule(symbol: Symbol) -> dict[str, Any]:
-    """Return the fields that a known variable has from its symbol."""
+    """Return the fields of a known variable that come from its symbol."""
     return {
         "name": symbol.name,
         "bits": symbol.bits,
@@ -336,7 +338,7 @@ def _rule(symbol: Symbol) -> dict[str, Any]:
 
 
 def _cycle(parents: Mapping[str, Sequence[str]]) -> list[str]:
-    """Return names along a directed cycle, the first one again at the end; empty where there is none."""
+    """Return the names on a directed cycle, with the first one again at the end; empty if there is none."""
     try:
         TopologicalSorter(parents).prepare()
     except CycleError as error:

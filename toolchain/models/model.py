@@ -1,7 +1,7 @@
-"""A model for a BM1: a searched variable on a grid, and variables known given each of its values (thesis 2.1.2).
+"""The model for a BM1: a searched variable on a grid, and known variables given its values (thesis 2.1.2).
 
 The machine computes P(S | k_1 ... k_N), proportional to P(S) P(k_1 | S) ... P(k_N | S) (equation 2.2). A
-model is the prior P(S), a table of P(K_i | S) for each known variable, and their order: the columns'.
+model consists of the prior P(S) and a table P(K_i | S) for each known variable, in the order of the columns.
 """
 
 import math
@@ -23,45 +23,45 @@ _SUM_TOLERANCE: Final = 1e-6
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Normal:
-    """The normals that a table was made of; `toolchain fit` replaces the parts that can be learnt."""
+    """The normals behind a table; `toolchain fit` replaces the parameters that can be learnt."""
 
     mean: NDArray[np.float64]
     """float64[lines], in the reading's unit."""
     sigma: ArrayLike
-    """Standard deviation, one or float64[lines], in the reading's unit."""
+    """Standard deviation, one for all or float64[lines], in the unit of the reading."""
     floor: float = 0.0
     """Added to each bin's probability for outliers, relative to the peak of the bin likelihood."""
     outliers: float = 0.0
-    """Share of readings that have nothing to do with S."""
+    """Share of readings that do not depend on S."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TabulatedVariable:
-    """A variable with a reading in every frame, a table, and a rule that makes readings addresses of the table."""
+    """A variable with a reading in every frame, a table, and the conversion of readings to addresses."""
 
     name: str
     """The variable's name: the field in the message, unless `path` is given."""
     table: NDArray[np.float64] = field(repr=False)
     """float64[values, lines]; row k is address k."""
     bits: int = 0
-    """Address bits; 0 for the fewest that hold all values and the top address, which is a missing reading."""
+    """Address bits; 0 for the minimum, including the top address, which means a missing reading."""
     offset: float = 0.0
-    """The reading that is address 0, in the variable's unit."""
+    """The reading with address 0, in the unit of the variable."""
     step: float = 1.0
-    """From one address to the next, in the variable's unit."""
+    """Difference between adjacent addresses, in the unit of the variable."""
     period: int | None = None
-    """The number of addresses after which the readings begin again (a turn of a bearing), or None."""
+    """The number of addresses after which the readings repeat (a turn of a bearing), or None."""
     on_range: Literal["error", "clamp", "missing"] = "error"
-    """The meaning of a reading out of range: an error, the nearest end, or a missing reading."""
+    """Treatment of a reading out of range: an error, the nearest end, or a missing reading."""
     on_missing: Literal["error", "missing"] = "error"
-    """`missing` where a reading may be missing."""
+    """`missing` if a reading may be missing."""
     path: str = ""
-    """The variable's place in the message; empty to search the message for the name."""
+    """Path of the variable in the message; empty to search the message for the name."""
     states: tuple[str, ...] = ()
-    """The values' names, or none; a reading may be a name."""
+    """Names of the values, or none; a reading may be a name."""
 
     def _keep_table(self, what: str) -> None:
-        """Keep a read-only copy of the table, and choose the address bits where none were given."""
+        """Store a read-only copy of the table, and choose the address bits if none were given."""
         given = np.asarray(self.table)
         if given.ndim != 2 or 0 in given.shape:
             raise ModelError(f"{what} has shape {given.shape}, expected (values, lines)")
@@ -74,11 +74,11 @@ class TabulatedVariable:
 
     @property
     def values(self) -> int:
-        """The number of values that it has."""
+        """The number of values."""
         return len(self.table)
 
     def as_variable(self) -> Variable:
-        """Return the rule from readings to addresses, as `deployment.toml` has it; a ModelError if it is wrong."""
+        """Return the conversion of readings to addresses, as in `deployment.toml`, or raise a ModelError."""
         own = {each.name for each in fields(self)}
         rule = {key: getattr(self, key) for key in Variable.model_fields if key in own}
         try:
@@ -91,13 +91,14 @@ class TabulatedVariable:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Known(TabulatedVariable):
-    """A known variable K, which is a column of the machine: its table is P(K | S), and each line's column sums to 1."""
+    """A known variable K, a column of the machine: its table is P(K | S), and sums to 1 on each line."""
 
     floor: float = 0.0
-    """The least probability of an outlier in the table, relative to the peak of the likelihood; 0 for none.
-    Quantising warns when codes are too coarse to hold it."""
+    """The minimum probability of an outlier in the table, relative to the peak of the likelihood; 0 for none.
+    Quantising warns if codes are too coarse for it.
+    """
     normal: Normal | None = field(default=None, repr=False)
-    """The normals that the table was made of, or None."""
+    """The normals behind the table, or None."""
 
     def __post_init__(self) -> None:
         what = f"P({self.name} | S)"
@@ -121,34 +122,33 @@ class PriorSelect(TabulatedVariable):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Model:
-    """A naive Bayesian fusion, which a BM1 computes."""
+    """A naive Bayesian fusion, computed by a BM1."""
 
     name: str
-    """The deployment's name."""
+    """Name of the deployment."""
     searched: tuple[Dimension, ...]
     """The searched variable's dimensions, the slowest first; line = y * width + x for (y, x)."""
     known: tuple[Known, ...]
     """The known variables in the order of the machine's columns 1..N."""
     prior: NDArray[np.float64] | None = None
-    """P(S), float64[lines] summing to 1; None for a uniform one, or with a `prior_select` for the mean of
-    its rows."""
+    """P(S), float64[lines] summing to 1; None for a uniform one or, with a `prior_select`, for the mean of
+    its rows.
+    """
     prior_select: PriorSelect | None = None
-    """The variable that selects the prior; then `prior` is the one without a selection."""
+    """The variable that selects the prior; then `prior` is the prior without a selection."""
 
     def __post_init__(self) -> None:
         name = self.name if isinstance(self.name, str) else ""  # a user's file is not type-checked
         if not (0 < len(name) <= NAME_MAX and name.isprintable()):
             raise ModelError(
-                f"the model's name is {str(self.name)[:NAME_MAX]!r}, expected 1 to {NAME_MAX} characters that can be printed"
+                f"the model's name is {str(self.name)[:NAME_MAX]!r}, expected 1 to {NAME_MAX} printable characters"
             )
         if not self.searched:
-            raise ModelError(
-                f"model {self.name!r} searches nothing: it needs at least one searched dimension"
-            )
+            raise ModelError(f"model {self.name!r} has no searched dimension: it needs at least one")
         if self.lines > MAX_LINES:
             sizes = " x ".join(str(each.size) for each in self.searched)
             raise ModelError(
-                f"model {self.name!r} searches {sizes} = {self.lines} values; the most is {MAX_LINES}"
+                f"model {self.name!r} searches {sizes} = {self.lines} values; the maximum is {MAX_LINES}"
             )
         for kind, names in (
             ("known variable", [known.name for known in self._all_known()]),
@@ -168,7 +168,7 @@ class Model:
         prior = self._default_prior() if self.prior is None else np.array(self.prior, float)
         _check_distribution("the prior P(S)", prior)
         if self.prior_select is not None:
-            self._default_prior()  # checks that its rows have this model's lines
+            self._default_prior()  # checks that its rows have the lines of this model
         prior.flags.writeable = False
         object.__setattr__(self, "prior", prior)
 
@@ -198,7 +198,7 @@ class Model:
 
     @property
     def variables(self) -> tuple[Variable, ...]:
-        """All known variables as `deployment.toml` has them: the columns', then the one that selects the prior."""
+        """All known variables as in `deployment.toml`: the columns, then the one that selects the prior."""
         return tuple(known.as_variable() for known in self._all_known())
 
     @property
@@ -216,12 +216,13 @@ class Model:
 def dimension(
     label: str, *, size: int, offset: float = 0.0, step: float = 1.0, states: tuple[str, ...] = ()
 ) -> Dimension:
-    """Return a searched dimension: `size` cells, the first centred at `offset`, the next a `step` further.
+    """Return a searched dimension: `size` cells with centres at `offset`, `offset + step` and so on.
 
-    `states` names the cells, where they have names.
+    `states` are the names of the cells, if any.
 
     Raises:
-        ModelError: No cells, no name, another number of states than cells, or a step of 0.
+        ModelError: There are no cells, the name is empty, the number of states differs from that of cells, or
+            the step is 0.
     """
     check_size(f"searched dimension {str(label)[:NAME_MAX]!r}", size, MAX_LINES)
     try:
@@ -231,32 +232,34 @@ def dimension(
 
 
 def interval(label: str, low: float, high: float, *, cells: int) -> Dimension:
-    """Return a searched dimension that cuts [low, high] into equal cells; a ModelError if it has none."""
+    """Return a searched dimension that divides [low, high] into equal cells, or raise a ModelError."""
     if cells < 1 or not low < high:
-        raise ModelError(f"searched dimension {label!r}: [{low:g}, {high:g}] can't be cut into {cells} cells")
+        raise ModelError(
+            f"searched dimension {label!r}: [{low:g}, {high:g}] can't be divided into {cells} cells"
+        )
     step = (high - low) / cells
     return dimension(label, size=cells, offset=low + step / 2, step=step)
 
 
 def cell_centres(*searched: Dimension) -> tuple[NDArray[np.float64], ...]:
-    """Return each dimension's value at the centre of every line's cell: float64[lines] per dimension."""
+    """Return the value of each dimension at the centre of every line's cell: float64[lines] per dimension."""
     check_size("the grid of cells", math.prod(each.size for each in searched), MAX_LINES)
     axes = [d.offset + np.arange(d.size) * d.step for d in searched]
     return tuple(axis.ravel() for axis in np.meshgrid(*axes, indexing="ij"))
 
 
 def check_table(what: str, values: int, lines: int) -> None:
-    """Refuse, with a ModelError, a known variable's table that is too large, before it is made."""
+    """Raise a ModelError for a known variable's table that would be too large."""
     if values > MAX_VALUES:
         raise ModelError(
-            f"{what} has {values} values; a column serves at most {MAX_VALUES}: use a larger step"
+            f"{what} has {values} values; a column supports at most {MAX_VALUES}: use a larger step"
         )
     check_size(what, values * lines, MAX_TABLE_ENTRIES, ": use larger steps or fewer lines")
 
 
 def _check_distribution(what: str, table: NDArray[np.float64]) -> None:
     if not np.all(np.isfinite(table)) or np.any(table < 0):
-        raise ModelError(f"{what} holds a number that is not a probability: negative, infinite or NaN")
+        raise ModelError(f"{what} contains a number that is not a probability: negative, infinite or NaN")
     sums = np.atleast_1d(table.sum(axis=0))
     wrong = np.abs(sums - 1) > _SUM_TOLERANCE
     if np.any(wrong):

@@ -1,4 +1,4 @@
-"""The moral graph of a product of factors without its searched and given symbols: which symbols it joins."""
+"""The moral graph of a product of factors without its searched and given symbols."""
 
 from collections import deque
 from collections.abc import Iterable, Sequence
@@ -12,15 +12,15 @@ from toolchain.models.distribution import Distribution, Factor
 from toolchain.models.elimination import Term
 
 _LONGEST_DRAWN: Final = 12
-"""Symbols of a path that is drawn whole."""
+"""Maximum number of symbols in a path that is shown completely."""
 _SHOWN: Final = 4
-"""Arcs that are drawn at either end of a longer path."""
+"""Number of arcs shown at either end of a longer path."""
 
 
 class Links:
-    """The symbols that share a factor, without the searched and given ones.
+    """Links between symbols that share a factor, without the searched and given ones.
 
-    After cutting, symbols of different components are independent given what was cut (the moral graph's criterion).
+    Symbols in different components are independent given the removed ones (moral graph criterion).
     """
 
     def __init__(self, terms: Sequence[Term], factors: Sequence[Factor], cut: set[str]) -> None:
@@ -30,12 +30,12 @@ class Links:
             for name in inside:
                 beside = self._neighbours.setdefault(name, {})
                 for other in inside:
-                    # an arc between the two explains more than a common child
+                    # an arc between the two is a better explanation than a common child
                     if other != name and (other not in beside or _is_arc(factor, name, other)):
                         beside[other] = factor
 
     def components(self) -> list[set[str]]:
-        """Return the sets of symbols that are joined, in a fixed order."""
+        """Return the connected components, in a fixed order."""
         found: list[set[str]] = []
         placed: set[str] = set()
         for name in self._neighbours:
@@ -45,11 +45,11 @@ class Links:
         return found
 
     def joined(self, observed: Sequence[str]) -> bool:
-        """Return whether two of some symbols are joined."""
+        """Return whether two of some symbols are connected."""
         return any(len(component.intersection(observed)) > 1 for component in self.components())
 
     def path(self, start: str, end: str) -> list[str]:
-        """Return the shortest path between two symbols; empty where they are not joined."""
+        """Return the shortest path between two symbols; empty if they are not connected."""
         before = self._reached(start)
         if end not in before:
             return []
@@ -59,15 +59,15 @@ class Links:
         return path[::-1]
 
     def lengths(self, start: str, ends: Sequence[str]) -> dict[str, int]:
-        """Return the number of symbols on the shortest path to each of some symbols that is joined, both ends included."""
+        """Return the number of symbols on the shortest path to each connected one of some symbols."""
         before = self._reached(start)
         count = {start: 1}
-        for name in before:  # nearer ones come first
+        for name in before:  # nearer ones are first
             count.setdefault(name, count[before[name]] + 1)
         return {end: count[end] for end in ends if end in count}
 
     def _reached(self, start: str) -> dict[str, str]:
-        """Return every symbol that is joined to one, with the symbol before it on the shortest path."""
+        """Return every symbol connected to one, with its predecessor on the shortest path."""
         before = {start: start}
         waiting = deque([start])
         while waiting:
@@ -79,7 +79,7 @@ class Links:
         return before
 
     def drawn(self, path: Sequence[str]) -> str:
-        """Return a path as arrows, with common children between their parents; of a long path only the ends."""
+        """Return a path as text with arrows, common children between their parents; a long one is cut."""
         arrows = [self._arrow(before, after) for before, after in pairwise(path)]
         if len(path) > _LONGEST_DRAWN:
             arrows[_SHOWN:-_SHOWN] = [f" ... {path[-1 - _SHOWN]}"]
@@ -101,7 +101,7 @@ def _is_arc(factor: Factor, name: str, other: str) -> bool:
 
 
 def relevant(factors: Iterable[Factor], asked: set[str]) -> list[Factor]:
-    """Leave out factors that sum to 1: distributions of symbols that are not asked for and on which none depends."""
+    """Remove factors that sum to 1: distributions of unused symbols on which no other symbol depends."""
     kept = list(factors)
     uses: dict[str, int] = {}
     own: dict[str, int] = {}
@@ -126,7 +126,7 @@ def relevant(factors: Iterable[Factor], asked: set[str]) -> list[Factor]:
 
 
 def without_idle(factor: Factor) -> Factor:
-    """Return the factor without the symbols that change nothing in it."""
+    """Return the factor without symbols that have no influence in it."""
     scope, table = list(factor.scope), factor.table
     for axis in range(len(scope) - 1, 0, -1):
         first = np.take(table, [0], axis=axis)

@@ -1,4 +1,4 @@
-"""Symbols: the variables of a joint distribution, each with a type that defines its values, as in ProBT."""
+"""Symbols: variables of a joint distribution, each with a type that defines its values, as in ProBT."""
 
 import math
 import re
@@ -18,13 +18,13 @@ _YES: Final = {"true", "yes", "on"}
 
 
 def _is_whole(number: object) -> bool:
-    """Return whether it is an integer of Python or of NumPy; a user's file is not type-checked."""
+    """Return whether a value is a Python or NumPy integer, because a user's file is not type-checked."""
     return isinstance(number, int | np.integer)
 
 
 @dataclass(frozen=True, slots=True)
 class IntegerType:
-    """The whole numbers `low` to `high`; with `wraps` they lie on a circle, and `high` is beside `low`."""
+    """The whole numbers `low` to `high`; with `wraps` they are on a circle, and `high` is adjacent to `low`."""
 
     low: int
     high: int
@@ -48,7 +48,7 @@ class IntegerType:
 
     @property
     def step(self) -> float:
-        """From one value to the next."""
+        """Difference between adjacent values."""
         return 1.0
 
     @property
@@ -59,9 +59,9 @@ class IntegerType:
 
 @dataclass(frozen=True, slots=True)
 class IntervalType:
-    """The real numbers from `low` to `high`, cut into equal intervals, each of which is one value: its middle.
+    """The real numbers from `low` to `high`, divided into equal intervals, each represented by its centre.
 
-    With `wraps` they lie on a circle: `high` is `low` again, as for a bearing from 0 to 360.
+    With `wraps` they are on a circle: `high` equals `low`, as for a bearing from 0 to 360.
     """
 
     low: float
@@ -84,7 +84,7 @@ class IntervalType:
 
     @property
     def offset(self) -> float:
-        """The first interval's middle."""
+        """The centre of the first interval."""
         return self.low + self.step / 2
 
     @property
@@ -100,10 +100,10 @@ class IntervalType:
 
 @dataclass(frozen=True, slots=True, init=False)
 class LabelType:
-    """Named values. As numbers they count from 0 in their order, but for two cases.
+    """Named values. Their numbers are 0, 1, 2 ... in order, with two exceptions.
 
-    Names that are equally spaced numbers (`10`, `20`, `30`) are these numbers. `false`, `no` and `off` are 0, and `true`,
-    `yes` and `on` are 1, whichever comes first, as in a ROS bool.
+    Names that are equally spaced numbers (`10`, `20`, `30`) have these numbers. `false`, `no` and `off` are
+    0, and `true`, `yes` and `on` are 1, regardless of the order, as in a ROS bool.
     """
 
     labels: tuple[str, ...]
@@ -122,17 +122,17 @@ class LabelType:
 
     @property
     def wraps(self) -> bool:
-        """False: its values never lie on a circle."""
+        """False, because named values are never on a circle."""
         return False
 
     @property
     def offset(self) -> float:
-        """The first name's number."""
+        """The number of the first name."""
         return self._numbers()[0]
 
     @property
     def step(self) -> float:
-        """From one name's number to the next."""
+        """Difference between the numbers of adjacent names."""
         return self._numbers()[1]
 
     def _numbers(self) -> tuple[float, float]:
@@ -152,20 +152,20 @@ Type: TypeAlias = IntegerType | IntervalType | LabelType
 
 @dataclass(frozen=True, slots=True)
 class Symbol:
-    """A variable: its name, its type, and the source of its readings when a question knows it."""
+    """A variable: its name, its type, and the source of its readings if it is known."""
 
     name: str
-    """Its name; also the field in the message, unless `path` is given."""
+    """Its name, which is also the field in the message unless `path` is given."""
     type: Type
     """Its values."""
     path: str = ""
-    """Its place in the message; empty to search the message for the name."""
+    """Its path in the message; empty to search the message for the name."""
     bits: int = 0
-    """Address bits of its column; 0 for the fewest that are enough."""
+    """Address bits of its column; 0 for the minimum."""
     on_range: Literal["error", "clamp", "missing"] = "error"
-    """The meaning of a reading beyond its values: an error, the nearest end, or a missing reading."""
+    """Treatment of a reading out of range: an error, the nearest end, or a missing reading."""
     on_missing: Literal["error", "missing"] = "error"
-    """`missing` where a reading may be missing."""
+    """`missing` if a reading may be missing."""
 
     def __post_init__(self) -> None:
         if not self.name:
@@ -179,7 +179,7 @@ class Symbol:
 
     @property
     def period(self) -> int | None:
-        """The number of values after which they begin again; None where they don't."""
+        """The number of values after which they repeat; None if they don't."""
         return self.type.size if self.type.wraps else None
 
     def values(self) -> NDArray[np.float64]:
@@ -188,7 +188,7 @@ class Symbol:
         return values
 
     def index(self, label: str) -> int:
-        """Return the index of the value that a label or a number names, or raise a ModelError."""
+        """Return the index of the value with this label or number, or raise a ModelError."""
         if label in self.type.labels:
             return self.type.labels.index(label)
         if not self.type.labels and _NUMBER.fullmatch(label):

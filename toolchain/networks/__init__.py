@@ -1,4 +1,4 @@
-"""Readers of Bayesian networks' files: BIF, XMLBIF, UAI and NET become joint distributions."""
+"""Readers of network files: BIF, XMLBIF, UAI and NET become joint distributions."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ if TYPE_CHECKING:
     from toolchain.networks.builder import NetworkBuilder
 
 MAX_BYTES: Final = 32 << 20
-"""The largest file that is read."""
+"""Maximum size of a file in bytes."""
 
 SUFFIXES: Final = (".bif", ".xmlbif", ".bifxml", ".xml", ".uai", ".net")
-"""Endings of the names of networks' files."""
+"""Suffixes of network files."""
 
 
 def is_network(path: Path) -> bool:
-    """Return whether a path is named like a network's file."""
+    """Return whether a path has the suffix of a network file."""
     return Path(path).suffix.lower() in SUFFIXES
 
 
@@ -30,7 +30,8 @@ def read_network(path: Path, *, on_missing: Literal["error", "missing"] = "error
     """Return the joint distribution of a file whose name ends in one of `SUFFIXES`.
 
     Raises:
-        NetworkFileError: The file is absent, too large, or not a network; names the file and the line.
+        NetworkFileError: The file is missing, too large, or not a network; the sentence contains file and
+            line.
     """
     from toolchain.networks.builder import NetworkBuilder
 

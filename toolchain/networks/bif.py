@@ -14,11 +14,11 @@ _COMMENTS: Final = r"//[^\n]*|/\*"
 def read_bif(data: bytes, builder: NetworkBuilder) -> None:
     """Read a BIF file.
 
-    `table` lists a distribution with the child's states slowest and the last parent fastest; `(a, b) ...` gives one
-    row, `default ...` those that are not given.
+    In `table`, the child varies slowest and the last parent fastest; `(a, b) ...` defines one row, `default
+    ...` all others.
 
     Raises:
-        NetworkFileError: The file is not BIF; names the line and what was expected.
+        NetworkFileError: The file is not BIF; the sentence contains the line and the expected token.
     """
     text = Scanner(data, builder.path, comments=_COMMENTS)
     while (block := text.next()) or text.quoted:

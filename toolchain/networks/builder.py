@@ -1,4 +1,4 @@
-"""The variables and tables that a reader finds, bounded and checked as they come, each mistake with its line."""
+"""A builder of joint distributions for readers, with limits and checks; errors give the line."""
 
 import math
 from collections.abc import Sequence
@@ -17,15 +17,18 @@ from toolchain.models.symbol import IntegerType, LabelType, Symbol
 
 MAX_VARIABLES: Final = 20_000
 MAX_STATES: Final = 65_535
-"""A column serves at most 2^16 - 1 values."""
+"""Maximum number of states: that of a column, 2^16 - 1."""
 MAX_PARENTS: Final = 30
-"""NumPy's arrays have at most 64 axes; no table of 2^24 entries needs as many."""
+"""Maximum number of parents: NumPy arrays have at most 64 axes, and no table of 2^24 entries needs as many.
+"""
 MAX_TOTAL: Final = 2 * MAX_ENTRIES
-"""Entries of all tables together."""
+"""Maximum number of entries of all tables together."""
 MAX_NAME: Final = 200
 
 _ROUNDING: Final = 0.02
-"""The most that the sum of a distribution may differ from 1: published networks are rounded to two or three digits."""
+"""Maximum difference between the sum of a distribution and 1: published networks are rounded to two or three
+digits.
+"""
 
 
 class Place(Protocol):
@@ -36,7 +39,7 @@ class Place(Protocol):
 
 
 class NetworkBuilder:
-    """A builder of a joint distribution; each method refuses wrong or too large parts with a NetworkFileError."""
+    """A builder of a joint distribution; its methods raise a NetworkFileError for wrong or too large parts."""
 
     def __init__(self, path: Path, *, on_missing: Literal["error", "missing"] = "error") -> None:
         self.path = path
@@ -48,23 +51,23 @@ class NetworkBuilder:
         self._entries = 0
 
     def name(self, name: str) -> None:
-        """Take the network's name; the file's name replaces `unknown` and the like."""
+        """Set the name of the network; the file name replaces `unknown` and similar names."""
         if name.lower() not in {"unknown", "network", "unnamed", "default", ""}:
             self._name = "".join(each for each in name if each.isprintable())[:MAX_NAME]
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The variables so far, in the file's order."""
+        """The variables so far, in the order of the file."""
         return tuple(self._symbols)
 
     def size(self, name: str, place: Place) -> int:
-        """Return how many states a variable has."""
+        """Return the number of states of a variable."""
         if name not in self._symbols:
             raise place.error(f"there is no variable {name[:MAX_NAME]!r} before this line")
         return self._symbols[name].size
 
     def state(self, name: str, label: str, place: Place) -> int:
-        """Return which state of a variable a label is."""
+        """Return the index of a state by its label."""
         self.size(name, place)
         try:
             return self._symbols[name].index(label)
@@ -72,7 +75,7 @@ class NetworkBuilder:
             raise place.error(str(reason)) from None
 
     def variable(self, name: str, states: Sequence[str] | int, place: Place) -> None:
-        """Take a variable with the names of its states, or with the number of its states."""
+        """Add a variable with the names or the number of its states."""
         if not 0 < len(name) <= MAX_NAME:
             raise place.error(f"a variable's name has {len(name)} characters, expected 1 to {MAX_NAME}")
         if not name.isprintable():
@@ -95,9 +98,9 @@ class NetworkBuilder:
             raise place.error(f"variable {name}: {reason}") from None
 
     def shape(self, scope: Sequence[str], place: Place) -> tuple[int, ...]:
-        """Return the shape of a table over some variables, within the limits."""
+        """Return the shape of a table over some variables, after checking the limits."""
         if len(scope) > MAX_PARENTS + 1:
-            raise place.error(f"a table of {len(scope)} variables; the most is {MAX_PARENTS + 1}")
+            raise place.error(f"a table of {len(scope)} variables; the maximum is {MAX_PARENTS + 1}")
         if len(set(scope)) < len(scope):
             raise place.error(f"the table of {', '.join(scope)} names a variable twice")
         shape = tuple(self.size(name, place) for name in scope)
@@ -113,7 +116,7 @@ class NetworkBuilder:
     def distribution(
         self, child: str, parents: Sequence[str], values: NDArray[np.float64], place: Place
     ) -> None:
-        """Take P(child | parents), float64[child's states, each parent's]; sums that are nearly 1 are divided out."""
+        """Add P(child | parents), float64[child's states, each parent's], normalised if sums are nearly 1."""
         if child in self._children:
             raise place.error(f"{child} has two tables")
         self._children.add(child)
@@ -138,14 +141,14 @@ class NetworkBuilder:
             raise place.error(str(reason)) from None
 
     def potential(self, scope: Sequence[str], values: NDArray[np.float64], place: Place) -> None:
-        """Take a potential, float64[states of each variable]."""
+        """Add a potential, float64[states of each variable]."""
         try:
             self._factors.append(potential([self._symbols[name] for name in scope], values))
         except ModelError as reason:
             raise place.error(str(reason)) from None
 
     def joint(self) -> JointDistribution:
-        """Return the joint distribution; its symbols are in the file's order."""
+        """Return the joint distribution; its symbols are in the order of the file."""
         if not self._symbols:
             raise ModelError("the file has no variables")
         used = {symbol.name for symbol in chain.from_iterable(factor.scope for factor in self._factors)}

@@ -1,4 +1,4 @@
-"""NET, Hugin's format: `node` blocks with their states, `potential` blocks with their data."""
+"""NET, the format of Hugin: `node` blocks with states, `potential` blocks with data."""
 
 from collections.abc import Iterator
 from typing import Final
@@ -13,7 +13,7 @@ _OTHER_NODES: Final = {"continuous", "utility", "decision", "function"}
 
 
 def read_net(data: bytes, builder: NetworkBuilder) -> None:
-    """Read a NET file of discrete chance nodes; `data` has the parents in their order, the child fastest."""
+    """Read a NET file of discrete chance nodes; in `data`, parents are in order and the child is fastest."""
     text = Scanner(data, builder.path, signs="{}()|;,=", comments=_COMMENTS)
     in_class = False
     while (block := text.next()) or text.quoted:

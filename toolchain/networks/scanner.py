@@ -1,4 +1,4 @@
-"""A scanner of text files: words, quoted words, signs and numbers, with the line of each."""
+"""A scanner for text files: words, quoted words, signs and numbers, with their lines."""
 
 import math
 import re
@@ -14,13 +14,13 @@ _SHOWN: Final = 40
 
 
 class Scanner:
-    """A scanner that moves forward; each method refuses what it does not expect with a NetworkFileError."""
+    """A forward scanner; its methods raise a NetworkFileError for an unexpected token."""
 
     def __init__(self, data: bytes, path: Path, *, signs: str = "{}()[]|;,", comments: str = "") -> None:
-        """Scan a file's bytes.
+        """Scan the bytes of a file.
 
-        `signs` stand for themselves, and a word ends before one. `comments` is a regular expression for the format's
-        comments; of /* ... */ only for the beginning.
+        `signs` are tokens themselves, and end a word. `comments` is a regular expression for comments, or
+        only for the beginning of /* ... */.
         """
         self._path = path
         try:
@@ -45,9 +45,9 @@ class Scanner:
         return NetworkFileError(sentence, path=self._path, line=line)
 
     def next(self) -> str:
-        """Take the next token: a word, a quoted word without its quotes, or a sign; empty at the end."""
+        """Consume the next token: a word, a quoted word without its quotes, or a sign; empty at the end."""
         match = self._token.match(self._text, self._end)
-        if match is None:  # the last alternative takes any character
+        if match is None:  # the last alternative matches any character
             raise AssertionError
         self._start, self._end = match.span()
         self.quoted = match[1] is not None
@@ -56,27 +56,27 @@ class Scanner:
         return match[match.lastindex or 4]
 
     def peek(self) -> str:
-        """Return the next token without taking it."""
+        """Return the next token without consuming it."""
         start, end, quoted = self._start, self._end, self.quoted
         piece = self.next()
         self._start, self._end, self.quoted = start, end, quoted
         return piece
 
     def sign(self, wanted: str) -> None:
-        """Take a sign or a keyword."""
+        """Consume a sign or a keyword."""
         found = self.next()
         if found != wanted or self.quoted:
             raise self.error(f"expected {wanted!r}, found {_shown(found)}")
 
     def word(self, what: str) -> str:
-        """Take a word, plain or quoted; `what` names it in errors."""
+        """Consume a word, plain or quoted; `what` names it in errors."""
         found = self.next()
         if not self.quoted and (not found or self._is_sign(found)):
             raise self.error(f"expected {what}, found {_shown(found)}")
         return found
 
     def words(self, end: str, what: str, most: int) -> list[str]:
-        """Take at most `most` words up to a sign and the sign, with or without commas between them."""
+        """Consume at most `most` words up to a sign and the sign, with or without commas."""
         found: list[str] = []
         while True:
             piece = self.next()
@@ -91,7 +91,7 @@ class Scanner:
             found.append(piece)
 
     def scope(self, what: str, most: int) -> tuple[str, list[str]]:
-        """Take `( CHILD | PARENTS )` or `( CHILD )`; `what` names the child in errors."""
+        """Consume `( CHILD | PARENTS )` or `( CHILD )`; `what` names the child in errors."""
         self.sign("(")
         child = self.word(what)
         separator = self.next()
@@ -100,14 +100,14 @@ class Scanner:
         return child, self.words(")", "parents", most) if separator == "|" else []
 
     def count(self, what: str, most: int) -> int:
-        """Take a whole number from 0 to `most`."""
+        """Consume a whole number from 0 to `most`."""
         word = self.word(what)
         if not (word.isascii() and word.isdigit() and len(word) <= 9) or int(word) > most:
             raise self.error(f"expected {what}, 0 to {most}, found {_shown(word)}")
         return int(word)
 
     def numbers(self, end: str, wanted: int, what: str, *, between: str = ",") -> NDArray[np.float64]:
-        """Take numbers up to a sign and the sign, with the signs `between` anywhere among them: float64[wanted]."""
+        """Consume numbers up to a sign and the sign, ignoring the signs `between`: float64[wanted]."""
         stop = self._text.find(end, self._end)
         if stop < 0:
             self._start = self._end = len(self._text)
@@ -121,7 +121,7 @@ class Scanner:
         return self._floats(piece.split(maxsplit=wanted), wanted, what, begin)
 
     def next_numbers(self, wanted: int, what: str) -> NDArray[np.float64]:
-        """Take this many numbers with only white space between them: float64[wanted]."""
+        """Consume this many numbers separated by white space: float64[wanted]."""
         begin, words = self._end, []
         for _ in range(wanted):
             word = self.next()
@@ -131,7 +131,7 @@ class Scanner:
         return self._floats(words, wanted, what, begin)
 
     def skip(self, end: str) -> None:
-        """Take everything up to a sign and the sign, but for signs in brackets and quotes."""
+        """Consume everything up to a sign and the sign, except for signs in brackets and quotes."""
         depth = 0
         while True:
             piece = self.next()
@@ -146,7 +146,7 @@ class Scanner:
                 raise self.error(f"expected {end!r}, found {piece!r}")
 
     def _without(self, comments: re.Pattern[str]) -> str:
-        """Return the text with comments replaced by spaces, and the same number of lines."""
+        """Return the text with comments replaced by spaces, keeping line numbers."""
         parts, end, at = [], 0, 0
         while match := comments.search(self._text, at):
             begin, at = match.span()
@@ -165,7 +165,7 @@ class Scanner:
         return self._signs.fullmatch(piece) is not None
 
     def _floats(self, words: list[str], wanted: int, what: str, begin: int) -> NDArray[np.float64]:
-        """Return words as numbers; the last word may be the rest of the text, and is only counted."""
+        """Return words as numbers; the last one may be the rest of the text, and is only counted."""
         values = []
         for word in words[:wanted]:
             try:
@@ -182,7 +182,7 @@ class Scanner:
 
 def _float(word: str) -> float:
     number = float(word)
-    if "_" in word or math.isnan(number):  # the former is Python's own notation
+    if "_" in word or math.isnan(number):  # the former is the notation of Python
         raise ValueError
     return number
 

@@ -1,4 +1,4 @@
-"""UAI: a network as numbers alone, BAYES or MARKOV; its variables are called 0, 1, 2 and so on."""
+"""UAI, a network of only numbers, BAYES or MARKOV; its variables are named 0, 1, 2 and so on."""
 
 import math
 from typing import Final
@@ -13,13 +13,13 @@ _COMMENTS: Final = r"#[^\n]*|(?m:^c\b[^\n]*)"
 
 
 def read_uai(data: bytes, builder: NetworkBuilder) -> None:
-    """Read a UAI file: a preamble (kind, sizes, each factor's variables), then each factor's numbers.
+    """Read a UAI file: a preamble (kind, sizes, variables of each factor), then the numbers of each factor.
 
-    A factor's last variable is the fastest in its numbers; in a BAYES file it is the child. (pyagrum 3.3.1 writes the
-    first parent fastest, against the format's definition.)
+    The last variable of a factor varies fastest; in a BAYES file it is the child. (pyagrum 3.3.1 writes the
+    first parent fastest, contrary to the format.)
 
     Raises:
-        NetworkFileError: The file is not UAI; names the line and what was expected.
+        NetworkFileError: The file is not UAI; the sentence contains the line and the expected token.
     """
     text = Scanner(data, builder.path, comments=_COMMENTS)
     kind = text.word("BAYES or MARKOV")

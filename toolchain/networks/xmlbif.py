@@ -1,4 +1,4 @@
-"""XMLBIF (version 0.3): a network as XML, read without entities, external or internal."""
+"""XMLBIF (version 0.3), a network in XML, without external or internal entities."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ _DECIMAL: Final = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 
 
 def read_xmlbif(data: bytes, builder: NetworkBuilder) -> None:
-    """Read an XMLBIF file without entities; a TABLE has the GIVENs in their order, the FOR fastest."""
+    """Read an XMLBIF file without entities; in a TABLE, the GIVENs are in order and the FOR is fastest."""
     _Reader(builder).read(data)
 
 
 class _Reader:
-    """A reader of elements; definitions wait for the last variable, which may follow them."""
+    """A reader of elements; definitions are processed after the last variable, which may follow them."""
 
     def __init__(self, builder: NetworkBuilder) -> None:
         self._builder = builder
@@ -56,7 +56,9 @@ class _Reader:
         return _Line(self._builder.path, self._parser.CurrentLineNumber)
 
     def _entity(self, name: str, *_rest: object) -> None:
-        raise self._here.error(f"the entity {name[:40]!r}: a network needs none, and none is read")
+        raise self._here.error(
+            f"the entity {name[:40]!r}: a network does not need entities, and they are refused"
+        )
 
     def _start(self, name: str, attributes: dict[str, str]) -> None:
         if len(self._path) == _MAX_DEPTH:

@@ -1,8 +1,9 @@
 """The memories of a machine on each board, each with its MIF: priors, tiles, random numbers (thesis 3.2).
 
-A column's tiles all see the same reading, so a column is one memory: its address is the reading's, and a word
-holds the code of every line of the board, line 0 in the lowest bits. The prior elements are one memory likewise. Where
-each line has a reading of its own, a tile is a memory by itself: its bits of those words.
+All tiles of a column have the same reading, so a column is one memory: its address is that of the reading,
+and a word contains the codes of all lines of the board, with line 0 in the lowest bits. The prior elements
+are also one memory. If each line has its own reading, each tile is a separate memory with its bits of these
+words.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -26,10 +27,10 @@ _ROWS_AT_ONCE: Final = 64
 
 @dataclass(frozen=True, slots=True)
 class Memory:
-    """A memory of a board, or one that all boards share."""
+    """A memory of a board, or a memory shared by all boards."""
 
     name: str
-    """Its file's name."""
+    """Its file name."""
     width: int
     """Bits of a word."""
     depth: int
@@ -37,7 +38,7 @@ class Memory:
     words: Callable[[], Iterable[int]]
     """A function that returns every word, from address 0."""
     comments: tuple[str, ...]
-    """Lines for the head of the file."""
+    """Comment lines for the beginning of the file."""
 
     def lines(self) -> Iterator[str]:
         """Yield the MIF, in canonical form."""
@@ -45,9 +46,9 @@ class Memory:
 
 
 def memories(deployment: Deployment, images: Sequence[Image]) -> tuple[Memory, ...]:
-    """Return every memory of a deployment's machine, board by board and then what all boards share.
+    """Return the memories of a deployment's machine, board by board and then the shared ones.
 
-    Generators that exist emulated only (`rng = ideal`) have no memories.
+    Generators that exist only in emulation (`rng = ideal`) have no memories.
     """
     found: list[Memory] = []
     for board, image in enumerate(images):
@@ -63,21 +64,19 @@ def memories(deployment: Deployment, images: Sequence[Image]) -> tuple[Memory, .
 
 
 def prior_name(board: int) -> str:
-    """Return the file's name of a board's prior."""
+    """Return the file name of a board's prior."""
     return f"board{board}_prior.mif"
 
 
 def column_name(board: int, column: int, sensors: int) -> str:
-    """Return the file's name of a board's column, 1 to `sensors`; all are equally long, so that they sort."""
+    """Return the file name of a board's column, 1 to `sensors`; all have the same length, for sorting."""
     return f"board{board}_column{column:0{len(str(sensors))}d}.mif"
 
 
 def seed_words(machine: BM1Machine) -> NDArray[np.uint64]:
     """Return the start of every generator in every bank: uint64[banks, columns] or [banks, lines, columns]."""
     parameters = machine.parameters
-    if (
-        parameters.rng in POLYNOMIALS
-    ):  # all banks at once: bank b's generators are numbered on from bank b - 1's
+    if parameters.rng in POLYNOMIALS:  # all banks at once: the numbers of bank b follow those of bank b - 1
         shape = generator_numbers(parameters, 0).shape
         every = np.arange(parameters.rng_banks * generators(parameters), dtype=np.uint64)
         return LFSR(parameters.rng).seeds(every.reshape(-1, *shape))
@@ -93,7 +92,7 @@ def seed_width(machine: BM1Machine) -> int:
 
 
 def packed_words(codes: NDArray[np.uint16], prob_bits: int) -> Iterator[int]:
-    """Yield a word for every row of uint16[rows, lines]: line 0's code in the lowest bits, `prob_bits` each."""
+    """Yield a word per row of uint16[rows, lines]: the code of line 0 in the lowest bits, `prob_bits` each."""
     weights = np.arange(prob_bits - 1, -1, -1, dtype=np.uint16)
     for start in range(0, len(codes), _ROWS_AT_ONCE):
         rows = codes[start : start + _ROWS_AT_ONCE, ::-1]
@@ -125,7 +124,7 @@ def _prior(deployment: Deployment, board: int, image: Image) -> Memory:
 
 
 def _written_prior(name: str, what: str, image: Image) -> Memory:
-    """Return what the words that the host may write hold first: a word for every line."""
+    """Return the initial contents of the words that the host may write: one word per line."""
     part = image.partition
     return Memory(
         name=name,
@@ -194,7 +193,7 @@ def _seeds(machine: BM1Machine, prefix: str) -> list[Memory]:
 
 
 def generators(parameters: BM1Parameters) -> int:
-    """Return the number of generators of a board: one a column, or one a cell."""
+    """Return the number of generators of a board: one per column, or one per cell."""
     return parameters.columns * (1 if parameters.shared else parameters.lines)
 
 

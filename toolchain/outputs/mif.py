@@ -1,7 +1,7 @@
 """Memory initialisation files (MIF), the text in which an FPGA's memories get their contents (thesis 3.2).
 
-Written in one canonical form, an entry a line in hexadecimal; read in every form that Quartus knows: five
-radices, runs (`A : D0 D1;`), ranges (`[A0..A1] : D;`) and both kinds of comments.
+Files are written in one canonical form, with one hexadecimal entry per line, and read in every form of
+Quartus: five radices, runs (`A : D0 D1;`), ranges (`[A0..A1] : D;`) and both kinds of comments.
 """
 
 import re
@@ -14,16 +14,16 @@ from toolchain.errors import MifError
 from toolchain.files.bounded_file import read_bounded
 
 MOST_BYTES: Final = 1 << 30
-"""Larger files are not read."""
+"""Maximum size of a file in bytes."""
 
 MOST_WORDS: Final = 1 << 24
-"""A deeper memory is not read: a few bytes could claim any depth."""
+"""Maximum depth of a memory, because a few bytes could declare any depth."""
 
 MOST_WIDTH: Final = 1 << 20
-"""Bits of the widest word that is read: 4096 lines with the widest codes have 65,536."""
+"""Maximum width of a word in bits: 4096 lines with the widest codes have 65,536."""
 
 _BASES: Final = {"BIN": 2, "OCT": 8, "DEC": 10, "UNS": 10, "HEX": 16}
-_DECIMAL_DIGITS: Final = 4000  # Python refuses to read longer decimal numbers, whose time is quadratic
+_DECIMAL_DIGITS: Final = 4000  # Python refuses longer decimal numbers, because the time is quadratic
 
 _TOKEN: Final = re.compile(
     r"(?P<newline>\n)|(?P<space>[^\S\n]+)|(?P<comment>--[^\n]*|%[^%]*%)|(?P<dots>\.\.)|(?P<sign>[=:;\[\]])"
@@ -34,25 +34,26 @@ _TOKEN: Final = re.compile(
 
 @dataclass(frozen=True, slots=True)
 class Mif:
-    """A memory's contents."""
+    """The contents of a memory."""
 
     width: int
     """Bits of a word."""
     words: tuple[int, ...]
-    """Every word, from address 0; addresses that a file leaves out are 0, as in Quartus."""
+    """All words, from address 0; omitted addresses are 0, as in Quartus."""
 
     def __post_init__(self) -> None:
         if not self.words or self.width < 1:
-            raise MifError(f"a memory of {len(self.words)} words of {self.width} bits holds nothing")
+            raise MifError(f"a memory of {len(self.words)} words of {self.width} bits is empty")
         for address, word in enumerate(self.words):
             if word < 0 or word.bit_length() > self.width:
                 raise MifError(f"the word at address {address} doesn't fit {self.width} bits")
 
 
 def mif_lines(width: int, depth: int, words: Iterable[int], comments: Iterable[str] = ()) -> Iterator[str]:
-    """Yield a file in its canonical form, a line at a time: everything in hexadecimal, an entry a line.
+    """Yield the lines of a file in canonical form: hexadecimal, with one entry per line.
 
-    `words` are all words from address 0, and `comments` lines for the head, whose odd characters are escaped.
+    `words` are all words from address 0, and `comments` lines for the beginning, in which unprintable
+    characters are escaped.
     """
     for comment in comments:
         yield f"-- {printable(comment)}\n"
@@ -64,23 +65,23 @@ def mif_lines(width: int, depth: int, words: Iterable[int], comments: Iterable[s
 
 
 def printable(text: str) -> str:
-    """Return a name as one line of printable ASCII, for a comment that every tool reads."""
+    """Return a name as one line of printable ASCII, for comments that all tools accept."""
     return text.encode("unicode_escape").decode("ascii")
 
 
 def read_mif(path: Path) -> Mif:
-    """Read a memory's contents from a file in any form of MIF; a MifError names the line."""
+    """Read the contents of a memory from any form of MIF; a MifError contains the line."""
     data = read_bounded(path, MOST_BYTES, MifError)
     return parse_mif(data.decode("latin-1"), str(path))
 
 
 def parse_mif(text: str, name: str = "the MIF") -> Mif:
-    """Return a memory's contents from a text; a MifError names the line and what was expected."""
+    """Return the contents of a memory from a text; a MifError contains the line and the expected token."""
     return _Reader(text, name).read()
 
 
 class _Reader:
-    """A reader by token; `_kind` and `_word` are the current token, `_line` is its line."""
+    """A token reader; `_kind` and `_word` are the current token, `_line` is its line."""
 
     def __init__(self, text: str, name: str) -> None:
         self._name = name
@@ -95,7 +96,7 @@ class _Reader:
         while not self._at("END"):
             self._entry(words, width, address_radix, data_radix)
         self._next()
-        if self._kind:  # the semicolon after END is often left out at the end of a file
+        if self._kind:  # the semicolon after END is often omitted
             self._expect(";")
         if self._kind:
             self._refuse("the end of the file after END;")
@@ -165,7 +166,7 @@ class _Reader:
         for place, address in enumerate(range(first, end + 1)):
             if words[address] is not None:
                 self._fail(f"address {address} is given twice, the second time by the entry of line {line}")
-            # the words of a range are repeated until it is full
+            # the words are repeated to fill the range
             words[address] = values[place % len(values)]
         self._next()
 
@@ -204,8 +205,8 @@ class _Reader:
                 self._line += match[0].count("\n")
             elif kind == "other":
                 if match[0] == "%":
-                    self._fail("a comment begins with % and never ends")
-                self._fail(f"{match[0]!r} means nothing here")
+                    self._fail("a comment that begins with % does not end")
+                self._fail(f"{match[0]!r} is unexpected here")
             elif kind is not None and kind != "space":
                 yield kind, match[0]
 

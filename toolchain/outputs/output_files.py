@@ -1,4 +1,4 @@
-"""The files that follow from a deployment, written together, and the change of each."""
+"""Writing of the files of a deployment, and the change of each."""
 
 import filecmp
 import re
@@ -23,7 +23,7 @@ from toolchain.outputs.vhdl_parameters import parameters_vhd
 
 
 class Change(StrEnum):
-    """The change that writing made to a file."""
+    """The change of a file by writing."""
 
     UNCHANGED = "unchanged"
     CHANGED = "changed"
@@ -33,12 +33,12 @@ class Change(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class OutputFiles:
-    """A part of a deployment: all its files, and a pattern for those left from an earlier build."""
+    """A part of a deployment: its files, and a pattern for files of earlier builds."""
 
     contents: dict[str, Callable[[], Iterable[bytes]]]
-    """Functions that return the content in pieces, by the path from the deployment's folder."""
+    """Functions that return the content in pieces, by the path in the deployment's folder."""
     own: re.Pattern[str]
-    """Paths of this part: those that are not in `contents` are removed."""
+    """Paths of this part; files that are not in `contents` are removed."""
 
 
 _MEMORIES: Final = re.compile(
@@ -61,7 +61,7 @@ def memory_files(deployment: Deployment, images: Sequence[Image]) -> OutputFiles
 
 
 def quartus_files(deployment: Deployment, images: Sequence[Image]) -> OutputFiles:
-    """Return the Quartus project; none for generators that exist emulated only."""
+    """Return the Quartus project; none for generators that exist only in emulation."""
     if deployment.machine.rng is RngKind.IDEAL:
         return OutputFiles({}, _PROJECT)
     mifs = [f"{MEMORIES_FOLDER}/{memory.name}" for memory in memories(deployment, images)]
@@ -72,7 +72,7 @@ def quartus_files(deployment: Deployment, images: Sequence[Image]) -> OutputFile
 
 
 def image_files(deployment: Deployment, images: Sequence[Image]) -> OutputFiles:
-    """Return the boards' programming files."""
+    """Return the programming files."""
     contents: dict[str, Callable[[], Iterable[bytes]]] = {
         board.image: partial(_image, image) for board, image in zip(deployment.boards, images, strict=True)
     }
@@ -80,12 +80,12 @@ def image_files(deployment: Deployment, images: Sequence[Image]) -> OutputFiles:
 
 
 def text_file(name: str, text: str) -> OutputFiles:
-    """Return one file of text."""
+    """Return one text file."""
     return OutputFiles({name: partial(iter, [text.encode()])}, re.compile(re.escape(name)))
 
 
 def write_files(directory: Path, files: OutputFiles) -> list[tuple[str, Change]]:
-    """Write a part of a deployment, each file whole or not at all; return every path, sorted, and its change."""
+    """Write the files of a part atomically; return every path, sorted, and its change."""
     changes: dict[str, Change] = {}
     for name, pieces in files.contents.items():
         changes[name] = _write(directory / name, pieces)
@@ -97,7 +97,7 @@ def write_files(directory: Path, files: OutputFiles) -> list[tuple[str, Change]]
 
 
 def compare_files(directory: Path, files: OutputFiles) -> list[tuple[str, Change]]:
-    """Return the changes that `write_files` would make; files that differ in comments alone are unchanged."""
+    """Return the changes that `write_files` would make; files that differ only in comments are unchanged."""
     changes: dict[str, Change] = {}
     for name, pieces in files.contents.items():
         path = directory / name
@@ -147,11 +147,11 @@ def _remove(path: Path) -> None:
 
 
 def _says_the_same(path: Path, pieces: Iterable[bytes]) -> bool:
-    """Compare a file with its expected content, line by line but for comments and empty lines."""
+    """Compare a file with its expected content line by line, ignoring comments and empty lines."""
     expected = (line for piece in pieces for line in piece.splitlines())
     try:
         with path.open("rb") as file:
-            # a line that is much too long is read in parts, which then differ from the expected line
+            # a much too long line is read in parts, which then differ from the expected line
             found = iter(partial(file.readline, _LONGEST_LINE), b"")
             pairs = zip_longest(filter(None, map(_plain, found)), filter(None, map(_plain, expected)))
             return all(one == other for one, other in pairs)

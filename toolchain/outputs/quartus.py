@@ -1,4 +1,4 @@
-"""The Quartus project of a deployment: a revision for every board, and a script that compiles them (thesis 3.2)."""
+"""The Quartus project of a deployment: one revision per board, and a script that compiles them (thesis 3.2)."""
 
 from collections.abc import Sequence
 from typing import Final
@@ -9,7 +9,7 @@ from toolchain.outputs.vhdl_parameters import FILE as PARAMETERS_FILE
 
 FAMILY: Final = "Stratix V"
 DEVICE: Final = "5SGSMD8K2F40C2"
-"""A Stratix V GS D8, as on the thesis's Proce V boards; package and speed grade are to be compared with the board's."""
+"""A Stratix V GS D8, as on the thesis's Proce V boards; compare package and speed grade with the board."""
 
 PROJECT: Final = "bm1"
 
@@ -21,7 +21,7 @@ _UNVERIFIED: Final = """\
 
 
 def project_files(deployment: Deployment, mifs: Sequence[str]) -> dict[str, str]:
-    """Return the project's files by name: `bm1.qpf`, a `.qsf` for every board, `bm1.tcl`; `mifs` are its memories."""
+    """Return the project's files by name: `bm1.qpf`, a `.qsf` per board, `bm1.tcl`; `mifs` are its memories."""
     boards = range(len(deployment.boards))
     head = (
         f"# The Bayesian machine of the model {printable(deployment.name)}, written by 'toolchain build'.\n"

@@ -1,4 +1,4 @@
-"""The table of random numbers that `rng = table` plays (thesis 3.2): generated, or read from a user's MIF."""
+"""The table of random numbers for `rng = table` (thesis 3.2): generated, or read from a user's MIF."""
 
 from pathlib import Path
 from typing import Final
@@ -12,19 +12,19 @@ from toolchain.errors import BuildError
 from toolchain.outputs.mif import read_mif
 
 LENGTH: Final = 1 << 16
-"""Numbers of a generated table: a multiple of every number of codes."""
+"""Length of a generated table: a multiple of every number of codes."""
 
 
 def table_length(machine: BM1Machine) -> int:
-    """Return the length of a machine's table of random numbers; that of a generated one where it has none."""
+    """Return the length of a machine's table of random numbers, or of a generated one if it has none."""
     return LENGTH if machine.rng_table is None else machine.rng_table.size
 
 
 def random_table(prob_bits: int) -> NDArray[np.uint32]:
-    """Return numbers of `prob_bits` bits in a random order, uint32[65536], each equally often.
+    """Return numbers of `prob_bits` bits in a random order, uint32[65536], all equally frequent.
 
-    So every code's probability is exact over the ring's length. The order is always the same: that of splitmix64's
-    numbers.
+    The probability of every code is therefore exact over the whole table. The order is always the same, from
+    splitmix64.
     """
     keys = mix(np.arange(1, LENGTH + 1, dtype=np.uint64) * np.uint64(GOLDEN))
     numbers: NDArray[np.uint32] = (np.argsort(keys, kind="stable") % (1 << prob_bits)).astype(np.uint32)
@@ -32,7 +32,7 @@ def random_table(prob_bits: int) -> NDArray[np.uint32]:
 
 
 def read_table(path: Path) -> NDArray[np.uint32]:
-    """Return the random numbers in a user's MIF, uint32[length]; a MifError or BuildError if it has none."""
+    """Return the random numbers in a user's MIF, uint32[length], or raise a MifError or BuildError."""
     mif = read_mif(path)
     if mif.width > 32:
         raise BuildError(

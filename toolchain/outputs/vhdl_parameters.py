@@ -1,4 +1,4 @@
-"""`bm1_parameters.vhd`: all parameters of a model that the machine's VHDL needs, in one package (thesis 3.2)."""
+"""`bm1_parameters.vhd`: all parameters for the VHDL of the machine, in one package (thesis 3.2)."""
 
 from collections.abc import Iterable, Sequence
 from typing import Final
@@ -13,7 +13,7 @@ from toolchain.outputs.mif import printable
 FILE: Final = "bm_arch/bm1_parameters.vhd"
 
 _MOST_SEEDS: Final = 4096
-"""More are in the memory file alone."""
+"""Maximum number of seeds in the package; more are only in the memory file."""
 
 _TYPES: Final = """\
   type rng_kind_t is (RNG_LFSR8, RNG_LFSR16, RNG_LFSR24, RNG_LFSR32, RNG_TABLE, RNG_IDEAL);
@@ -103,12 +103,12 @@ def _vector(bits: int) -> str:
 
 
 def _hexadecimal(value: int, bits: int) -> str:
-    """Return a bit string literal: hexadecimal for a multiple of 4 bits, else binary."""
+    """Return a bit string literal: hexadecimal for a multiple of 4 bits, otherwise binary."""
     return f'x"{value:0{bits // 4}X}"' if bits % 4 == 0 else f'"{value:0{bits}b}"'
 
 
 def _array(name: str, kind: str, rows: Iterable[tuple[int, str, str]], range_: str) -> str:
-    """Return an array constant with a row a line: index, value, comment."""
+    """Return an array constant with one row per line: index, value, comment."""
     listed = list(rows)
     if not listed:
         return f"  constant {name:17} : {kind}({range_}) := (others => 0);\n"

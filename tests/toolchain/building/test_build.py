@@ -155,7 +155,7 @@ def test_a_build_over_another_leaves_nothing_of_it_even_if_it_fails_half_way(tmp
     (tmp_path / "boards" / "board1.bm" / "in the way").mkdir(parents=True)
     with pytest.raises(BuildError, match="can't be written"):
         build_deployment(model(), tmp_path, replace(OPTIONS, partitions=2))
-    with pytest.raises(DeploymentError, match="holds no deployment"):
+    with pytest.raises(DeploymentError, match="deployment.toml"):
         load_deployment(tmp_path)
 
 

@@ -236,4 +236,4 @@ def test_no_deployment_or_a_damaged_one(built, part):
     image.write_bytes(image.read_bytes()[:-1] + b"x")
     assert "board1.bm is damaged" in regenerate(part, built, code=2).stderr
     shutil.rmtree(built)
-    assert "holds no deployment" in regenerate(part, built, code=2).stderr
+    assert "deployment.toml" in regenerate(part, built, code=2).stderr

@@ -238,14 +238,14 @@ def test_a_wrong_key_or_value_has_its_line(folder, old, new, line, place):
 @pytest.mark.parametrize(
     ("old", "new", "advice"),
     [
-        ("on_range", "on_rnage", "in [[variable]] 1; did you mean 'on_range'?"),
-        ("prob_bits", "zzzz", "in [machine]; expected one of type, lines, interface"),
-        ('"slices"', '"slice"', "in [machine] is not a value it can have; did you mean 'slices'?"),
+        ("on_range", "on_rnage", r"\[\[variable\]\] 1; .*'on_range'\?$"),
+        ("prob_bits", "zzzz", r"\[machine\]; .* type, lines, interface"),
+        ('"slices"', '"slice"', r"\[machine\] .*; .*'slices'\?$"),
     ],
 )
 def test_the_advice_is_the_nearest_right_name(folder, old, new, advice):
     edit(folder, old, new)
-    assert advice in refused(folder)
+    assert re.search(advice, refused(folder))
 
 
 @pytest.mark.parametrize(
@@ -266,7 +266,7 @@ def test_parts_that_disagree(folder, old, new):
 
 
 def test_no_deployment(tmp_path):
-    with pytest.raises(DeploymentError, match="holds no deployment"):
+    with pytest.raises(DeploymentError, match="deployment.toml"):
         load_deployment(tmp_path / "nowhere")
     file = tmp_path / "deployment.toml"
     file.write_text("")

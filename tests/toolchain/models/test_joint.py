@@ -212,20 +212,20 @@ NEVER = (uniform(S), table(R, [[1, 1], [0, 0]], given=[S]))
 @pytest.mark.parametrize(
     ("make", "sentence"),
     [
-        (lambda: SPRINKLER.ask([], ["G"]), "searches nothing"),
-        (lambda: SPRINKLER.ask(["R"], ["R"]), "R is in the question twice"),
-        (lambda: SPRINKLER.ask(["R"], ["G"], given={"G": "yes"}), "G is in the question twice"),
-        (lambda: SPRINKLER.ask(["R"], ["G"], prior_select="G"), "G is in the question twice"),
-        (lambda: SPRINKLER.ask(["rain"], ["G"]), "no variable 'rain'; it has R, S, G"),
-        (lambda: SPRINKLER.ask(["R"], given={"S": "maybe"}), "S is never 'maybe'; expected no, yes"),
-        (lambda: JointDistribution("j", (table(S, COIN, given=[R]),)), "R has no distribution"),
-        (lambda: JointDistribution("j", (uniform(R), uniform(R))), "R has two distributions"),
+        (lambda: SPRINKLER.ask([], ["G"]), "sprinkler"),
+        (lambda: SPRINKLER.ask(["R"], ["R"]), "R is "),
+        (lambda: SPRINKLER.ask(["R"], ["G"], given={"G": "yes"}), "G is "),
+        (lambda: SPRINKLER.ask(["R"], ["G"], prior_select="G"), "G is "),
+        (lambda: SPRINKLER.ask(["rain"], ["G"]), "'rain'; .*R, S, G"),
+        (lambda: SPRINKLER.ask(["R"], given={"S": "maybe"}), "S .*'maybe'; .*no, yes"),
+        (lambda: JointDistribution("j", (table(S, COIN, given=[R]),)), r"uniform\(R\)"),
+        (lambda: JointDistribution("j", (uniform(R), uniform(R))), "j: R "),
         (
             lambda: JointDistribution("j", (uniform(R), uniform(Symbol("R", IntegerType(0, 1))))),
-            "two different symbols 'R'",
+            "j: .*'R'",
         ),
-        (lambda: JointDistribution("j", tuple(CYCLE)), "is a cycle"),
-        (lambda: JointDistribution("j", NEVER).ask(["S"], given={"R": "yes"}).model(), "impossible|never"),
+        (lambda: JointDistribution("j", tuple(CYCLE)), "j: .* -> "),
+        (lambda: JointDistribution("j", NEVER).ask(["S"], given={"R": "yes"}).model(), "j: "),
     ],
 )
 def test_refused_joints_and_questions(make, sentence):
