@@ -23,6 +23,8 @@ from toolchain.models.model import Known, Model, dimension
 from toolchain.outputs.vhdl_parameters import parameters_vhd
 
 DOCS = Path(__file__).parents[2] / "docs"
+DEPLOYMENT = (DOCS / "reference" / "deployment.md").read_text()
+TOOLCHAIN = (DOCS / "reference" / "toolchain.md").read_text()
 
 
 def documented(text, heading):
@@ -51,7 +53,7 @@ def sections():
 
 @pytest.mark.parametrize(("heading", "keys"), list(sections()))
 def test_every_key_of_the_deployment(heading, keys):
-    assert sorted(documented((DOCS / "reference" / "deployment.md").read_text(), heading)) == sorted(keys)
+    assert sorted(documented(DEPLOYMENT, heading)) == sorted(keys)
 
 
 def options_of(*path):
@@ -73,21 +75,14 @@ def test_every_option_of_a_command(command, page, heading):
 
 @pytest.mark.parametrize("part", ["memories", "project", "deployment"])
 def test_every_option_of_regenerate(part):
-    section = (
-        (DOCS / "reference" / "toolchain.md")
-        .read_text()
-        .split("\n## One part again", 1)[1]
-        .split("\n## ", 1)[0]
-    )
+    section = TOOLCHAIN.split("\n## One part again", 1)[1].split("\n## ", 1)[0]
     question = {"--set", "--searched", "--known", "--given", "--prior-select", "--on-missing"}
     for name in options_of("regenerate", part) - question:
         assert name in section
 
 
 def test_the_example_is_a_model(tmp_path):
-    example = re.search(r"```python\n(.*?)```", (DOCS / "reference" / "toolchain.md").read_text(), re.DOTALL)[
-        1
-    ]
+    example = re.search(r"```python\n(.*?)```", TOOLCHAIN, re.DOTALL)[1]
     (tmp_path / "model.py").write_text(example)
     model = load_model(tmp_path, {"cells": "7"})
     assert model.lines == 7
@@ -139,7 +134,7 @@ def test_the_boiler_is_a_question_and_the_printed_refusal_is_said(tmp_path):
 
 
 def test_every_check_is_described():
-    described = documented((DOCS / "reference" / "toolchain.md").read_text(), "Checks before anything runs")
+    described = documented(TOOLCHAIN, "Checks before anything runs")
     assert set(described) == set(Check) - {Check.RNG}
 
 
@@ -150,18 +145,14 @@ def test_every_constant_of_the_parameters():
 
 
 def built_for_the_documentation():
-    model = Model(
-        name="m",
-        searched=(dimension("s", size=2),),
-        known=(Known(name="K", table=np.full((2, 2), 0.5)),),
-    )
+    known = Known(name="K", table=np.full((2, 2), 0.5))
+    model = Model(name="m", searched=(dimension("s", size=2),), known=(known,))
     built = assemble(model, BuildOptions(uri="ws://robot:9090", topic="/readings", type="a/B"))
     return built.deployment, built.images
 
 
 def test_the_sources_of_the_deployment_page(tmp_path):
-    page = (DOCS / "reference" / "deployment.md").read_text()
-    (example,) = re.findall(r"^```toml\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    (example,) = re.findall(r"^```toml\n(.*?)^```", DEPLOYMENT, re.MULTILINE | re.DOTALL)
     (tmp_path / "sources.toml").write_text(example)
     file = read_sources(tmp_path / "sources.toml", "ws://robot:9090")
     names = ("ahead", "colour", "left", "near", "turn")
@@ -178,8 +169,7 @@ def test_the_sources_of_the_deployment_page(tmp_path):
 
 @pytest.mark.parametrize("mode", ["cell", "threshold"])
 def test_inspect_explains_the_disparity_model(tmp_path, mode):
-    page = (DOCS / "reference" / "toolchain.md").read_text()
-    (example,) = re.findall(r"```python\n(# disparity/model\.py.*?)```", page, re.DOTALL)
+    (example,) = re.findall(r"```python\n(# disparity/model\.py.*?)```", TOOLCHAIN, re.DOTALL)
     model, out = tmp_path / "disparity", tmp_path / "out"
     model.mkdir()
     (model / "model.py").write_text(example)

@@ -42,16 +42,20 @@ class Peer:
     def subscribe(self, topic: str, **more: Any) -> None:
         self.send(op="subscribe", topic=topic, **more)
 
-    def read(self) -> list[dict[str, Any]]:
+    def payloads(self) -> list[bytes]:
         """Drain its outbox, as a socket that accepts everything does."""
-        operations = []
-        while (payload := self.client.outbox.pop()) is not None:
-            assert len(payload) <= self.hub.broker.limits.message_bytes
-            if is_text(payload):
-                operations.append(json.loads(payload, parse_constant=_no_constant))
-            else:
-                operations.append(cbor_codec.decode(payload))
-        return operations
+        payloads = list(iter(self.client.outbox.pop, None))
+        assert all(len(payload) <= self.hub.broker.limits.message_bytes for payload in payloads)
+        return payloads
+
+    def read(self) -> list[dict[str, Any]]:
+        """Drain its outbox of operations."""
+        return [
+            json.loads(payload, parse_constant=_no_constant)
+            if is_text(payload)
+            else cbor_codec.decode(payload)
+            for payload in self.payloads()
+        ]
 
     def messages(self, topic: str | None = None) -> list[Any]:
         """Drain its outbox of messages, of one topic or all; anything else is an error."""

@@ -15,16 +15,9 @@ from rosbags.typesys import Stores, get_typestore
 from bridge.codecs import cbor_codec, png
 from bridge.codecs.fragments import Reassembler
 from bridge.hub.handlers import topics
-from tests.bridge.hub.broker_harness import WALL_CLOCK, Harness, Peer, publisher_and_subscriber
+from tests.bridge.hub.broker_harness import WALL_CLOCK, Harness, publisher_and_subscriber
 
 ARRAY = "std_msgs/Float64MultiArray"
-
-
-def _raw(peer: Peer) -> list[bytes]:
-    payloads = []
-    while (payload := peer.client.outbox.pop()) is not None:
-        payloads.append(payload)
-    return payloads
 
 
 def _whole(payloads: list[bytes]) -> bytes:
@@ -42,7 +35,7 @@ def test_cbor_has_bytes_and_typed_arrays_of_the_types_elements() -> None:
     publisher, subscriber = publisher_and_subscriber("sensor_msgs/LaserScan", compression="cbor")
     scan = {"ranges": [1.5, 2, None], "intensities": [], "angle_min": -1.5, "header": {"frame_id": "é"}}
     publisher.publish("/t", scan)
-    (payload,) = _raw(subscriber)
+    (payload,) = subscriber.payloads()
     msg = cbor_codec.decode(payload, arrays="numpy")["msg"]
     np.testing.assert_array_equal(msg["ranges"], np.array([1.5, 2, math.nan], "f4"), strict=True)
     np.testing.assert_array_equal(msg["intensities"], np.array([], "f4"), strict=True)
@@ -69,7 +62,7 @@ def test_of_an_unknown_field_floats_alone_are_packed(
         monkeypatch.setitem(sys.modules, "rosbags.typesys", None)
     publisher, subscriber = publisher_and_subscriber(type_name or ARRAY, compression="cbor")
     publisher.publish("/t", message)
-    (payload,) = _raw(subscriber)
+    (payload,) = subscriber.payloads()
     msg = cbor_codec.decode(payload, arrays="numpy")["msg"]
     assert msg["data"].dtype == "f8"
     assert msg["n"] == [1, 2]
@@ -89,7 +82,7 @@ def test_cbor_raw_is_what_ros_would_send(ros_version: Any) -> None:
     for names in (own, other):
         header = {"stamp": dict(zip(names, (12, 34), strict=True)), "frame_id": "map"}
         publisher.publish("/t", {"header": header, "pose": {"position": {"x": 1.5, "y": 2}}})
-    payloads = _raw(subscriber)
+    payloads = subscriber.payloads()
     store = get_typestore(Stores.ROS1_NOETIC if ros_version == 1 else Stores.ROS2_JAZZY)
     read = store.deserialize_ros1 if ros_version == 1 else store.deserialize_cdr
     for payload in payloads:
@@ -107,7 +100,7 @@ def test_arrays_are_serialised_with_their_type_and_length() -> None:
     publisher, subscriber = publisher_and_subscriber("sensor_msgs/Imu", 2, compression="cbor-raw")
     publisher.publish("/t", {"orientation_covariance": [0.5, *[None] * 8]})
     imu: Any = get_typestore(Stores.ROS2_JAZZY).deserialize_cdr(
-        cbor_codec.decode(_raw(subscriber)[0])["msg"]["bytes"], "sensor_msgs/msg/Imu"
+        cbor_codec.decode(subscriber.payloads()[0])["msg"]["bytes"], "sensor_msgs/msg/Imu"
     )
     assert imu.orientation_covariance[0] == 0.5
     assert math.isnan(imu.orientation_covariance[8])
@@ -155,7 +148,7 @@ def test_a_message_in_fragments(asked: int, size: int, compression: str) -> None
     for message in messages:
         publisher.publish("/t", message)
     by_id: dict[str, list[bytes]] = {}
-    for payload in _raw(subscriber):
+    for payload in subscriber.payloads():
         operation = json.loads(payload)
         assert operation["op"] == "fragment"
         assert 1 <= len(operation["data"]) <= size
@@ -186,7 +179,7 @@ def test_fragments_are_dropped_as_messages_are() -> None:
     publisher, slow = publisher_and_subscriber("a/B", limits={"queue_length": 2}, fragment_size=256)
     for index in range(10):
         publisher.publish("/t", {"i": index, "data": "x" * 1000})
-    payloads = _raw(slow)
+    payloads = slow.payloads()
     half = len(payloads) // 2
     assert [json.loads(_whole(part))["msg"]["i"] for part in (payloads[:half], payloads[half:])] == [8, 9]
 
@@ -194,7 +187,7 @@ def test_fragments_are_dropped_as_messages_are() -> None:
 def test_the_answer_to_a_call_in_fragments_and_as_png() -> None:
     peer = Harness().connect()
     peer.send(op="call_service", service="/rosapi/services", id="x", fragment_size=300)
-    assert "/rosapi/topics" in json.loads(_whole(_raw(peer)))["values"]["services"]
+    assert "/rosapi/topics" in json.loads(_whole(peer.payloads()))["values"]["services"]
     peer.send(op="call_service", service="/rosapi/services", id="x", compression="png")
     (operation,) = peer.read()
     assert json.loads(png.decode(operation["data"]))["id"] == "x"
@@ -212,7 +205,7 @@ def test_of_several_wishes_the_last_form_and_the_least_size_count() -> None:
     assert subscriber.messages() == [{"data": noise}], "as CBOR"
     subscriber.send(op="unsubscribe", topic="/t", id=2)
     publisher.publish("/t", {"data": noise})
-    payloads = _raw(subscriber)
+    payloads = subscriber.payloads()
     assert max(len(json.loads(payload)["data"]) for payload in payloads) == 320
     assert json.loads(_whole(payloads))["op"] == "png"
 
@@ -251,7 +244,7 @@ def test_large_messages_are_cut_out_only_where_that_is_sure(raw: bytes, cut: boo
     raw %= b"x" * size
     publisher, subscriber = publisher_and_subscriber("a/B")
     publisher.send_raw(raw)
-    (payload,) = _raw(subscriber)
+    (payload,) = subscriber.payloads()
     operation = json.loads(payload, parse_constant=lambda name: pytest.fail(f"{name} on the wire"))
     expected = json.loads(raw, parse_constant=lambda _: None)["msg"]
     assert operation["msg"] == {key: None if value == math.inf else value for key, value in expected.items()}
