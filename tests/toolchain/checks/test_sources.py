@@ -2,19 +2,16 @@
 
 import pytest
 
+from tests.toolchain.deployments import boat
 from toolchain.checks.finding import Check, Severity
 from toolchain.checks.sources import source_findings
-from toolchain.deployment import Board, Deployment, Dimension, MachineSection, Source, Variable
+from toolchain.deployment import Source, Variable
 
 
-def deployment(*types, tolerance_s=0.05):
-    return Deployment(
-        name="test",
-        source=[Source(uri="ws://robot:9090", topic=f"/t{at}", type=type_) for at, type_ in enumerate(types)],
-        variable=[Variable(name=f"D{at}", source=at, bits=7, values=101) for at in range(len(types))],
-        searched=[Dimension(label="x", size=4)],
-        machine=MachineSection(lines=4),
-        board=[Board(image="boards/board0.bm", image_hash="0" * 64, line_offset=0, lines=4)],
+def deployment(*types, tolerance_s):
+    return boat(
+        sources=tuple(Source(uri="ws://a:1", topic=f"/t{at}", type=each) for at, each in enumerate(types)),
+        variables=tuple(Variable(name=f"D{at}", source=at, bits=7, values=101) for at in range(len(types))),
         tolerance_s=tolerance_s,
     )
 

@@ -14,16 +14,15 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
+from tests.toolchain.deployments import boat
 from tests.toolchain.running import OPTIONS
 from toolchain.building.build import build_deployment
 from toolchain.deployment import (
     Board,
-    Deployment,
     Dimension,
     MachineSection,
     Output,
     Queue,
-    Source,
     Stop,
     Variable,
     deployment_hash,
@@ -36,34 +35,9 @@ from toolchain.errors import DamagedDeploymentError, DeploymentError, Deployment
 from toolchain.models.model import Known, Model, dimension
 
 
-def deployment(**fields):
-    return Deployment(
-        **(
-            {
-                "name": "boat",
-                "sources": (Source(uri="ws://a:9090", topic="/boat/sensors", type="boat_msgs/Sensors"),),
-                "variables": (
-                    Variable(name="D1", bits=7, values=101, on_range="clamp"),
-                    Variable(name="B1", bits=9, values=360, period=360, path="bearings[0]"),
-                ),
-                "searched": (
-                    Dimension(label="y", size=4, offset=-3.0, step=2.0),
-                    Dimension(label="x", size=3),
-                ),
-                "machine": MachineSection(lines=12),
-                "boards": (
-                    Board(image="boards/board0.bm", image_hash="0" * 64, line_offset=0, lines=6),
-                    Board(image="boards/board1.bm", image_hash="1" * 64, line_offset=6, lines=6),
-                ),
-            }
-            | fields
-        )
-    )
-
-
 @pytest.fixture
 def folder(tmp_path):
-    write_deployment(tmp_path, deployment())
+    write_deployment(tmp_path, boat())
     return tmp_path
 
 
@@ -94,7 +68,7 @@ def test_what_is_written_is_read_back(folder):
     assert written.output_uri(written.outputs[0]) == "ws://a:9090"
     assert written.machine.stop is Stop.SLICES
     assert (written.machine.interface_sensors, written.machine.interface_results) == (20, 1200)
-    assert written == deployment(hash=deployment_hash(deployment()), directory=folder)
+    assert written == boat(hash=deployment_hash(boat()), directory=folder)
     assert [written.searched[0].value(i) for i in (0, 3)] == [-3.0, 3.0]
 
 
@@ -114,7 +88,7 @@ def deployments(draw):
     starts = [0, *cuts]
     names = draw(st.lists(NAMES, unique=True, max_size=4))
     step = FLOATS.filter(bool)
-    return deployment(
+    return boat(
         name=draw(NAMES),
         queue=draw(st.sampled_from(list(Queue))),
         tolerance_s=draw(st.floats(0, 86_400)),
@@ -179,7 +153,7 @@ def test_any_other_edit_is_found(folder, old, new):
     edit(folder, "lines = 6\n", "lines = 6\n\n# no change\n")
     load_deployment(folder, images=False)
     edit(folder, old, new)
-    assert deployment_hash(deployment())[:16] in refused(folder, DamagedDeploymentError)
+    assert deployment_hash(boat())[:16] in refused(folder, DamagedDeploymentError)
 
 
 @pytest.mark.parametrize(
@@ -273,7 +247,7 @@ def test_no_deployment(tmp_path):
     with pytest.raises(DeploymentError, match=rf"is a file; give the folder .* {re.escape(str(tmp_path))}"):
         load_deployment(file)
     with pytest.raises(DeploymentError):
-        write_deployment(tmp_path / "not" / "there", deployment())
+        write_deployment(tmp_path / "not" / "there", boat())
 
 
 @given(st.binary(max_size=200))
@@ -288,7 +262,7 @@ def test_no_bytes_get_past(tmp_path_factory, content):
 
 def test_objects_are_checked_like_files():
     with pytest.raises(ValidationError, match="expected 0"):
-        deployment(boards=(Board(image="b.bm", image_hash="0" * 64, line_offset=1, lines=11),))
+        boat(boards=(Board(image="b.bm", image_hash="0" * 64, line_offset=1, lines=11),))
 
 
 @pytest.fixture

@@ -2,40 +2,19 @@
 
 import pytest
 
-from toolchain.deployment import (
-    Board,
-    Deployment,
-    Dimension,
-    MachineSection,
-    Output,
-    Queue,
-    Source,
-    Variable,
-    WrittenPrior,
-)
+from tests.toolchain.deployments import boat
+from toolchain.deployment import Deployment, MachineSection, Output, Queue, Source, Variable, WrittenPrior
 from toolchain.deployment.same_shape import differences
 
-SOURCE = Source(uri="ws://a:9090", topic="/boat/sensors", type="boat_msgs/Sensors")
+(SOURCE,), BOARDS, (Y, X) = boat().sources, boat().boards, boat().searched
 D1 = Variable(name="D1", bits=7, values=101)
 B1 = Variable(name="B1", bits=7, values=100)
 ROOM = Variable(name="room", kind="prior_select", bits=2, values=3)
-Y, X = Dimension(label="y", size=4), Dimension(label="x", size=3)
 MACHINE = MachineSection(lines=12, prior_bits=2, prior_mode="written")
-BOARDS = tuple(
-    Board(image=f"boards/board{at}.bm", image_hash=str(at) * 64, line_offset=6 * at, lines=6) for at in (0, 1)
-)
 
 
 def deployment(**fields):
-    made = {
-        "name": "boat",
-        "sources": (SOURCE,),
-        "variables": (D1, B1, ROOM),
-        "searched": (Y, X),
-        "machine": MACHINE,
-        "boards": BOARDS,
-    }
-    return Deployment(**(made | fields))
+    return boat(**({"variables": (D1, B1, ROOM), "machine": MACHINE} | fields))
 
 
 def changed(section, **fields):
@@ -49,15 +28,8 @@ def changed(section, **fields):
         {"boards": tuple(changed(each, image="b.bm", image_hash="f" * 64) for each in BOARDS)},
         {"machine": changed(MACHINE, target_count=100, max_cycles=4096, stop="own", scale="column")},
         {"variables": (B1, D1, ROOM)},
-        {
-            "variables": (
-                changed(
-                    D1, offset=1.0, step=0.5, values=90, on_range="clamp", on_missing="missing", path="d.one"
-                ),
-                B1,
-                ROOM,
-            )
-        },
+        {"variables": (changed(D1, offset=1.0, step=0.5, values=90, path="d.one"), B1, ROOM)},
+        {"variables": (changed(D1, on_range="clamp", on_missing="missing"), B1, ROOM)},
         {"searched": (changed(Y, offset=5.0, step=2.0), changed(X, states=("a", "b", "c")))},
         {"prior": WrittenPrior(path="prior")},
     ],

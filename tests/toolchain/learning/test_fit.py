@@ -261,20 +261,23 @@ def test_a_fit_that_was_edited_wrongly(tmp_path, old, new):
         with_fit(room(), path)
 
 
-def test_what_cannot_be_learnt_in_this_way():
+OTHER = Model(
+    name="o", searched=(dimension("x", size=3),), known=(Known(name="door", table=np.full((2, 3), 0.5)),)
+)
+
+
+@pytest.mark.parametrize(
+    "attempt",
+    [
+        lambda: learn(door(), {"x": [0]}, {"door": [1]}),
+        lambda: learn(door(), {"x": [77]}, {"door": [1]}, method=FitMethod.COUNTS),
+        lambda: learn(room(), *simulated(20), pool=("rnge*",)),
+        lambda: apply_fit(OTHER, learn(door(), {"x": [0]}, {"door": [1]}, method=FitMethod.COUNTS)[0]),
+    ],
+)
+def test_what_cannot_be_learnt_in_this_way(attempt):
     with pytest.raises(ModelError):
-        learn(door(), {"x": [0]}, {"door": [1]})
-    with pytest.raises(ModelError):
-        learn(door(), {"x": [77]}, {"door": [1]}, method=FitMethod.COUNTS)
-    truth, readings = simulated(20)
-    with pytest.raises(ModelError):
-        learn(room(), truth, readings, pool=("rnge*",))
-    fit, _ = learn(door(), {"x": [0]}, {"door": [1]}, method=FitMethod.COUNTS)
-    other = Model(
-        name="o", searched=(dimension("x", size=3),), known=(Known(name="door", table=np.full((2, 3), 0.5)),)
-    )
-    with pytest.raises(ModelError):
-        apply_fit(other, fit)
+        attempt()
 
 
 @pytest.fixture
