@@ -53,7 +53,7 @@ class Listener:
             if self._truths.waits and now() >= min(flushing, end):
                 self._ready.extend(self._truths.flush())
             elif now() >= end:
-                raise self._heard.no_result_error(limit_s)
+                raise await self._heard.no_result_error(limit_s)
             else:
                 self._news.clear()
                 with contextlib.suppress(TimeoutError):

@@ -24,6 +24,7 @@ from typing import Any, Final, Protocol, Self, TypeVar
 from bridge.client import Message, Ros, State, Subscription, connect
 from bridge.client.protocol import Compression
 from bridge.errors import ConcurrentReadError, DisconnectedError, OptionError
+from bridge.names import same_type
 from posteriors.errors import BadResultError, NoResultError
 from posteriors.frame_report import FRAME_TOPIC, FRAME_TYPE, read_frame_report
 from posteriors.pairing import WAITING, FrameOutcome, Pairing
@@ -141,16 +142,16 @@ class Posteriors:
             raise DisconnectedError(f"the subscription of {self._topic} is closed") from None
         except TimeoutError:
             pass
-        raise self.no_result_error(timeout)
+        raise await self.no_result_error(timeout)
 
-    def no_result_error(self, waited: float | None) -> NoResultError:
-        """Return the error for `waited` seconds without a frame, with the state of the connection."""
+    async def no_result_error(self, waited: float | None) -> NoResultError:
+        """Return the error for `waited` seconds without a frame, with the state of connection and topic."""
         ros = self._ros
-        why = (
-            "is the master running, and do readings reach it?"
-            if ros.state is State.CONNECTED
-            else f"the connection is {ros.state}: {ros.last_error}"
-        )
+        why = "is the master running, and do readings reach it?"
+        if ros.state is not State.CONNECTED:
+            why = f"the connection is {ros.state}: {ros.last_error}"
+        elif (known := await ros.topic_type(self._topic)) and not same_type(known, RESULTS_TYPE):
+            why = f"{self._topic} is {known[:80]} there, not {RESULTS_TYPE}: no master can publish on it"
         limit = "" if waited is None else f" within {waited:g} s"
         return NoResultError(
             f"nothing arrived on {self._frame_topic} and {self._topic} from {ros.uri}{limit}: {why}"

@@ -25,7 +25,9 @@ It behaves as real servers do (A: rosbridge_suite on ROS 1, B: on ROS 2, R: rosb
 * a subscription made before a best-effort publisher began never hears it (B: `MultiSubscriber.__init__` in
   rosbridge_library/internal/subscribers.py chooses the reliability once), for topics of `start_best_effort`;
 * a type with an array of fixed length is never sent as CBOR (A, B: `extract_cbor_values` in
-  rosbridge_library/internal/cbor_conversion.py fails on it), for topics in `fails_as_cbor`.
+  rosbridge_library/internal/cbor_conversion.py fails on it), for topics in `fails_as_cbor`;
+* a topic that `topics_glob` does not allow is neither advertised nor subscribed, and only the server's log says so (A, B:
+  rosbridge_library/capabilities/advertise.py), for topics in `refused_topics`.
 """
 
 import asyncio
@@ -117,6 +119,7 @@ class FakeRosbridge:
         self.latched: dict[str, dict[str, Any]] = {}
         self.services: dict[str, Callable[[dict[str, Any]], Any]] = {}
         self.fails_as_cbor: set[str] = set()
+        self.refused_topics: set[str] = set()
         self._best_effort: dict[str, float] = {}
         self._begun: dict[str, float] = {}
         self._clients: set[_Client] = set()
@@ -332,6 +335,8 @@ class FakeRosbridge:
 
     async def _op_advertise(self, client: _Client, op: dict[str, Any]) -> None:
         topic, type_name = _slashed(op.get("topic")), op.get("type")
+        if topic in self.refused_topics:
+            return
         if not self._is_type(type_name):
             await self._complain(client, f"cannot load type {type_name!r}")
             return
@@ -386,6 +391,8 @@ class FakeRosbridge:
 
     async def _op_subscribe(self, client: _Client, op: dict[str, Any]) -> None:
         topic, type_name = _slashed(op.get("topic")), op.get("type")
+        if topic in self.refused_topics:
+            return
         if type_name is None and topic not in self.types:
             await self._complain(client, f"type is required: {topic} is not known")
         elif type_name is not None and not self._is_type(type_name):

@@ -317,6 +317,11 @@ class Ros:
         self._session.core.wire.ros_version = self.ros_version
         return self.ros_version
 
+    async def topic_type(self, topic: str, timeout: float = 1.0) -> str | None:  # noqa: ASYNC109  # as above
+        """Return the type of a topic at the server: empty if it does not know the topic, None without rosapi."""
+        known = (await self._session.ask_rosapi("topic_type", {"topic": topic}, timeout)).get("type")
+        return known if isinstance(known, str) else None
+
     async def _ask_version(self, limit: float) -> RosVersion | None:
         version = (await self._session.ask_rosapi("get_ros_version", {}, limit)).get("version")
         return 1 if version == 1 else 2 if version == 2 else None

@@ -47,6 +47,7 @@ MOST_AT_PUBLISHER = 8
 _LOSSES = {
     Outcome.NO_POSTERIOR: LossReason.NO_POSTERIOR,
     Outcome.ROSBRIDGE_AWAY: LossReason.ROSBRIDGE_AWAY,
+    Outcome.REFUSED: LossReason.REFUSED,
 }
 
 

@@ -3,11 +3,15 @@
 import asyncio
 import time
 from collections import Counter
+from typing import NoReturn
+
+import msgspec
 
 from bridge.client import State
 from bridge.errors import BridgeError
 from posteriors.posterior import posterior_layout
 from services.pipeline.connections import reconnect_now, report_failure
+from services.pipeline.delivery import CHECK_INTERVAL, SETTLED_TIME, NotReceivableError, refusals
 from services.pipeline.generations import Generations
 from services.pipeline.result_topics import RESULTS_DEPTH, ROLE, ResultTopics
 from services.settings import Settings
@@ -53,6 +57,7 @@ class Publisher:
         self._where = ""
         self._outcomes: Counter[Outcome] = Counter()
         self._last = (0, 0)
+        self._refused: dict[str, str] = {}
 
     def status(self) -> ProcessStatus:
         """Return the status of this process."""
@@ -110,6 +115,8 @@ class Publisher:
 
     def _report(self, published: Published) -> None:
         """Count and log the outcome of a result, and send it to the master."""
+        if published.outcome is Outcome.PUBLISHED and self._refused:
+            published = self._without_refused(published)
         self._link.send(published)
         self._outcomes[published.outcome] += 1
         if published.outcome is Outcome.PUBLISHED:
@@ -122,6 +129,34 @@ class Publisher:
                 ms=f"{published.total_ns / 1e6:.2f}",
             )
 
+    def _without_refused(self, published: Published) -> Published:
+        refused = sum(topic.name in self._refused for topic in self._topics.advertised)
+        if refused == len(self._topics.advertised):
+            return msgspec.structs.replace(published, outcome=Outcome.REFUSED, missed=0)
+        return msgspec.structs.replace(published, missed=max(published.missed, refused))
+
+    async def _check_delivery(self, *, settled: bool) -> None:
+        """Look which topics the servers do not pass on, and report each once.
+
+        Raises:
+            NotReceivableError: Nobody can receive the result of a run of one frame.
+        """
+        topics = self._topics.advertised
+        refused = await refusals(
+            [*topics, *([self._topics.reports] if self._topics.reports else [])], settled=settled
+        )
+        if self._once and all(topic.name in refused for topic in topics):
+            raise NotReceivableError(refused[topics[0].name])
+        for name in refused.keys() - self._refused.keys():
+            self._link.notice("warning", refused[name])
+        self._refused = refused
+
+    async def _keep_checking(self) -> NoReturn:
+        await asyncio.sleep(SETTLED_TIME)
+        while True:
+            await self._check_delivery(settled=True)
+            await asyncio.sleep(CHECK_INTERVAL)
+
     def _state_changed(self, uri: str, state: State, reason: str) -> None:
         topics, rosbridge = self._topics.served_by(uri)
         if state is State.RECONNECTING:
@@ -132,18 +167,36 @@ class Publisher:
         if self._where:
             self._link.keep(Rosbridge(self._topics.is_connected))
 
+    async def _publish_waiting(self) -> NoReturn:
+        while True:
+            publish = await self._waiting.get()
+            if self._once:
+                await self._check_delivery(settled=False)
+            published = await self._topics.publish(publish, look=self._once)
+            if published.seen is False:
+                await self._check_delivery(settled=True)
+            self._report(published)
+            self._draining = not self._waiting.empty()
+
     async def run(self) -> int:
         """Serve until a signal, or raise a BridgeError if a server is unreachable or not a rosbridge server."""
         async with self._link, status_served(self._run_directory, ROLE, self.status):
             try:
                 async with self._topics.opened(self._state_changed) as where:
+                    await self._check_delivery(settled=False)
                     self._where = where
                     self._link.keep(Ready(where))
                     self._draining = False
-                    while True:
-                        publish = await self._waiting.get()
-                        self._report(await self._topics.publish(publish, look=self._once))
-                        self._draining = not self._waiting.empty()
+                    tasks = [
+                        asyncio.ensure_future(each)
+                        for each in (self._publish_waiting(), self._keep_checking())
+                    ]
+                    try:
+                        ended, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+                        return ended.pop().result()
+                    finally:
+                        for task in tasks:
+                            task.cancel()
             except BridgeError as error:
                 await report_failure(self._link, error)
                 raise

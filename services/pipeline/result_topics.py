@@ -14,6 +14,7 @@ from bridge.errors import BridgeError, DisconnectedError, NoMessageError, SlowPe
 from posteriors.frame_report import FRAME_TOPIC, FRAME_TYPE, write_frame_report
 from posteriors.posterior import MAX_RESULT, posterior_layout
 from services.pipeline.connections import OnState, connect_all
+from services.pipeline.delivery import AdvertisedTopic
 from services.pipeline.inference import Inference, report_of
 from services.settings import Settings
 from services.sockets.records import Outcome, Publish, Published
@@ -42,6 +43,7 @@ class ResultTopics:
 
     Attributes:
         rosbridges: The connections by URI.
+        advertised: The output topics, once they are advertised, and `reports` that of the frame reports.
     """
 
     def __init__(self, settings: Settings, deployment: Deployment) -> None:
@@ -53,6 +55,8 @@ class ResultTopics:
         self._watched: Subscription | None = None
         self._previous_out_ns = 0
         self.rosbridges: dict[str, Ros] = {}
+        self.advertised: list[AdvertisedTopic] = []
+        self.reports: AdvertisedTopic | None = None
 
     def use(self, deployment: Deployment, generation: int) -> None:
         """From now on, publish results of another deployment on the same topics."""
@@ -76,6 +80,11 @@ class ResultTopics:
                 self._ros_version = await first.detect_ros_version() or 2
             else:
                 self._ros_version = 1 if settings.ros_version == "1" else 2
+            self.advertised = [
+                AdvertisedTopic(by_uri[uri], uri, output.topic, output.type)
+                for uri, output in zip(uris, deployment.outputs, strict=True)
+            ]
+            self.reports = AdvertisedTopic(first, uris[0], FRAME_TOPIC, FRAME_TYPE)
             topics = ", ".join(output.topic for output in deployment.outputs)
             yield f"publishing on {topics} at {', '.join(by_uri)}"
 

@@ -27,6 +27,8 @@ class LossReason(StrEnum):
     IN_RELOAD = "lost in a reload"
     NO_POSTERIOR = "no posterior"
     ROSBRIDGE_AWAY = "rosbridge away"
+    REFUSED = "refused by rosbridge"
+    """The server does not pass the topic on: it has another type, or is not allowed."""
     SOME_TOPICS = "on some topics only"
     """Published, but not on the topics of a disconnected server."""
 
@@ -38,6 +40,7 @@ class Outcome(StrEnum):
     NO_POSTERIOR = "no posterior"
     """All counts were 0."""
     ROSBRIDGE_AWAY = "rosbridge away"
+    REFUSED = "refused by rosbridge"
 
 
 class FailureReason(StrEnum):

@@ -281,3 +281,11 @@ def test_a_thread_without_a_loop_raises_in_the_caller(monkeypatch):
     monkeypatch.setattr(asyncio, "run", run)
     with pytest.raises(OSError, match="Too many"):
         listen("ws://127.0.0.1:1", print)
+
+
+async def test_silence_on_a_topic_of_another_type_names_the_type():
+    async with FakeRosbridge(rosapi=True) as fake, connect(fake.uri) as ros:
+        fake.know("/BMresults", "std_msgs/msg/String")
+        async with posteriors(ros) as heard:
+            with pytest.raises(NoResultError, match="std_msgs/msg/String"):
+                await heard.next(0.1)

@@ -5,14 +5,16 @@ import contextlib
 from contextlib import asynccontextmanager
 
 import numpy as np
+import pytest
 
 from bridge.client import State
 from pcie_shim.host.frame import BoardResult
 from services.boards.frames import encode_boards
+from services.pipeline.delivery import NotReceivableError
 from services.pipeline.publisher import Publisher
 from services.pipeline.result_topics import ResultTopics
 from services.settings import Settings
-from services.sockets.records import FrameResult, Notice, Outcome, Publish, Published, Ready, Rosbridge
+from services.sockets.records import Begin, FrameResult, Notice, Outcome, Publish, Published, Ready, Rosbridge
 from tests.fake_rosbridge import FakeRosbridge
 from toolchain.deployment import Output
 
@@ -49,6 +51,8 @@ class FakeTopics:
 
     must_wait = True
     rosbridges = {}  # noqa: RUF012  # nobody changes it
+    advertised = ()
+    reports = None
 
     def __init__(self):
         self.published = []
@@ -158,3 +162,56 @@ async def test_the_largest_posterior_goes_out(boat):
         await topics.publish_array(np.full(64 * 4096, np.nextafter(1 / 262145, 1)))
         said = await first.wait_for_op("publish", topic="/BMresults")
         assert len(said["msg"]["data"]) == 64 * 4096
+
+
+async def running_publisher(boat, link, uri):
+    publisher = Publisher(Settings(uri=uri, seen_timeout=0.2), boat, link.make)
+    running = asyncio.create_task(publisher.run())
+    while not running.done() and not any(isinstance(each, Ready) for each in link.sent):
+        await asyncio.sleep(0.01)
+    return publisher, running
+
+
+async def outcome_of(link):
+    while not (found := [each for each in link.sent if isinstance(each, Published)]):
+        await asyncio.sleep(0.01)
+    return found[-1].outcome
+
+
+@pytest.mark.parametrize("other", ["std_msgs/msg/String", ""])
+async def test_results_that_nobody_can_receive_are_lost(boat, link, monkeypatch, other):
+    """The topic has another type, or the server's `topics_glob` refuses it."""
+    monkeypatch.setattr("services.pipeline.publisher.SETTLED_TIME", 0.01)
+    monkeypatch.setattr("services.pipeline.publisher.CHECK_INTERVAL", 0.01)
+    async with FakeRosbridge(rosapi=True) as fake:
+        if other:
+            fake.know("/BMresults", other)
+        else:
+            fake.refused_topics.add("/BMresults")
+        _, running = await running_publisher(boat, link, fake.uri)
+        while not any(isinstance(each, Notice) for each in link.sent):
+            await asyncio.sleep(0.01)
+        link.take(result(boat, 1))
+        assert await outcome_of(link) is Outcome.REFUSED
+        fake.types.pop("/BMresults", None)
+        fake.know("/BMresults", "std_msgs/msg/Float64MultiArray")
+        link.sent.clear()
+        await asyncio.sleep(0.3)
+        link.take(result(boat, 2))
+        assert await outcome_of(link) is Outcome.PUBLISHED
+        running.cancel()
+
+
+@pytest.mark.parametrize("other", ["std_msgs/msg/String", ""])
+async def test_one_result_that_nobody_can_receive_is_an_error(boat, link, other):
+    async with FakeRosbridge(rosapi=True) as fake:
+        if other:
+            fake.know("/BMresults", other)
+        else:
+            fake.refused_topics.add("/BMresults")
+        _, running = await running_publisher(boat, link, fake.uri)
+        link.take(Begin(once=True))
+        link.take(result(boat, 1))
+        with pytest.raises(NotReceivableError) as caught:
+            await running
+        assert caught.value.exit_code == 3

@@ -1,0 +1,60 @@
+"""Whether the rosbridge servers pass results on: rosapi tells which type a topic has after it was advertised."""
+
+import asyncio
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from bridge.client import Ros, State
+from bridge.errors import BridgeError
+from bridge.names import same_type
+
+ROSAPI_TIME = 2.0
+"""Seconds in which a server may answer; many have no rosapi, and then nothing is known."""
+SETTLED_TIME = 3.0
+"""Seconds after which a server that knows nothing of an advertised topic has refused it."""
+CHECK_INTERVAL = 10.0
+
+
+class NotReceivableError(BridgeError):
+    """Raised when nobody can receive the result of a run of one frame."""
+
+
+@dataclass(frozen=True, slots=True)
+class AdvertisedTopic:
+    """A topic that was advertised at a server."""
+
+    ros: Ros
+    uri: str
+    name: str
+    type: str
+
+
+async def refusals(topics: Iterable[AdvertisedTopic], *, settled: bool) -> dict[str, str]:
+    """Return why nobody can receive a topic, by the topic's name, as far as rosapi tells.
+
+    Args:
+        topics: The topics.
+        settled: Whether the servers had the time to make them known.
+    """
+    asked = list(topics)
+    found = await asyncio.gather(*(_refusal(topic, settled=settled) for topic in asked))
+    return {topic.name: why for topic, why in zip(asked, found, strict=True) if why}
+
+
+async def _refusal(topic: AdvertisedTopic, *, settled: bool) -> str:
+    if topic.ros.state is not State.CONNECTED:
+        return ""
+    known = await topic.ros.topic_type(topic.name, ROSAPI_TIME)
+    if known is None:
+        return ""
+    if known and not same_type(known, topic.type):
+        return (
+            f"nobody can receive {topic.name} at {topic.uri}: it is {known[:80]} there, not {topic.type}; "
+            "end the other publisher, or build with another output topic"
+        )
+    if not known and settled:
+        return (
+            f"nobody can receive {topic.name} at {topic.uri}: the server does not know it although it was advertised; "
+            f"does its topics_glob allow the topic, and has it {topic.type.partition('/')[0]}?"
+        )
+    return ""
