@@ -50,8 +50,8 @@ def model(
         raise ModelError(
             f"bearing_values is {bearing_values}, expected the number of bearings in a turn, from 1"
         )
-    rows = interval("y", *Y_LIMITS, cells=height)
-    columns = interval("x", *X_LIMITS, cells=width)
+    rows = interval("y", *Y_LIMITS, cells=height, unit="m")
+    columns = interval("x", *X_LIMITS, cells=width, unit="m")
     y, x = cell_centres(rows, columns)
     known: list[Known] = []
     for landmark in read_landmarks(landmarks):

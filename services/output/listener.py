@@ -7,9 +7,9 @@ from posteriors.errors import BadResultError, NoResultError
 from posteriors.listening import posteriors
 from posteriors.posterior import MAX_RESULT, Posterior
 from services.errors import SettingsError
+from services.output.axes import Axis, axes_of
 from services.output.posterior_file import ResultFile
 from services.output.posterior_lines import Show
-from services.output.posterior_picture import Axis, axes_of
 from services.settings import Settings
 from terminal.connection import report_connection
 from terminal.output import say

@@ -1,10 +1,12 @@
 """Output of results by `master`: one JSON object per line, or one sentence."""
 
+from collections.abc import Sequence
+
 from services.errors import StackError
+from services.output.axes import Axis, deployment_axes, in_words
 from services.pipeline.generations import InForce
 from services.sockets.records import Published
 from terminal.output import put_json
-from toolchain.deployment import Deployment
 
 
 def print_json(record: Published, in_force: InForce) -> None:
@@ -14,10 +16,13 @@ def print_json(record: Published, in_force: InForce) -> None:
         BrokenPipeError: The reader has closed the pipe.
         StackError: Standard output can't be written.
     """
+    axes = deployment_axes(in_force.deployment)
+    best = _cell(axes, record.best_line)
     result = {
         "frame": record.number,
-        "best": cell(in_force.deployment, record.best_line),
         "probability": record.best_probability,
+        "best": best,
+        "best_value": {axis.label: axis.value(best[axis.label]) for axis in axes},
         "cycles": record.cycles,
         "ms": round(record.total_ns / 1e6, 3),
         "seen": record.seen,
@@ -32,21 +37,18 @@ def print_json(record: Published, in_force: InForce) -> None:
 
 
 def print_sentence(record: Published, in_force: InForce) -> None:
-    """Print a result as a sentence."""
-    where = ", ".join(
-        f"{label} = {value:g}" for label, value in cell(in_force.deployment, record.best_line).items()
-    )
+    """Print a result as a line, with the words of `listen`."""
+    axes = deployment_axes(in_force.deployment)
     print(
-        f"frame {record.number}: most probable {where} (p = {record.best_probability:.3g}), "
-        f"{record.cycles} cycles, {record.total_ns / 1e6:.2f} ms",
+        f"frame {record.number}: {in_words(axes, _cell(axes, record.best_line))} with {record.best_probability:.3g}; "
+        f"{record.cycles} cycles; {record.total_ns / 1e6:.2f} ms",
         flush=True,
     )
 
 
-def cell(deployment: Deployment, line: int) -> dict[str, float]:
-    """Return the values of a line of the result, by label; the last dimension is the fastest."""
-    values: dict[str, float] = {}
-    for dimension in reversed(deployment.result_dimensions):
-        line, index = divmod(line, dimension.size)
-        values[dimension.label] = dimension.value(index)
-    return dict(reversed(values.items()))
+def _cell(axes: Sequence[Axis], line: int) -> dict[str, int]:
+    """Return the index of each dimension at a line of the result; the last dimension is the fastest."""
+    indices: dict[str, int] = {}
+    for axis in reversed(axes):
+        line, indices[axis.label] = divmod(line, axis.size)
+    return {axis.label: indices[axis.label] for axis in axes}

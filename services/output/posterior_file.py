@@ -14,7 +14,7 @@ import orjson
 from posteriors.pairing import FrameOutcome
 from posteriors.posterior import Posterior
 from services.errors import SettingsError
-from services.output.posterior_picture import Axis
+from services.output.axes import Axis
 
 MOST_NUMBERS: Final = 1 << 26
 """Maximum number of probabilities in an archive (512 MiB), which is in memory until it is written."""

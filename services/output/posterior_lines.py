@@ -12,8 +12,9 @@ from rich.text import Text
 from posteriors.errors import LabelError
 from posteriors.pairing import FrameOutcome
 from posteriors.posterior import Posterior
+from services.output.axes import Axis, in_words
 from services.output.posterior_file import record
-from services.output.posterior_picture import ROWS, Axis, in_colour, picture, printable
+from services.output.posterior_picture import ROWS, in_colour, picture
 from terminal.output import put_json
 
 _PICTURES_A_SECOND: Final = 10
@@ -46,17 +47,13 @@ def line(frame: FrameOutcome, axes: list[Axis]) -> str:
 
 
 def _best(posterior: Posterior, axes: list[Axis]) -> str:
-    best = posterior.best()
-    where = ", ".join(f"{printable(axis.label)} {axis.shown(best[axis.label])}" for axis in axes)
-    return f"{where} with {posterior.probability:.3g}"
+    return f"{in_words(axes, posterior.best())} with {posterior.probability:.3g}"
 
 
 def _means(posterior: Posterior, axes: list[Axis]) -> list[str]:
     """Return the part of a line with the means, or an empty text if no axis has one."""
     numbers = [axis for axis in axes if not axis.has_states]
-    mean = posterior.mean() if numbers else {}
-    shown = ", ".join(f"{printable(axis.label)} {axis.shown(mean[axis.label])}" for axis in numbers)
-    return [f"mean {shown}"] if shown else []
+    return [f"mean {in_words(numbers, posterior.mean())}"] if numbers else []
 
 
 def _of_replica(frame: Posterior, at: int, axes: list[Axis]) -> str:

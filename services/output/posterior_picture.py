@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 from rich.console import Console
 from rich.text import Text
 
 from posteriors.posterior import Posterior
-from toolchain.deployment import Deployment, Dimension
+from services.output.axes import Axis, printable
 
 if TYPE_CHECKING:
     import numpy as np
@@ -25,53 +24,6 @@ _COLOURS: Final = (
     *((34, 167, 132), (68, 190, 112), (121, 209, 81), (189, 222, 38), (253, 231, 36)),
 )
 """Viridis in eleven steps."""
-_LABEL: Final = 24
-
-
-@dataclass(frozen=True, slots=True)
-class Axis:
-    """A dimension of a posterior, with the values of its indices if the deployment is known."""
-
-    label: str
-    size: int
-    dimension: Dimension | None = None
-
-    @property
-    def has_states(self) -> bool:
-        """Whether cells have names instead of values."""
-        return self.dimension is not None and bool(self.dimension.states)
-
-    def value(self, index: float) -> float | str:
-        """Return the value of an index: a number in its unit, the name of a state, or the index itself."""
-        if self.dimension is None:
-            return index
-        if self.dimension.states:
-            return self.dimension.states[round(index)]
-        return self.dimension.value(index)
-
-    def shown(self, index: float) -> str:
-        """Return the value of an index as text for a terminal."""
-        value = self.value(index)
-        return printable(value) if isinstance(value, str) else f"{value:.6g}"
-
-
-def axes_of(posterior: Posterior, deployment: Deployment | None) -> list[Axis]:
-    """Return the dimensions of a received posterior; a ValueError if they differ from the deployment's."""
-    if deployment is None:
-        return [Axis(label, size) for label, size in zip(posterior.labels, posterior.sizes, strict=True)]
-    ours = [(dimension.label, dimension.size) for dimension in deployment.result_dimensions]
-    theirs = list(zip(posterior.labels, posterior.sizes, strict=True))
-    if ours != theirs:
-        raise ValueError(
-            f"the received posterior has {_grid(theirs)}, but the deployment of {deployment.directory} has {_grid(ours)}"
-        )
-    return [Axis(dimension.label, dimension.size, dimension) for dimension in deployment.result_dimensions]
-
-
-def printable(text: str) -> str:
-    """Return received text without control characters, and shortened."""
-    text = text if len(text) <= _LABEL else text[: _LABEL - 3] + "..."
-    return text if text.isprintable() else repr(text)
 
 
 def in_colour(console: Console) -> bool:

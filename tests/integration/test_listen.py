@@ -159,7 +159,7 @@ async def test_neither_a_lost_server_nor_a_signal_loses_anything(stage, stack, t
         await printed(listen, lines + 5)
         listen.send(number)
         assert await listen.end() == code
-        frames.append([int(frame) for frame in re.findall(r"^frame (\d+): y", listen.out, re.MULTILINE)])
+        frames.append([int(frame) for frame in re.findall(r"^frame (\d+): cell y", listen.out, re.MULTILINE)])
     with np.load(paths[0]) as saved:
         assert (saved["probabilities"].max(axis=(1, 2)) == 0.75).all()
         assert saved["frame"].tolist() == frames[0]
@@ -199,7 +199,7 @@ async def test_silence_nonsense_and_another_model(stage, boat):
         await waiting.says("warning: nothing .* within 2 s")
         before = len(waiting.out.splitlines())
         await results.publish(result(2))
-        assert (await printed(waiting, before + 1))[-1].startswith("frame -: y 0, x 2 with 0.75")
+        assert (await printed(waiting, before + 1))[-1].startswith("frame -: cell y 0, x 2 with 0.75")
         waiting.send(signal.SIGTERM)
         assert await waiting.end() == 143
         other = stage.start("listen", "-d", str(boat), "--uri", uri)

@@ -76,6 +76,10 @@ Item = TypeVar("Item")
 # TOML arrays and strings become tuples and enums; their contents stay strict.
 Sequence = Annotated[tuple[Item, ...], Field(strict=False), FailFast()]
 Choice = Annotated[Item, Field(strict=False)]
+Unit = Annotated[
+    str, Field(max_length=NAME_MAX, exclude_if=lambda unit: not unit), AfterValidator(_printable)
+]
+"""A unit such as m; an empty one is omitted from the file and from its hash."""
 # empty states are omitted from the file and from its hash
 States = Annotated[tuple[Name, ...], Field(strict=False, exclude_if=lambda states: not states)]
 

@@ -23,7 +23,7 @@ _DEPLOYMENT_FREE: Final = {"name", "hash", "tolerance_s", "prior", "directory"}
 _VARIABLE_FREE: Final = {
     *("source", "path", "offset", "step", "period", "values", "on_range", "on_missing", "states"),
 }
-_DIMENSION_FREE: Final = {"offset", "step", "states"}
+_DIMENSION_FREE: Final = {"offset", "step", "unit", "states"}
 _MACHINE_FREE: Final = {"scale", "target_count", "max_cycles", "stop"}
 _BOARD_FREE: Final = {"image", "image_hash"}
 _TABLES: Final = {"sources", "variables", "searched", "machine", "boards", "outputs"}

@@ -26,6 +26,7 @@ from toolchain.deployment.fields import (
     States,
     Step,
     Topic,
+    Unit,
     WebSocketUri,
     states_fit,
     websocket_uri,
@@ -124,6 +125,7 @@ class Dimension(Section):
     size: int = Field(ge=1)
     offset: float = 0.0
     step: Step = 1.0
+    unit: Unit = ""
     states: States = ()
 
     @model_validator(mode="after")

@@ -254,6 +254,7 @@ class Question:
                     size=each.size,
                     offset=each.type.offset,
                     step=each.type.step,
+                    unit=each.type.unit,
                     states=each.type.labels,
                 )
                 for each in self.searched

@@ -214,11 +214,17 @@ class Model:
 
 
 def dimension(
-    label: str, *, size: int, offset: float = 0.0, step: float = 1.0, states: tuple[str, ...] = ()
+    label: str,
+    *,
+    size: int,
+    offset: float = 0.0,
+    step: float = 1.0,
+    unit: str = "",
+    states: tuple[str, ...] = (),
 ) -> Dimension:
     """Return a searched dimension: `size` cells with centres at `offset`, `offset + step` and so on.
 
-    `states` are the names of the cells, if any.
+    `unit` is that of offset and step, such as m; `states` are the names of the cells, if any.
 
     Raises:
         ModelError: There are no cells, the name is empty, the number of states differs from that of cells, or
@@ -226,19 +232,19 @@ def dimension(
     """
     check_size(f"searched dimension {str(label)[:NAME_MAX]!r}", size, MAX_LINES)
     try:
-        return Dimension(label=label, size=size, offset=offset, step=step, states=states)
+        return Dimension(label=label, size=size, offset=offset, step=step, unit=unit, states=states)
     except ValidationError as reason:
         raise ModelError(f"searched dimension {label!r}: {_first(reason)}") from None
 
 
-def interval(label: str, low: float, high: float, *, cells: int) -> Dimension:
+def interval(label: str, low: float, high: float, *, cells: int, unit: str = "") -> Dimension:
     """Return a searched dimension that divides [low, high] into equal cells, or raise a ModelError."""
     if cells < 1 or not low < high:
         raise ModelError(
             f"searched dimension {label!r}: [{low:g}, {high:g}] can't be divided into {cells} cells"
         )
     step = (high - low) / cells
-    return dimension(label, size=cells, offset=low + step / 2, step=step)
+    return dimension(label, size=cells, offset=low + step / 2, step=step, unit=unit)
 
 
 def cell_centres(*searched: Dimension) -> tuple[NDArray[np.float64], ...]:

@@ -29,6 +29,7 @@ class IntegerType:
     low: int
     high: int
     wraps: bool = False
+    unit: str = ""
 
     def __post_init__(self) -> None:
         if not (_is_whole(self.low) and _is_whole(self.high)):
@@ -68,6 +69,7 @@ class IntervalType:
     high: float
     intervals: int
     wraps: bool = False
+    unit: str = ""
 
     def __post_init__(self) -> None:
         if not _is_whole(self.intervals):
@@ -124,6 +126,11 @@ class LabelType:
     def wraps(self) -> bool:
         """False, because named values are never on a circle."""
         return False
+
+    @property
+    def unit(self) -> str:
+        """The unit of the values: none."""
+        return ""
 
     @property
     def offset(self) -> float:

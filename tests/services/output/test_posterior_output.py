@@ -17,9 +17,10 @@ from posteriors.frame_report import FrameReport
 from posteriors.posterior import Posterior
 from services.errors import SettingsError
 from services.output import posterior_file
+from services.output.axes import Axis, axes_of
 from services.output.posterior_file import open_result_file, record
 from services.output.posterior_lines import line
-from services.output.posterior_picture import ROWS, Axis, axes_of, in_colour, picture
+from services.output.posterior_picture import ROWS, in_colour, picture
 from toolchain.deployment import Board, Deployment, Dimension, MachineSection, Source
 
 HASH = "0" * 64
@@ -65,7 +66,7 @@ class TestLine:
     def test_indices_or_values_in_their_units(self):
         posterior = made([[0, 0, 1], [1, 0, 2]], "y", "x")
         assert line(posterior, axes_of(posterior, None)) == (
-            "frame 7: y 1, x 2 with 0.5; mean y 0.75, x 1.5; 812 cycles; 3.21 ms"
+            "frame 7: cell y 1, x 2 with 0.5; mean cell y 0.75, x 1.5; 812 cycles; 3.21 ms"
         )
         assert "y 2.5, x -0.5 with 0.5; mean y 2, x -0.625;" in line(posterior, axes_of(posterior, GRID))
 
@@ -73,11 +74,11 @@ class TestLine:
         posterior = made([[0, 0, 1], [0, 0, 0], [1, 2, 1]], "replica", "x")
         posterior = replace(posterior, probabilities=(0, 0, 1, 0, 0, 0, 0.25, 0.5, 0.25))
         assert line(posterior, axes_of(posterior, None)) == (
-            "frame 7: 3 replicas; replica 0 x 2 with 1; replica 1 no posterior; replica 2 x 1 with 0.5; "
+            "frame 7: 3 replicas; replica 0 cell x 2 with 1; replica 1 no posterior; replica 2 cell x 1 with 0.5; "
             "812 cycles; 3.21 ms"
         )
         many = replace(posterior, probabilities=(1.0,) * 200, sizes=(200, 1))
-        assert "replica 3 x 0 with 1; and 196 more; 812 cycles" in line(many, axes_of(many, None))
+        assert "replica 3 cell x 0 with 1; and 196 more; 812 cycles" in line(many, axes_of(many, None))
 
     def test_states_have_names_and_no_mean_and_a_frame_may_have_no_posterior(self):
         posterior = made([1, 3, 0], "room", number=None)

@@ -85,3 +85,18 @@ def test_a_function_has_one_value():
 def test_refusals(make):
     with np.errstate(divide="ignore"), pytest.raises(ModelError):
         make()
+
+
+def test_a_function_gets_the_numbers_of_labels_as_arrays_of_all_combinations():
+    valve, pressure = Symbol("valve", LabelType("shut", "open")), Symbol("pressure", IntegerType(0, 2))
+    got = []
+
+    def inside(bar, position):
+        got.append((bar, position))
+        return np.where(position == 1, bar, 0)
+
+    function(Symbol("inside", IntegerType(0, 2)), [pressure, valve], inside)
+    ((bar, position),) = got
+    assert bar.dtype == position.dtype == np.float64
+    assert bar.tolist() == [[0, 0], [1, 1], [2, 2]]
+    assert position.tolist() == [[0, 1]] * 3

@@ -1,0 +1,78 @@
+"""Dimensions of posteriors, with units and names of states, and cells in words: the same for all commands."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+from posteriors.posterior import Posterior
+from toolchain.deployment import Deployment, Dimension
+
+_LABEL: Final = 24
+
+
+@dataclass(frozen=True, slots=True)
+class Axis:
+    """A dimension of a posterior, with the values of its indices if the deployment is known."""
+
+    label: str
+    size: int
+    dimension: Dimension | None = None
+
+    @property
+    def unit(self) -> str:
+        """The unit of its values; empty without one."""
+        return "" if self.dimension is None else self.dimension.unit
+
+    @property
+    def has_states(self) -> bool:
+        """Whether cells have names instead of values."""
+        return self.dimension is not None and bool(self.dimension.states)
+
+    def value(self, index: float) -> float | str:
+        """Return the value of an index: a number in its unit, the name of a state, or the index itself."""
+        if self.dimension is None:
+            return index
+        if self.dimension.states:
+            return self.dimension.states[round(index)]
+        return self.dimension.value(index)
+
+    def shown(self, index: float) -> str:
+        """Return the value of an index as text for a terminal."""
+        value = self.value(index)
+        if isinstance(value, str):
+            return printable(value)
+        return f"{value:.6g} {self.unit}".rstrip()
+
+
+def axes_of(posterior: Posterior, deployment: Deployment | None) -> list[Axis]:
+    """Return the dimensions of a received posterior; a ValueError if they differ from the deployment's."""
+    if deployment is None:
+        return [Axis(label, size) for label, size in zip(posterior.labels, posterior.sizes, strict=True)]
+    ours = [(dimension.label, dimension.size) for dimension in deployment.result_dimensions]
+    theirs = list(zip(posterior.labels, posterior.sizes, strict=True))
+    if ours != theirs:
+        raise ValueError(
+            f"the received posterior has {_grid(theirs)}, but the deployment of {deployment.directory} has {_grid(ours)}"
+        )
+    return deployment_axes(deployment)
+
+
+def deployment_axes(deployment: Deployment) -> list[Axis]:
+    """Return the dimensions of a deployment's posteriors, in their order."""
+    return [Axis(dimension.label, dimension.size, dimension) for dimension in deployment.result_dimensions]
+
+
+def in_words(axes: Sequence[Axis], indices: Mapping[str, float]) -> str:
+    """Return a cell, or a mean, in words: `y 2.5 m, x -0.5 m`, `room hall`, or `cell y 1, x 2` without values."""
+    words = ", ".join(f"{printable(axis.label)} {axis.shown(indices[axis.label])}" for axis in axes)
+    return words if any(axis.dimension for axis in axes) else f"cell {words}"
+
+
+def printable(text: str) -> str:
+    """Return received text without control characters, and shortened."""
+    text = text if len(text) <= _LABEL else text[: _LABEL - 3] + "..."
+    return text if text.isprintable() else repr(text)
+
+
+def _grid(dimensions: list[tuple[str, Any]]) -> str:
+    return " x ".join(f"{printable(label)} {size}" for label, size in dimensions)
