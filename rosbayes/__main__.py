@@ -38,7 +38,7 @@ for name, place, panel, purpose in (
         _BOAT,
         "Turn raw readings into whole numbers in range.",
     ),
-    ("boat-viewer", "casestudies.boat.viewer", _BOAT, "Show posteriors beside the boat's true cell."),
+    ("boat-viewer", "casestudies.boat.viewer", _BOAT, "Show posteriors beside the boat's true position."),
 ):
     app.add_later(name, place, purpose=purpose, panel=panel)
 

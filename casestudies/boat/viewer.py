@@ -28,20 +28,23 @@ POSITIONS_PICTURE: Final = "figure-4.4.png"
 SHARES_PICTURE: Final = "figure-4.5.png"
 KEPT: Final = 2000
 """Frames kept for pictures and numbers by a viewer that runs without end."""
-HEADING: Final = "frame     true cell  estimated mean  distance     cycles   time (ms)"
+HEADING: Final = "frame     true y, x     mean y, x  distance     cycles   time (ms)"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Line:
-    """The line printed for a frame. Cells are (column, row) from the lower left corner; None is unknown.
+    """The line printed for a frame. All pairs are (y, x), the order of the model; None is unknown.
 
-    `mean` is in cells, with a cell's centre at its whole number, and `distance` is the distance in cells from the
+    `true_cell` and `mean` are indices of cells, from the lower left corner, as in the objects of `listen --json`;
+    `true_position` and `mean_value` are the positions in map units. `distance` is the distance in cells from the
     posterior's mean to the centre of the true cell.
     """
 
     frame: int | None
+    true_position: tuple[float, float] | None
     true_cell: tuple[int, int] | None
     mean: tuple[float, float] | None
+    mean_value: tuple[float, float] | None
     distance: float | None
     cycles: int | None
     time_ms: float | None
@@ -50,14 +53,14 @@ class Line:
     def __str__(self) -> str:
         """Return the line in the columns of `HEADING`."""
         frame = "-" if self.frame is None else str(self.frame)
-        cell = "not known" if self.true_cell is None else "({:2d}, {:2d})".format(*self.true_cell)
-        if self.mean is None:
-            return f"{frame:>5}  {cell:>12}  no posterior: {self.outcome or 'no reason given'}"
-        mean = "({:4.1f}, {:4.1f})".format(*self.mean)
+        true = "not known" if self.true_position is None else "{:.1f}, {:.1f}".format(*self.true_position)
+        if self.mean_value is None:
+            return f"{frame:>5}  {true:>12}  no posterior: {self.outcome or 'no reason given'}"
+        mean = "{:.1f}, {:.1f}".format(*self.mean_value)
         distance = "-" if self.distance is None else f"{self.distance:.2f}"
         cycles = "-" if self.cycles is None else str(self.cycles)
         time = "-" if self.time_ms is None else f"{self.time_ms:.2f}"
-        return f"{frame:>5}  {cell:>12}  {mean:>14}  {distance:>8}  {cycles:>9}  {time:>10}"
+        return f"{frame:>5}  {true:>12}  {mean:>12}  {distance:>8}  {cycles:>9}  {time:>10}"
 
 
 def line_of(instance: "Instance") -> Line:
@@ -66,17 +69,23 @@ def line_of(instance: "Instance") -> Line:
     from casestudies.boat.pictures import posterior_grid
 
     grid = map_grid() if instance.posterior is None else posterior_grid(instance.posterior)
-    true_cell = None if instance.truth is None else grid.cell(instance.truth.x, instance.truth.y)
-    mean = None
+    true_position = true_cell = mean = mean_value = None
+    if instance.truth is not None:
+        true_position = instance.truth.y, instance.truth.x
+        column, row = grid.cell(instance.truth.x, instance.truth.y)
+        true_cell = row, column
     if instance.posterior is not None:
         x, y = grid.mean(instance.posterior.probabilities)
-        mean = (x - grid.x_low) / grid.cell_width - 0.5, (y - grid.y_low) / grid.cell_height - 0.5
+        mean_value = y, x
+        mean = (y - grid.y_low) / grid.cell_height - 0.5, (x - grid.x_low) / grid.cell_width - 0.5
     report = instance.report
     latency_us = instance.posterior.latency_us if instance.posterior else None
     return Line(
         frame=report.number if report else None,
+        true_position=true_position,
         true_cell=true_cell,
         mean=mean,
+        mean_value=mean_value,
         distance=math.dist(true_cell, mean) if true_cell and mean else None,
         cycles=report.cycles if report else None,
         time_ms=None if latency_us is None else latency_us / 1000,
@@ -237,10 +246,11 @@ def _frame_numbers(line: Line, instance: "Instance") -> dict[str, object]:
     return {
         "frame": line.frame,
         "stamp_ns": report.stamp_ns if report else None,
-        "true_position": [truth.x, truth.y] if truth else None,
+        "true_position": _by_label(line.true_position),
         "true_position_age_ms": instance.truth_age_ns / 1e6 if truth else None,
-        "true_cell": line.true_cell,
-        "mean_cell": line.mean,
+        "true_cell": _by_label(line.true_cell),
+        "mean": _by_label(line.mean),
+        "mean_value": _by_label(line.mean_value),
         "distance_cells": line.distance,
         "cycles": line.cycles,
         "counts_total": report.counts_total if report else None,
@@ -252,6 +262,10 @@ def _frame_numbers(line: Line, instance: "Instance") -> dict[str, object]:
             for b in (report.boards if report else ())
         ],
     }
+
+
+def _by_label(pair: tuple[float, float] | None) -> dict[str, float] | None:
+    return None if pair is None else dict(zip(("y", "x"), pair, strict=True))
 
 
 def _stage_numbers(stage: "StageShare") -> dict[str, object]:
@@ -298,7 +312,7 @@ def boat_viewer(
     first_timeout: Annotated[float, typer.Option(min=0.1, help="Seconds until the first result.")] = 60.0,
     timeout: Annotated[float, typer.Option(min=0.1, help="Seconds between two results.")] = 30.0,
 ) -> None:
-    """Show each posterior's mean beside the boat's true cell, and draw the thesis's figures 4.4 and 4.5.
+    """Show each posterior's mean beside the boat's true position, and draw the thesis's figures 4.4 and 4.5.
 
     It subscribes to /BMresults, /bm/frame and the topic of the true pose, and needs nothing else.
     """
