@@ -21,6 +21,7 @@ async def serve(
     *,
     access: AccessPolicy,
     message_bytes: int,
+    clients: int,
     ros_version: Literal[1, 2],
     announce: str | None,
 ) -> int:
@@ -56,7 +57,9 @@ async def serve(
         host,
         port,
         access=access,
-        limits=HubLimits(message_bytes=message_bytes, client_bytes=4 * max(message_bytes, MAX_SIZE)),
+        limits=HubLimits(
+            message_bytes=message_bytes, clients=clients, client_bytes=4 * max(message_bytes, MAX_SIZE)
+        ),
         ros_version=ros_version,
         on_ready=on_ready,
         on_graph=graphs.append,

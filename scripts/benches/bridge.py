@@ -97,6 +97,14 @@ class Bare(asyncio.Protocol):
         """Send frames made before."""
         self._transport.write(frames)
 
+    def pause(self) -> None:
+        """Stop reading."""
+        self._transport.pause_reading()
+
+    def resume(self) -> None:
+        """Read on."""
+        self._transport.resume_reading()
+
     def close(self) -> None:
         """Hang up."""
         self._transport.abort()

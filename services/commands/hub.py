@@ -7,6 +7,7 @@ import typer
 
 from bridge.codecs.json_codec import MAX_SIZE
 from bridge.hub.access import AccessPolicy, is_loopback, read_tokens, tls_context
+from bridge.hub.limits import HubLimits
 from services.errors import SettingsError
 from services.hub_process import serve
 from services.supervision.parent import end_with_parent
@@ -60,6 +61,9 @@ def hub(
             help="Maximum message size in bytes, both ways; a client that exceeds it is disconnected.",
         ),
     ] = MAX_SIZE,
+    clients: Annotated[
+        int, typer.Option(min=1, max=4096, help="Clients at the same time; a further one is refused.")
+    ] = HubLimits().clients,
     announce: Annotated[
         str | None,
         typer.Option(
@@ -94,6 +98,7 @@ def hub(
             port,
             access=access,
             message_bytes=message_bytes,
+            clients=clients,
             ros_version=2 if ros_version == "2" else 1,
             announce=announce,
         )
