@@ -82,18 +82,18 @@ async def test_a_uri_that_is_none(uri):
 
 
 @pytest.mark.parametrize(
-    "options",
+    ("option", "value"),
     [
-        {"ros_version": "3"},
-        {"connect_timeout": 0},
-        {"max_size": 0},
-        {"ping_interval": -1},
-        {"ping_timeout": 0},
+        ("ros_version", "3"),
+        ("connect_timeout", 0),
+        ("max_size", 0),
+        ("ping_interval", -1),
+        ("ping_timeout", 0),
     ],
 )
-def test_an_option_that_is_none(options):
-    with pytest.raises(OptionError, match=next(iter(options))) as caught:
-        connect("ws://127.0.0.1:9090", **options)
+def test_an_option_that_is_none(option, value):
+    with pytest.raises(OptionError, match=option) as caught:
+        connect("ws://127.0.0.1:9090", **{option: value})
     assert caught.value.exit_code == 2
 
 

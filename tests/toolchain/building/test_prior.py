@@ -95,15 +95,9 @@ def test_rows_that_are_not_served_are_impossible():
 
 def test_a_question_selects_its_prior_by_a_variable():
     time, room = Symbol("time", LabelType("day", "night")), Symbol("room", IntegerType(0, 3))
-    heard = Symbol("heard", LabelType("no", "yes"))
-    joint = JointDistribution(
-        "rooms",
-        (
-            table(time, [0.75, 0.25]),
-            table(room, PRIORS[:2].T, given=[time]),
-            table(heard, HEARD, given=[room]),
-        ),
-    )
+    heard = table(Symbol("heard", LabelType("no", "yes")), HEARD, given=[room])
+    by_time = table(room, PRIORS[:2].T, given=[time])
+    joint = JointDistribution("rooms", (table(time, [0.75, 0.25]), by_time, heard))
     asked = joint.ask(["room"], ["heard"], prior_select="time").model()
     assert asked.prior_select.table == pytest.approx(PRIORS[:2])
     assert asked.prior_distribution == pytest.approx(0.75 * PRIORS[0] + 0.25 * PRIORS[1])
@@ -112,7 +106,7 @@ def test_a_question_selects_its_prior_by_a_variable():
         selecting = exact_posterior(asked, [1], prior_address=address)
         assert selecting == pytest.approx(exact_posterior(as_column, [1, address]))
     assert exact_posterior(asked, [1]) == pytest.approx(exact_posterior(as_column, [1, None]))
-    never = JointDistribution("r", (table(time, [1, 0]), table(room, PRIORS[:2].T, given=[time])))
+    never = JointDistribution("r", (table(time, [1, 0]), by_time))
     plain = never.ask(["room"], prior_select="time").model()
     assert plain.prior_select.table[1] == pytest.approx(PRIORS[0])
     words = asked.prior_select.as_variable()
@@ -121,14 +115,8 @@ def test_a_question_selects_its_prior_by_a_variable():
 
 @pytest.mark.parametrize("partitions", [1, 2])
 def test_a_written_prior_stands_in_the_place_of_the_models(tmp_path, partitions):
-    deployment = build(
-        tmp_path,
-        model(),
-        prior_mode=PriorMode.WRITTEN,
-        prior_path="prior.data",
-        partitions=partitions,
-        **FINE,
-    )
+    written = {"prior_mode": PriorMode.WRITTEN, "prior_path": "prior.data"}
+    deployment = build(tmp_path, model(), partitions=partitions, **written, **FINE)
     assert deployment.machine.prior_mode is PriorMode.WRITTEN
     assert deployment.prior == WrittenPrior(path="prior.data")
     wish = [0.1, 0.2, 0.3, 0.4]
@@ -161,24 +149,31 @@ def test_a_prior_that_cannot_be_written(prior):
 
 
 @pytest.mark.parametrize(
-    ("error", "make"),
+    ("fields", "options"),
     [
-        (BuildError, lambda folder: build(folder, model(), prior_path="prior")),
-        (
-            BuildError,
-            lambda folder: build(folder, model(prior_select=selected()), prior_mode=PriorMode.WRITTEN),
-        ),
-        (BuildError, lambda folder: build(folder, model(), prior_mode=PriorMode.WRITTEN, prior_path="")),
-        (ModelError, lambda _: PriorSelect(name="a", table=PRIORS * 2)),
-        (ModelError, lambda _: PriorSelect(name="a", table=PRIORS, bits=1)),
-        (ModelError, lambda _: PriorSelect(name="a", table=PRIORS[0])),
-        (ModelError, lambda _: model(prior_select=PriorSelect(name="a", table=np.full((2, 3), 1 / 3)))),
-        (ModelError, lambda _: model(prior_select=PriorSelect(name="heard", table=PRIORS))),
+        ({}, {"prior_path": "prior"}),
+        ({}, {"prior_mode": PriorMode.WRITTEN, "prior_path": ""}),
+        ({"prior_select": selected()}, {"prior_mode": PriorMode.WRITTEN}),
     ],
 )
-def test_priors_that_do_not_fit(tmp_path, error, make):
-    with pytest.raises(error):
-        make(tmp_path)
+def test_priors_that_cannot_be_built(tmp_path, fields, options):
+    with pytest.raises(BuildError):
+        build(tmp_path, model(**fields), **options)
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"table": PRIORS * 2},
+        {"table": PRIORS, "bits": 1},
+        {"table": PRIORS[0]},
+        {"table": np.full((2, 3), 1 / 3)},
+        {"table": PRIORS, "name": "heard"},
+    ],
+)
+def test_selected_priors_that_do_not_fit(fields):
+    with pytest.raises(ModelError):
+        model(prior_select=PriorSelect(**({"name": "a"} | fields)))
 
 
 def test_a_deployment_whose_prior_does_not_agree_is_refused(tmp_path):

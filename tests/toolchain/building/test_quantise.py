@@ -16,15 +16,6 @@ from toolchain.models.conditional import normal, wrapped_normal
 from toolchain.models.model import Known, Model, PriorSelect, dimension
 
 
-def model_of(*tables, prior=None, **fields):
-    return Model(
-        name="m",
-        searched=(dimension("s", size=np.asarray(tables[0]).shape[1]),),
-        known=tuple(Known(name=f"K{i}", table=np.asarray(t, float), **fields) for i, t in enumerate(tables)),
-        prior=prior,
-    )
-
-
 @st.composite
 def models(draw):
     random = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
@@ -156,4 +147,4 @@ def test_codes_of_one_bit_hold_no_floor():
 @pytest.mark.parametrize("prob_bits", [0, 17])
 def test_codes_that_no_machine_has(prob_bits):
     with pytest.raises(ParameterError):
-        quantise(model_of(np.full((2, 3), 0.5)), prob_bits=prob_bits)
+        with_floor(0.0, prob_bits)

@@ -227,17 +227,10 @@ HEADER = "{{'descr': '{}', 'fortran_order': False, 'shape': {}, }}"
 )
 def test_a_damaged_or_hostile_file_of_tables_is_refused(tmp_path, members):
     path = archive(tmp_path / "x.npz", members)
-    with pytest.raises(ModelError, match=re.escape(str(path))):
-        read_fit(path)
-
-
-def test_a_file_that_unpacks_to_too_much_is_refused(tmp_path):
-    path = archive(tmp_path / "bomb.npz", {"fit.json": bytes(300 << 20)})
-    with pytest.raises(ModelError, match="bomb.npz"):
-        read_fit(path)
-    path.write_bytes(b"no archive")
-    with pytest.raises(ModelError, match="bomb.npz"):
-        read_fit(path)
+    for cut in (0, 9):
+        path.write_bytes(path.read_bytes()[cut:])
+        with pytest.raises(ModelError, match=re.escape(str(path))):
+            read_fit(path)
 
 
 @pytest.mark.parametrize(

@@ -37,24 +37,11 @@ def case(tmp_path):
     return write
 
 
-def test_defaults(case):
-    model = load_model(case() / "model.py", {})
-    assert model.lines == 4
-    assert model.name == "tiny NoneType True FINE 'a' 3"
-
-
 def test_values_are_read_as_their_parameters_types(case):
-    settings = {
-        "size": "3",
-        "share": "0.25",
-        "name": "12",
-        "file": "x.csv",
-        "flat": "No",
-        "kind": "coarse",
-        "mode": "2",
-        "plain": "7",
-    }
-    model = load_model(case(), settings)
+    default = load_model(case() / "model.py", {})
+    assert (default.lines, default.name) == (4, "tiny NoneType True FINE 'a' 3")
+    settings = {"size": "3", "share": "0.25", "name": "12", "file": "x.csv", "flat": "No"}
+    model = load_model(case(), settings | {"kind": "coarse", "mode": "2", "plain": "7"})
     assert model.lines == 3
     assert model.known[0].table[0, 0] == 0.25
     assert model.name == f"12 {type(Path()).__name__} False COARSE 2 7"

@@ -223,17 +223,7 @@ def test_no_sensors_and_many_seeds(tmp_path):
         ghdl(tmp_path, "-a", "--std=08", "bm_arch/bm1_parameters.vhd")
 
 
-def test_names_harm_no_file(tmp_path):
-    build(tmp_path)
-    for path in tmp_path.rglob("*.*"):
-        if path.suffix in {".vhd", ".mif", ".qsf", ".qpf", ".tcl"}:
-            text = path.read_text(encoding="ascii")
-            named = [line for line in text.splitlines() if "quoted" in line or "D %1" in line]
-            assert all(re.search(r"(^#|--).*(quoted|D %1)", line) for line in named)
-    assert "tiles, P(D %1; | S)" in (tmp_path / "bm_arch" / "Memory_MIFs" / "board0_column1.mif").read_text()
-
-
-def test_the_project_has_a_revision_for_every_board(tmp_path):
+def test_the_project_has_a_revision_for_every_board_and_names_harm_no_file(tmp_path):
     build(tmp_path, partitions=2)
     project = (tmp_path / "bm1.qpf").read_text()
     assert re.findall(r'PROJECT_REVISION = "(.*)"', project) == ["bm1_board0", "bm1_board1"]
@@ -241,18 +231,22 @@ def test_the_project_has_a_revision_for_every_board(tmp_path):
         text = (tmp_path / f"bm1_board{board}.qsf").read_text()
         named = re.findall(r'-name (?:MIF|VHDL)_FILE "(.*)"', text)
         assert all((tmp_path / name).is_file() for name in named)
+        memories = {f"board{board}_{name}.mif" for name in ("prior", "column1", "column2")}
         assert {name.rpartition("/")[2] for name in named} == {
             "bm1_parameters.vhd",
-            f"board{board}_prior.mif",
-            f"board{board}_column1.mif",
-            f"board{board}_column2.mif",
             "rng_seeds.mif",
-        }
+        } | memories
         assert f"set_parameter -name BOARD {board}\n" in text
         assert "DEVICE 5SGSMD8" in text
     assert "foreach revision {bm1_board0 bm1_board1} {" in (tmp_path / "bm1.tcl").read_text()
     for path in tmp_path.glob("bm1*"):
         assert "NOT VERIFIED BY QUARTUS" in path.read_text()
+    for path in tmp_path.rglob("*.*"):
+        if path.suffix in {".vhd", ".mif", ".qsf", ".qpf", ".tcl"}:
+            text = path.read_text(encoding="ascii")
+            named = [line for line in text.splitlines() if "quoted" in line or "D %1" in line]
+            assert all(re.search(r"(^#|--).*(quoted|D %1)", line) for line in named)
+    assert "tiles, P(D %1; | S)" in (tmp_path / "bm_arch" / "Memory_MIFs" / "board0_column1.mif").read_text()
 
 
 TCL = """

@@ -71,11 +71,8 @@ def test_every_form_is_read(data, address_radix, data_radix):
     assert parse_mif(text + data.draw(st.sampled_from(["END;", "end ;\n", "END"]))) == Mif(8, tuple(words))
 
 
-def test_what_is_left_out_is_zero_and_hexadecimal_is_the_default():
+def test_what_is_left_out_is_zero_hexadecimal_is_the_default_and_words_of_a_range_are_repeated():
     assert parse_mif("DEPTH=12;WIDTH=8;CONTENT BEGIN A:10; END;").words == (0,) * 10 + (16, 0)
-
-
-def test_the_words_of_a_range_are_repeated():
     assert parse_mif(HEAD + "[1..5] : 1 2;\nEND;").words == (0, 1, 2, 1, 2, 1, 0, 0)
 
 
