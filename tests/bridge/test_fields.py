@@ -161,8 +161,6 @@ def test_a_field_is_found_where_a_simple_search_finds_it(message):
         assert field.place == (found[0] if found else None)
 
 
-# Arrays in every form in which they may come
-
 PIXELS = bytes(range(250, 256)) + b"\x00\x7f"
 
 

@@ -193,9 +193,6 @@ def test_bad_names_are_refused_before_anything_is_sent():
     assert sent(core) == []
 
 
-# Calling
-
-
 def test_a_call_and_its_answer():
     core = connected()
     call = core.calls.send("/s", {"a": 1})
@@ -222,9 +219,6 @@ def test_answers_as_servers_give_them(answer, ok, values):
     core = connected()
     call = core.calls.send("/s", {})
     assert tell(core, op="service_response", id=call, **answer) == CallAnswered(call, ok=ok, values=values)
-
-
-# Serving
 
 
 @pytest.mark.parametrize("identity", [{"id": "x1"}, {}])
@@ -262,9 +256,6 @@ def test_what_cannot_be_served_is_refused_on_the_spot():
     assert tell(core, op="call_service", service="/s", id=4) is None
 
 
-# Losing and restoring
-
-
 def test_calls_are_bounded_and_they_and_requests_end_with_the_connection():
     core = connected()
     core.services.advertise("/s", "p/T")
@@ -280,9 +271,6 @@ def test_calls_are_bounded_and_they_and_requests_end_with_the_connection():
     core.services.answer(request.ticket, {})
     assert sent(core) == []
     assert tell(core, op="service_response", id=call, values={}, result=True) is None
-
-
-# Whatever arrives
 
 
 @pytest.mark.parametrize(

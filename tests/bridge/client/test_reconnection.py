@@ -262,9 +262,6 @@ async def test_nothing_is_left_open():
         again.bind(("127.0.0.1", fake.port))
 
 
-# How long it was dark
-
-
 async def test_the_first_message_after_losses_says_how_long_it_was_dark(fake, ros):
     subscription = ros.subscribe("/a", "p/T")
     await fake.wait_for_op("subscribe")

@@ -55,9 +55,6 @@ async def test_the_end_of_the_connection_fails_what_waits(fake, ros, end):
         assert ros.state is State.CLOSED
 
 
-# Serving
-
-
 async def test_a_service_of_this_client(fake, ros, caller):
     async def double(args: dict[str, Any]) -> dict[str, Any]:
         await asyncio.sleep(0)

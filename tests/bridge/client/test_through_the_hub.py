@@ -57,9 +57,6 @@ async def settled(ros: Ros) -> None:
     await ros.call("/rosapi/get_time", timeout=PATIENCE)
 
 
-# Forms
-
-
 @pytest.mark.parametrize("compression", ["none", "png", "cbor"])
 @pytest.mark.parametrize("fragment_size", [None, 50])
 @pytest.mark.parametrize("arrays", ["list", "numpy"])
@@ -81,9 +78,6 @@ async def test_a_scan_comes_as_it_was_sent(one, other, compression, fragment_siz
     assert list(msg["ranges"]) == [0.5, 1.5, 2.5]
     if arrays == "numpy" and compression == "cbor":
         assert msg["ranges"].dtype == np.float32
-
-
-# Actions
 
 
 class ActionServer:

@@ -343,9 +343,6 @@ async def test_a_server_that_takes_nothing_more(fake, ros):
     assert [op["msg"]["n"] for op in fake.ops("publish")[-3:]] == [0, 1, 2], "in their order"
 
 
-# Servers that are late or wrong
-
-
 async def test_nonsense_is_counted_and_survived(fake, ros, caplog):
     subscription = ros.subscribe("/a", "p/T")
     await fake.wait_for_op("subscribe")
@@ -356,9 +353,6 @@ async def test_nonsense_is_counted_and_survived(fake, ros, caplog):
     assert (await subscription.next(30)).msg == {"n": 1}
     assert (ros.unusable, ros.reconnections) == (100, 0)
     assert sum(record.levelname == "WARNING" for record in caplog.records) == 7
-
-
-# Which ROS
 
 
 @pytest.mark.parametrize(

@@ -95,9 +95,6 @@ async def test_an_address_that_is_in_use_or_not_ours_is_an_error(host: str, port
             await serve_hub(host, used if port is None else port, stop=asyncio.Event())
 
 
-# --- access
-
-
 async def test_too_many_clients_are_answered_503() -> None:
     async with running_hub(limits=HubLimits(clients=2)) as port:
         async with client(port) as one, client(port):

@@ -18,8 +18,6 @@ SIZES = [0, 1, 125, 126, 127, 65_535, 65_536]
 LARGEST = 200
 URI = parse_uri("ws://localhost:9090")
 
-# --- finding and writing
-
 
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("masked", [True, False])

@@ -164,9 +164,6 @@ def test_written_priors_of_replicas():
             written_prior(wrong, lines=3, prob_bits=8, replicas=2)
 
 
-# Builds
-
-
 @pytest.mark.parametrize(
     "options",
     [
@@ -226,9 +223,6 @@ def test_options_that_do_not_fit_have_a_way_out(of, options, mended, advice):
     with pytest.raises(BuildError, match=advice):
         assemble(of, options)
     assemble(of, replace(options, **mended))
-
-
-# Regenerating
 
 
 @pytest.mark.parametrize(("mode", "replicas"), [("cell", 2), ("threshold", 1), ("column", 3)])

@@ -194,9 +194,6 @@ def test_true_lines_lost_to_the_codes():
     assert "most often one of D (" in only(findings, Check.LOST_MASS).what
 
 
-# Generators
-
-
 @pytest.mark.parametrize(
     ("changes", "check", "about", "numbers"),
     [
@@ -269,9 +266,6 @@ def test_codes_of_any_width(bits):
     assert not [finding for finding in check_model(model(), options) if finding.check.startswith("rng")]
 
 
-# Ranges and columns
-
-
 @pytest.mark.parametrize(
     ("changes", "check", "numbers", "advice"),
     [
@@ -301,9 +295,6 @@ def test_columns_without_effect_and_readings_used_twice():
     finding = only(check_model(model(*bare), OPTIONS), Check.SAME_READING)
     assert finding.about == "D and E"
     assert finding.what.split()[-1] == "D"
-
-
-# What can't be built
 
 
 def test_several_mistakes_at_once():
@@ -363,9 +354,6 @@ def test_comments_are_not_contents(deployment):
     assert check_deployment(deployment) == []
     path.write_text(path.read_text().replace("LINES             : positive := 10", "LINES : positive := 11"))
     assert len(check_deployment(deployment)) == 1
-
-
-# The command
 
 
 MODEL = """

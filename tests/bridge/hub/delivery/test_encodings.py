@@ -127,9 +127,6 @@ def test_a_message_that_cannot_be_serialised_is_reported_once(type_name: str, me
     assert publisher.read() == []
 
 
-# --- PNG
-
-
 def test_a_png_that_is_larger_than_may_be_is_refused() -> None:
     publisher, subscriber = publisher_and_subscriber("a/B", limits={"message_bytes": 400}, compression="png")
     publisher.publish("/t", {"data": base64.b85encode(bytes(range(256))).decode()[:300]})
@@ -193,9 +190,6 @@ def test_the_answer_to_a_call_in_fragments_and_as_png() -> None:
     assert json.loads(png.decode(operation["data"]))["id"] == "x"
 
 
-# --- several wishes, one writing
-
-
 def test_of_several_wishes_the_last_form_and_the_least_size_count() -> None:
     publisher, subscriber = publisher_and_subscriber("a/B", id=1, fragment_size=640)
     subscriber.subscribe("/t", id=2, compression="cbor")
@@ -216,9 +210,6 @@ def test_a_dropped_message_is_not_encoded(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(topics.Message, "payload", None)
     publisher.publish("/t", {"data": [2.5]})
     assert subscriber.messages() == [{"data": [1.5]}]
-
-
-# --- cut out of what came
 
 
 @pytest.mark.parametrize(
@@ -309,9 +300,6 @@ def test_a_failure_on_rosout_is_not_reported_there(
     assert [operation["op"] for operation in peer.read()] == ["status"]
 
 
-# --- quality of service
-
-
 @pytest.mark.parametrize(
     ("wish", "length"),
     [
@@ -330,9 +318,6 @@ def test_depth_is_the_length_of_the_queue(wish: dict[str, Any], length: int) -> 
     for index in range(100):
         publisher.publish("/t", {"i": index})
     assert len(slow.messages()) == length
-
-
-# --- descriptions of types
 
 
 @pytest.mark.parametrize(("ros_version", "time"), [(1, "time"), (2, "builtin_interfaces/msg/Time")])

@@ -63,9 +63,6 @@ def test_dropping_does_not_make_the_queue_longer() -> None:
     assert _drain(outbox) == [b"first", b"x"]
 
 
-# --- straight onto the wire
-
-
 def test_while_the_socket_takes_it_nothing_waits() -> None:
     outbox, lane = Outbox(10), _lane(queue_length=1)
     outbox.wire = []

@@ -77,9 +77,6 @@ def test_malformed_names_and_types_are_refused(hub: Harness, name: Any, type_nam
     assert not hub.broker.graph.topics
 
 
-# --- publishing without advertising
-
-
 def test_publishing_advertises_where_the_type_is_known_or_given(hub: Harness) -> None:
     publisher, subscriber = hub.connect(), hub.connect()
     subscriber.subscribe("/known/0", type="a/B")
@@ -271,9 +268,6 @@ def test_a_slow_client_keeps_the_newest_and_costs_the_others_nothing() -> None:
     assert slow.client.subscriptions["/t"].lane.dropped == 90
 
 
-# --- numbers, sizes
-
-
 @pytest.mark.parametrize(
     ("sent", "received"),
     [
@@ -314,9 +308,6 @@ def test_a_message_that_goes_out_larger_than_the_limit_is_refused(
         peer.send_raw(frame % (b"x" * size))
         assert bool(peer.read()) is arrives
     assert peer.client.refused == 1
-
-
-# --- limits
 
 
 def test_topics_are_counted() -> None:
