@@ -19,6 +19,12 @@ def toolchain(*arguments):
     return invoke(app, arguments)
 
 
+def done(result):
+    """Assert that a command succeeded, and return its result."""
+    assert result.exit_code == 0, result.output
+    return result
+
+
 def assert_refused(result, *named):
     """Assert that a command ended with exit code 2 and one sentence that has these names and values in it."""
     assert (result.exit_code, result.stdout) == (2, "")

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from pcie_shim.programming_file import read_image
-from tests.toolchain.running import TARGET, assert_refused, toolchain
+from tests.toolchain.running import TARGET, assert_refused, done, toolchain
 from toolchain.deployment import load_deployment
 from toolchain.outputs.mif import read_mif
 
@@ -30,8 +30,7 @@ def build(case, *arguments, target=TARGET):
 
 def test_a_build(case):
     os.utime(case / "model.py", (1_000_000_000, 1_000_000_000))
-    result = build(case, "--partitions", "2", "--set", "size=6", "--queue", "all", "--interface", "1x3")
-    assert result.exit_code == 0, result.stderr
+    result = done(build(case, "--partitions", "2", "--set", "size=6", "--queue", "all", "--interface", "1x3"))
     out = case.parent / "out"
     assert result.stdout == (out / "report.txt").read_text()
     assert f"Reading {case / 'model.py'}" in result.stderr
@@ -71,12 +70,9 @@ def test_mistakes(case, arguments, named):
 def test_machine_options(case):
     table = case.parent / "random.mif"
     table.write_text("WIDTH=4; DEPTH=3; CONTENT BEGIN 0 : 1 F 7; END;")
-    result = build(
-        case,
-        *("--rng", "table", "--rng-table", str(table), "--per-cell", "--steps-per-clock", "2"),
-        *("--prob-bits", "3", "--bits", "K=4", "--prior-mode", "written", "--prior-path", "prior.data"),
-    )
-    assert result.exit_code == 0, result.stderr
+    rng = ("--rng", "table", "--rng-table", table, "--per-cell", "--steps-per-clock", "2")
+    prior = ("--prior-mode", "written", "--prior-path", "prior.data")
+    done(build(case, *rng, "--prob-bits", "3", "--bits", "K=4", *prior))
     deployment = load_deployment(case.parent / "out")
     machine = deployment.machine
     assert (machine.rng, machine.shared, machine.steps_per_clock) == ("table", False, 2)
@@ -89,8 +85,9 @@ def test_machine_options(case):
 
 
 def test_a_network_with_a_question(network):
-    result = build(network, "--searched", "rain,sprinkler", "--known", "shoes", "--on-missing", "missing")
-    assert result.exit_code == 0, result.stderr
+    result = done(
+        build(network, "--searched", "rain,sprinkler", "--known", "shoes", "--on-missing", "missing")
+    )
     deployment = load_deployment(network.parent / "out")
     assert deployment.name == "garden"
     assert [(each.label, each.states) for each in deployment.searched] == [
@@ -105,7 +102,7 @@ def test_a_network_with_a_question(network):
 
 def test_a_network_with_a_fixed_and_a_selecting_variable(network):
     question = "--searched grass --known shoes --given sprinkler=on --prior-select rain"
-    assert build(network, *question.split()).exit_code == 0
+    done(build(network, *question.split()))
     deployment = load_deployment(network.parent / "out")
     assert [(each.name, each.kind) for each in deployment.variables] == [
         ("shoes", "sensor"),

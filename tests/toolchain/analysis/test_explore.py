@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from machines.parameters import RngKind, SensorMode
 from tests.toolchain.corridor import corridor
-from tests.toolchain.running import assert_refused, toolchain
+from tests.toolchain.running import assert_refused, done, toolchain
 from toolchain.analysis.exploration.pictures import check_pictures_possible
 from toolchain.analysis.exploration.results import Point, Results, pareto
 from toolchain.analysis.exploration.sweep import Frames, Sweep, run_sweep, run_task, tasks
@@ -165,8 +165,7 @@ def test_what_is_not_on_the_front_is_beaten_by_what_is(figures):
 def test_a_network_is_explored_too(network):
     question = ["--searched", "grass", "--known", "shoes"]
     lists = ["--prob-bits", "8", "--targets", "15", "--rngs", "lfsr16,table", "--scales", "none"]
-    result = run(network, *question, *lists)
-    assert result.exit_code == 0, result.stderr
+    result = done(run(network, *question, *lists))
     assert "none     table" in result.stdout
     assert_refused(run(network.parent, *question), "--searched")
 
@@ -175,8 +174,7 @@ def test_the_command(case):
     lists = ["--prob-bits", "4,8", "--targets", "15", "--rngs", "lfsr8,lfsr16", "--scales", "address"]
     pytest.importorskip("matplotlib")
     lists += ["--plot", case.parent / "sweep.png"]
-    result = run(case, *lists)
-    assert result.exit_code == 0, result.stderr
+    result = done(run(case, *lists))
     # An LFSR of 8 bits is too narrow for codes of 8: three machines are left.
     assert result.stderr.startswith("3 machines of corridor over 5 frames drawn from the model (seed 1)\n")
     assert "3 of 3 machines are in" in result.stderr
@@ -198,10 +196,9 @@ def test_the_command(case):
 
 def test_sensor_modes_and_replicas(case):
     lists = ["--prob-bits", "8", "--targets", "15", "--rngs", "lfsr16", "--scales", "address,column"]
-    assert run(case, *lists).exit_code == 0
+    done(run(case, *lists))
     more = [*lists, "--sensor-modes", "column,cell,threshold", "--replicas", "1,3"]
-    result = run(case, *more, "--plot", case.parent / "sweep.png")
-    assert result.exit_code == 0, result.stderr
+    result = done(run(case, *more, "--plot", case.parent / "sweep.png"))
     # 2 scales of columns, 1 of the others, each with 1 and 3 replicas; the single machines of columns are there
     assert result.stderr.startswith("8 machines of corridor over 5 frames")
     assert "; 2 of them are in" in result.stderr

@@ -16,7 +16,7 @@ from machines.kernel import make_kernel
 from machines.parameters import RngKind, SensorMode
 from machines.posterior import posterior
 from pcie_shim.programming_file import read_image
-from tests.toolchain.running import OPTIONS, TARGET, contents, toolchain
+from tests.toolchain.running import OPTIONS, TARGET, contents, done, toolchain
 from toolchain.analysis.accuracy.emulation import EmulatedBoards, one_replica
 from toolchain.analysis.accuracy.measurement import measure
 from toolchain.analysis.accuracy.readings import readings_of_lines, sample_readings
@@ -228,11 +228,9 @@ def test_options_that_do_not_fit_have_a_way_out(of, options, mended, advice):
 @pytest.mark.parametrize(("mode", "replicas"), [("cell", 2), ("threshold", 1), ("column", 3)])
 def test_regenerated_memories_are_the_same(case, mode, replicas):
     out = case.parent / "out"
-    built = toolchain("build", case, "-o", out, *TARGET, "--sensor-mode", mode, "--replicas", replicas)
-    assert built.exit_code == 0, built.output
+    done(toolchain("build", case, "-o", out, *TARGET, "--sensor-mode", mode, "--replicas", replicas))
     before = contents(out)
-    again = toolchain("regenerate", "memories", out, "--model", case)
-    assert again.exit_code == 0, again.output
+    done(toolchain("regenerate", "memories", out, "--model", case))
     assert contents(out) == before
 
 

@@ -4,7 +4,7 @@ import shutil
 
 import pytest
 
-from tests.toolchain.running import TARGET, contents, toolchain
+from tests.toolchain.running import TARGET, contents, done, toolchain
 from toolchain.building.regenerate import DeploymentEdits, edited
 from toolchain.deployment import load_deployment
 from toolchain.errors import DamagedDeploymentError
@@ -26,8 +26,7 @@ OPTIONS = ("--partitions", "2", "--scale", "column", "--bits", "D1=6", "--prob-b
 
 def build(case, name, *arguments):
     out = case.parent / name
-    result = toolchain("build", case, "-o", out, *TARGET, *arguments)
-    assert result.exit_code == 0, result.stderr
+    done(toolchain("build", case, "-o", out, *TARGET, *arguments))
     return out
 
 

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from bridge.errors import PathError
 from bridge.fields import parse_path
-from tests.toolchain.running import assert_refused, toolchain
+from tests.toolchain.running import assert_refused, done, toolchain
 from toolchain.building.sources_file import read_sources
 from toolchain.deployment import Variable, deployment_hash, load_deployment, write_deployment
 from toolchain.deployment.fields import MESSAGE_PATH
@@ -61,10 +61,11 @@ def build(tmp_path, *flags):
 
 def test_a_build_from_several_topics(tmp_path, written):
     path = str(written(FILE))
-    result = build(
-        tmp_path, "--sources", path, "--uri", "ws://one:9090", "--tolerance", "0.2", "--set", "path=a.b"
+    result = done(
+        build(
+            tmp_path, "--sources", path, "--uri", "ws://one:9090", "--tolerance", "0.2", "--set", "path=a.b"
+        )
     )
-    assert result.exit_code == 0, result.stderr
     deployment = load_deployment(tmp_path / "out")
     assert [(each.uri, each.topic, each.compression) for each in deployment.sources] == [
         ("ws://one:9090", "/range", "none"),
@@ -82,8 +83,7 @@ def test_a_build_from_several_topics(tmp_path, written):
 
 
 def test_a_source_without_compression_has_the_hash_that_it_always_had(tmp_path):
-    result = build(tmp_path, "--uri", "ws://one:9090", "--topic", "/t", "--type", "a/B")
-    assert result.exit_code == 0
+    done(build(tmp_path, "--uri", "ws://one:9090", "--topic", "/t", "--type", "a/B"))
     deployment = load_deployment(tmp_path / "out")
     assert "compression" not in (tmp_path / "out" / "deployment.toml").read_text()
     source = deployment.sources[0].model_copy(update={"compression": "cbor"})
@@ -95,7 +95,7 @@ def test_a_source_without_compression_has_the_hash_that_it_always_had(tmp_path):
 def test_a_prior_of_one_of_them(tmp_path, written):
     text = FILE.replace('type = "sensor_msgs/Imu"', 'type = "a/B"\nprior = "data"')
     flags = ("--sources", str(written(text)), "--uri", "ws://one:9090")
-    assert build(tmp_path, *flags, "--prior-mode", "written").exit_code == 0
+    done(build(tmp_path, *flags, "--prior-mode", "written"))
     prior = load_deployment(tmp_path / "out").prior
     assert (prior.source, prior.path) == (2, "data")
     assert_refused(build(tmp_path, *flags), "--prior-mode written")

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from tests.toolchain.running import TARGET, assert_refused, toolchain
+from tests.toolchain.running import TARGET, assert_refused, done, toolchain
 from toolchain.analysis.inspection.report import _unit
 from toolchain.deployment import load_deployment
 
@@ -16,9 +16,7 @@ def deployment(case):
 
 
 def build(case, *arguments):
-    result = toolchain("build", case, "-o", case.parent / "out", *TARGET, "--partitions", 2, *arguments)
-    assert result.exit_code == 0, result.stderr
-    return result
+    return done(toolchain("build", case, "-o", case.parent / "out", *TARGET, "--partitions", 2, *arguments))
 
 
 def look(deployment, *arguments):
@@ -26,8 +24,7 @@ def look(deployment, *arguments):
 
 
 def test_with_the_model(case, deployment):
-    result = look(deployment, "--model", str(case), "--clock", "50e6")
-    assert result.exit_code == 0, result.stderr
+    result = done(look(deployment, "--model", str(case), "--clock", "50e6"))
     text = result.stdout
     assert text.startswith("Deployment corridor (")
     assert "12 lines (x 12), 2 sensor columns and the prior, on 2 boards of 6 lines each." in text
@@ -40,8 +37,7 @@ def test_with_the_model(case, deployment):
 
 
 def test_without_the_model(deployment):
-    result = look(deployment)
-    assert result.exit_code == 0, result.stderr
+    result = done(look(deployment))
     report = (deployment / "report.txt").read_text()
     losses = next(part for part in report.split("\n\n") if part.startswith("Lost by quantising"))
     assert losses in result.stdout
@@ -66,10 +62,9 @@ def test_json(case, deployment):
 def test_recorded_readings(case, deployment):
     recording = case.parent / "run.csv"
     recording.write_text("range_m,loud\n3.0,1\n,0\n4.5,0\n")
-    result = look(
-        deployment, "--readings", str(recording), "--reading", "range=range_m", "--reading", "loud=loud"
+    result = done(
+        look(deployment, "--readings", str(recording), "--reading", "range=range_m", "--reading", "loud=loud")
     )
-    assert result.exit_code == 0, result.stderr
     assert "Readings: 3 of 3 rows of run.csv, each with 4 sets of seeds." in result.stdout
 
 
@@ -79,8 +74,7 @@ def test_deployments_of_other_machines(case):
     assert "Readings: 20 frames " in slow.stdout
     build(case, "--bits", "range=6", "--scale", "column", "--rng", "lfsr16", "--stop", "own")
     out = case.parent / "out"
-    result = look(out, "--model", str(case), "--bits", "range=6")
-    assert result.exit_code == 0, result.stderr
+    result = done(look(out, "--model", str(case), "--bits", "range=6"))
     assert "(scale = column)" in result.stdout
     assert "stop = own" in result.stdout
 

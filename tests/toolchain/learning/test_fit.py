@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.toolchain.running import toolchain
+from tests.toolchain.running import done, toolchain
 from toolchain.errors import ModelError
 from toolchain.learning.fit import LEAST_READINGS, fit_model, locate, mixture
 from toolchain.learning.fit_options import FitMethod, FitOptions, FitPrior
@@ -297,8 +297,7 @@ def fit(folder, *arguments):
 def test_the_command_fits_normals_and_a_model_loads_them(corridor):
     out = corridor / "fit.toml"
     readings = ["--reading", "wall=wall_m", "--reading", "back=back_m"]
-    result = fit(corridor, "-o", out, "--floor", "0", *readings, "--check", corridor / "check.csv")
-    assert result.exit_code == 0, result.stderr
+    result = done(fit(corridor, "-o", out, "--floor", "0", *readings, "--check", corridor / "check.csv"))
     assert "400 rows with a truth inside the searched dimensions, 0 others" in result.stdout
     assert re.search(r"wall +400 +\d+ +\d% +\d+ +0.1\d* +0 +0.\d%", result.stdout)
     assert re.search(r"back +(19|2)\d\d? ", result.stdout)
@@ -313,8 +312,9 @@ def test_the_command_fits_normals_and_a_model_loads_them(corridor):
 
 def test_the_command_counts(corridor):
     out = corridor / "fit.npz"
-    result = fit(corridor, "-o", out, "--reading", "door=door", "--method", "counts", "--pseudo-count", "3")
-    assert result.exit_code == 0, result.stderr
+    result = done(
+        fit(corridor, "-o", out, "--reading", "door=door", "--method", "counts", "--pseudo-count", "3")
+    )
     assert "worth 3 readings a cell" in result.stdout
     fitted = load_model(corridor / "corridor", {"fit": str(out)})
     assert fitted.known[2].table[1, :50].mean() == pytest.approx(0.8, abs=0.05)
@@ -345,8 +345,7 @@ def test_mistakes_of_the_command(corridor, arguments):
 def test_a_star_stands_for_the_same_text(corridor):
     case = corridor / "corridor" / "model.py"
     case.write_text(case.read_text().replace('"wall"', '"wall_range"').replace('"back"', '"back_range"'))
-    result = fit(corridor, "-o", str(corridor / "fit.toml"), "--reading", "*_range=*_m", "--pool", "*_range")
-    assert result.exit_code == 0, result.stderr
+    done(fit(corridor, "-o", str(corridor / "fit.toml"), "--reading", "*_range=*_m", "--pool", "*_range"))
     variables = read_fit(corridor / "fit.toml").file.variables
     assert [variable.name for variable in variables] == ["wall_range", "back_range"]
     assert variables[0].sigma == variables[1].sigma
