@@ -62,7 +62,7 @@ Reading: TypeAlias = int | Sequence[int] | npt.NDArray[np.integer] | None
 
 
 def posterior(
-    machine: BM1Machine,
+    machine: BM1Machine | Sequence[BM1Machine],
     readings: Sequence[Reading] | Sequence[Sequence[Reading]] | npt.NDArray[np.integer],
     *,
     prior_address: int | tuple[int, ...] = 0,
@@ -74,7 +74,8 @@ def posterior(
     """Run one machine, without boards or processes, and return the posterior for its readings (thesis 2.1.2).
 
     Args:
-        machine: The machine to run.
+        machine: The machine to run, or the machines of all boards, in the order of their lines: each is then
+            given the same readings, and stops at its own cycle.
         readings: One address per sensor column, columns 1..N; None for a missing reading. With inputs per
             cell (`sensor_mode`), the reading of a column is a row with one address, or one code, per line.
             With several replicas, a list of one such set for each; if no reading is missing, this may be one
@@ -98,36 +99,43 @@ def posterior(
 
     if not isinstance(readings, Sized):
         raise StartError(f"Readings must be a list with one for each sensor column, not {readings!r}.")
-    parameters = machine.parameters
+    machines = [machine] if isinstance(machine, BM1Machine) else machine
+    parameters = machines[0].parameters
     sets = [readings] if parameters.replicas == 1 else readings
     if len(sets) != parameters.replicas:
         raise StartError(
             f"There are readings of {len(sets)} machines; this machine has {parameters.replicas} replicas."
         )
-    inputs = [_inputs(parameters, cast("Sequence[Reading]", own)) for own in sets]
-    kernel = make_kernel(machine)
-    kernel.start(
-        Start(
-            addresses=np.reshape(inputs, parameters.input_shape),
-            prior_address=prior_address,
-            prior_codes=prior_codes,
-            target_count=target_count,
-            max_cycles=max_cycles,
-            bank=bank,
+    kernels = []
+    for each in machines:
+        inputs = [_inputs(each.parameters, cast("Sequence[Reading]", own)) for own in sets]
+        kernels.append(make_kernel(each))
+        kernels[-1].start(
+            Start(
+                addresses=np.reshape(inputs, each.parameters.input_shape),
+                prior_address=prior_address,
+                prior_codes=prior_codes,
+                target_count=target_count,
+                max_cycles=max_cycles,
+                bank=bank,
+            )
         )
-    )
-    counts = kernel.counts.reshape(parameters.replicas, parameters.lines)
+    counts = [kernel.counts.reshape(parameters.replicas, -1) for kernel in kernels]
     joints = [
-        joint_posterior([own], [cycles]) for own, cycles in zip(counts, kernel.replica_cycles, strict=True)
+        joint_posterior(
+            [own[replica] for own in counts], [kernel.replica_cycles[replica] for kernel in kernels]
+        )
+        for replica in range(parameters.replicas)
     ]
     if all(joint is None for joint in joints):
         cause = (
             "these readings select a code 0 on every line"
-            if kernel.reason is StopReason.IMPOSSIBLE
-            else f"all counts are 0 after {kernel.cycles} cycles"
+            if all(kernel.reason is StopReason.IMPOSSIBLE for kernel in kernels)
+            else f"all counts are 0 after {max(kernel.cycles for kernel in kernels)} cycles"
         )
         raise NoPosteriorError(f"There is no posterior: {cause}.")
-    rows = [np.zeros(parameters.lines) if joint is None else joint for joint in joints]
+    lines = sum(each.parameters.lines for each in machines)
+    rows = [np.zeros(lines) if joint is None else joint for joint in joints]
     return rows[0] if parameters.replicas == 1 else np.stack(rows)
 
 

@@ -1,5 +1,6 @@
 """Posteriors as ROS messages: writing, reading, pairing with the reports of their frames, and receiving."""
 
+from posteriors.emulation import posterior
 from posteriors.errors import BadResultError, LabelError, NoResultError, PosteriorError
 from posteriors.frame_report import BoardReport, FrameReport, StageTimes
 from posteriors.listening import Posteriors, listen, posteriors
@@ -16,5 +17,6 @@ __all__ = [
     "Posteriors",
     "StageTimes",
     "listen",
+    "posterior",
     "posteriors",
 ]

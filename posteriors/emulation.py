@@ -1,0 +1,62 @@
+"""The posterior of a deployment for given readings, computed in this process: for notebooks and tests of models."""
+
+import difflib
+import time
+from collections.abc import Mapping
+from pathlib import Path
+
+from posteriors.errors import LabelError, PosteriorError
+from posteriors.posterior import Posterior
+from toolchain.deployment import load_deployment
+
+
+def posterior(folder: str | Path, readings: Mapping[str, object], *, bank: int = 0) -> Posterior:
+    """Run the machines of a deployment, without boards, processes or a rosbridge server.
+
+    Args:
+        folder: The folder that `toolchain build` wrote.
+        readings: The readings by the names of their variables, as in messages: numbers in their units, or names of
+            states. A variable that is not named has no reading.
+        bank: Set of seeds; each gives another draw of the same distribution.
+
+    Returns:
+        The posterior in the shape of the model, with its labels; `report` is None.
+
+    Raises:
+        LabelError: The deployment has no variable of this name.
+        PosteriorError: The machine has replicas, or readings for each line, which `machines.posterior` takes.
+        ToolchainError: The deployment is damaged, or a reading cannot be used.
+        NoPosteriorError: All counts are 0 for these readings.
+    """
+    from machines.posterior import posterior as run
+    from pcie_shim.programming_file import read_image
+    from toolchain.deployment.address import to_address
+
+    deployment = load_deployment(Path(folder))
+    names = [variable.name for variable in deployment.variables]
+    for name in readings:
+        if name not in names:
+            near = difflib.get_close_matches(name, names, 1, 0.5)
+            hint = f"did you mean {near[0]!r}?" if near else f"there are {', '.join(names)}"
+            raise LabelError(f"the deployment of {folder} has no variable {name!r}; {hint}")
+    if any(deployment.reading_shape(variable) for variable in deployment.variables):
+        raise PosteriorError(
+            f"the machine of {folder} has replicas or readings for each line: use machines.posterior with its image"
+        )
+    addresses, row = deployment.machine_addresses(
+        [to_address(variable, readings.get(variable.name)) for variable in deployment.variables]
+    )
+    values = run(
+        [read_image(deployment.image_path(board)).machine for board in range(len(deployment.boards))],
+        addresses,
+        prior_address=row,
+        target_count=deployment.machine.target_count,
+        max_cycles=deployment.machine.max_cycles,
+        bank=bank,
+    )
+    return Posterior(
+        probabilities=tuple(values.tolist()),
+        labels=tuple(dimension.label for dimension in deployment.searched),
+        sizes=tuple(dimension.size for dimension in deployment.searched),
+        heard_ns=time.time_ns(),
+    )
