@@ -39,6 +39,10 @@ class Settings(BaseSettings):
     boards: Annotated[tuple[str, ...], NoDecode] = Field(
         default=(), description="endpoints of running boards, comma-separated"
     )
+    ca: Path | None = Field(
+        default=None,
+        description="certificates (PEM) that sign that of a wss:// server; the system's without it",
+    )
     key_file: Path | None = Field(default=None, description="file with the key that boards over TCP share")
     board_ca: Path | None = Field(
         default=None,
@@ -71,7 +75,7 @@ class Settings(BaseSettings):
     )
 
     @field_validator(
-        "deployment", "key_file", "board_ca", "run_directory", "control_directory", mode="before"
+        "deployment", "ca", "key_file", "board_ca", "run_directory", "control_directory", mode="before"
     )
     @classmethod
     def _no_directory(cls, value: object) -> object:

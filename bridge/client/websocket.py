@@ -285,7 +285,10 @@ def _connect_error(
             f"{uri} is not a rosbridge server: it answers like a web server ({seen}); check port and path"
         )
     if isinstance(error, InvalidMessage) and not heard:
-        perhaps = " (some servers do so without a client_certificate)" if uri.startswith("wss:") else ""
+        is_tls = uri.startswith("wss:")
+        perhaps = (
+            " (some servers do so without a client_certificate)" if is_tls else "; does it expect wss://?"
+        )
         return UnreachableError(f"{uri} is unreachable: it closed the connection without an answer{perhaps}")
     if isinstance(error, InvalidHandshake) or (isinstance(error, TimeoutError) and heard):
         why = f"within {seconds:g} s " if isinstance(error, TimeoutError) else ""

@@ -45,6 +45,16 @@ Uri = Annotated[
         rich_help_panel=SERVER,
     ),
 ]
+Ca = Annotated[
+    Path | None,
+    setting(
+        "ca",
+        "Certificates that sign that of a wss:// server.",
+        otherwise="the system's",
+        metavar="FILE",
+        rich_help_panel=SERVER,
+    ),
+]
 Listen = Annotated[
     str | None,
     typer.Option(

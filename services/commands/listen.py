@@ -28,6 +28,7 @@ app = CommandLine(
 @app.command(help=app.info.help)
 def listen(
     uri: options.Uri = None,
+    ca: options.Ca = None,
     deployment: options.Deployment = None,
     topic: Annotated[
         str | None,
@@ -68,6 +69,7 @@ def listen(
         raise SettingsError("--json and --plot both use standard output: give one of them")
     settings = load_settings(
         uri=uri,
+        ca=ca,
         deployment=deployment,
         first_data_timeout=first_data_timeout,
         connect_timeout=connect_timeout,

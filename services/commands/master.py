@@ -38,6 +38,7 @@ def master(
     count: options.Count = None,
     deployment: options.Deployment = None,
     uri: options.Uri = None,
+    ca: options.Ca = None,
     connect: Annotated[
         Path | None,
         typer.Option(
@@ -85,6 +86,7 @@ def master(
     settings = load_settings(
         deployment=deployment,
         uri=uri,
+        ca=ca,
         boards=boards,
         queue=queue,
         stop=stop,

@@ -25,6 +25,7 @@ app = CommandLine(
 def publisher(
     deployment: options.Deployment = None,
     uri: options.Uri = None,
+    ca: options.Ca = None,
     listen: options.Listen = None,
     ros_version: options.RosVersion = None,
     connect_timeout: options.ConnectTimeout = None,
@@ -39,6 +40,7 @@ def publisher(
     settings = load_settings(
         deployment=deployment,
         uri=uri,
+        ca=ca,
         ros_version=ros_version,
         connect_timeout=connect_timeout,
         seen_timeout=seen_timeout,

@@ -32,6 +32,7 @@ app = CommandLine(
 def subscriber(
     deployment: options.Deployment = None,
     uri: options.Uri = None,
+    ca: options.Ca = None,
     topic: Annotated[
         str | None,
         typer.Option(help="Topic to subscribe to.", metavar="TOPIC", rich_help_panel=_WITHOUT_DEPLOYMENT),
@@ -64,6 +65,7 @@ def subscriber(
     settings = load_settings(
         deployment=deployment,
         uri=uri,
+        ca=ca,
         queue=queue,
         ros_version=ros_version,
         connect_timeout=connect_timeout,

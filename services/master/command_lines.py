@@ -32,6 +32,7 @@ def service_command(
         return [*command, "--reprogram"] if reprogram else command
     command += ["--uri", settings.uri] if settings.uri else []
     command += ["--ros-version", settings.ros_version, "--connect-timeout", str(settings.connect_timeout)]
+    command += ["--ca", str(settings.ca)] if settings.ca else []
     if role == "publisher":
         return [*command, "--seen-timeout", str(settings.seen_timeout)]
     command += ["--first-data-timeout", str(settings.first_data_timeout)]

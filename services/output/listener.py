@@ -47,6 +47,7 @@ async def show_frames(
             uri,
             connect_timeout=settings.connect_timeout,
             retry=True,
+            ca_file=settings.ca,
             ros_version=settings.ros_version,
             on_state=report_connection(uri),
             max_size=MAX_RESULT,

@@ -44,6 +44,7 @@ async def connect_all(
                     used,
                     connect_timeout=settings.connect_timeout,
                     retry=True,
+                    ca_file=settings.ca,
                     ros_version=settings.ros_version,
                     on_state=None if on_state is None else partial(on_state, used),
                     **options,

@@ -225,7 +225,7 @@ class Subscriber:
             compression=source.compression,
         )
         timeout = self._settings.first_data_timeout
-        first = True
+        first, silent = True, False
         connection: int | None = None
         lost_before = 0
         while True:
@@ -235,8 +235,11 @@ class Subscriber:
                 if first and ros.state is State.CONNECTED and self._assembler.needs(at):
                     raise
                 self._link.notice("warning", str(error))
+                silent = True
                 continue
-            first = False
+            if silent:
+                self._link.notice("info", f"messages of {source.topic} are back")
+            first = silent = False
             self._received += 1
             if connection != ros.reconnections and not self._queue_all:
                 connection = ros.reconnections

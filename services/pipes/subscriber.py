@@ -24,7 +24,11 @@ async def print_variables(settings: Settings, source: Source, names: list[str], 
     """
     fields = [Field(name) for name in names]
     async with connect(
-        source.uri, connect_timeout=settings.connect_timeout, retry=True, ros_version=settings.ros_version
+        source.uri,
+        connect_timeout=settings.connect_timeout,
+        retry=True,
+        ca_file=settings.ca,
+        ros_version=settings.ros_version,
     ) as ros:
         subscription = ros.subscribe(source.topic, source.type, queue_size=RECEIVED_QUEUE)
         printed = 0

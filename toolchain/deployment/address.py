@@ -30,7 +30,7 @@ def to_address(variable: Variable, value: object) -> int | None:
             infinite and the variable periodic.
     """
     if value is None:
-        return _missing(variable, "is absent or null")
+        return _missing(variable, "is absent or null (NaN is null in JSON)")
     if isinstance(value, str) and value in variable.states:
         return variable.states.index(value)
     if not isinstance(value, int | float):  # bool is an int: False is 0, True is 1
