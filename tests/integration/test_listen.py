@@ -30,7 +30,7 @@ from tests.integration.conftest import BIN, PATIENCE, ROOT, Running, until, unti
 def programs(page: str) -> list[str]:
     """The page's Python that hears posteriors."""
     blocks = re.findall(r"^```python\n(.*?)^```", (ROOT / page).read_text(), re.MULTILINE | re.DOTALL)
-    return [block for block in blocks if "from posteriors import" in block]
+    return [block for block in blocks if "from posteriors import" in block and "ws://" in block]
 
 
 GUIDE = programs("docs/how-to/listening.md")
