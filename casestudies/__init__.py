@@ -1,1 +1,1 @@
-"""Case studies: a model, a simulator or a data reader, and a page of words each."""
+"""Case studies, each with a model, a simulator or a data reader, and a page that describes it."""

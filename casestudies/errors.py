@@ -4,10 +4,10 @@ from typing import ClassVar
 
 
 class CaseStudyError(Exception):
-    """Root of the case studies' errors; `str()` is one sentence that says what to do."""
+    """Base class of the case studies' errors; `str()` is one sentence that says what to do."""
 
     exit_code: ClassVar[int] = 2
 
 
 class DataFileError(CaseStudyError):
-    """A file of recorded data is missing, or is not such a file."""
+    """A file of recorded data is missing or is not valid."""

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Grid:
-    """A grid over x in [x_low, x_high] and y in [y_low, y_high], in the map's units.
+    """A grid over [x_low, x_high] and [y_low, y_high], in the map's units.
 
-    Cells are counted from the lower left corner, row-major with y first, as the lines of the machine
-    are: line = row * width + column (row along y, column along x).
+    Cells are numbered from the lower left corner in row-major order, like the lines of the machine: line =
+    row * width + column (row along y, column along x).
     """
 
     x_low: float
@@ -40,18 +40,18 @@ class Grid:
         return (self.y_high - self.y_low) / self.height
 
     def cell(self, x: float, y: float) -> tuple[int, int]:
-        """Return the (column, row) of the cell around a point; points outside belong to the nearest border cell."""
+        """Return the (column, row) of the cell that contains a point, or of the border cell nearest to it."""
         column = math.floor((x - self.x_low) / self.cell_width)
         row = math.floor((y - self.y_low) / self.cell_height)
         return min(max(column, 0), self.width - 1), min(max(row, 0), self.height - 1)
 
     def line(self, x: float, y: float) -> int:
-        """Return the machine's line of the cell around a point."""
+        """Return the machine's line of the cell that contains a point."""
         column, row = self.cell(x, y)
         return row * self.width + column
 
     def centre(self, line: int) -> tuple[float, float]:
-        """Return the centre (x, y) of a line's cell, in the map's units; an IndexError if there is no such line."""
+        """Return the centre (x, y) of a line's cell, in the map's units, or raise an IndexError."""
         if not 0 <= line < self.cells:
             raise IndexError(f"line {line} of a grid of {self.cells} cells")
         row, column = divmod(line, self.width)

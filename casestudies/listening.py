@@ -18,14 +18,14 @@ _PATIENCE_S: Final = 1.0
 
 
 class Listener:
-    """The frames received and not yet taken; made by `listen`.
+    """The frames received and not yet returned by `next`; created by `listen`.
 
     Attributes:
         route: The true positions received, the newest last.
     """
 
     def __init__(self, heard: Posteriors, truths: Truths) -> None:
-        """Take the source of frames and the store of truths."""
+        """Start without frames."""
         self.route: deque[Truth] = deque(maxlen=100_000)
         self._heard = heard
         self._truths = truths
@@ -35,14 +35,14 @@ class Listener:
 
     @property
     def announced_only(self) -> int:
-        """The number of frames that `/bm/frame` announced and whose result never came."""
+        """The number of frames that `/bm/frame` announced and whose result never arrived."""
         return self._heard.announced_only
 
     async def next(self, limit_s: float) -> Instance:
         """Wait for the next frame.
 
         Raises:
-            NoResultError: No frame came within the limit, in seconds.
+            NoResultError: No frame arrived within the limit, in seconds.
             BadResultError: A message was not a result.
         """
         now = asyncio.get_running_loop().time
@@ -89,9 +89,9 @@ class Listener:
 async def listen(
     ros: Ros, *, truth_topic: str | None = None, truth_tolerance_s: float = 0.0
 ) -> AsyncIterator[Listener]:
-    """Subscribe to `/bm/frame`, `/BMresults` and, if given, a topic of geometry_msgs/PoseStamped with the truth.
+    """Subscribe to `/bm/frame`, `/BMresults` and, if given, a geometry_msgs/PoseStamped topic of true poses.
 
-    A true pose has the stamp of a frame's readings, or one older by at most the tolerance.
+    A true pose belongs to a frame if it has the same stamp, or one older by at most the tolerance.
     """
     async with contextlib.AsyncExitStack() as stack:
         heard = await stack.enter_async_context(posteriors(ros, queue_size=_QUEUE_SIZE))

@@ -1,4 +1,4 @@
-"""Readiness of a case study's process: whether it did its work lately, shown on its status socket."""
+"""Readiness of a case study's process, which its status socket reports."""
 
 import contextlib
 import json
@@ -7,37 +7,37 @@ import time
 from collections.abc import AsyncIterator
 from typing import Final
 
-from terminal.health import health_served
+from terminal.health import serve_health
 
 RECENT_S: Final = 10.0
-"""Seconds after which the last piece of work is too long ago."""
+"""Seconds without work after which a process is not ready."""
 
 
 class Readiness:
-    """When a process last did its work."""
+    """Whether a process has worked within the last `RECENT_S` seconds."""
 
     def __init__(self, work: str) -> None:
-        """Begin with nothing done; `work` names the work in the past tense: "a reading was published"."""
+        """Start with no work done; `work` names it in the past tense, such as "a reading was published"."""
         self._work = work
         self._last: float | None = None
         self._done = 0
 
-    def did(self) -> None:
-        """Note a piece of work."""
+    def record(self) -> None:
+        """Record that the process worked."""
         self._last = time.monotonic()
         self._done += 1
 
     def state(self) -> tuple[bool, str]:
         """Return whether the process is ready, and why."""
         if self._last is None:
-            return False, f"not once yet: {self._work}"
+            return False, f"not yet: {self._work}"
         age = time.monotonic() - self._last
         return age <= RECENT_S, f"{self._work} {age:.1f} s ago, {self._done} in all"
 
 
 @contextlib.asynccontextmanager
-async def readiness_served(name: str, readiness: Readiness) -> AsyncIterator[None]:
-    """Show the readiness in the folder that BM_RUN_DIRECTORY names, if any, while the context lasts."""
+async def serve_readiness(name: str, readiness: Readiness) -> AsyncIterator[None]:
+    """Report the readiness on a socket in the folder that BM_RUN_DIRECTORY names, if any, within the context."""
     started = time.monotonic()
 
     def answer() -> bytes:
@@ -46,5 +46,5 @@ async def readiness_served(name: str, readiness: Readiness) -> AsyncIterator[Non
         status = {"ready": ready, "why": why, "name": name, "pid": os.getpid(), "uptime_s": uptime}
         return json.dumps(status).encode()
 
-    async with health_served(os.environ.get("BM_RUN_DIRECTORY") or None, name, answer):
+    async with serve_health(os.environ.get("BM_RUN_DIRECTORY") or None, name, answer):
         yield

@@ -1,4 +1,4 @@
-"""True positions, matched with frames by their stamps."""
+"""True positions, matched with frames by time stamp."""
 
 from collections import deque
 from dataclasses import dataclass
@@ -28,7 +28,7 @@ class Truth:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Instance:
-    """A frame's outcome and its truth.
+    """A frame's outcome and its true position.
 
     `truth` is None if no true pose matches the stamp. `truth_age_ns` is the age of the true pose relative to the
     frame's stamp, 0 if the stamps are equal.
@@ -72,7 +72,7 @@ class _PoseStamped(_Part):
 
 
 def read_truth(message: dict[str, Any], topic: str) -> Truth:
-    """Return a geometry_msgs/PoseStamped as a true position; a BadResultError without a stamp or a position."""
+    """Return a geometry_msgs/PoseStamped as a true position, or raise a BadResultError."""
     try:
         pose = _PoseStamped.model_validate(message)
     except ValidationError as error:
@@ -84,11 +84,11 @@ def read_truth(message: dict[str, Any], topic: str) -> Truth:
 
 
 class Truths:
-    """Frames and true positions, matched in whatever order they arrive.
+    """Frames and true positions, matched in any order of arrival.
 
-    A frame waits for its truth until a newer truth or the next frame arrives. Without a truth of exactly its stamp a
-    frame takes the newest older one, if that is at most `tolerance_ns` older: a message without a header is stamped
-    only when it reaches the host.
+    A frame waits for its truth until a newer truth or the next frame arrives. If no truth has exactly the
+    frame's stamp, the newest older one is used, if it is at most `tolerance_ns` older: a message without a
+    header is stamped only when it reaches the host.
     """
 
     def __init__(self, *, tolerance_ns: int = 0) -> None:
@@ -112,7 +112,7 @@ class Truths:
         return self._resolve()
 
     def flush(self) -> list[Instance]:
-        """Return the frames that still wait for a truth, which will not come."""
+        """Return the frames that still wait for a truth that will not arrive."""
         ended = [self._with_truth(instance) for instance in self._untrue]
         self._untrue.clear()
         return ended

@@ -19,7 +19,7 @@ class InputLineError(StackError):
 
 
 class LocalSocketError(StackError):
-    """A local socket can't be created, or bytes from it are not a record."""
+    """A local socket cannot be created, or bytes from it are not a record."""
 
     exit_code = ExitCode.CHILD
 
@@ -69,7 +69,7 @@ class NotPreparedError(StackError):
 
 
 class ShapeError(StackError):
-    """A deployment can't replace the one in force: its boards or topics differ."""
+    """A deployment cannot replace the one in force: its boards or topics differ."""
 
 
 class NotReloadedError(StackError):

@@ -10,7 +10,7 @@ from bridge.hub.graph import Graph
 from bridge.hub.limits import HubLimits
 from bridge.hub.server import serve_hub
 from services.settings import load_settings
-from services.sockets.status import HubStatus, ProcessStatus, status_served
+from services.sockets.status import HubStatus, ProcessStatus, serve_status
 from terminal.logs import log_libraries
 from terminal.output import say
 
@@ -65,7 +65,7 @@ async def serve(
         on_graph=graphs.append,
         stop=asyncio.Event(),
     )
-    async with status_served(run_directory, "hub", status):
+    async with serve_status(run_directory, "hub", status):
         announcing = None if announce is None else asyncio.ensure_future(announce_once_ready(announce))
         tasks = [asyncio.ensure_future(hub), *([announcing] if announcing else [])]
         try:

@@ -75,7 +75,7 @@ def _system_sentence(error: OSError) -> str | None:
         return f"{error.filename}: {error.strerror}"
     if error.errno in _NO_SPACE:
         discard_output()
-        return f"the output can't be written: {error.strerror}; free some space, or redirect it elsewhere"
+        return f"the output cannot be written: {error.strerror}; free some space, or redirect it elsewhere"
     if error.errno in _TOO_MANY_FILES:
-        return f"this process can't open another file: {error.strerror}; raise the limit (ulimit -n), or end other programs"
+        return f"this process cannot open another file: {error.strerror}; raise the limit (ulimit -n), or end other programs"
     return None

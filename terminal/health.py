@@ -83,10 +83,10 @@ def read_status(path: str, timeout: float) -> bytes:
     except OSError as error:
         sentence = f"is not running, or does not report its status at {path} ({error.strerror or error})"
         raise NoHealthError(Silence.NO_SOCKET, sentence) from None
-    raise not_ours(path)
+    raise foreign_socket_error(path)
 
 
-def not_ours(path: str) -> NoHealthError:
+def foreign_socket_error(path: str) -> NoHealthError:
     """Return the error for an answer that is not a status."""
     sentence = f"is not a rosbayes process of this version, according to its answer at {path}"
     return NoHealthError(Silence.NOT_OURS, sentence)
@@ -99,7 +99,7 @@ def is_ready(path: str, timeout: float) -> tuple[bool, str]:
         status = json.loads(data)
         return status["ready"] is True, str(status["why"])
     except (ValueError, TypeError, KeyError, RecursionError):
-        raise not_ours(path) from None
+        raise foreign_socket_error(path) from None
 
 
 # --- answering -------------------------------------------------------------------------------------
@@ -135,7 +135,7 @@ def _listening(directory: str | os.PathLike[str] | None, name: str) -> Iterator[
             from terminal.output import say
 
             reason = "another process listens there" if error.errno == errno.EADDRINUSE else error.strerror
-            say(f"{name}: warning: its status can't be shown at {path}: {reason or error}")
+            say(f"{name}: warning: its status cannot be shown at {path}: {reason or error}")
     try:
         yield listener
     finally:
@@ -146,7 +146,7 @@ def _listening(directory: str | os.PathLike[str] | None, name: str) -> Iterator[
 
 
 @contextlib.asynccontextmanager
-async def health_served(
+async def serve_health(
     directory: str | os.PathLike[str] | None,
     name: str,
     answer: Callable[[], bytes],
@@ -183,7 +183,7 @@ async def health_served(
 
 
 @contextlib.contextmanager
-def health_thread(
+def serve_health_in_thread(
     directory: str | os.PathLike[str] | None,
     name: str,
     answer: Callable[[], bytes],
@@ -191,7 +191,7 @@ def health_thread(
 ) -> Iterator[None]:
     """Answer from a thread within the context, for a process whose main thread blocks.
 
-    The arguments are those of `health_served`; `answer` and `sample` run in the thread.
+    The arguments are those of `serve_health`; `answer` and `sample` run in the thread.
     """
     with _listening(directory, name) as listener:
         if listener is None:

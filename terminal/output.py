@@ -50,7 +50,7 @@ def _write(text: str) -> None:
     stream.flush()
 
 
-def put_json(value: Any) -> None:
+def print_json_line(value: Any) -> None:
     """Print a line of JSON on standard output, free of terminal control characters."""
     line = orjson.dumps(value)
     if not line.isascii():  # orjson escapes only the control characters of ASCII

@@ -22,7 +22,7 @@ _ENDS = {
 _received: list[int] = []
 
 
-def stopped_by(number: int) -> StoppedError:
+def stopped_error(number: int) -> StoppedError:
     """Return the error, with exit code and sentence, for the signal that ends a process."""
     return StoppedError(*_ENDS[signal.Signals(number)])
 
@@ -42,7 +42,7 @@ def raise_on_signals() -> None:
 def _stop(number: int, _frame: object) -> None:
     _received.append(number)
     if len(_received) == 1:
-        raise stopped_by(number)
+        raise stopped_error(number)
 
 
 def _report_dropped(dropped: sys.UnraisableHookArgs) -> None:
@@ -54,7 +54,7 @@ def _report_dropped(dropped: sys.UnraisableHookArgs) -> None:
 def check_signals() -> None:
     """Raise a StoppedError for a signal whose exception was dropped; call this before blocking."""
     if _received:
-        raise stopped_by(_received[0])
+        raise stopped_error(_received[0])
 
 
 def ignore_signals() -> None:
@@ -95,7 +95,7 @@ def run_async(main: Coroutine[Any, Any, int | None]) -> int:
         else:
             if not received:
                 return int(code or 0)
-        raise stopped_by(received[0])
+        raise stopped_error(received[0])
 
     handlers = {number: signal.getsignal(number) for number in _ENDS}
     try:

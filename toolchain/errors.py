@@ -34,11 +34,11 @@ class NetworkFileError(ModelError):
 
 
 class MifError(ToolchainError):
-    """A memory file can't be read: not a MIF, or words that don't fit; the sentence contains file and line."""
+    """A memory file cannot be read: not a MIF, or words that don't fit; the sentence contains file and line."""
 
 
 class BuildError(ToolchainError):
-    """A build is impossible: options contradict each other, or a folder can't be written."""
+    """A build is impossible: options contradict each other, or a folder cannot be written."""
 
 
 class DeploymentError(ToolchainError):

@@ -1,4 +1,4 @@
-"""Figures of a posterior's quality, against the truth and against float64 fusion of the same readings."""
+"""Accuracy of posteriors, relative to the truth and to a float64 fusion of the same readings."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -11,7 +11,7 @@ REGION_MASS: Final = 0.95
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Correctness:
-    """Figures over many frames of one grid; shares are 0..1, distances are in cells.
+    """The accuracy over many frames of one grid; shares are 0..1, distances are in cells.
 
     Coverage is the share of frames whose true cell lies in the posterior's 95 % region.
     """
@@ -31,10 +31,10 @@ class Correctness:
 
 
 def in_region(true_lines: ArrayLike, posteriors: ArrayLike, mass: float = REGION_MASS) -> NDArray[np.bool_]:
-    """Return for each frame whether its true cell lies in the smallest region that holds this much of the posterior.
+    """Return for each frame whether its true cell lies in the smallest region with this much probability.
 
-    The region takes the most probable cells first; cells of equal probability enter together, so that the
-    answer does not depend on the order of lines. `posteriors` are float64[frames, lines], each summing to 1.
+    The most probable cells are added first, and cells of equal probability together, so the result does not
+    depend on the order of lines. `posteriors` are float64[frames, lines], each summing to 1.
     """
     probabilities = _two_dimensional(posteriors)
     at_truth = np.take_along_axis(probabilities, np.asarray(true_lines)[:, None], axis=1)
@@ -54,14 +54,14 @@ def means(posteriors: ArrayLike, width: int) -> NDArray[np.float64]:
 
 
 def total_variation(posteriors: ArrayLike, exact: ArrayLike) -> NDArray[np.float64]:
-    """Return half the sum of absolute differences of each frame: float64[frames], 0..1."""
+    """Return the total variation distance of each pair of posteriors: float64[frames], 0..1."""
     differences: NDArray[np.float64] = np.abs(_two_dimensional(posteriors) - _two_dimensional(exact))
     halves: NDArray[np.float64] = 0.5 * differences.sum(axis=1)
     return halves
 
 
 def correctness(true_lines: ArrayLike, posteriors: ArrayLike, exact: ArrayLike, *, width: int) -> Correctness:
-    """Return all figures of the machine's posteriors beside float64 fusion of the same readings.
+    """Return the accuracy of the machine's posteriors, compared with a float64 fusion of the same readings.
 
     `true_lines` are int[frames], both kinds of posteriors float64[frames, lines]; a row of the grid has `width` cells.
 

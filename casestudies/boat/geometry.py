@@ -10,22 +10,24 @@ from typing import Final
 from casestudies.grid import Grid
 
 MAP_LOW: Final = -50.0
-"""The map is the square [MAP_LOW, MAP_HIGH]^2."""
+"""Lowest coordinate of the map, the square [MAP_LOW, MAP_HIGH]^2."""
 MAP_HIGH: Final = 50.0
 BEACONS: Final = ((-50.0, -50.0), (-50.0, 0.0), (0.0, -50.0))
-"""Lower left corner, middle of the left side, middle of the lower side (thesis 4.1)."""
+"""Positions of the beacons: lower left corner, middle of the left side, middle of the lower side (4.1).
+"""
 DISTANCE_NAMES: Final = ("D1", "D2", "D3")
 BEARING_NAMES: Final = ("B1", "B2", "B3")
 SENSOR_NAMES: Final = DISTANCE_NAMES + BEARING_NAMES
-"""In the order of the machine's columns, and of the numbers in an array message."""
+"""Names of the sensors, in the order of the machine's columns and of the numbers in an array message."""
 LONGEST_DISTANCE: Final = 100
-"""Readings are whole numbers 0..100; the map's far corners are further away and clamp."""
+"""Readings are whole numbers 0..100; longer distances, such as those to the map's far corners, are clamped.
+"""
 BEARING_SIGMA: Final = 10.0
 """Standard deviation of a bearing, in degrees."""
 
 
 def map_grid(width: int = 32, height: int = 32) -> Grid:
-    """Return the map cut into cells; 32 x 32 is what the thesis ran on four boards (4.2)."""
+    """Return the map as a grid of cells; the thesis ran 32 x 32 on four boards (4.2)."""
     return Grid(x_low=MAP_LOW, x_high=MAP_HIGH, y_low=MAP_LOW, y_high=MAP_HIGH, width=width, height=height)
 
 

@@ -9,7 +9,7 @@ from terminal.output import say
 
 
 class LossyPublication:
-    """A publication that drops messages while the server is away, or is slow, which it reports once each time."""
+    """A publication that drops messages while the server is away or slow, with one warning each time."""
 
     def __init__(self, publication: Publication) -> None:
         """Wrap a publication."""

@@ -1,7 +1,7 @@
-"""The boat's ROS messages: fields with the sensors' names, or six numbers in a row.
+"""The boat's ROS messages: fields named after the sensors, or an array of six numbers.
 
-Named fields (`boat_msgs/Raw`, `boat_msgs/Sensors`) read well and carry the reading's time. A ROS server
-accepts types of installed packages only: for one without `boat_msgs` the same numbers travel as
+Messages with named fields (`boat_msgs/Raw`, `boat_msgs/Sensors`) are easy to read and carry a time stamp. A
+ROS server accepts only types of installed packages; on one without `boat_msgs` the same numbers are sent as
 std_msgs/Float64MultiArray, in the order of `SENSOR_NAMES`.
 """
 
@@ -62,9 +62,9 @@ def true_pose(x: float, y: float, head: dict[str, Any]) -> dict[str, Any]:
 def readings_message(
     values: Sequence[float], head: Mapping[str, Any] | None, *, array: bool
 ) -> dict[str, Any]:
-    """Return six readings in the order of `SENSOR_NAMES` as a message, with this header if any.
+    """Return six readings, in the order of `SENSOR_NAMES`, as a message with this header, if any.
 
-    With `array` it is a std_msgs/Float64MultiArray, which has no place for a header.
+    With `array` it is a std_msgs/Float64MultiArray, which does not have a header.
     """
     if array:
         return {
@@ -81,7 +81,7 @@ def readings_message(
 def read_raw(
     message: Mapping[str, Any], *, array: bool
 ) -> tuple[tuple[float, ...], Mapping[str, Any] | None]:
-    """Return the six raw readings of a message, and its header if any; a BadReadingError if one is not a finite number."""
+    """Return the six raw readings of a message and its header, if any, or raise a BadReadingError."""
     if array:
         data = message.get("data")
         if not isinstance(data, list) or len(data) != len(SENSOR_NAMES):

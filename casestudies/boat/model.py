@@ -38,11 +38,11 @@ def model(
     Args:
         width: Cells along x; the thesis ran 32 and describes 64.
         height: Cells along y.
-        distance_step: Map units between distinguishable distances; readings are whole numbers 0..100, those
-            beyond clamp and the end bins hold the tails.
-        bearing_step: Degrees between distinguishable bearings; must divide a turn.
-        array: Whether the readings come as six numbers in a std_msgs/Float64MultiArray, in the columns' order,
-            instead of fields with the sensors' names: for servers that know installed message types only.
+        distance_step: Map units between distinguishable distances; readings are whole numbers 0..100, others
+            are clamped and the first and last bins hold the tails.
+        bearing_step: Degrees between distinguishable bearings; a divisor of 360.
+        array: Whether readings are six numbers in a std_msgs/Float64MultiArray, in the order of the columns,
+            instead of fields named after the sensors; for servers that accept only installed message types.
 
     Raises:
         ModelError: A grid without cells, or a step that does not fit.

@@ -1,4 +1,4 @@
-"""Normaliser of the boat's raw readings into whole numbers in the machine's ranges (thesis chapter 4)."""
+"""Normaliser of the boat's raw readings to whole numbers in the machine's ranges (thesis chapter 4)."""
 
 import math
 from typing import Annotated
@@ -26,17 +26,17 @@ from terminal.signals import run_async
 
 
 def normalise_distance(raw: float) -> int:
-    """Return a distance as whole map units 0..100, halves up; values beyond the range are clamped."""
+    """Return a distance in whole map units, rounded half up and clamped to 0..100."""
     return min(max(math.floor(raw + 0.5), 0), LONGEST_DISTANCE)
 
 
 def normalise_bearing(raw: float) -> int:
-    """Return a bearing in radians as whole degrees 0..359, halves up."""
+    """Return a bearing, given in radians, in whole degrees 0..359, rounded half up."""
     return math.floor(math.degrees(raw) + 0.5) % 360
 
 
 def normalise(raw: tuple[float, ...]) -> tuple[int, ...]:
-    """Return raw readings in the order of `SENSOR_NAMES` as the machine's."""
+    """Return the machine's readings for raw ones in the order of `SENSOR_NAMES`."""
     return tuple(
         normalise_distance(value) if is_distance(name) else normalise_bearing(value)
         for name, value in zip(SENSOR_NAMES, raw, strict=True)
@@ -53,12 +53,12 @@ async def serve(uri: str, *, raw_topic: str, sensors_topic: str, array: bool) ->
     """
     from bridge.client import connect
     from casestudies.boat.lossy import LossyPublication
-    from casestudies.readiness import Readiness, readiness_served
+    from casestudies.readiness import Readiness, serve_readiness
 
     reported: set[str] = set()
     readiness = Readiness("a reading was normalised")
     async with (
-        readiness_served("boat-normaliser", readiness),
+        serve_readiness("boat-normaliser", readiness),
         connect(uri, retry=True, on_state=report_connection(uri)) as ros,
     ):
         sensors = LossyPublication(await ros.advertise(sensors_topic, ARRAY_TYPE if array else SENSORS_TYPE))
@@ -72,7 +72,7 @@ async def serve(uri: str, *, raw_topic: str, sensors_topic: str, array: bool) ->
                     reported.add(str(error))
                 continue
             if await sensors.publish(readings_message(normalise(values), head, array=array)):
-                readiness.did()
+                readiness.record()
 
 
 app = CommandLine()

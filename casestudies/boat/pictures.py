@@ -1,4 +1,4 @@
-"""Pictures of posteriors beside the truth (thesis figure 4.4) and of shares of time (figure 4.5)."""
+"""Pictures of posteriors next to the truth (thesis figure 4.4) and of a frame's time by stage (figure 4.5)."""
 
 import math
 from collections.abc import Iterable, Sequence
@@ -14,7 +14,7 @@ from posteriors.posterior import Posterior
 from terminal.errors import OutputError
 
 POSITIONS_SHOWN: Final = 4
-"""The number that the thesis shows."""
+"""Number of positions in figure 4.4, as in the thesis."""
 
 _PART_COLOURS: Final = {
     Part.ROSBRIDGE: "#4477aa",
@@ -25,11 +25,11 @@ _PART_COLOURS: Final = {
 _TRUTH_COLOUR: Final = "#ff4d4d"
 _DPI: Final = 130
 _EDGE: Final = 0.2
-"""Share of the map's width at each edge where a label is not centred."""
+"""Share of the map's width, at each edge, in which a label is not centred."""
 
 
 def check_pictures_possible() -> None:
-    """Check before a long run that its pictures can be drawn; an OutputError without matplotlib."""
+    """Raise an OutputError if matplotlib is missing, so that a long run does not end without its pictures."""
     if find_spec("matplotlib") is None:
         raise OutputError(
             "the pictures need matplotlib, which is not installed: run pip install matplotlib, "
@@ -40,8 +40,8 @@ def check_pictures_possible() -> None:
 def far_apart(instances: Iterable[Instance], count: int = POSITIONS_SHOWN) -> tuple[Instance, ...]:
     """Return results whose true positions lie far from each other, in the order of time.
 
-    The first one is kept, then repeatedly the one that is furthest from all kept ones. Results without a truth
-    are used only if there are no others.
+    The first result is chosen, then repeatedly the one furthest from all those chosen. Results without a
+    truth are used only if there are no others.
     """
     results = [instance for instance in instances if instance.posterior is not None]
     candidates = [instance for instance in results if instance.truth is not None] or results
@@ -53,7 +53,7 @@ def far_apart(instances: Iterable[Instance], count: int = POSITIONS_SHOWN) -> tu
 
 
 def draw_positions(path: Path, instances: Sequence[Instance], *, route: Sequence[Truth] = ()) -> None:
-    """Write figure 4.4: for each instance the true position on the map, and beside it the posterior over y and x.
+    """Draw figure 4.4: for each instance the true position and, next to it, the posterior over y and x.
 
     The true positions of the whole route are drawn faintly.
 
@@ -82,13 +82,13 @@ def draw_positions(path: Path, instances: Sequence[Instance], *, route: Sequence
     )
     between = " " if across > 1 else "\n"
     figure.suptitle(
-        f"Where the boat is (a),{between}and what the Bayesian machine says from its readings (b)"
+        f"The boat's position (a){between}and the Bayesian machine's posterior given its readings (b)"
     )
     _save(figure, path)
 
 
 def draw_shares(path: Path, shares: Sequence[StageShare], *, frames: int) -> None:
-    """Write figure 4.5: the mean time of each stage, in the order of a frame's way, and its share of a frame.
+    """Draw figure 4.5: the mean time of each stage, in order, and its share of a frame's time.
 
     Raises:
         OutputError: matplotlib is missing, or the file cannot be written.
@@ -119,15 +119,15 @@ def draw_shares(path: Path, shares: Sequence[StageShare], *, frames: int) -> Non
         ncols=2,
         frameon=False,
     )
-    axes.set_title(f"Where a frame's time goes: {sum(times):.2f} ms, mean of {frames} frames")
+    axes.set_title(f"Time of a frame by stage: {sum(times):.2f} ms, mean of {frames} frames")
     _save(figure, path)
 
 
 def posterior_grid(posterior: Posterior) -> Grid:
-    """Return the map cut into the posterior's cells; an OutputError if it does not have two dimensions."""
+    """Return the map as a grid of the posterior's cells, or raise an OutputError."""
     if len(posterior.sizes) != 2:
         raise OutputError(
-            f"the boat's posterior has two dimensions, y and x, but what arrived has "
+            f"the boat's posterior has two dimensions, y and x, but the one received has "
             f"{' x '.join(map(str, posterior.sizes))} values: is this the boat's deployment?"
         )
     height, width = posterior.sizes

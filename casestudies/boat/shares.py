@@ -1,4 +1,4 @@
-"""Shares of a frame's time: the mean of each stage, as in the thesis's figure 4.5."""
+"""A frame's time by stage: means and shares, as in the thesis's figure 4.5."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from casestudies.truths import Instance
 
 
 class Part(StrEnum):
-    """The parts of the system that the thesis measured, and the host's own sockets, which it did not."""
+    """The parts of the system that the thesis measured, and the host's sockets, which it did not measure."""
 
     ROSBRIDGE = "rosbridge"
     HOST = "between the host's processes"
@@ -51,9 +51,10 @@ _STAGES: Final[tuple[tuple[str, Part, Callable[[Instance], float | None]], ...]]
 
 
 def stage_shares(instances: Iterable[Instance]) -> tuple[StageShare, ...]:
-    """Return the stages in order; those that no published frame reports are left out.
+    """Return the stages in order, without those that no published frame reports.
 
-    `rosbridge out` is measured here, from the sending of a result to its arrival; `/bm/frame` has the others.
+    `rosbridge out` is measured here, from the sending of a result to its arrival; the others come from
+    `/bm/frame`.
     """
     published = [instance for instance in instances if instance.posterior is not None]
     means: list[tuple[str, Part, float]] = []

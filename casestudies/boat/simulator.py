@@ -32,18 +32,18 @@ from terminal.connection import report_connection
 from terminal.output import say
 from terminal.signals import run_async
 
-_SHORE = 2.0  # waypoints keep this far from the map's edge
+_SHORE = 2.0  # waypoints are at least this far from the map's edge
 _SEEDS = 1_000_000
 
 
 class Boat:
     """A boat that starts in the middle of the map and is driven along random waypoints (thesis 4.1).
 
-    Two boats with the same seed take the same route and the same measurements.
+    Two boats with the same seed sail the same route and measure the same readings.
     """
 
     def __init__(self, seed: int, speed: float) -> None:
-        """Put the boat into the middle of the map; `speed` is in map units per second."""
+        """Put the boat in the middle of the map; `speed` is in map units per second."""
         self._random = random.Random(seed)
         self._speed = speed
         self.x = (MAP_LOW + MAP_HIGH) / 2
@@ -51,7 +51,7 @@ class Boat:
         self._waypoint = self._next_waypoint()
 
     def sail(self, seconds: float) -> None:
-        """Sail along the waypoints for this many seconds."""
+        """Sail along the waypoints for that many seconds."""
         left = self._speed * seconds
         while left > 0:
             to_go = math.dist((self.x, self.y), self._waypoint)
@@ -66,7 +66,7 @@ class Boat:
     def measure(self) -> tuple[float, ...]:
         """Return noisy readings D1, D2, D3 (map units) and B1, B2, B3 (radians), with the model's noise.
 
-        A distance may be negative or too long, a bearing outside one turn; the normaliser corrects that.
+        A distance may be negative or too long, and a bearing outside one turn; the normaliser corrects both.
         """
         ranges = [distance(self.x, self.y, beacon) for beacon in BEACONS]
         distances = [self._random.gauss(true, distance_sigma(true)) for true in ranges]
@@ -90,7 +90,7 @@ async def simulate(
     array: bool = False,
     count: int | None = None,
 ) -> None:
-    """Sail and publish `count` readings, or without end.
+    """Sail and publish `count` readings, or publish until cancelled.
 
     Each step publishes the true pose and then the readings, with the same stamp, on `topic`: `boat_msgs/Raw`, or with
     `array` std_msgs/Float64MultiArray. While the server is away the boat sails on.
@@ -101,11 +101,11 @@ async def simulate(
     from bridge.client import connect
     from bridge.stamps import header
     from casestudies.boat.lossy import LossyPublication
-    from casestudies.readiness import Readiness, readiness_served
+    from casestudies.readiness import Readiness, serve_readiness
 
     readiness = Readiness("a reading was published")
     async with (
-        readiness_served("boat-simulator", readiness),
+        serve_readiness("boat-simulator", readiness),
         connect(uri, retry=True, on_state=report_connection(uri)) as ros,
     ):
         ros_version = await ros.detect_ros_version()
@@ -117,7 +117,7 @@ async def simulate(
             head = header(time.time_ns(), MAP_FRAME, ros_version)
             await poses.publish(true_pose(boat.x, boat.y, head))
             if await readings.publish(readings_message(boat.measure(), head, array=array)):
-                readiness.did()
+                readiness.record()
             step += 1
             boat.sail(1 / rate)
             await asyncio.sleep(begin + step / rate - time.monotonic())

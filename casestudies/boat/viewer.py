@@ -1,4 +1,4 @@
-"""Viewer of the boat's posteriors beside the truth, which subscribes to three topics and needs nothing else."""
+"""Viewer of the boat's posteriors next to the truth; it needs only three topics."""
 
 import math
 import sys
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 POSITIONS_PICTURE: Final = "figure-4.4.png"
 SHARES_PICTURE: Final = "figure-4.5.png"
 KEPT: Final = 2000
-"""Frames kept for pictures and numbers by a viewer that runs without end."""
+"""Number of frames kept for pictures and numbers by a viewer that runs until Ctrl-C."""
 HEADING: Final = "frame     true y, x     mean y, x  distance     cycles   time (ms)"
 
 
@@ -51,7 +51,7 @@ class Line:
     outcome: str
 
     def __str__(self) -> str:
-        """Return the line in the columns of `HEADING`."""
+        """Return the line, aligned with the columns of `HEADING`."""
         frame = "-" if self.frame is None else str(self.frame)
         true = "not known" if self.true_position is None else "{:.1f}, {:.1f}".format(*self.true_position)
         if self.mean_value is None:
@@ -64,7 +64,7 @@ class Line:
 
 
 def line_of(instance: "Instance") -> Line:
-    """Return the line for a frame; an OutputError if its posterior is not over a map."""
+    """Return the line for a frame, or raise an OutputError if its posterior is not over a map."""
     from casestudies.boat.geometry import map_grid
     from casestudies.boat.pictures import posterior_grid
 
@@ -94,17 +94,17 @@ def line_of(instance: "Instance") -> Line:
 
 
 class Viewer:
-    """The frames of a run, with a line for each, and the pictures at the end.
+    """The frames of a run and their lines, from which the pictures are drawn.
 
     Attributes:
-        instances: The frames, the newest last; the last `KEPT` if the viewer runs without end.
+        instances: The frames, the newest last; only the last `KEPT` if the viewer runs until Ctrl-C.
         lines: The line of each.
         frames: The number of frames.
         results: The number of frames with a posterior.
     """
 
     def __init__(self, count: int | None) -> None:
-        """Take the number of results to wait for; None for no end."""
+        """Start without frames; `count` is the number of results to wait for, None to run until Ctrl-C."""
         self.count = count
         kept = KEPT if count is None else None
         self.instances: deque[Instance] = deque(maxlen=kept)
@@ -115,7 +115,7 @@ class Viewer:
 
     @property
     def done(self) -> bool:
-        """Whether all requested results have come."""
+        """Whether all requested results have arrived."""
         return self.count is not None and self.results >= self.count
 
     def add(self, instance: "Instance") -> Line:
@@ -136,7 +136,7 @@ class Viewer:
         first_limit_s: float,
         limit_s: float,
     ) -> None:
-        """Listen until all results have come, and print a line for each frame.
+        """Listen until all results have arrived, and print a line for each frame.
 
         Raises:
             NoResultError: No result came in time.
@@ -145,11 +145,11 @@ class Viewer:
         """
         from bridge.client import connect
         from casestudies.listening import listen
-        from casestudies.readiness import Readiness, readiness_served
+        from casestudies.readiness import Readiness, serve_readiness
 
         readiness = Readiness("a result was shown")
         async with (
-            readiness_served("boat-viewer", readiness),
+            serve_readiness("boat-viewer", readiness),
             connect(uri, retry=True, on_state=report_connection(uri)) as ros,
             listen(ros, truth_topic=truth_topic, truth_tolerance_s=truth_tolerance_s) as listener,
         ):
@@ -160,7 +160,7 @@ class Viewer:
                     while not self.done:
                         line = self.add(await listener.next(limit_s if self.lines else first_limit_s))
                         shown.line(str(line))
-                        readiness.did()
+                        readiness.record()
                         shown.count(self.results)
                 except NoResultError as error:
                     if not self.lines:
@@ -172,7 +172,7 @@ class Viewer:
                         say(f"warning: frames on /bm/frame without their result: {listener.announced_only}")
 
     def draw(self, folder: Path) -> tuple[Path, ...]:
-        """Write the two pictures and return their paths; an OutputError if that is not possible."""
+        """Write the two pictures and return their paths, or raise an OutputError."""
         from casestudies.boat.pictures import draw_positions, draw_shares, far_apart
         from casestudies.boat.shares import stage_shares
 
@@ -186,7 +186,7 @@ class Viewer:
         return tuple(written)
 
     def write_numbers(self, path: Path) -> None:
-        """Write the frames and the shares of time as one JSON object; an OutputError if that is not possible."""
+        """Write the frames and the times by stage as one JSON object, or raise an OutputError."""
         from casestudies.boat.shares import stage_shares
 
         distances = [line.distance for line in self.lines if line.distance is not None]
@@ -312,7 +312,7 @@ def boat_viewer(
     first_timeout: Annotated[float, typer.Option(min=0.1, help="Seconds until the first result.")] = 60.0,
     timeout: Annotated[float, typer.Option(min=0.1, help="Seconds between two results.")] = 30.0,
 ) -> None:
-    """Show each posterior's mean beside the boat's true position, and draw the thesis's figures 4.4 and 4.5.
+    """Show each posterior's mean next to the boat's true position, and draw the thesis's figures 4.4 and 4.5.
 
     It subscribes to /BMresults, /bm/frame and the topic of the true pose, and needs nothing else.
     """

@@ -1,1 +1,1 @@
-"""A real robot among landmarks: range and bearing from the UTIAS MR.CLAM data set."""
+"""A real robot among landmarks, with ranges and bearings from the UTIAS MR.CLAM data set."""

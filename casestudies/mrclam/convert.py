@@ -1,4 +1,4 @@
-"""Conversion of the downloaded data set into CSV files of the seconds in which a robot stood nearly still.
+"""Conversion of the downloaded data set into CSV files of the seconds in which a robot hardly moved.
 
 python -m casestudies.mrclam.convert MRCLAM_Dataset1 -o DATA_DIR
 """
@@ -24,14 +24,14 @@ from terminal.errors import OutputError
 from terminal.output import check_writable, say
 
 LARGEST_FILE: Final = 1 << 28
-"""Bytes of the largest file that is read; the largest of the collection has some 20 million."""
+"""Size limit of a file, in bytes; the largest of the data set has some 20 million."""
 LEAST_LANDMARKS: Final = 3
 MOST_MOVED_M: Final = 0.12
 WINDOW_S: Final = 1.0
 _REFERENCE_GAP_S: Final = 0.2
-"""Positions further apart than this are not interpolated."""
+"""Time in seconds beyond which two positions are not interpolated."""
 _REFERENCE_STD_M: Final = 0.001
-"""The motion capture's own precision, as the collection's page gives it."""
+"""Precision of the motion capture in metres, from the data set's page."""
 _SUBJECTS: Final = range(1, 21)
 
 Floats = NDArray[np.float64]
@@ -47,19 +47,19 @@ class Track:
     heading: Floats
 
     def at(self, time: float) -> tuple[float, float, float]:
-        """Return position and heading at a time, interpolated linearly."""
+        """Return the position and heading at a time, interpolated linearly."""
         x, y, heading = (float(np.interp(time, self.time, each)) for each in (self.x, self.y, self.heading))
         return x, y, heading
 
     def known(self, begin: float, end: float) -> bool:
-        """Return whether there are samples all the way from one time to another."""
+        """Return whether the samples between two times have no gaps."""
         inside = self.time[(self.time > begin) & (self.time < end)]
         around = np.concatenate((self.time[self.time <= begin][-1:], inside, self.time[self.time >= end][:1]))
         ends_known = len(around) > 1 and around[0] <= begin and around[-1] >= end
         return bool(ends_known and np.diff(around).max() <= _REFERENCE_GAP_S)
 
     def moved(self, begin: float, end: float) -> float:
-        """Return the diagonal of the smallest box around all positions between two times, in metres."""
+        """Return the diagonal of the bounding box of all positions between two times, in metres."""
         inside = (self.time > begin) & (self.time < end)
         (x_0, y_0, _), (x_1, y_1, _) = self.at(begin), self.at(end)
         x, y = np.append(self.x[inside], (x_0, x_1)), np.append(self.y[inside], (y_0, y_1))
@@ -68,7 +68,7 @@ class Track:
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """A sighting of the camera: time (s), landmark, range (m), and bearing (rad) from the robot's heading."""
+    """A sighting by the camera: time (s), landmark, range (m), bearing (rad) relative to the heading."""
 
     time: float
     landmark: int
@@ -78,7 +78,7 @@ class Measured:
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """A second of a robot: its middle, the reference there, and the median sighting of each landmark."""
+    """One second of a track: its middle, the reference pose then, and each landmark's median sighting."""
 
     time: float
     x: float
@@ -88,7 +88,7 @@ class Window:
 
 
 def read_columns(path: Path, names: Sequence[str]) -> Iterator[tuple[str, tuple[float, ...]]]:
-    """Read a file of the collection: numbers with spaces between them, comments after `#`.
+    """Read a file of the data set: numbers separated by spaces, comments after `#`.
 
     Yields:
         Each line's place, for error messages, and its numbers.
@@ -125,7 +125,7 @@ def read_columns(path: Path, names: Sequence[str]) -> Iterator[tuple[str, tuple[
 
 
 def read_barcodes(folder: Path) -> dict[int, int]:
-    """Return each barcode's subject from `Barcodes.dat` (1 to 5: robots, 6 to 20: landmarks), or raise a DataFileError."""
+    """Return the subject of each barcode (1 to 5: robots, 6 to 20: landmarks), or raise a DataFileError."""
     subjects: dict[int, int] = {}
     for where, (subject, barcode) in read_columns(folder / "Barcodes.dat", ("subject", "barcode")):
         if subject not in _SUBJECTS or barcode != int(barcode):
@@ -151,7 +151,7 @@ def read_positions(folder: Path) -> dict[int, tuple[float, float]]:
 
 
 def read_track(folder: Path, robot: int) -> Track:
-    """Return a robot's track, from `RobotN_Groundtruth.dat`; a DataFileError if its times do not rise."""
+    """Return a robot's track from `RobotN_Groundtruth.dat`, or raise a DataFileError."""
     path = folder / f"Robot{robot}_Groundtruth.dat"
     names = ("time (s)", "x (m)", "y (m)", "orientation (rad)")
     rows = np.array([values for _, values in read_columns(path, names)], dtype=np.float64).reshape(-1, 4)
@@ -180,7 +180,7 @@ def read_measured(folder: Path, robot: int, subjects: dict[int, int]) -> tuple[l
 def windows(
     track: Track, measured: Sequence[Measured], *, length_s: float = WINDOW_S
 ) -> tuple[list[Window], Counter[str]]:
-    """Cut a robot's track into windows, and keep those in which it stood nearly still and saw enough landmarks.
+    """Cut a robot's track into windows, and keep those in which it hardly moved and saw enough landmarks.
 
     Returns:
         The windows, and the number of others for each reason.
@@ -214,7 +214,7 @@ def _medians(track: Track, sightings: Sequence[Measured]) -> dict[int, tuple[flo
     for landmark in sorted({each.landmark for each in sightings}):
         own = [each for each in sightings if each.landmark == landmark]
         bearings = np.array([each.bearing_rad + track.at(each.time)[2] for each in own])
-        first = bearings[0]  # around it, a circle is a line
+        first = bearings[0]  # near the first bearing the circle is a line, which has a median
         away = np.median((bearings - first + math.pi) % (2 * math.pi) - math.pi)
         seen[landmark] = (float(np.median([each.range_m for each in own])), _wrapped(first + float(away)))
     return seen
@@ -262,7 +262,7 @@ def _write(path: Path, heading: Sequence[str], rows: Sequence[Sequence[str]]) ->
 
 
 def robots_in(folder: Path) -> list[int]:
-    """Return the robots that the folder has measurements of; a DataFileError if there are none."""
+    """Return the robots that the folder has measurements of, or raise a DataFileError."""
     found = sorted(
         int(match[1])
         for path in folder.glob("Robot*_Measurement.dat")

@@ -1,6 +1,6 @@
-"""Unquantised float64 fusion of raw readings, against which the machine's posteriors are measured.
+"""Unquantised float64 fusion of raw readings, the reference for the machine's posteriors.
 
-Gaussian densities at the cells' centres and the same outlier floor, no bins, no codes, no counts.
+Gaussian densities at the cells' centres and the same outlier floor, without bins, codes or counts.
 """
 
 from collections.abc import Sequence
@@ -33,8 +33,8 @@ def unquantised_posterior(
 ) -> NDArray[np.float64]:
     """Return the posterior over the cells, float64[width * height] with line = y * width + x.
 
-    There is a reading for each landmark, in the same order; an outlier gets the floor everywhere, relative to the
-    density's peak. Without a floor, readings that are impossible on every line are a ModelError.
+    There is one reading for each landmark, in the same order. An outlier's density is the floor everywhere,
+    relative to the peak. Without a floor, readings that are impossible on every line raise a ModelError.
     """
     y, x = cell_centres(interval("y", *Y_LIMITS, cells=height), interval("x", *X_LIMITS, cells=width))
     factors = []

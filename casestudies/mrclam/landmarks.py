@@ -18,10 +18,11 @@ class Landmark:
 
 
 def read_landmarks(path: Path) -> tuple[Landmark, ...]:
-    """Return the landmarks of a CSV with the columns landmark, x_m and y_m, in the file's order.
+    """Return the landmarks of a CSV file with the columns landmark, x_m and y_m, in the file's order.
 
     Raises:
-        ModelError: The file can't be read, has other columns, a line that is not a landmark, a landmark twice, or none at all.
+        ModelError: The file cannot be read, has other columns or an invalid line, or has a landmark twice or
+            none.
     """
     found: list[Landmark] = []
     try:
@@ -31,10 +32,10 @@ def read_landmarks(path: Path) -> tuple[Landmark, ...]:
                 found.append(_landmark(row, f"{path}, line {rows.line_num}"))
                 if found[-1].number in {landmark.number for landmark in found[:-1]}:
                     raise ModelError(
-                        f"{path}, line {rows.line_num}: landmark {found[-1].number} is there twice"
+                        f"{path}, line {rows.line_num}: landmark {found[-1].number} is listed twice"
                     )
     except OSError as reason:
-        raise ModelError(f"the landmarks' file {path} can't be read: {reason.strerror or reason}") from None
+        raise ModelError(f"the landmarks' file {path} cannot be read: {reason.strerror or reason}") from None
     except (UnicodeDecodeError, csv.Error) as reason:
         raise ModelError(f"{path} is not a CSV of landmarks: {reason}") from None
     if not found:

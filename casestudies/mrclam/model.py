@@ -1,7 +1,7 @@
-"""A robot among landmarks: P(range | cell) and P(bearing | cell) for each one, with an outlier floor.
+"""The robot's model: P(range | cell) and P(bearing | cell) for each landmark, with an outlier floor.
 
 Column order range_6, bearing_6, range_7, bearing_7, ... for the landmarks of the file in its order; line = y *
-width + x from the lower left corner. A landmark that is not seen is a missing reading.
+width + x from the lower left corner. Readings of a landmark that is not seen are missing.
 """
 
 from pathlib import Path
@@ -30,21 +30,21 @@ def model(
     bearing_values: int = 255,
     fit: Path | None = None,
 ) -> Model:
-    """Return the model of a robot's position, in metres, from its sightings of landmarks.
+    """Return the model of a robot's position, in metres, given its sightings of landmarks.
 
     Args:
-        landmarks: A CSV with the columns landmark, x_m, y_m; the data set's README says where to get it.
+        landmarks: A CSV file with the columns landmark, x_m, y_m; the data set's README says where to get it.
         width: Cells along x in [-2, 7] m.
         height: Cells along y in [-7, 7] m.
-        floor: What an outlier gets everywhere, relative to the peak of the bin likelihood. Codes of 8 bits
-            round 1e-3 to 0, and then one wild reading makes every line impossible.
+        floor: Likelihood of an outlier everywhere, relative to the peak of the bins' likelihood. Codes of 8
+            bits round 1e-3 to 0, and then a single outlier makes every line impossible.
         range_step: Metres between distinguishable ranges, from 0; longer ranges are clamped.
         range_values: The number of distinguishable ranges.
         bearing_values: The number of distinguishable bearings in a turn; readings are radians, any turn.
-        fit: What `toolchain fit` learnt from a recording, in the place of the sigmas and floors set by hand.
+        fit: The file that `toolchain fit` learned from a recording, instead of sigmas and floors set by hand.
 
     Raises:
-        ModelError: A file that holds no landmarks, or a size that is not positive.
+        ModelError: The file does not hold landmarks, or a size is not positive.
     """
     if bearing_values < 1:
         raise ModelError(

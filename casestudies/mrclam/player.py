@@ -1,4 +1,4 @@
-"""Player of a recording through a rosbridge server, which reports each posterior's distance from the reference.
+"""Player of a recording on a rosbridge server; it prints each posterior's distance from the reference.
 
 python -m casestudies.mrclam.player DATA_DIR/ds1_robot3.csv --uri ws://127.0.0.1:9090
 """
@@ -38,14 +38,14 @@ if TYPE_CHECKING:
     from casestudies.truths import Instance
 
 LOST_DISTANCE: Final = 9.0
-"""Distance in metres that a frame without a result counts as: the width of the area."""
+"""Distance in metres at which a frame without a result is counted: the width of the area."""
 _REPEAT_S: Final = 1.0
-"""Seconds between publications of the first frame, until a result comes."""
+"""Seconds between publications of the first frame, until its result arrives."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlayedFrame:
-    """A recorded frame and its result: the published posterior, or None and the reason."""
+    """A recorded frame and its result: the published posterior, or None and why there is none."""
 
     frame: RecordedFrame
     posterior: "Posterior | None"
@@ -53,7 +53,7 @@ class PlayedFrame:
     outcome: str
 
     def estimate(self) -> tuple[float, float] | None:
-        """Return the posterior's mean (x, y), in metres; a BadResultError if it is not over the area."""
+        """Return the posterior's mean (x, y) in metres, or raise a BadResultError if it is not over the area."""
         if self.posterior is None:
             return None
         if len(self.posterior.sizes) != 2:
@@ -84,11 +84,11 @@ async def play(
     timeout_s: float = 10.0,
     on_frame: Callable[[PlayedFrame], None] = lambda _: None,
 ) -> list[PlayedFrame]:
-    """Publish each frame and wait for its result before the next one; return an entry for each frame, in order.
+    """Publish each frame, wait for its result before the next one, and return the played frames in order.
 
-    Frames carry the time of their publication, which identifies their results. The first frame is published again
-    every second until its result comes, since the subscriber may not be there yet; every other frame is published
-    once, and has no result after `timeout_s`.
+    Frames are stamped with the time of their publication, which identifies their results. The first frame is
+    published every second until its result arrives, since the master may not have subscribed yet. Every other
+    frame is published once and counts as lost after `timeout_s`.
 
     Raises:
         NoResultError: The first frame had no result.
@@ -135,7 +135,7 @@ class _Turn:
         self._stamps: set[int] = set()
 
     async def take(self, limit_s: float, *, repeat_s: float) -> "Instance | None":
-        """Publish until a result comes and return it, or None after the limit."""
+        """Publish until a result arrives and return it, or None after the limit."""
         end = time.monotonic() + limit_s
         while (left := end - time.monotonic()) > 0:
             await self._publish()
@@ -153,7 +153,7 @@ class _Turn:
         )
 
     async def _answer(self, limit_s: float) -> "Instance":
-        """Return the next result of this frame, and skip late ones of earlier frames."""
+        """Return the next result of this frame; skip late results of earlier frames."""
         end = time.monotonic() + limit_s
         while True:
             instance = await self._listener.next(max(end - time.monotonic(), 0.0))
@@ -175,7 +175,7 @@ def _played(frame: RecordedFrame, instance: "Instance | None", timeout_s: float)
 
 
 def _line(played: PlayedFrame) -> str:
-    """Return the line that is printed for a frame."""
+    """Return the line to print for a frame."""
     frame = played.frame
     seen = len(frame.sightings)
     start = f"{frame.number:>5}  {seen:>4}  ({frame.x:6.3f}, {frame.y:6.3f})"

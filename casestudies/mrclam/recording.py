@@ -29,7 +29,7 @@ _REFERENCE_COLUMNS: Final = ("time_s", "ref_x_m", "ref_y_m", "ref_std_m", "headi
 
 
 def area_grid(width: int = 32, height: int = 32) -> Grid:
-    """Return the area of the experiment cut into cells: x in [-2, 7] m, y in [-7, 7] m."""
+    """Return the area of the experiment, x in [-2, 7] m and y in [-7, 7] m, as a grid of cells."""
     return Grid(x_low=-2.0, x_high=7.0, y_low=-7.0, y_high=7.0, width=width, height=height)
 
 
@@ -54,7 +54,7 @@ class RecordedFrame:
 
 
 def read_recording(path: Path) -> tuple[RecordedFrame, ...]:
-    """Read a file like `ds1_robot3.csv`; a DataFileError names the line that is damaged."""
+    """Read a file such as `ds1_robot3.csv`, or raise a DataFileError that names the damaged line."""
     try:
         with path.open(newline="", encoding="utf-8") as file:
             rows = csv.reader(file, strict=True)
@@ -73,7 +73,7 @@ def read_recording(path: Path) -> tuple[RecordedFrame, ...]:
 
 
 def sightings_message(frame: RecordedFrame, header: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a frame as `mrclam_msgs/Sightings`, without the landmarks that were not seen."""
+    """Return a frame as a `mrclam_msgs/Sightings` message, without the landmarks that were not seen."""
     message: dict[str, Any] = {"header": dict(header)}
     for sighting in frame.sightings:
         message[f"range_{sighting.landmark}"] = sighting.range_m
@@ -89,7 +89,7 @@ def _landmarks(path: Path, columns: Sequence[str]) -> tuple[int, ...]:
     if missing or not landmarks:
         raise DataFileError(
             f"{path} is not a recording of sightings: its first line lacks the column "
-            f"{missing[0] if missing else 'range_N_m'}; a file like ds1_robot3.csv is wanted"
+            f"{missing[0] if missing else 'range_N_m'}; name a file such as ds1_robot3.csv"
         )
     if unknown := set(landmarks) - set(LANDMARKS):
         raise DataFileError(
@@ -106,7 +106,7 @@ def _frames(
         where = f"{path}, line {number + 1}"
         if len(row) != len(columns):
             raise DataFileError(
-                f"{where} has {len(row)} values, its heading has {len(columns)}: is the file cut?"
+                f"{where} has {len(row)} values, but the heading has {len(columns)}: is the file truncated?"
             )
         cells = dict(zip(columns, row, strict=True))
         sightings = []

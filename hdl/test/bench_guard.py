@@ -39,7 +39,7 @@ _GOOD: Final = {
 """An access and a state in which a start is allowed, and a resume too."""
 
 
-async def judged(dut: Any, **others: int) -> tuple[ErrorCode, bool]:
+async def verdict_on(dut: Any, **others: int) -> tuple[ErrorCode, bool]:
     """Return the verdict on the good access with some values changed, and whether a doorbell rings."""
     for name, value in (_GOOD | others).items():
         getattr(dut, name).value = value
@@ -55,10 +55,10 @@ async def doorbells_are_numbers_that_go_round(dut: Any) -> None:
         for number in {done, due, (due + 1) % 2**32, 1, 0xFFFFFFFF} - {0}:
             for doorbell in (rm.START, rm.RESUME):
                 expected = ErrorCode.NONE if number == due else ErrorCode.DOORBELL
-                found = await judged(dut, done_i=done, data_i=number, address_i=doorbell)
+                found = await verdict_on(dut, done_i=done, data_i=number, address_i=doorbell)
                 assert found == (expected, number == due), f"{number} after {done}"
         for doorbell in (rm.START, rm.RESUME):
-            assert await judged(dut, done_i=done, data_i=0, address_i=doorbell) == (ErrorCode.NONE, False)
+            assert await verdict_on(dut, done_i=done, data_i=0, address_i=doorbell) == (ErrorCode.NONE, False)
 
 
 @cocotb.test()
@@ -89,7 +89,7 @@ async def values_at_their_limits(dut: Any) -> None:
         ("halt_i", 2**256 - 1, True),  # a start halts nobody
         ("can_resume_i", 0, True),
     ):
-        assert await judged(dut, **{name: value}) == (good if allowed else bad), f"start, {name} {value}"
+        assert await verdict_on(dut, **{name: value}) == (good if allowed else bad), f"start, {name} {value}"
     for others, verdict in (
         ({"can_resume_i": 0}, (ErrorCode.DOORBELL, False)),
         ({"run_until_i": 100}, bad),
@@ -106,7 +106,7 @@ async def values_at_their_limits(dut: Any) -> None:
         ({"halt_i": 2**255}, bad),
         ({"target_i": 0, "bad_input_i": 1, "max_cycles_i": 0, "bank_i": 9}, good),  # a frame keeps its own
     ):
-        assert await judged(dut, address_i=rm.RESUME, **others) == verdict, f"resume, {others}"
+        assert await verdict_on(dut, address_i=rm.RESUME, **others) == verdict, f"resume, {others}"
 
 
 @cocotb.test()
@@ -129,23 +129,26 @@ async def every_address(dut: Any) -> None:
     near |= {int(word) * 4 for word in random.integers(rm.BAR_SIZE // 4, size=400)}
     for address in sorted(near & set(range(rm.BAR_SIZE))):
         expected = ErrorCode.NONE if address in kind else ErrorCode.OUTSIDE
-        assert await judged(dut, address_i=address, write_i=0, strobe_i=0, running_i=1) == (expected, False)
+        assert await verdict_on(dut, address_i=address, write_i=0, strobe_i=0, running_i=1) == (
+            expected,
+            False,
+        )
         if address in {rm.START, rm.RESUME}:
             continue
         if address in kind and not kind[address]:
             expected = ErrorCode.READ_ONLY
-        assert await judged(dut, address_i=address) == (expected, False), f"write of {address:#x}"
+        assert await verdict_on(dut, address_i=address) == (expected, False), f"write of {address:#x}"
         if expected == ErrorCode.NONE:
             resets = address == rm.CONTROL
             busy = ErrorCode.NONE if resets else ErrorCode.BUSY
-            assert await judged(dut, address_i=address, running_i=1) == (busy, False), f"{address:#x}"
-            assert await judged(dut, address_i=address, running_i=1, data_i=2) == (ErrorCode.BUSY, False)
+            assert await verdict_on(dut, address_i=address, running_i=1) == (busy, False), f"{address:#x}"
+            assert await verdict_on(dut, address_i=address, running_i=1, data_i=2) == (ErrorCode.BUSY, False)
         for odd in (1, 2, 3):
-            found = await judged(dut, address_i=address + odd, write_i=0)
+            found = await verdict_on(dut, address_i=address + odd, write_i=0)
             assert found == (ErrorCode.MISALIGNED, False)
     for doorbell in (rm.START, rm.RESUME):
         for number in (0, 1):
-            found = await judged(dut, address_i=doorbell, data_i=number, running_i=1)
+            found = await verdict_on(dut, address_i=doorbell, data_i=number, running_i=1)
             assert found == (ErrorCode.BUSY, False)
     for strobe in range(15):
-        assert await judged(dut, strobe_i=strobe) == (ErrorCode.MISALIGNED, False)
+        assert await verdict_on(dut, strobe_i=strobe) == (ErrorCode.MISALIGNED, False)

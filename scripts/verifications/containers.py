@@ -479,7 +479,7 @@ def fetch_wheels(folder: Path) -> None:
     """Download the wheels of the lock file, hashes checked, for the image's Python.
 
     Raises:
-        CheckError: pip can't get them.
+        CheckError: pip cannot get them.
     """
     lock = ROOT / "requirements.lock"
     made = folder / ".made"

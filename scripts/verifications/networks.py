@@ -51,7 +51,7 @@ _JOINED = re.compile(r"(\S+) and (\S+) are not independent given")
 
 
 class VerifyError(Exception):
-    """The other side can't be had here; one sentence says why."""
+    """The other side cannot be had here; one sentence says why."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ def environment() -> tuple[Path, Path]:
     """Return the other side's Python and pgmpy's wheel, and install them first if they are missing.
 
     Raises:
-        VerifyError: They can't be downloaded or installed.
+        VerifyError: They cannot be downloaded or installed.
     """
     cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     home = (
@@ -153,7 +153,7 @@ def compare(checks: Checks, folder: Path, name: str) -> JointDistribution:
     entries = sum(table.size for table in tables.values())
     checks.check(f"{name} read", held, f"{len(tables)} variables, {entries} entries; " + ", ".join(details))
     if from_bif is None:
-        raise VerifyError(f"{name}.bif can't be read")
+        raise VerifyError(f"{name}.bif cannot be read")
     return from_bif
 
 

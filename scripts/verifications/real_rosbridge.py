@@ -43,7 +43,7 @@ _SIOCGIFFLAGS, _SIOCSIFFLAGS, _IFF_UP = 0x8913, 0x8914, 0x1
 
 
 class RealServerError(Exception):
-    """The real server can't be had here; one sentence says why, and what to do."""
+    """The real server cannot be had here; one sentence says why, and what to do."""
 
 
 def home() -> Path:
@@ -58,7 +58,7 @@ def install() -> Path:
     """Return the installed server's folder (bin, lib), and install it first if it is missing.
 
     Raises:
-        RealServerError: another kind of machine, nothing to download from, a folder that can't be written.
+        RealServerError: another kind of machine, nothing to download from, a folder that cannot be written.
     """
     digest = hashlib.sha256(LAYOUT.encode() + LOCK.read_bytes()).hexdigest()[:12]
     prefix = home() / f"jazzy-{digest}"
@@ -79,7 +79,7 @@ def install() -> Path:
                     raise
     except OSError as error:
         raise RealServerError(
-            f"{error.filename or prefix} can't be written: {error.strerror or error}; set {HOME_VARIABLE} to another folder"
+            f"{error.filename or prefix} cannot be written: {error.strerror or error}; set {HOME_VARIABLE} to another folder"
         ) from error
     return prefix
 
@@ -199,7 +199,7 @@ def become(command: list[str], environment: dict[str, str] | None = None) -> Non
     try:
         os.execvpe(command[0], command, environment or dict(os.environ))  # noqa: S606 - no shell is wanted
     except OSError as error:
-        raise RealServerError(f"{command[0]} can't be started: {error.strerror or error}") from error
+        raise RealServerError(f"{command[0]} cannot be started: {error.strerror or error}") from error
 
 
 def serve(port: int) -> None:

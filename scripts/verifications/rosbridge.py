@@ -165,7 +165,7 @@ async def plain_client(uri: str) -> AsyncIterator[PlainClient]:
                 break
             except (OSError, InvalidHandshake, TimeoutError) as error:
                 if time.monotonic() > deadline:
-                    raise CheckError(f"a plain client can't connect to {uri}: {error}") from error
+                    raise CheckError(f"a plain client cannot connect to {uri}: {error}") from error
                 await asyncio.sleep(0.1)
         client = PlainClient(socket)
         listening = asyncio.create_task(client.listen())

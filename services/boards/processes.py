@@ -16,7 +16,7 @@ from pcie_shim.board.server import StopSignal, serve_board
 from pcie_shim.endpoint import Endpoint
 from services.errors import BoardFailedError, SettingsError
 from services.settings import endpoint_in
-from services.sockets.status import BoardStatus, ProcessStatus, status_thread
+from services.sockets.status import BoardStatus, ProcessStatus, serve_status_in_thread
 from services.supervision.child import RESTARTS_WITHIN, how_it_ended
 from services.supervision.parent import end_with_parent
 from services.supervision.private_directory import remove_stale_sockets
@@ -65,7 +65,7 @@ def serve_one(
         listening.append(board)
         on_ready()
 
-    with status_thread(directory, f"board{index}", status):
+    with serve_status_in_thread(directory, f"board{index}", status):
         serve_board(endpoint, index=index, stop=stop, misbehave=misbehave, on_ready=ready)
     return ended_by[0] if ended_by else 0
 

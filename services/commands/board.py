@@ -21,7 +21,7 @@ from services.supervision.parent import end_with_parent, leave_private_directory
 from terminal.command_line import CommandLine
 from terminal.ending import PARENT_VARIABLE
 from terminal.output import say
-from terminal.signals import check_signals, stopped_by
+from terminal.signals import check_signals, stopped_error
 
 _SEVERAL: Final = "Several boards"
 _OVER_TCP: Final = "A board over TCP"
@@ -91,7 +91,7 @@ def board(
             directory.mkdir(mode=0o700, exist_ok=True)
         except OSError as error:
             raise SettingsError(
-                f"--directory {directory} is not a folder and can't be created ({error.strerror}); name one for the boards' sockets"
+                f"--directory {directory} is not a folder and cannot be created ({error.strerror}); name one for the boards' sockets"
             ) from None
         if directory.stat().st_mode & 0o077:
             raise SettingsError(
@@ -111,7 +111,7 @@ def board(
     fault = Misbehaviour.parse(misbehave) if misbehave else None
     ended_by = serve_one(endpoint, index, fault, run_directory, on_ready=on_ready)
     if ended_by:
-        raise stopped_by(ended_by)
+        raise stopped_error(ended_by)
     return 0
 
 

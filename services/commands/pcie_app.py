@@ -11,7 +11,7 @@ from services.pipes.lines import require_pipe
 from services.pipes.pcie_app import compute_lines
 from services.settings import load_settings
 from services.sockets.serving import board_endpoints, deployment_for, own_endpoint
-from services.sockets.status import status_thread
+from services.sockets.status import serve_status_in_thread
 from services.supervision.parent import end_with_parent
 from terminal.command_line import CommandLine
 
@@ -59,7 +59,7 @@ def pcie_app(
     deployed = DeployedBoards(settings, loaded, board_endpoints(settings, loaded), reprogram=reprogram)
     if listen is not None:
         pcie = PcieApp(deployed, own_endpoint(listen, insecure=insecure), settings.log_level)
-        with status_thread(settings.run_directory, ROLE, pcie.status):
+        with serve_status_in_thread(settings.run_directory, ROLE, pcie.status):
             return pcie.serve()
     require_pipe(ROLE, "readings")
     return compute_lines(deployed, loaded.machine.rng_banks)

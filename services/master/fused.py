@@ -21,7 +21,7 @@ from services.pipeline.subscriber import Subscriber
 from services.settings import Settings
 from services.sockets.records import AnyRecord, Frame, Notice, Prepare, Ready, Record, Switch, Trouble
 from services.sockets.serving import Link, MakeLink, board_endpoints
-from services.sockets.status import status_served
+from services.sockets.status import serve_status
 from terminal.errors import exit_code_of
 from toolchain.deployment import Deployment
 
@@ -93,9 +93,9 @@ class FusedBoards:
         """Serve until cancelled.
 
         Raises:
-            PcieShimError: The boards can't be opened, or a board came back with another image.
+            PcieShimError: The boards cannot be opened, or a board came back with another image.
         """
-        async with self._link, status_served(self._run_directory, PCIE_APP, self._progress.status):
+        async with self._link, serve_status(self._run_directory, PCIE_APP, self._progress.status):
             try:
                 self._progress.ready = Ready(await _in_thread(self._boards.open))
                 self._link.keep(self._progress.ready)

@@ -22,13 +22,13 @@ def read_new(folder: Path, in_force: Deployment, as_used: Callable[[Deployment],
 
     Raises:
         ToolchainError: It is damaged, of another version, or missing.
-        ShapeError: It differs in fields that a run can't change.
+        ShapeError: It differs in fields that a run cannot change.
         SettingsError: The folder is not accessible.
     """
     try:
         loaded = load_deployment(folder, images=False)
     except OSError as error:
-        raise SettingsError(f"{folder} can't be read: {error.strerror or error}") from error
+        raise SettingsError(f"{folder} cannot be read: {error.strerror or error}") from error
     found = differences(as_used(in_force), as_used(loaded))
     if found:
         rest = f"; {len(found) - _NAMED} more" if len(found) > _NAMED else ""
@@ -45,8 +45,8 @@ def keep(deployment: Deployment, directory: Path, generation: int) -> Path:
     A restarted child reads the copy, so it does not depend on the original folder.
 
     Raises:
-        SettingsError: A file is missing, can't be read, or is not a regular file.
-        NotReloadedError: The files can't be copied, or were changed meanwhile.
+        SettingsError: A file is missing, cannot be read, or is not a regular file.
+        NotReloadedError: The files cannot be copied, or were changed meanwhile.
         ToolchainError: The copy is not a deployment.
     """
     kept = directory / f"{COPY_PREFIX}{generation}"
@@ -59,7 +59,7 @@ def keep(deployment: Deployment, directory: Path, generation: int) -> Path:
             shutil.copyfile(source, copy)
         except OSError as error:
             raise NotReloadedError(
-                f"{source} can't be copied to {kept}, for services that are restarted: {error.strerror or error}"
+                f"{source} cannot be copied to {kept}, for services that are restarted: {error.strerror or error}"
             ) from error
     if load_deployment(kept, images=False).hash != deployment.hash:
         raise NotReloadedError(
@@ -69,13 +69,13 @@ def keep(deployment: Deployment, directory: Path, generation: int) -> Path:
 
 
 def _check_readable(source: Path) -> None:
-    """Raise a SettingsError for a file that can't be read, is not a regular file, or is too large."""
+    """Raise a SettingsError for a file that cannot be read, is not a regular file, or is too large."""
     try:
         found = source.stat()
         if stat.S_ISREG(found.st_mode):  # opening a pipe would wait for a writer
             source.open("rb").close()
     except OSError as error:
-        raise SettingsError(f"{source} can't be read: {error.strerror or error}") from error
+        raise SettingsError(f"{source} cannot be read: {error.strerror or error}") from error
     if not stat.S_ISREG(found.st_mode) or found.st_size > _LARGEST_FILE:
         raise SettingsError(
             f"{source} is not a file of at most {_LARGEST_FILE >> 20} MiB, like those of a deployment; build it again"

@@ -189,11 +189,11 @@ class Peers:
             for peer in self
         ]
 
-    def give(self, flag: str, value: str) -> None:
+    def set_flag(self, flag: str, value: str) -> None:
         """From now on, start the master's own services with another value of a flag."""
         for peer in self:
             if peer.child is not None:
-                peer.child.give(flag, value)
+                peer.child.set_flag(flag, value)
 
     def renew(self, peer: Peer, sentence: str) -> None:
         """Restart or reconnect a service, after a warning; a restarted one uses the deployment in force."""
@@ -324,7 +324,7 @@ class Peers:
 
     async def _keep_boards(self, boards: Child) -> None:
         while True:
-            await boards.ended()
+            await boards.wait()
             failure = boards.failure()
             if boards.exit_code == ExitCode.BOARD:
                 raise failure
@@ -367,7 +367,7 @@ class Peers:
         while True:
             child = peer.child
             if child is not None and not child.is_running:
-                await child.ended()
+                await child.wait()
                 raise child.failure()
             try:
                 await open_connection(peer.endpoint, make)
@@ -436,10 +436,10 @@ class Peers:
             peer.missed = True
             return
         with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(child.ended(), self._settings.stop_timeout)
+            await asyncio.wait_for(child.wait(), self._settings.stop_timeout)
         if child.is_running:
             child.kill()
-            await child.ended()
+            await child.wait()
         failure = child.failure()
         if self._once or failure.exit_code != ExitCode.CHILD:
             raise failure

@@ -94,7 +94,7 @@ class Reloads:
             await self._drain()
             self._flow.hold()
             if app.child is not None:
-                app.child.give("--reprogram")  # if it is restarted meanwhile, boards hold either image
+                app.child.set_flag("--reprogram")  # if it is restarted meanwhile, boards hold either image
             boards = len(new.boards) * max(_PROGRAM_TIME, self._settings.peer_timeout)
             await self._ask(app, Switch(number), limit + boards)
         except asyncio.CancelledError:  # the run ends, so services need not switch back
@@ -188,7 +188,7 @@ class Reloads:
     def _adopt(self, new: Deployment, folder: Path, kept: Path) -> None:
         """Put the deployment into force whose tables the boards have."""
         self._in_force.replace(new, folder)
-        self._peers.give("--deployment", str(kept))
+        self._peers.set_flag("--deployment", str(kept))
         self._peers.app.generation = self._in_force.generation
         if self._peers.directory is not None:
             # a child may still be reading the previous copy
@@ -226,7 +226,7 @@ class Reloads:
             )
             return
         if self._in_force.generation == 0:
-            self._peers.give("--deployment", str(kept))
+            self._peers.set_flag("--deployment", str(kept))
 
 
 def fates(in_flight: int, lost: int, lost_meanwhile: int = 0) -> str:

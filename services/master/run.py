@@ -15,9 +15,9 @@ from services.master.reload import Reloads
 from services.output.master_output import print_json, print_sentence
 from services.pipeline.generations import InForce
 from services.settings import Settings
-from services.sockets.control_socket import control_served
+from services.sockets.control_socket import serve_control
 from services.sockets.records import LossReason, Published
-from services.sockets.status import ProcessStatus, status_served
+from services.sockets.status import ProcessStatus, serve_status
 from terminal.errors import ExitCode
 from terminal.logs import get_logger
 from terminal.output import say
@@ -59,10 +59,10 @@ class Master:
         try:
             peers.prepare()
             run_directory = settings.run_directory or peers.directory
-            await sockets.enter_async_context(status_served(run_directory, ROLE, self.status))
+            await sockets.enter_async_context(serve_status(run_directory, ROLE, self.status))
             if not self._once:
                 control = settings.control_directory or run_directory
-                await sockets.enter_async_context(control_served(control, self._reloads.order))
+                await sockets.enter_async_context(serve_control(control, self._reloads.order))
                 self._begin_task(self._reloads.keep_first())
                 if sys.stderr.isatty():
                     self._begin_task(self._show_progress())

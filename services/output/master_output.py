@@ -6,7 +6,7 @@ from services.errors import StackError
 from services.output.axes import Axis, deployment_axes, in_words
 from services.pipeline.generations import InForce
 from services.sockets.records import Published
-from terminal.output import put_json
+from terminal.output import print_json_line
 
 
 def print_json(record: Published, in_force: InForce) -> None:
@@ -14,7 +14,7 @@ def print_json(record: Published, in_force: InForce) -> None:
 
     Raises:
         BrokenPipeError: The reader has closed the pipe.
-        StackError: Standard output can't be written.
+        StackError: Standard output cannot be written.
     """
     axes = deployment_axes(in_force.deployment)
     best = _cell(axes, record.best_line)
@@ -29,11 +29,11 @@ def print_json(record: Published, in_force: InForce) -> None:
         "generation": in_force.generation,
     }
     try:
-        put_json(result)
+        print_json_line(result)
     except BrokenPipeError:
         raise
     except OSError as error:
-        raise StackError(f"standard output can't be written: {error.strerror or error}") from error
+        raise StackError(f"standard output cannot be written: {error.strerror or error}") from error
 
 
 def print_sentence(record: Published, in_force: InForce) -> None:

@@ -15,7 +15,7 @@ from posteriors.posterior import Posterior
 from services.output.axes import Axis, in_words
 from services.output.posterior_file import record
 from services.output.posterior_picture import ROWS, in_colour, picture
-from terminal.output import put_json
+from terminal.output import print_json_line
 
 _PICTURES_A_SECOND: Final = 10
 _REPLICAS: Final = 4
@@ -71,7 +71,7 @@ def print_line(frame: FrameOutcome, axes: list[Axis]) -> None:
 
 def print_json(frame: FrameOutcome, axes: list[Axis]) -> None:
     """Print a frame as a JSON object."""
-    put_json(record(frame, axes))
+    print_json_line(record(frame, axes))
 
 
 @contextlib.contextmanager

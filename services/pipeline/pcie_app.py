@@ -108,7 +108,7 @@ class PcieApp:
         """Serve until a signal raises in this thread.
 
         Raises:
-            PcieShimError: The boards can't be opened, or a board came back with another image.
+            PcieShimError: The boards cannot be opened, or a board came back with another image.
             OutdatedError: A master uses the current content of the folder, and this service an earlier one.
         """
         listener = listen(self._endpoint)

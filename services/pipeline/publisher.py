@@ -34,7 +34,7 @@ from services.sockets.status import (
     connections,
     reasons,
     seconds_since,
-    status_served,
+    serve_status,
     why_not_connected,
 )
 from terminal.logs import get_logger
@@ -180,7 +180,7 @@ class Publisher:
 
     async def run(self) -> int:
         """Serve until a signal, or raise a BridgeError if a server is unreachable or not a rosbridge server."""
-        async with self._link, status_served(self._run_directory, ROLE, self.status):
+        async with self._link, serve_status(self._run_directory, ROLE, self.status):
             try:
                 async with self._topics.opened(self._state_changed) as where:
                     await self._check_delivery(settled=False)

@@ -36,7 +36,7 @@ from services.sockets.status import (
     connections,
     reasons,
     seconds_since,
-    status_served,
+    serve_status,
     why_not_connected,
 )
 from terminal.logs import get_logger
@@ -53,7 +53,7 @@ _BACKLOG_LIMIT = min(1 << 18, MAX_RECORD)
 """
 
 
-async def newest_now(subscription: Subscription, message: Message) -> tuple[Message, int]:
+async def newest_message(subscription: Subscription, message: Message) -> tuple[Message, int]:
     """Return the newest of the first messages of a subscription, and the number of older ones.
 
     ROS 2 servers first send a backlog from before the subscription in one burst, the oldest message first.
@@ -184,7 +184,7 @@ class Subscriber:
         settings = self._settings
         sources = self._deployment.sources
         self._lost = asyncio.get_running_loop().create_future()
-        status = status_served(settings.run_directory, ROLE, self.status)
+        status = serve_status(settings.run_directory, ROLE, self.status)
         async with self._link, status, contextlib.AsyncExitStack() as stack:
             try:
                 uris = [source.uri for source in sources]
@@ -243,7 +243,7 @@ class Subscriber:
             self._received += 1
             if connection != ros.reconnections and not self._queue_all:
                 connection = ros.reconnections
-                message, older = await newest_now(subscription, message)
+                message, older = await newest_message(subscription, message)
                 self._passed_over += older
             self._passed_over += subscription.lost - lost_before
             lost_before = subscription.lost

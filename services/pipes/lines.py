@@ -1,4 +1,4 @@
-"""Lines of standard input, bounded in length (`terminal.output.put_json` writes lines of standard output)."""
+"""Lines of standard input, bounded in length (`terminal.output.print_json_line` writes lines of standard output)."""
 
 import asyncio
 import os

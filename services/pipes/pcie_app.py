@@ -12,7 +12,7 @@ from services.errors import InputLineError
 from services.pipeline.inference import REASON_WORDS
 from services.pipes.lines import blocking_lines, decoded
 from services.sockets.records import Addresses, Frame
-from terminal.output import put_json, say
+from terminal.output import print_json_line, say
 
 
 class LineReading(msgspec.Struct):
@@ -48,7 +48,7 @@ def compute_lines(boards: DeployedBoards, banks: int) -> int:
                 output = boards.run(frame)
             except FrameInputError as error:
                 raise InputLineError(f"line {number} of standard input: {error}") from error
-            put_json(_line(number, output, reading.stamp_ns))
+            print_json_line(_line(number, output, reading.stamp_ns))
     finally:
         boards.close()
     return 0

@@ -11,7 +11,7 @@ from services.pipeline.subscriber import RECEIVED_QUEUE
 from services.pipeline.timed_frames import TimedFrames
 from services.settings import Settings
 from services.sockets.records import Reading
-from terminal.output import put_json
+from terminal.output import print_json_line
 from toolchain.deployment import Deployment, Source
 
 
@@ -40,7 +40,7 @@ async def print_variables(settings: Settings, source: Source, names: list[str], 
                 if not present:
                     raise field.missing(message.msg)
                 values[field.name] = value
-            put_json(values or message.msg)
+            print_json_line(values or message.msg)
             printed += 1
     return 0
 
@@ -60,7 +60,7 @@ async def print_addresses(settings: Settings, deployment: Deployment, count: int
             return
         printed += 1
         codes = list(memoryview(reading.prior_codes).cast("H"))
-        put_json(
+        print_json_line(
             {"stamp_ns": reading.stamp_ns, "addresses": reading.addresses}
             | ({"prior_codes": codes} if codes else {})
         )

@@ -119,10 +119,10 @@ class _Clients:
 
 
 @contextlib.asynccontextmanager
-async def control_served(directory: Path | None, execute: Execute) -> AsyncIterator[None]:
+async def serve_control(directory: Path | None, execute: Execute) -> AsyncIterator[None]:
     """Accept orders in the running loop within the context; do nothing without a directory.
 
-    A socket that can't be opened only causes a warning, because it must not end a robot's run.
+    A socket that cannot be opened only causes a warning, because it must not end a robot's run.
     """
     endpoint = Endpoint(path="" if directory is None else str(control_socket(directory)))
     try:

@@ -18,7 +18,7 @@ import msgspec
 from services.errors import SettingsError
 from services.sockets.records import VERSION
 from services.supervision.parent import leave_private_directory
-from terminal.health import health_served, health_thread, not_ours, read_status
+from terminal.health import foreign_socket_error, read_status, serve_health, serve_health_in_thread
 
 if TYPE_CHECKING:
     # boards and pcie-app start without importing the bridge
@@ -181,21 +181,21 @@ def _check(directory: Path | None) -> None:
 
 
 @contextlib.asynccontextmanager
-async def status_served(directory: Path | None, name: str, get_status: GetStatus) -> AsyncIterator[None]:
+async def serve_status(directory: Path | None, name: str, get_status: GetStatus) -> AsyncIterator[None]:
     """Answer in the running loop within the context; do nothing without a directory, which must exist."""
     _check(directory)
     answerer = _Answerer(name, get_status)
-    async with health_served(directory, name, answerer.answer, answerer.sample):
+    async with serve_health(directory, name, answerer.answer, answerer.sample):
         yield
 
 
 @contextlib.contextmanager
-def status_thread(directory: Path | None, name: str, get_status: GetStatus) -> Iterator[None]:
+def serve_status_in_thread(directory: Path | None, name: str, get_status: GetStatus) -> Iterator[None]:
     """Answer from a thread within the context, for a process with one blocking thread."""
     _check(directory)
     answerer = _Answerer(name, get_status)
     try:
-        with health_thread(directory, name, answerer.answer, answerer.sample):
+        with serve_health_in_thread(directory, name, answerer.answer, answerer.sample):
             yield
     finally:
         leave_private_directory()
@@ -206,4 +206,4 @@ def read_process_status(path: str, timeout: float) -> ProcessStatus:
     try:
         return msgspec.json.decode(read_status(path, timeout), type=ProcessStatus)
     except (msgspec.MsgspecError, RecursionError):
-        raise not_ours(path) from None
+        raise foreign_socket_error(path) from None

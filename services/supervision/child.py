@@ -86,7 +86,7 @@ class Child:
             )
         except OSError as error:
             raise StackError(
-                f"can't start {self.name} ({self._command[0]}): {error.strerror or error}; install rosbayes into this environment"
+                f"cannot start {self.name} ({self._command[0]}): {error.strerror or error}; install rosbayes into this environment"
             ) from error
         finally:
             os.close(write_end)
@@ -107,7 +107,7 @@ class Child:
         """Whether the process was started and has not ended."""
         return self._process is not None and self._process.returncode is None
 
-    def give(self, flag: str, value: str | None = None) -> None:
+    def set_flag(self, flag: str, value: str | None = None) -> None:
         """From now on, start the process with another value of a flag, or with a flag without a value."""
         if flag not in self._command:
             self._command = [*self._command, flag, *([] if value is None else [value])]
@@ -115,7 +115,7 @@ class Child:
             at = self._command.index(flag) + 1
             self._command = [*self._command[:at], value, *self._command[at + 1 :]]
 
-    async def ended(self) -> None:
+    async def wait(self) -> None:
         """Wait until the process has exited and its lines have been forwarded."""
         if self._process is not None:
             await self._process.wait()
@@ -193,11 +193,11 @@ async def end_all(children: Iterable[Child], stop_timeout: float) -> list[str]:
     with contextlib.suppress(TimeoutError):
         async with asyncio.timeout(stop_timeout):
             for child in running:
-                await child.ended()
+                await child.wait()
     stubborn = [child for child in running if child.is_running]
     for child in stubborn:
         child.kill()
     for child in children:
-        await child.ended()
+        await child.wait()
         child.close()
     return [child.name for child in stubborn]

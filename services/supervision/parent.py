@@ -11,7 +11,7 @@ from pathlib import Path
 
 from services.supervision.private_directory import COPY_PREFIX, has_master, remove_stale_sockets
 from terminal.ending import PARENT_VARIABLE
-from terminal.signals import stopped_by
+from terminal.signals import stopped_error
 
 DIRECTORY_VARIABLE = "ROSBAYES_DIRECTORY"
 """Environment variable with the private directory of the run, which the last process to exit removes."""
@@ -41,7 +41,7 @@ def end_with_parent() -> None:
     ask_for_end_with_parent()
     # the parent may have exited before the request to the kernel
     if os.getppid() != int(parent):
-        raise stopped_by(signal.SIGTERM)
+        raise stopped_error(signal.SIGTERM)
 
 
 def leave_private_directory() -> None:

@@ -64,7 +64,7 @@ def make_private_directory() -> Path:
         return Path(tempfile.mkdtemp(prefix=DIRECTORY_PREFIX, dir=_parent()))
     except OSError as error:
         raise StackError(
-            f"can't create a private directory for the local sockets: {error.strerror or error}; set TMPDIR to a writable folder"
+            f"cannot create a private directory for the local sockets: {error.strerror or error}; set TMPDIR to a writable folder"
         ) from error
 
 

@@ -7,7 +7,7 @@ import re
 import pytest
 
 from casestudies import readiness as module
-from casestudies.readiness import Readiness, readiness_served
+from casestudies.readiness import Readiness, serve_readiness
 from terminal.health import is_ready, read_status, status_socket
 
 WORK = "a result was shown"
@@ -17,7 +17,7 @@ WORK = "a result was shown"
 async def readiness(tmp_path, monkeypatch):
     monkeypatch.setenv("BM_RUN_DIRECTORY", str(tmp_path))
     readiness = Readiness(WORK)
-    async with readiness_served("boat-viewer", readiness):
+    async with serve_readiness("boat-viewer", readiness):
         yield readiness
 
 
@@ -26,8 +26,10 @@ async def asked(directory):
 
 
 async def test_ready_once_it_has_worked(tmp_path, readiness):
-    assert await asked(tmp_path) == (False, f"not once yet: {WORK}")
-    readiness.did()
+    ready, why = await asked(tmp_path)
+    assert not ready
+    assert why.endswith(WORK)
+    readiness.record()
     ready, why = await asked(tmp_path)
     assert ready
     assert re.fullmatch(WORK + r" [\d.]+ s ago, 1 in all", why)
@@ -35,7 +37,7 @@ async def test_ready_once_it_has_worked(tmp_path, readiness):
 
 async def test_not_ready_when_its_work_stopped(tmp_path, readiness, monkeypatch):
     monkeypatch.setattr(module, "RECENT_S", 0.0)
-    readiness.did()
+    readiness.record()
     await asyncio.sleep(0.01)
     assert not (await asked(tmp_path))[0]
 
@@ -50,6 +52,6 @@ async def test_is_a_status_of_the_stack(tmp_path, readiness):
 @pytest.mark.parametrize("directory", ["", "missing"])
 async def test_works_without_a_place_for_it(tmp_path, monkeypatch, capsys, directory):
     monkeypatch.setenv("BM_RUN_DIRECTORY", str(tmp_path / directory) if directory else "")
-    async with readiness_served("boat-simulator", Readiness(WORK)):
+    async with serve_readiness("boat-simulator", Readiness(WORK)):
         pass
-    assert ("can't be shown" in capsys.readouterr().err) is bool(directory)
+    assert ("boat-simulator: warning: " in capsys.readouterr().err) is bool(directory)

@@ -13,7 +13,7 @@ PROGRAM = """
 import os, signal, threading, time
 from rich.console import Console
 from terminal.command_line import CommandLine
-from terminal.output import put_json
+from terminal.output import print_json_line
 from terminal.signals import check_signals, run_async
 app = CommandLine(help="a command")
 
@@ -79,7 +79,13 @@ def test_a_dropped_signal_counts_at_the_end_of_a_command():
 
 @pytest.mark.parametrize(
     "command",
-    [["print(1)"], ["print(1, flush=True)"], ["put_json(1)"], ["Console().print(1)"], ["pass", "--help"]],
+    [
+        ["print(1)"],
+        ["print(1, flush=True)"],
+        ["print_json_line(1)"],
+        ["Console().print(1)"],
+        ["pass", "--help"],
+    ],
 )
 def test_a_full_disk_behind_standard_output_is_one_sentence(command):
     with Path("/dev/full").open("w") as full:

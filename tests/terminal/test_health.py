@@ -1,6 +1,6 @@
 """The status socket: one JSON object per connection, for its user alone, whatever asks and whatever answers.
 
-is_ready, read_status ──▶ NAME.status.sock ◀── health_served (a loop), health_thread (a blocking process)
+is_ready, read_status ──▶ NAME.status.sock ◀── serve_health (a loop), serve_health_in_thread (a blocking process)
 """
 
 import asyncio
@@ -20,10 +20,10 @@ from terminal.health import (
     ANSWER_LIMIT,
     NoHealthError,
     Silence,
-    health_served,
-    health_thread,
     is_ready,
     read_status,
+    serve_health,
+    serve_health_in_thread,
     status_socket,
 )
 
@@ -43,14 +43,14 @@ class Server:
             return json.dumps(status).encode()
 
         if self.kind == "thread":
-            with health_thread(directory, name, answer, self.sample):
+            with serve_health_in_thread(directory, name, answer, self.sample):
                 yield
             return
         loop = asyncio.new_event_loop()
         begun, over = threading.Event(), asyncio.Event()
 
         async def serve():
-            async with health_served(directory, name, answer, self.sample):
+            async with serve_health(directory, name, answer, self.sample):
                 begun.set()
                 await over.wait()
 

@@ -11,7 +11,7 @@ import pytest
 import websockets
 
 from terminal.one_line import one_line, shown
-from terminal.output import put_json, say, say_lines
+from terminal.output import print_json_line, say, say_lines
 
 HOSTILE = "a\nerror: all is well\r\x1b[2J\x9b31m\x07\x08\x7f\u202eend\ud800"
 HARMLESS = "a\\nerror: all is well\\r\\x1b[2J\\x9b31m\\x07\\x08\\x7f\\u202eend\\ud800"
@@ -125,7 +125,7 @@ async def test_a_server_writes_nothing_over_the_terminal(variables):
 
 def test_what_is_printed_for_programs_is_what_it_was(capsysbinary):
     told = {"a\x9b31m": "\u202e\U000e0001\n°"}
-    put_json(told)
+    print_json_line(told)
     line = capsysbinary.readouterr().out.decode()
     assert line.removesuffix("\n").isprintable()
     assert json.loads(line) == told

@@ -44,7 +44,7 @@ def build_deployment(model: Model, directory: Path, options: BuildOptions, *, re
     The same model and options give the same bytes. A deployment in the folder is replaced; `remark` ends the report.
 
     Raises:
-        BuildError: The options contradict each other, the model or the register map, or the folder can't be
+        BuildError: The options contradict each other, the model or the register map, or the folder cannot be
             written.
     """
     built = assemble(model, options)
@@ -55,7 +55,7 @@ def build_deployment(model: Model, directory: Path, options: BuildOptions, *, re
         (directory / FILE_NAME).unlink(missing_ok=True)
     except OSError as reason:
         raise BuildError(
-            f"{directory} can't be written: {reason.strerror or reason}; choose another folder with -o"
+            f"{directory} cannot be written: {reason.strerror or reason}; choose another folder with -o"
         ) from None
     for part in (
         image_files(built.deployment, built.images),

@@ -27,13 +27,13 @@ def machine_options(source: BuildOptions | MachineSection) -> dict[str, Any]:
 
 
 def machine_parameters(model: Model, options: BuildOptions) -> BM1Parameters:
-    """Return the parameters of the whole model's machine; a BuildError if it can't be built."""
+    """Return the parameters of the whole model's machine; a BuildError if it cannot be built."""
     if options.prior_mode is PriorMode.TABLE and options.written_prior is not None:
         flag = "--prior-path" if options.sources is None else options.sources.toml.path
         raise BuildError(f"{flag} is for a written prior: add --prior-mode written")
     if options.prior_mode is PriorMode.WRITTEN and model.prior_select is not None:
         raise BuildError(
-            f"the prior is selected by {model.prior_select.name}, so it can't be written too: leave "
+            f"the prior is selected by {model.prior_select.name}, so it cannot be written too: leave "
             "--prior-mode written out, or the selection"
         )
     codes = model.lines * sum(2**known.bits for known in model.known)

@@ -25,7 +25,7 @@ def partition_lines(lines: int, count: int) -> tuple[Block, ...]:
     """Return the blocks of `lines` lines on `count` boards, in order; the first `lines` mod `count` are one longer."""
     if not 1 <= count <= lines:
         raise BuildError(
-            f"{lines} lines can't be divided among {count} boards: expected 1 to {lines} partitions"
+            f"{lines} lines cannot be divided among {count} boards: expected 1 to {lines} partitions"
         )
     shorter, longer = divmod(lines, count)
     return tuple(

@@ -52,12 +52,12 @@ def check_deployment(directory: Path) -> list[Finding]:
 
 
 def refusal(reason: Exception, about: str) -> Finding:
-    """Return the finding that a model can't be built, or a deployment can't be read."""
+    """Return the finding that a model cannot be built, or a deployment cannot be read."""
     return error(Check.CANNOT_BE_BUILT, about, str(reason).rstrip("."))
 
 
 def _refusals(model: Model, options: BuildOptions, first: ToolchainError) -> list[Finding]:
-    """Return the reasons why a model can't be built; parts are checked separately, to find all mistakes."""
+    """Return the reasons why a model cannot be built; parts are checked separately, to find all mistakes."""
     tries: list[tuple[str, Callable[[], object]]] = [
         ("the partitions", lambda: partition_lines(model.lines, options.partitions)),
         ("the machine", lambda: machine_parameters(model, options)),

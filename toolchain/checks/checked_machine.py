@@ -39,16 +39,16 @@ class CheckedMachine:
         """The columns' names, the prior first."""
         return ["the prior", *(variable.name for variable in self.deployment.sensors)]
 
-    def served(self, column: int) -> NDArray[np.uint16]:
+    def addressable_rows(self, column: int) -> NDArray[np.uint16]:
         """Return the rows of a column (from 0) that readings, and permitted missing readings, address."""
-        return _served(self.deployment.sensors[column], self.tables[column])
+        return _addressable(self.deployment.sensors[column], self.tables[column])
 
     def prior_rows(self) -> NDArray[np.uint16]:
         """Return the rows of the prior that can be selected."""
         select = self.deployment.prior_select
-        return self.prior if select is None else _served(select, self.prior)
+        return self.prior if select is None else _addressable(select, self.prior)
 
 
-def _served(variable: Variable, rows: NDArray[np.uint16]) -> NDArray[np.uint16]:
+def _addressable(variable: Variable, rows: NDArray[np.uint16]) -> NDArray[np.uint16]:
     served = rows[: variable.values]
     return np.vstack([served, rows[-1:]]) if variable.on_missing == "missing" else served

@@ -73,7 +73,7 @@ def _alive(machine: CheckedMachine) -> NDArray[np.bool_]:
     if machine.parameters.prior_mode is PriorMode.TABLE:  # the written prior is unknown here
         alive &= machine.prior_rows().any(axis=0)
     for column in range(len(machine.tables)):
-        alive &= machine.served(column).any(axis=0)
+        alive &= machine.addressable_rows(column).any(axis=0)
     return alive
 
 
@@ -92,7 +92,7 @@ def _lines(machine: CheckedMachine) -> Iterator[Finding]:
     if machine.parameters.prior_mode is PriorMode.TABLE:
         yield from _dead_prior(machine)
     for column, variable in enumerate(deployment.sensors[: len(machine.tables)]):
-        lines = np.flatnonzero(~machine.served(column).any(axis=0))
+        lines = np.flatnonzero(~machine.addressable_rows(column).any(axis=0))
         if lines.size:
             yield warning(
                 Check.DEAD_LINES,

@@ -10,7 +10,7 @@ class Severity(StrEnum):
     """The severity of a finding."""
 
     ERROR = "error"
-    """The model can't be built, or computes wrong results."""
+    """The model cannot be built, or computes wrong results."""
     WARNING = "warning"
     """Some readings get no posterior or a wrong one, or resources are wasted."""
     NOTE = "note"

@@ -225,7 +225,7 @@ def _run_claims(directory: Path, *, frames: int, seed: int) -> None:
     try:
         directory.mkdir(parents=True, exist_ok=True)
     except OSError as reason:
-        raise BuildError(f"{directory} can't be created: {reason.strerror or reason}") from None
+        raise BuildError(f"{directory} cannot be created: {reason.strerror or reason}") from None
     check_pictures_possible(picture)
     with progress(experiments()) as advance:
         claims = run_claims(frames=frames, seed=seed, advance=advance)
@@ -243,7 +243,7 @@ def _run_claims(directory: Path, *, frames: int, seed: int) -> None:
     try:
         figures.write_text(claims.as_json(), encoding="utf-8")
     except OSError as reason:
-        raise BuildError(f"{figures} can't be written: {reason.strerror or reason}") from None
+        raise BuildError(f"{figures} cannot be written: {reason.strerror or reason}") from None
     draw_claims(picture, claims)
     typer.echo(f"Wrote {figures} and {picture}", err=True)
 

@@ -30,7 +30,7 @@ def new(
             raise BuildError(f"{name / file} already exists; choose another name")
     if not name.parent.is_dir():
         raise BuildError(
-            f"{name.parent} is not a folder, so {model} can't be created in it; create it first, or correct the path"
+            f"{name.parent} is not a folder, so {model} cannot be created in it; create it first, or correct the path"
         )
     try:
         name.mkdir(exist_ok=True)
@@ -38,7 +38,7 @@ def new(
             text = files("toolchain.commands").joinpath("template", file + ".txt").read_text(encoding="utf-8")
             (name / file).write_text(text.replace("NAME", model), encoding="utf-8")
     except OSError as reason:
-        raise BuildError(f"{name} can't be written: {reason.strerror or reason}") from None
+        raise BuildError(f"{name} cannot be written: {reason.strerror or reason}") from None
     typer.echo(_next_steps(name), nl=False)
 
 

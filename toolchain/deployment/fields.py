@@ -54,7 +54,7 @@ def _not_zero(step: float) -> float:
 
 def _printable(name: str) -> str:
     if not name.isprintable():
-        raise ValueError(f"{name!r} has a character that can't be printed")
+        raise ValueError(f"{name!r} has a character that cannot be printed")
     return name
 
 

@@ -17,12 +17,12 @@ def open_regular(path: Path, error: type[ToolchainError], most: int | None = Non
     """Open a regular file for reading, because a FIFO or a device could block forever or never end.
 
     Raises:
-        error: The file is missing, can't be read, is not a regular file, or has more than `most` bytes.
+        error: The file is missing, cannot be read, is not a regular file, or has more than `most` bytes.
     """
     try:
         number = os.open(path, os.O_RDONLY | os.O_NONBLOCK)  # otherwise, opening a FIFO waits for a writer
     except OSError as reason:
-        raise error(f"{path} can't be read: {reason.strerror or reason}") from None
+        raise error(f"{path} cannot be read: {reason.strerror or reason}") from None
     state = os.fstat(number)
     if stat.S_ISREG(state.st_mode) and (most is None or state.st_size <= most):
         return os.fdopen(number, "rb")
@@ -43,7 +43,7 @@ def read_bounded(path: Path, most: int, error: type[ToolchainError]) -> bytes:
                 pieces.append(piece)
                 size += len(piece)
     except OSError as reason:
-        raise error(f"{path} can't be read: {reason.strerror or reason}") from None
+        raise error(f"{path} cannot be read: {reason.strerror or reason}") from None
     if size > most:  # it has grown, or is a file in /proc, which reports the size 0
         raise error(f"{path} has more than {most} bytes, the maximum")
     return b"".join(pieces)

@@ -23,7 +23,7 @@ def whole_file(path: Path, error: type[ToolchainError]) -> Iterator[Path]:
         if partial.exists():
             partial.replace(path)
     except OSError as reason:
-        raise error(f"{path} can't be written: {reason.strerror or reason}") from None
+        raise error(f"{path} cannot be written: {reason.strerror or reason}") from None
     finally:
         with suppress(OSError):
             partial.unlink(missing_ok=True)

@@ -37,7 +37,7 @@ def run_fit(
     for path in checks:
         if any(path.resolve() == other.resolve() for other in recordings):
             raise BuildError(
-                f"{path} is used for learning, so it can't show how good the fit is: omit it on one side"
+                f"{path} is used for learning, so it cannot show how good the fit is: omit it on one side"
             )
     model = load_model(case, key_values(settings))
     truth_columns = _truth_columns(model, options.truth)

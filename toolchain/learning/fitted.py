@@ -212,7 +212,7 @@ def _read_tables(path: Path) -> Fit:
                 for number, variable in enumerate(counted)
             }
     except OSError as reason:
-        raise ModelError(f"{path} can't be read: {reason.strerror or reason}") from None
+        raise ModelError(f"{path} cannot be read: {reason.strerror or reason}") from None
     except (
         zipfile.BadZipFile,
         KeyError,

@@ -78,7 +78,7 @@ def _read_csv(path: Path, columns: Sequence[str]) -> Recording:
             if not rows:
                 raise ModelError(f"{path} has a heading and no rows")
     except OSError as reason:
-        raise ModelError(f"{path} can't be read: {reason.strerror or reason}") from None
+        raise ModelError(f"{path} cannot be read: {reason.strerror or reason}") from None
     except UnicodeDecodeError:
         raise ModelError(
             f"{path} is not a CSV file: it is not UTF-8 text, at the line after {lines.line_num} or later"
@@ -179,7 +179,7 @@ def _messages(path: Path, topics: tuple[str, ...]) -> Iterator[tuple[str, int, A
     except Exception as reason:  # rosbags supports many formats, and each fails in its own way
         text = " ".join(str(reason).split())[:200]
         raise ModelError(
-            f"{path} can't be read as a bag, after {count} messages: {text or type(reason).__name__}"
+            f"{path} cannot be read as a bag, after {count} messages: {text or type(reason).__name__}"
         ) from None
 
 

@@ -73,7 +73,7 @@ def _importing_from(folder: Path) -> Iterator[None]:
 def _model_function(path: Path) -> Callable[..., object]:
     spec = importlib.util.spec_from_file_location("rosbayes_case_study_model", path)
     if spec is None or spec.loader is None:
-        raise ModelError(f"{path} can't be loaded as a Python module")
+        raise ModelError(f"{path} cannot be loaded as a Python module")
     module: ModuleType = importlib.util.module_from_spec(spec)
     loader = spec.loader
     sys.modules[spec.name] = module  # dataclasses and get_type_hints look up their module
@@ -169,7 +169,7 @@ def _value(key: str, text: str, wanted: Any) -> object:
                 f"--set {key}={text}: expected {'an integer' if wanted is int else 'a number'}"
             ) from None
     else:
-        raise ModelError(f"--set {key}={text}: the model's {key} can't be given on the command line")
+        raise ModelError(f"--set {key}={text}: the model's {key} cannot be given on the command line")
     if text not in choices:
         raise ModelError(f"--set {key}={text}: expected one of {', '.join(choices)}")
     return choices[text]

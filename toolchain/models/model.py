@@ -241,7 +241,7 @@ def interval(label: str, low: float, high: float, *, cells: int, unit: str = "")
     """Return a searched dimension that divides [low, high] into equal cells, or raise a ModelError."""
     if cells < 1 or not low < high:
         raise ModelError(
-            f"searched dimension {label!r}: [{low:g}, {high:g}] can't be divided into {cells} cells"
+            f"searched dimension {label!r}: [{low:g}, {high:g}] cannot be divided into {cells} cells"
         )
     step = (high - low) / cells
     return dimension(label, size=cells, offset=low + step / 2, step=step, unit=unit)

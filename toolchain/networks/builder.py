@@ -79,7 +79,7 @@ class NetworkBuilder:
         if not 0 < len(name) <= MAX_NAME:
             raise place.error(f"a variable's name has {len(name)} characters, expected 1 to {MAX_NAME}")
         if not name.isprintable():
-            raise place.error(f"the variable {name!r} has a character in its name that can't be printed")
+            raise place.error(f"the variable {name!r} has a character in its name that cannot be printed")
         if name in self._symbols:
             raise place.error(f"the variable {name!r} is defined twice")
         if len(self._symbols) == MAX_VARIABLES:
@@ -92,7 +92,7 @@ class NetworkBuilder:
             if any(len(label) > MAX_NAME for label in kind.labels):
                 raise place.error(f"a state of {name} has more than {MAX_NAME} characters")
             if wrong := next((label for label in kind.labels if not label.isprintable()), None):
-                raise place.error(f"the state {wrong!r} of {name} has a character that can't be printed")
+                raise place.error(f"the state {wrong!r} of {name} has a character that cannot be printed")
             self._symbols[name] = Symbol(name, kind, on_missing=self._on_missing)
         except ModelError as reason:
             raise place.error(f"variable {name}: {reason}") from None

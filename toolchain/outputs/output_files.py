@@ -143,7 +143,7 @@ def _remove(path: Path) -> None:
     try:
         path.unlink()
     except OSError as reason:
-        raise BuildError(f"{path} can't be written: {reason.strerror or reason}") from None
+        raise BuildError(f"{path} cannot be written: {reason.strerror or reason}") from None
 
 
 def _says_the_same(path: Path, pieces: Iterable[bytes]) -> bool:

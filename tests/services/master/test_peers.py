@@ -74,7 +74,7 @@ async def test_a_process_of_its_own_may_start_slowly(peers, events, tmp_path, ow
         if peer.protocol is not None:
             peer.protocol.close()
         child.kill()
-        await child.ended()
+        await child.wait()
         child.close()
 
 

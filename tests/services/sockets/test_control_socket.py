@@ -15,9 +15,9 @@ from services.sockets.control_socket import (
     ANSWER_LIMIT,
     CLIENTS,
     ReloadOrder,
-    control_served,
     give_order,
     order_of,
+    serve_control,
 )
 from terminal.errors import ExitCode
 
@@ -53,7 +53,7 @@ async def test_an_order_is_executed_and_answered(path):
             raise ShapeError("another shape")
         return "done"
 
-    async with control_served(path.parent, execute):
+    async with serve_control(path.parent, execute):
         assert stat.S_IMODE(path.stat().st_mode) == 0o600
         assert await give_order(path, ReloadOrder("/a"), timeout=PATIENCE) == "done"
         assert await give_order(path, ReloadOrder(), timeout=PATIENCE) == "done"
@@ -85,7 +85,7 @@ async def test_anything_else_is_refused(path, monkeypatch, data):
     async def execute(_):
         raise AssertionError
 
-    async with control_served(path.parent, execute):
+    async with serve_control(path.parent, execute):
         answer = await answer_to(path, data)
     assert answer["exit_code"] == ExitCode.USAGE
     assert answer["sentence"]
@@ -98,7 +98,7 @@ async def test_too_many_clients_are_refused(path):
         await free.wait()
         return "done"
 
-    async with control_served(path.parent, execute):
+    async with serve_control(path.parent, execute):
         order = b'{"order":"reload"}\n'
         clients = [asyncio.ensure_future(answer_to(path, order)) for _ in range(CLIENTS)]
         await asyncio.sleep(0)  # they connect first
@@ -115,7 +115,7 @@ async def test_a_client_notices_that_the_master_ends(path):
         begun.set()
         await asyncio.Event().wait()
 
-    async with control_served(path.parent, execute):
+    async with serve_control(path.parent, execute):
         order = asyncio.ensure_future(give_order(path, ReloadOrder(), timeout=PATIENCE))
         await begun.wait()
     with pytest.raises(NotReloadedError):

@@ -22,7 +22,7 @@ from services.sockets.status import (
     HubStatus,
     PeerStatus,
     ProcessStatus,
-    status_served,
+    serve_status,
 )
 
 
@@ -48,7 +48,7 @@ async def served(directory, **processes):
     async with contextlib.AsyncExitStack() as stack:
         for name, told in processes.items():
             await stack.enter_async_context(
-                status_served(directory, name.replace("_", "-"), lambda told=told: told)
+                serve_status(directory, name.replace("_", "-"), lambda told=told: told)
             )
         yield
 

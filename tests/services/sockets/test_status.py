@@ -15,11 +15,11 @@ from services.sockets.status import (
     ProcessStatus,
     read_process_status,
     seconds_since,
-    status_served,
-    status_thread,
+    serve_status,
+    serve_status_in_thread,
 )
 from services.supervision.private_directory import remove_stale_sockets
-from terminal.health import NoHealthError, Silence, health_thread, status_socket
+from terminal.health import NoHealthError, Silence, serve_health_in_thread, status_socket
 
 PATIENCE = 60.0
 
@@ -35,7 +35,7 @@ def get_status():
 
 
 def test_a_process_says_who_it_is(tmp_path):
-    with status_thread(tmp_path, "pcie-app", get_status):
+    with serve_status_in_thread(tmp_path, "pcie-app", get_status):
         found = read_process_status(status_socket(tmp_path, "pcie-app"), PATIENCE)
     assert (found.name, found.pid, found.version) == ("pcie-app", os.getpid(), VERSION)
     assert (found.ready, found.why, found.frames) == (True, "all is well", counts(7))
@@ -44,7 +44,7 @@ def test_a_process_says_who_it_is(tmp_path):
 
 def test_a_status_of_another_version_is_refused(tmp_path):
     with (
-        health_thread(tmp_path, "hub", lambda: b'{"ready":true,"why":3}', lambda: None),
+        serve_health_in_thread(tmp_path, "hub", lambda: b'{"ready":true,"why":3}', lambda: None),
         pytest.raises(NoHealthError) as silent,
     ):
         read_process_status(status_socket(tmp_path, "hub"), PATIENCE)
@@ -53,8 +53,8 @@ def test_a_status_of_another_version_is_refused(tmp_path):
 
 async def test_a_directory_that_is_not_there_is_the_users_mistake(tmp_path):
     with pytest.raises(SettingsError):
-        await status_served(tmp_path / "missing", "hub", get_status).__aenter__()
-    with pytest.raises(SettingsError), status_thread(tmp_path / "missing", "hub", get_status):
+        await serve_status(tmp_path / "missing", "hub", get_status).__aenter__()
+    with pytest.raises(SettingsError), serve_status_in_thread(tmp_path / "missing", "hub", get_status):
         pass
 
 
@@ -62,7 +62,7 @@ def test_stale_sockets_are_removed_and_live_ones_stay(tmp_path):
     with socket.socket(socket.AF_UNIX) as dead:
         dead.bind(status_socket(tmp_path, "master"))
     (tmp_path / "board0.sock").touch()
-    with status_thread(tmp_path, "board0", get_status):
+    with serve_status_in_thread(tmp_path, "board0", get_status):
         remove_stale_sockets(tmp_path)
         assert sorted(path.name for path in tmp_path.iterdir()) == ["board0.sock", "board0.status.sock"]
 

@@ -36,7 +36,7 @@ async def failure_of(code: str, number: int = 0) -> ReportedError:
     await one.start()
     if number:
         os.kill(one.pid, number)
-    await one.ended()
+    await one.wait()
     assert not one.is_running
     one.close()
     return one.failure()
@@ -124,9 +124,9 @@ def test_a_later_start_has_other_flags(run, tmp_path):
         one = Child("tester", [*command, "--deployment", "a", "--log-level", "info"])
         for flags in ((), (("--deployment", "b"), ("--reprogram",), ("--reprogram",))):
             for flag in flags:
-                one.give(*flag)
+                one.set_flag(*flag)
             await one.start()
-            await one.ended()
+            await one.wait()
         one.close()
 
     run(start_twice())

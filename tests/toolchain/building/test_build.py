@@ -141,7 +141,7 @@ def test_a_model_larger_than_the_register_map(tmp_path):
 def test_a_folder_that_cannot_be_written(tmp_path):
     (tmp_path / "file").write_text("")
     for folder in (tmp_path / "file", tmp_path / "file" / "below"):
-        with pytest.raises(BuildError, match="can't be written: .*; choose another folder"):
+        with pytest.raises(BuildError, match="cannot be written: .*; choose another folder"):
             build_deployment(model(), folder, OPTIONS)
 
 
@@ -153,7 +153,7 @@ def test_a_build_over_another_leaves_nothing_of_it_even_if_it_fails_half_way(tmp
     load_deployment(tmp_path)
     (tmp_path / "boards" / "board1.bm").unlink()
     (tmp_path / "boards" / "board1.bm" / "in the way").mkdir(parents=True)
-    with pytest.raises(BuildError, match="can't be written"):
+    with pytest.raises(BuildError, match="cannot be written"):
         build_deployment(model(), tmp_path, replace(OPTIONS, partitions=2))
     with pytest.raises(DeploymentError, match="deployment.toml"):
         load_deployment(tmp_path)

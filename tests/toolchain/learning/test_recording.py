@@ -127,10 +127,10 @@ def test_columns_that_a_bag_does_not_have(tmp_path, columns):
 def test_a_bag_that_is_none(tmp_path):
     for name in ("r.bag", "r.mcap", "r.xyz"):
         (tmp_path / name).write_bytes(b"nothing of a bag" * 50)
-        with pytest.raises(ModelError, match=rf"{name} can't be read as a bag, after 0 messages: "):
+        with pytest.raises(ModelError, match=rf"{name} cannot be read as a bag, after 0 messages: "):
             read_recording(tmp_path / name, ["/range:data"])
     (tmp_path / "cut").mkdir()
     path = bag1(tmp_path / "cut")
     path.write_bytes(path.read_bytes()[:700])
-    with pytest.raises(ModelError, match="can't be read as a bag"):
+    with pytest.raises(ModelError, match="cannot be read as a bag"):
         read_recording(path, ["/range:data"])

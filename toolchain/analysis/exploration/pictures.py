@@ -18,7 +18,7 @@ _KINDS_INSIDE: Final = 5
 
 
 def check_pictures_possible(path: Path | None = None) -> None:
-    """Raise a BuildError, before a long run, for a picture that can't be drawn or written."""
+    """Raise a BuildError, before a long run, for a picture that cannot be drawn or written."""
     if find_spec("matplotlib") is None:
         raise BuildError(
             "a plot needs matplotlib, which is not installed: run pip install matplotlib, or omit --plot"
@@ -36,7 +36,9 @@ def check_pictures_possible(path: Path | None = None) -> None:
         if not there:
             path.unlink()
     except OSError as reason:
-        raise BuildError(f"{path} can't be written: {reason.strerror or reason}; name another file") from None
+        raise BuildError(
+            f"{path} cannot be written: {reason.strerror or reason}; name another file"
+        ) from None
 
 
 def draw_sweep(path: Path, name: str, points: Sequence[Point], front: Sequence[Point]) -> None:
@@ -156,4 +158,4 @@ def _save(figure: Any, path: Path) -> None:
     try:
         figure.savefig(path, dpi=_DPI, metadata={"Software": None} if path.suffix == ".png" else None)
     except (OSError, ValueError) as reason:
-        raise BuildError(f"{path} can't be written: {getattr(reason, 'strerror', None) or reason}") from None
+        raise BuildError(f"{path} cannot be written: {getattr(reason, 'strerror', None) or reason}") from None

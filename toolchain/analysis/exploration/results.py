@@ -96,7 +96,7 @@ class Results:
             self.points[point.key] = point
 
     def check_writable(self) -> None:
-        """Create the file if it is missing, or raise a BuildError, before a long run, if it can't be written."""
+        """Create the file if it is missing, or raise a BuildError, before a long run, if it cannot be written."""
         try:
             os.close(self._opened())
         except OSError as reason:
@@ -118,13 +118,13 @@ class Results:
         except OSError as reason:
             raise self._not_writable(reason) from None
         if written != len(line):
-            raise BuildError(f"{self.path} can't be written: the disk is full")
+            raise BuildError(f"{self.path} cannot be written: the disk is full")
 
     def _opened(self) -> int:
         return os.open(self.path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
 
     def _not_writable(self, reason: OSError) -> BuildError:
-        return BuildError(f"{self.path} can't be written: {reason.strerror or reason}")
+        return BuildError(f"{self.path} cannot be written: {reason.strerror or reason}")
 
 
 def pareto(points: Sequence[Point]) -> list[Point]:

@@ -191,7 +191,7 @@ def tasks(model: Model, sweep: Sweep, frames: Frames, device: Device) -> list[Ta
 
 
 def run_task(model: Model, task: Task, frames: Frames, device: Device, banks: int) -> Point:
-    """Measure one machine; a ToolchainError if it can't be built or run."""
+    """Measure one machine; a ToolchainError if it cannot be built or run."""
     options = task.options
     parameters = machine_parameters(model, options)
     quantised = quantise(
