@@ -60,6 +60,9 @@ class Settings(BaseSettings):
     stop_timeout: Seconds = Field(default=5, description="grace period in seconds for processes to exit")
     seen_timeout: Seconds = Field(default=2, description="seconds until a result is seen on the wire")
 
+    message_bytes: int = Field(
+        default=16 << 20, ge=1 << 10, le=1 << 28, description="largest message of a topic, in bytes"
+    )
     fused: bool = Field(
         default=False, description="subscriber, publisher and pcie-app inside the master's process"
     )

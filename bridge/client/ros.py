@@ -322,6 +322,26 @@ class Ros:
         known = (await self._session.ask_rosapi("topic_type", {"topic": topic}, timeout)).get("type")
         return known if isinstance(known, str) else None
 
+    async def topics(self, timeout: float = 1.0) -> list[str] | None:  # noqa: ASYNC109  # as above
+        """Return the names of all topics at the server; None without rosapi."""
+        return await self._names("topics", {}, timeout)
+
+    async def publishers(self, topic: str, timeout: float = 1.0) -> list[str] | None:  # noqa: ASYNC109  # as above
+        """Return the names of the nodes that publish a topic; None without rosapi."""
+        return await self._names("publishers", {"topic": topic}, timeout)
+
+    async def nodes(self, timeout: float = 1.0) -> list[str] | None:  # noqa: ASYNC109  # as above
+        """Return the names of all nodes; None without rosapi."""
+        return await self._names("nodes", {}, timeout)
+
+    async def services(self, timeout: float = 1.0) -> list[str] | None:  # noqa: ASYNC109  # as above
+        """Return the names of all services; None without rosapi."""
+        return await self._names("services", {}, timeout)
+
+    async def _names(self, question: str, args: dict[str, Any], limit: float) -> list[str] | None:
+        names = (await self._session.ask_rosapi(question, args, limit)).get(question)
+        return [name for name in names if isinstance(name, str)] if isinstance(names, list) else None
+
     async def _ask_version(self, limit: float) -> RosVersion | None:
         version = (await self._session.ask_rosapi("get_ros_version", {}, limit)).get("version")
         return 1 if version == 1 else 2 if version == 2 else None

@@ -88,6 +88,16 @@ BoardCa = Annotated[
         rich_help_panel=BOARDS,
     ),
 ]
+MessageBytes = Annotated[
+    int | None,
+    setting(
+        "message_bytes",
+        "Largest message of a topic, in bytes; a larger one ends the connection.",
+        min=1 << 10,
+        max=1 << 28,
+        rich_help_panel=SERVER,
+    ),
+]
 RosVersion = Annotated[
     str | None,
     setting("ros_version", "Spelling of stamps and types.", metavar="auto|1|2", rich_help_panel=SERVER),

@@ -36,4 +36,5 @@ def service_command(
     if role == "publisher":
         return [*command, "--seen-timeout", str(settings.seen_timeout)]
     command += ["--first-data-timeout", str(settings.first_data_timeout)]
+    command += ["--message-bytes", str(settings.message_bytes)]
     return [*command, "--queue", settings.queue] if settings.queue else command

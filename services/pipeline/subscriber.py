@@ -2,12 +2,14 @@
 
 import asyncio
 import contextlib
+import difflib
 import time
 
 import msgspec
 
 from bridge.client import Message, Ros, State, Subscription
 from bridge.errors import BridgeError, NoMessageError
+from bridge.names import absolute
 from services.errors import RosbridgeLostError, VariableError
 from services.pipeline.connections import connect_all, reconnect_now, report_failure
 from services.pipeline.generations import Generations
@@ -40,6 +42,7 @@ from services.sockets.status import (
     why_not_connected,
 )
 from terminal.logs import get_logger
+from terminal.one_line import shown
 from toolchain.deployment import Deployment, Source
 
 ROLE = "subscriber"
@@ -48,6 +51,8 @@ RECEIVED_QUEUE = 64
 _BURST_PAUSE = 0.02
 """Seconds of silence that end the backlog sent to a new subscriber."""
 _BURST_LIMIT = 0.1
+_HINT_AFTER = 2.0
+"""Seconds without a first message after which a mistyped topic is suspected."""
 _BACKLOG_LIMIT = min(1 << 18, MAX_RECORD)
 """Maximum of bytes waiting for the master; then readings are passed over (queue = latest).
 """
@@ -189,7 +194,12 @@ class Subscriber:
             try:
                 uris = [source.uri for source in sources]
                 by_uri = await connect_all(
-                    stack, settings, uris, self._rosbridges, on_state=self._state_changed
+                    stack,
+                    settings,
+                    uris,
+                    self._rosbridges,
+                    on_state=self._state_changed,
+                    max_size=settings.message_bytes,
                 )
                 self._link.keep(Ready(f"connected to {', '.join(by_uri)}"))
                 await self._begun.wait()
@@ -225,6 +235,7 @@ class Subscriber:
             compression=source.compression,
         )
         timeout = self._settings.first_data_timeout
+        hint = asyncio.ensure_future(self._hint(ros, source))
         first, silent = True, False
         connection: int | None = None
         lost_before = 0
@@ -240,6 +251,7 @@ class Subscriber:
             if silent:
                 self._link.notice("info", f"messages of {source.topic} are back")
             first = silent = False
+            hint.cancel()
             self._received += 1
             if connection != ros.reconnections and not self._queue_all:
                 connection = ros.reconnections
@@ -248,6 +260,16 @@ class Subscriber:
             self._passed_over += subscription.lost - lost_before
             lost_before = subscription.lost
             self._read(at, message)
+
+    async def _hint(self, ros: Ros, source: Source) -> None:
+        """Report a topic that nobody publishes, with topics of similar names, since it may be mistyped."""
+        await asyncio.sleep(_HINT_AFTER)
+        if await ros.publishers(source.topic) != []:
+            return  # or the server has no rosapi
+        others = {name for name in await ros.topics() or [] if name != absolute(source.topic)}
+        near = difflib.get_close_matches(absolute(source.topic), others, 3, 0.6)
+        perhaps = f"; did you mean {' or '.join(shown(name) for name in near)}?" if near else ""
+        self._link.notice("warning", f"{source.topic} has no publisher at {ros.uri} yet{perhaps}")
 
     def _read(self, at: int, message: Message) -> None:
         try:

@@ -28,6 +28,7 @@ async def print_variables(settings: Settings, source: Source, names: list[str], 
         connect_timeout=settings.connect_timeout,
         retry=True,
         ca_file=settings.ca,
+        max_size=settings.message_bytes,
         ros_version=settings.ros_version,
     ) as ros:
         subscription = ros.subscribe(source.topic, source.type, queue_size=RECEIVED_QUEUE)
@@ -70,7 +71,12 @@ async def print_addresses(settings: Settings, deployment: Deployment, count: int
     finished: asyncio.Future[None] = asyncio.get_running_loop().create_future()
     frames = TimedFrames(deployment, put)
     async with contextlib.AsyncExitStack() as stack:
-        by_uri = await connect_all(stack, settings, [source.uri for source in deployment.sources])
+        by_uri = await connect_all(
+            stack,
+            settings,
+            [source.uri for source in deployment.sources],
+            max_size=settings.message_bytes,
+        )
 
         async def follow(at: int, source: Source) -> None:
             subscription = by_uri[settings.uri or source.uri].subscribe(

@@ -1,9 +1,15 @@
 """The subscriber's counters: what is lost reaches the master once, and stays in the status."""
 
+import asyncio
+import contextlib
+
+import pytest
+
 from bridge.client import Message
 from services.pipeline.subscriber import Subscriber
 from services.settings import Settings
-from services.sockets.records import LossReason, Unusable
+from services.sockets.records import Begin, LossReason, Notice, Reading, Ready, Rosbridge, Unusable
+from tests.fake_rosbridge import FakeRosbridge
 from tests.integration.conftest import READING
 
 BUSY = 1 << 19
@@ -31,3 +37,44 @@ def test_an_unusable_message_is_reported_by_its_cause(boat, link):
     assert isinstance(first, Unusable)
     assert first.cause == second.cause
     assert subscriber.status().frames.lost == {LossReason.UNUSABLE: 2}
+
+
+@pytest.mark.parametrize(("existing", "hinted"), [("/boat/sensors2", True), ("/elsewhere", False)])
+async def test_a_topic_that_nobody_publishes_is_reported_with_similar_names(
+    boat, link, monkeypatch, existing, hinted
+):
+    monkeypatch.setattr("services.pipeline.subscriber._HINT_AFTER", 0.05)
+    async with FakeRosbridge(rosapi=True) as fake:
+        fake.know(existing, "boat_msgs/Sensors")
+        subscriber = Subscriber(Settings(uri=fake.uri), boat, link.make)
+        running = asyncio.create_task(subscriber.run())
+        while not any(isinstance(each, Ready) for each in link.sent):
+            await asyncio.sleep(0.01)
+        link.take(Begin(once=False))
+        while not any(isinstance(each, Notice) for each in link.sent):
+            await asyncio.sleep(0.01)
+        (notice,) = (each for each in link.sent if isinstance(each, Notice))
+        assert notice.level == "warning"
+        assert (existing in notice.sentence) is hinted
+        running.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await running
+
+
+@pytest.mark.parametrize(("limit", "completed"), [(4 << 20, 1), (1 << 20, 0)])
+async def test_a_large_message_is_taken_up_to_the_limit_of_the_settings(boat, link, limit, completed):
+    """As a camera beside the readings sends them."""
+    async with FakeRosbridge() as fake:
+        settings = Settings(uri=fake.uri, message_bytes=limit)
+        running = asyncio.create_task(Subscriber(settings, boat, link.make).run())
+        while not any(isinstance(each, Ready) for each in link.sent):
+            await asyncio.sleep(0.01)
+        link.take(Begin(once=False))
+        await fake.wait_for_op("subscribe", topic="/boat/sensors")
+        await fake.publish("/boat/sensors", READING | {"image": "x" * (2 << 20)})
+        while not any(isinstance(each, Reading | Rosbridge) for each in link.sent):
+            await asyncio.sleep(0.01)
+        assert sum(isinstance(each, Reading) for each in link.sent) == completed
+        running.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await running
