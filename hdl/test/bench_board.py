@@ -1,9 +1,9 @@
-"""The VHDL board beside the emulated one: the same accesses to both, the same answers from both.
+"""Comparison of the VHDL board with the emulated board: both get the same accesses and must answer alike.
 
     random accesses --+--> AXI4-Lite --> bm1 (GHDL)  --> answers, counters, states of the generators
                       +--> EmulatedBoard             --> the same?
 
-A cocotb module; `simulation.run_bench` runs it. The case is that of the variable `HDL_SEED`.
+This is a cocotb module, which `simulation.run_bench` runs. The variable `HDL_SEED` selects the case.
 """
 
 from __future__ import annotations
@@ -45,18 +45,18 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 FRAMES: Final = 5
-"""Frames of a session, between which anything may happen."""
+"""Number of frames in a session; anything may happen between them."""
 
 _ACCESS_CLOCKS: Final = 14
-"""More than an access takes, from the first address bit to its answer."""
+"""Upper bound of an access, in clocks, from the first address bit to its answer."""
 
 _NS: Final = 10
 _NOT_COMPARED: Final = (rm.CAP_SPEED, rm.COMPUTE_NS, rm.COMPUTE_NS + 4)
-"""What depends on the clock: the emulated board measures its own."""
+"""Registers that depend on the clock, which the emulated board measures itself."""
 
 
 class SlowKernel:
-    """A kernel that runs one cycle and pauses, so that the emulated board is found running."""
+    """A kernel that runs one cycle and pauses, so that the emulated board can be accessed while it runs."""
 
     def __init__(self, machine: BM1Machine) -> None:
         self.kernel: BM1Kernel = reference_kernel(machine)
@@ -66,7 +66,7 @@ class SlowKernel:
         return getattr(self.kernel, name)
 
     def start(self, start: Start) -> StopReason:
-        """Run a frame's first cycle; the board goes on with `resume`."""
+        """Run a frame's first cycle; the board continues with `resume`."""
         return self.kernel.start(replace(start, run_until=1) if self.slow else start)
 
     def resume(self, run_until: int, halted: Collection[int] = ()) -> StopReason:
@@ -75,7 +75,7 @@ class SlowKernel:
 
 
 class Both:
-    """Both boards: an access goes to each, and what they answer must be the same."""
+    """Both boards: each access is made on both, and their answers must be the same."""
 
     def __init__(self, dut: Any, case: Case) -> None:
         self.dut = dut
@@ -92,7 +92,7 @@ class Both:
         self.power_up()
 
     def power_up(self) -> None:
-        """Make the emulated board anew; the other one is reset with its pin."""
+        """Create a new emulated board, and reset the hardware with its pin."""
         self.board = EmulatedBoard(self._make)
         self.board.load(image_bytes(self.case.image))
         self.slow.slow = True
@@ -102,17 +102,17 @@ class Both:
         self.slow.slow = False  # while the board measures its speed
         return self.slow
 
-    # ---- signals whose names cocotb gives without a direction ------------------------------------------
+    # ---- signals ---------------------------------------------------------------------------------------
 
     async def reset_pin(self) -> None:
-        """Reset the hardware for some clocks."""
+        """Hold the hardware in reset for some clocks."""
         self.dut.rstn_i.value = 0
         await ClockCycles(self.dut.clk_i, 4)
         self.dut.rstn_i.value = 1
         await ClockCycles(self.dut.clk_i, 2)
 
     async def count_interrupts(self) -> None:
-        """Count the clocks in which the interrupt is raised, for ever."""
+        """Count the clocks in which the interrupt is raised, until the simulation ends."""
         while True:
             await FallingEdge(self.dut.clk_i)
             self.interrupts += self.dut.irq_o.value == 1
@@ -120,7 +120,7 @@ class Both:
     # ---- accesses ----------------------------------------------------------------------------------------
 
     async def hardware_read(self, address: int) -> int | None:
-        """Return a word of the hardware, None where it refuses."""
+        """Return a word of the hardware, None if it refuses the read."""
         answer = await self.axi.read(address, 4 - address % 4)
         if answer.resp == AxiResp.SLVERR:
             return None
@@ -128,7 +128,7 @@ class Both:
         return int.from_bytes(answer.data[:4], "little")
 
     async def read(self, address: int) -> int | None:
-        """Read a word of both and compare; None where both refuse."""
+        """Read a word of both, compare, and return it; None if both refuse."""
         found = await self.hardware_read(address)
         try:
             expected: int | None = int.from_bytes(self.board.read(address, 1), "little")
@@ -144,7 +144,7 @@ class Both:
         return found
 
     async def write(self, address: int, value: int) -> bool:
-        """Write a word to both and compare the answers; whether it was taken."""
+        """Write a word to both, compare the answers, and return whether it was accepted."""
         answer = await self.axi.write(address, value.to_bytes(4, "little")[: 4 - address % 4])
         try:
             self.board.write(address, value.to_bytes(4, "little"))
@@ -180,7 +180,7 @@ class Both:
         assert found == expected, f"generators: {found} instead of {expected}"
 
     async def compare_outcome(self) -> None:
-        """Compare all that an interrupt carries, every result, and the generators."""
+        """Compare the interrupt's message, every result, and the generators."""
         for address in (rm.STATUS, rm.DONE, rm.CYCLES, rm.CYCLES + 4, rm.START, rm.RESUME):
             await self.read(address)
         _, results = interface_words(self.parameters)
@@ -193,14 +193,14 @@ class Both:
         self.compare_states()
 
     async def compare_everything(self) -> None:
-        """Compare every word that the board implements, and the first one of each block that it does not."""
+        """Compare every implemented word, and the first unimplemented word after each block."""
         for block in rm.BLOCKS:
             for word in range(block.words):
                 if await self.read(block.address + 4 * word) is None and block.address not in _NOT_COMPARED:
                     break
 
     async def wait_for_seeds(self) -> None:
-        """Wait until the generators are loaded: after a reset it takes a clock for each."""
+        """Wait until the generators are loaded, which takes one clock for each after a reset."""
         for _ in range(self.slow.rng_state.size + 8):
             if self.dut.core.seeds_ready.value == 1 and self.dut.rstn_i.value == 1:
                 return
@@ -210,7 +210,7 @@ class Both:
     # ---- running -----------------------------------------------------------------------------------------
 
     def cycles_left(self) -> int:
-        """Return how many cycles the emulated machine still has to run, of this slice."""
+        """Return the number of cycles that remain for the emulated machine in this slice."""
         if not self.board.running:
             return 0
         kernel = copy.deepcopy(self.slow.kernel)
@@ -237,7 +237,7 @@ class Both:
 
 
 class Session:
-    """Frames on both boards, with all that a host may do, right and wrong."""
+    """Frames on both boards, with every correct and incorrect access that a host may make."""
 
     def __init__(self, both: Both) -> None:
         self.both = both
@@ -251,7 +251,7 @@ class Session:
         return self.parameters.replicas == 1 and self.parameters.sensor_mode is SensorMode.COLUMN
 
     def chance(self, probability: float) -> bool:
-        """Whether something happens that has this probability."""
+        """Return True with this probability."""
         return bool(self.random.random() < probability)
 
     def pick(self, choices: Sequence[int]) -> int:
@@ -284,7 +284,7 @@ class Session:
                 return
 
     async def frame_of_many_slices(self) -> None:
-        """Run a frame in slices of few cycles; what is halted after the first one stays so."""
+        """Run a frame in slices of few cycles; replicas that are halted after the first slice stay halted."""
         p, both = self.parameters, self.both
         await self.write_inputs()
         for address, value in ((rm.TARGET_COUNT, p.target_count_max), (rm.BANK, 0), (rm.PRIOR_SELECT, 0)):
@@ -305,10 +305,10 @@ class Session:
                 await both.write(rm.HALT, mask & 0xFFFFFFFF)
             doorbell = rm.RESUME
 
-    # ---- what a host writes -----------------------------------------------------------------------------
+    # ---- writes of a host -------------------------------------------------------------------------------
 
     async def write_inputs(self) -> None:
-        """Write readings, some of them missing, and priors."""
+        """Write priors and readings, some of which are missing."""
         p, both = self.parameters, self.both
         words = self.readings().ravel().tolist()
         for at, word in enumerate(words):
@@ -323,7 +323,7 @@ class Session:
                 await both.write(rm.PRIOR_CODES + 4 * at, word)
 
     def readings(self) -> NDArray[np.int64]:
-        """Return a frame's inputs; a third of the columns is missing."""
+        """Return a frame's inputs; a third of the readings are missing."""
         p = self.parameters
         if not p.sensors:
             return np.empty(0, np.int64)
@@ -340,12 +340,12 @@ class Session:
             if self.chance(1 / 3):
                 by_column[at] = (1 << p.sensor_bits[at % p.sensors]) - 1
         if self.chance(0.1):
-            # no reading at all: with a prior of ones every line overflows in the same cycle
+            # without readings and with a prior of ones, every line overflows in the same cycle
             drawn[:] = np.broadcast_to(tops, shape)
         return drawn
 
     async def write_settings(self) -> None:
-        """Write target, limits and bank; often so that two reasons to stop fall into the same cycle."""
+        """Write target, limits and bank, often such that two reasons to stop occur in the same cycle."""
         p, both = self.parameters, self.both
         target = int(
             self.random.choice(
@@ -377,7 +377,7 @@ class Session:
         await both.write(rm.CONTROL, rm.CONTROL_INTERRUPT_ENABLE_MASK if self.chance(0.7) else 0)
 
     def last_cycle(self) -> int:
-        """Return the cycle at which a frame with the settings as they stand would stop, without slices."""
+        """Return the cycle at which a frame with the current settings would stop without slices."""
         twin = copy.deepcopy(self.both.slow.kernel)
         board = EmulatedBoard(lambda _: twin)
         board.load(image_bytes(self.both.case.image))
@@ -397,10 +397,10 @@ class Session:
             board.step()
         return twin.cycles
 
-    # ---- what goes wrong --------------------------------------------------------------------------------
+    # ---- refused accesses -------------------------------------------------------------------------------
 
     async def wrong_accesses(self) -> None:
-        """Access what is not there, or not so."""
+        """Access words that do not exist, or that do not allow this access."""
         both = self.both
         inputs, results = both.case.image.interface_sensors, both.case.image.interface_results
         places = [
@@ -431,7 +431,7 @@ class Session:
             rm.ID + 2,
         ]
         for place in self.random.choice(places, 8).tolist():
-            # what is written to an input stays there: it must be a value that a start takes
+            # an input keeps what is written to it, so it must be a value that a start accepts
             if self.chance(0.5):
                 await both.write(place, 0)
             await both.read(place)
@@ -439,7 +439,7 @@ class Session:
         await both.read(rm.LIVENESS)
 
     async def wrong_start(self) -> None:
-        """Ring with a wrong number or wrong settings, then put them right."""
+        """Ring with a wrong number or wrong settings, then correct them."""
         p, both = self.parameters, self.both
         due = next_doorbell(both.board.done)
         await both.write(rm.START, 0)
@@ -474,15 +474,15 @@ class Session:
             assert before is not None
             await both.write(address, value)
             await both.read(address)
-            if await both.write(rm.START, due):  # the value means nothing to this machine
+            if await both.write(rm.START, due):  # this machine ignores the value
                 await both.finish()
                 due = next_doorbell(both.board.done)
             await both.write(address, before)
 
-    # ---- while it runs ----------------------------------------------------------------------------------
+    # ---- accesses while a frame runs --------------------------------------------------------------------
 
     async def while_running(self, number: int) -> bool:
-        """Do what a host may try while the machine runs `number`; whether the frame was lost in a reset."""
+        """Try accesses while frame `number` runs, and return whether a reset ended the frame."""
         both = self.both
         left = both.cycles_left()
         if self.chance(0.15):
@@ -511,10 +511,10 @@ class Session:
         return False
 
     async def reset_while_running(self, left: int, number: int) -> None:
-        """Reset at any clock of the frame, or just behind its end."""
+        """Reset at any clock of the frame, or just after its end."""
         both = self.both
         while not both.board.running and both.dut.running.value == 1:
-            await RisingEdge(both.dut.clk_i)  # a frame of one cycle, or of none, while its seeds are loaded
+            await RisingEdge(both.dut.clk_i)  # a frame of one cycle or none, while its seeds are loaded
         wait = int(self.random.integers(0, left + 12))
         await ClockCycles(both.dut.clk_i, wait)
         control = rm.CONTROL_RESET_MASK | rm.CONTROL_INTERRUPT_ENABLE_MASK * self.chance(0.5)
@@ -538,7 +538,7 @@ class Session:
         assert both.interrupts == both.expected_interrupts, "interrupts"
 
     async def resume(self) -> bool:
-        """Ring for the next slice; whether it runs."""
+        """Ring for the next slice, and return whether it runs."""
         p, both = self.parameters, self.both
         due = next_doorbell(both.board.done)
         cycles = both.slow.cycles
@@ -547,7 +547,7 @@ class Session:
             assert not await both.write(rm.RESUME, due)
             assert not await both.write(rm.RESUME, next_doorbell(due))
         if self.chance(0.4):
-            # the frame keeps the readings and the target that it was started with
+            # the frame keeps the readings and the target with which it was started
             await self.write_inputs()
             await both.write(rm.TARGET_COUNT, 1)
             await both.write_long(rm.MAX_CYCLES, 1)
@@ -560,7 +560,7 @@ class Session:
                 await both.write(rm.HALT + 4 * word, mask >> 32 * word & 0xFFFFFFFF)
         if await both.write(rm.RESUME, due):
             return True
-        # no replica is left that could go on, or one was halted that is not there
+        # no replica can continue, or the mask halts a replica that does not exist
         for word in range(rm.HALT_WORDS):
             await both.write(rm.HALT + 4 * word, 0)
         return await both.write(rm.RESUME, due)
@@ -568,7 +568,7 @@ class Session:
 
 @cocotb.test()
 async def same_as_the_emulated_board(dut: Any) -> None:
-    """Play a session of the case's seed on both boards."""
+    """Run a session, drawn from the case's seed, on both boards."""
     case = random_case(int(os.environ["HDL_SEED"]))
     frames = int(os.environ.get("HDL_FRAMES", FRAMES))
     for channel in ("awvalid", "wvalid", "arvalid", "bready", "rready"):

@@ -1,9 +1,9 @@
-"""The guard by itself: numbers, cycles and masks that a machine never reaches in a simulation.
+"""Bench of the guard alone: numbers, cycles and masks that a machine never reaches in a simulation.
 
     access, state, settings --> bm1_guard     --> verdict
                             --> EmulatedBoard --> the same?
 
-A cocotb module for the entity `bm1_guard`, built for 3 replicas.
+This is a cocotb module for the entity `bm1_guard`, built for 3 replicas.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ _GOOD: Final = {
     "halt_i": 0,
     "bad_input_i": 0,
 }
-"""An access and a state in which a start is allowed, and a resume too."""
+"""An access and a state in which both a start and a resume are allowed."""
 
 
 async def verdict_on(dut: Any, **others: int) -> tuple[ErrorCode, bool]:
-    """Return the verdict on the good access with some values changed, and whether a doorbell rings."""
+    """Return the verdict on the good access with some values changed, and whether the doorbell rings."""
     for name, value in (_GOOD | others).items():
         getattr(dut, name).value = value
     await Timer(1, "ns")
@@ -49,7 +49,7 @@ async def verdict_on(dut: Any, **others: int) -> tuple[ErrorCode, bool]:
 
 @cocotb.test()
 async def doorbells_are_numbers_that_go_round(dut: Any) -> None:
-    """Ring with every number around the one that is due, up to 2^32 - 1 and from 1 again."""
+    """Ring with the numbers around the expected one, which wraps from 2^32 - 1 to 1."""
     for done in (0, 1, 2, 0x7FFFFFFF, 0xFFFFFFFE, 0xFFFFFFFF):
         due = next_doorbell(done)
         for number in {done, due, (due + 1) % 2**32, 1, 0xFFFFFFFF} - {0}:
@@ -63,7 +63,7 @@ async def doorbells_are_numbers_that_go_round(dut: Any) -> None:
 
 @cocotb.test()
 async def values_at_their_limits(dut: Any) -> None:
-    """Start and resume with each value at its limit, and one past it."""
+    """Start and resume with each value at its limit and one beyond it."""
     bad = (ErrorCode.BAD_VALUE, False)
     good = (ErrorCode.NONE, True)
     top = 2**63
@@ -85,8 +85,8 @@ async def values_at_their_limits(dut: Any) -> None:
         ("bank_i", 5, False),
         ("bank_i", 2**31, False),
         ("bad_input_i", 1, False),
-        ("prior_i", 2**31, True),  # replicas have selects of their own
-        ("halt_i", 2**256 - 1, True),  # a start halts nobody
+        ("prior_i", 2**31, True),  # each replica has its own selects
+        ("halt_i", 2**256 - 1, True),  # a start does not halt replicas
         ("can_resume_i", 0, True),
     ):
         assert await verdict_on(dut, **{name: value}) == (good if allowed else bad), f"start, {name} {value}"
@@ -104,14 +104,14 @@ async def values_at_their_limits(dut: Any) -> None:
         ({"halt_i": 0b001, "ready_i": 0b011}, good),
         ({"halt_i": 0b1000}, bad),
         ({"halt_i": 2**255}, bad),
-        ({"target_i": 0, "bad_input_i": 1, "max_cycles_i": 0, "bank_i": 9}, good),  # a frame keeps its own
+        ({"target_i": 0, "bad_input_i": 1, "max_cycles_i": 0, "bank_i": 9}, good),  # a frame keeps its target
     ):
         assert await verdict_on(dut, address_i=rm.RESUME, **others) == verdict, f"resume, {others}"
 
 
 @cocotb.test()
 async def every_address(dut: Any) -> None:
-    """Read and write every word of the map, and bytes between words, standing and running."""
+    """Read and write every word of the map, and bytes between words, while idle and while running."""
     implemented = {
         "SENSORS": 0,
         "INPUTS": 9,

@@ -1,9 +1,9 @@
-"""The register block by itself: 64-bit values that a machine never reaches in a simulation.
+"""Bench of the register block alone: 64-bit values that a machine never reaches in a simulation.
 
     reads and writes --> bm_register_block --> words read
     64-bit counters  -->
 
-A cocotb module for the entity `bm_register_block`.
+This is a cocotb module for the entity `bm_register_block`.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ ROUNDS: Final = 40
 
 
 class Block:
-    """The block, with one access after the other."""
+    """The block, accessed one word at a time."""
 
     def __init__(self, dut: Any) -> None:
         self.dut = dut
 
     async def start(self) -> None:
-        """Give the clock, and reset."""
+        """Start the clock and reset the block."""
         Clock(self.dut.clk_i, 10, "ns").start(start_high=False)
         for name in dir(self.dut):
             if name.endswith("_i") and name != "clk_i":
@@ -56,7 +56,7 @@ class Block:
 
 @cocotb.test()
 async def the_low_word_holds_the_high_one(dut: Any) -> None:
-    """Read both words of a counter that goes on between the reads: the pair is the value of the first read."""
+    """Read both words of a counter that changes between the reads: the pair is the value at the first read."""
     block = Block(dut)
     await block.start()
     random = np.random.default_rng(1)
@@ -69,7 +69,7 @@ async def the_low_word_holds_the_high_one(dut: Any) -> None:
             await block.read(rm.STATUS)
             high = await block.read(address + 4)
             assert high << 32 | low == first
-            # it is held once: without a low word before, the high one is what it is
+            # the high word is held for one read only; without a read of the low word it is the current one
             assert await block.read(address + 4) == second >> 32
             port.value = third
             assert await block.read(address + 4) == third >> 32
@@ -77,7 +77,7 @@ async def the_low_word_holds_the_high_one(dut: Any) -> None:
 
 @cocotb.test()
 async def words_of_a_long_register_are_written_one_by_one(dut: Any) -> None:
-    """Write either word of a 64-bit setting: the other one stays."""
+    """Write either word of a 64-bit setting: the other word does not change."""
     block = Block(dut)
     await block.start()
     random = np.random.default_rng(2)
@@ -93,7 +93,7 @@ async def words_of_a_long_register_are_written_one_by_one(dut: Any) -> None:
 
 @cocotb.test()
 async def a_reset_is_a_pulse(dut: Any) -> None:
-    """Write CONTROL: the reset lasts one clock and reads 0; the interrupt's bit stays."""
+    """Write CONTROL: the reset lasts one clock and reads as 0; the interrupt's bit keeps its value."""
     block = Block(dut)
     await block.start()
     await block.write(rm.CONTROL, rm.CONTROL_RESET_MASK | rm.CONTROL_INTERRUPT_ENABLE_MASK)

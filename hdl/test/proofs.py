@@ -1,4 +1,4 @@
-"""Formal proofs of small properties, by yosys: for every input, table and seed, and not only for those of a simulation."""
+"""Formal proofs of small properties by yosys, for every input, table and seed."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ module bm1_table #(parameter FILE_NAME = 0, WORD_BITS = 1, DEPTH = 1, ADDRESS_BI
   assign data_o = anything;
 endmodule
 """
-"""A table that may say anything at any time."""
+"""A table whose output may be anything at any time."""
 
 _INDUCTION: Final = (
     "sat -verify -prove-asserts -set-assumes -tempinduct -seq 1 -maxsteps 4 "
-    # what the machine has kept of the start is what the properties have kept: without it an induction begins nowhere
+    # the machine and the properties keep the same values of a start; without this, induction fails
     "-prove frame_target core.core.control.target -prove frame_max core.core.control.max_cycles"
 )
 _BOUNDED: Final = (
@@ -39,15 +39,15 @@ def proofs() -> tuple[str, ...]:
 
 
 def failed_proof(name: str, folder: Path, hdl: Path = HDL) -> str | None:
-    """Try a proof, and return why it fails, None where it holds.
+    """Try a proof, and return why it fails, or None.
 
     Args:
         name: One of `proofs`.
-        folder: Where the tools work.
-        hdl: Folder of the VHDL; another one for mutants.
+        folder: Working folder of the tools.
+        hdl: Folder of the VHDL, which differs for mutants.
 
     Raises:
-        HardwareToolError: GHDL is not installed, or refuses the hardware.
+        HardwareToolError: GHDL is not installed or refuses the hardware.
     """
     image = random_case(0).image
     if name == "guard":

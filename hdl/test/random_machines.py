@@ -1,4 +1,4 @@
-"""Random machines whose hardware is compared with the emulated board: every mode and width comes up."""
+"""Random machines of every mode and width, whose hardware is compared with the emulated board."""
 
 from __future__ import annotations
 
@@ -22,7 +22,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 MOST_CELLS: Final = 450
-"""Cells of a machine over all replicas: a simulator runs some thousand cycles a second of these."""
+"""Maximum number of cells over all replicas, of which a simulator runs some thousand cycles per second.
+"""
 
 _KINDS: Final = (RngKind.LFSR32, RngKind.LFSR16, RngKind.TABLE, RngKind.LFSR24, RngKind.LFSR8)
 _MODES: Final = (SensorMode.COLUMN, SensorMode.CELL, SensorMode.COLUMN, SensorMode.THRESHOLD)
@@ -30,14 +31,14 @@ _MODES: Final = (SensorMode.COLUMN, SensorMode.CELL, SensorMode.COLUMN, SensorMo
 
 @dataclass(frozen=True)
 class Case:
-    """A machine on a board, and the seed of what is done with it."""
+    """A machine on a board, and the seed of its session."""
 
     image: Image
     seed: int
 
     @property
     def name(self) -> str:
-        """Size and modes, in a few words."""
+        """Size and modes of the machine, for people."""
         p = self.image.machine.parameters
         return (
             f"case {self.seed}: {p.lines} x {p.sensors}, codes {p.prob_bits}, counters {p.counter_bits}, {p.rng}, "
@@ -51,9 +52,9 @@ class Case:
 
 
 def random_case(seed: int, most_cells: int = MOST_CELLS) -> Case:
-    """Return the case of a seed: always the same.
+    """Return the case of a seed, always the same one.
 
-    Kinds of generators, sensor modes, sharing, priors and replicas go round with the seed; the rest is drawn.
+    Kinds of generators, sensor modes, sharing, priors and replicas cycle with the seed; the rest is random.
     """
     random = np.random.default_rng(seed)
     kind = _KINDS[seed % len(_KINDS)]
@@ -99,7 +100,7 @@ def random_case(seed: int, most_cells: int = MOST_CELLS) -> Case:
 def _tables(
     random: np.random.Generator, parameters: BM1Parameters
 ) -> tuple[NDArray[np.uint16], tuple[NDArray[np.uint16], ...]]:
-    """Return the prior and the tables of the columns, from some in which little survives to some full of ones."""
+    """Return the prior and the tables of the columns, which range from mostly zeros to mostly ones."""
     zeros = float(random.choice([0.0, 0.02, 0.1]))
     typical = float(random.choice([0.3, 0.7, 0.9, 1.0]))
     prior = codes(random, parameters, parameters.prior_addresses, zeros, typical)
@@ -107,7 +108,7 @@ def _tables(
     for bits in parameters.sensor_bits if parameters.has_tables else ():
         table = codes(random, parameters, 1 << bits, zeros, typical)
         if bits > 1 and random.random() < 0.5:
-            table[0] = 0  # an address at which no line can count
+            table[0] = 0  # an address at which every line is impossible
         table[-1] = parameters.ones_code
         tables.append(table)
     return prior, tuple(tables)
@@ -116,7 +117,7 @@ def _tables(
 def codes(
     random: np.random.Generator, parameters: BM1Parameters, rows: int, zeros: float, typical: float
 ) -> NDArray[np.uint16]:
-    """Return random codes, uint16[rows, lines]; lines are often equal, so that several overflow at once."""
+    """Return random codes, uint16[rows, lines], often with equal lines so that several overflow at once."""
     ones = parameters.ones_code
     shape = (rows, parameters.lines)
     spread = random.uniform(max(2 * typical - 1, 0), min(2 * typical, 1.1), shape)
@@ -130,7 +131,7 @@ def codes(
 
 
 def _numbers(random: np.random.Generator, parameters: BM1Parameters) -> NDArray[np.uint32] | None:
-    """Return a table of random numbers where one is played; its length is seldom a power of two."""
+    """Return a table of random numbers if the machine plays one; its length is seldom a power of two."""
     if parameters.rng is not RngKind.TABLE:
         return None
     length = int(random.choice([1, 2, 17, 64, 199, 500]))

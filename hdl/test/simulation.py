@@ -1,4 +1,4 @@
-"""GHDL and cocotb: analyses the hardware of an image and runs a bench on it."""
+"""Simulation by GHDL and cocotb: analysis of an image's hardware, and runs of benches on it."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ SOURCES: Final = (
     "bm1_axi.vhd",
     "bm1.vhd",
 )
-"""The hardware's files in the order of their analysis, after the generated package of parameters."""
+"""The hardware's files in the order of analysis, after the generated package of parameters."""
 
 SIMULATED_TABLE: Final = "simulation/bm1_table_textio.vhd"
 
@@ -51,12 +51,12 @@ _LIMIT_S: Final = 1200.0
 
 
 class HardwareToolError(Exception):
-    """A tool is missing or failed; the sentence says which, and its last words."""
+    """A tool is missing or failed; the text names it and ends with its output."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a bench found: nothing where the hardware is right."""
+    """The failures that a bench found."""
 
     failures: tuple[str, ...]
 
@@ -70,13 +70,13 @@ def prepare(image: Image, folder: Path, hdl: Path = HDL, more_sources: Sequence[
     """Write an image's files into a folder and analyse its hardware there.
 
     Args:
-        image: What the board is built for.
-        folder: Where the simulation lies.
-        hdl: Folder of the VHDL; another one for mutants.
+        image: Image of the board.
+        folder: Folder of the simulation.
+        hdl: Folder of the VHDL, which differs for mutants.
         more_sources: Further files, relative to `hdl`, after the others.
 
     Raises:
-        HardwareToolError: GHDL is not installed, or it refused a file.
+        HardwareToolError: GHDL is not installed or refused a file.
     """
     write_hardware_files(image, folder)
     sources = [hdl / SOURCES[0], folder / "bm1_parameters.vhd", *(hdl / name for name in SOURCES[1:])]
@@ -95,7 +95,7 @@ def run_bench(
 
     Args:
         module: The bench's module, such as `hdl.test.bench_board`.
-        folder: Where `prepare` analysed the design.
+        folder: Folder in which `prepare` analysed the design.
         top: The entity under test.
         variables: Further environment variables for the bench.
         options: Further options of the simulation, such as generics.
@@ -127,7 +127,7 @@ def run_bench(
     try:
         said = run_tool(command, folder, environment)
     except HardwareToolError as error:
-        # it ran, and went wrong: an index out of its bounds, an assertion
+        # it ran and failed, for example by an index out of bounds or an assertion
         if "simulation failed" not in str(error):
             raise
         return Outcome((next(line for line in str(error).splitlines() if ":error:" in line),))
@@ -153,7 +153,7 @@ def run_tool(
     *,
     separate: bool = False,
 ) -> str:
-    """Run a tool in a folder and return what it printed: with `separate`, its output without its warnings.
+    """Run a tool in a folder and return its output, with `separate` without its warnings.
 
     Raises:
         HardwareToolError: It is not installed, failed, or did not end in time.
@@ -175,7 +175,7 @@ def run_tool(
 
 
 def unit_benches() -> dict[str, tuple[str, dict[str, int]]]:
-    """Return the benches of single units: each one's module, and the unit with its generics."""
+    """Return the benches of single units: the module of each, and the unit with its generics."""
     from hdl.test.guard_generics import GENERICS
 
     return {

@@ -1,4 +1,4 @@
-"""The checks of the hardware, each by its name: sessions on random machines, benches of units, proofs."""
+"""Named checks of the hardware: sessions on random machines, benches of units, and proofs."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Check:
 
     Attributes:
         kind: `session`, `unit` or `proof`.
-        what: A session's seed, a bench's module, or a proof's name.
+        what: Seed of a session, module of a bench, or name of a proof.
     """
 
     kind: str
@@ -29,20 +29,20 @@ class Check:
 
     @property
     def name(self) -> str:
-        """What is checked, for people."""
+        """Description of the check, for people."""
         if self.kind == "session":
             return random_case(int(self.what)).name
         return f"{self.kind}: {self.what.rpartition('.')[2]}"
 
     def failure(self, hdl: Path = HDL, frames: int | None = None) -> str | None:
-        """Run the check and return why it fails, None where it passes.
+        """Run the check, and return why it fails, or None.
 
         Args:
-            hdl: Folder of the VHDL; another one for mutants.
-            frames: Frames of a session; None for as many as usual.
+            hdl: Folder of the VHDL, which differs for mutants.
+            frames: Number of frames in a session; None for the usual number.
 
         Raises:
-            HardwareToolError: A tool is missing, or refuses the hardware.
+            HardwareToolError: A tool is missing or refuses the hardware.
         """
         with tempfile.TemporaryDirectory(prefix="hdl-rosbayes-") as where:
             folder = Path(where)
