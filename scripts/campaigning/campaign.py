@@ -60,13 +60,13 @@ def expected_of(folders: list[Path]) -> Callable[[str, Addresses, int], Outcome]
     of_deployment = {folder.name: Expected(folder) for folder in folders}
     for folder, expected in zip(folders, of_deployment.values(), strict=True):
         kept = OUT / f"{folder.name}-{expected.hash}.pickle"
-        if not kept.exists():
+        outcomes = pickle.loads(kept.read_bytes()) if kept.exists() else {}  # noqa: S301 - our own file
+        if missing := {(pair, bank) for pair in POOL for bank in range(BANKS)} - outcomes.keys():
             print(f"computing the right results of {folder.name} (once) ...", file=sys.stderr)
-            outcomes = {(pair, bank): expected.outcome(pair, bank) for pair in POOL for bank in range(BANKS)}
+            outcomes |= {(pair, bank): expected.outcome(pair, bank) for pair, bank in missing}
             OUT.mkdir(parents=True, exist_ok=True)
             kept.write_bytes(pickle.dumps(outcomes))
-        for (pair, bank), right in pickle.loads(kept.read_bytes()).items():  # noqa: S301 - our own file
-            known[folder.name, pair, bank] = right
+        known |= {(folder.name, pair, bank): right for (pair, bank), right in outcomes.items()}
 
     def outcome(name: str, addresses: Addresses, bank: int) -> Outcome:
         key = name, addresses, bank

@@ -23,7 +23,10 @@ from scripts.campaigning.observer import OLDEST, Finding, Flaw, Observer
 from scripts.campaigning.stack import NotThereError, Stack, Topology
 from scripts.campaigning.wire import REPORTS, Client, now
 
-POOL = ((0, 0), (1, 0), (2, 1), (3, 2), (3, None), (4, 3), (5, 3), (6, 4), (None, 2), (None, None))
+POOL = (
+    *((0, 0), (2, 1), (3, 2), (5, 3), (6, 4), (3, None), (None, 2), (None, None)),
+    *((4, 1), (5, 1), (6, 1), (0, 3)),  # sensors that contradict each other need several slices
+)
 """Readings of a campaign; few, because the reference kernel is slow."""
 _ANSWER = 0.1
 """Seconds that the publisher waits for a result before it publishes the next reading."""
