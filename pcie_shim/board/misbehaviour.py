@@ -37,6 +37,10 @@ class MisbehaviourKind(StrEnum):
     """The machine starts and never stops."""
     DONE_TWICE = "done-twice"
     """An interrupt is sent twice, as two interrupts with the same doorbell number."""
+    DONE_EARLY = "done-early"
+    """An interrupt is sent while the machine is still running."""
+    STALE_RESULT = "stale-result"
+    """An interrupt has the doorbell number and the results of the one before."""
 
 
 @dataclass(frozen=True, slots=True)

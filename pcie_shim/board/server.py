@@ -244,6 +244,7 @@ class _Server:
         self._misbehaviour = misbehave
         self._starts = 0
         self._faults = 0
+        self._last_results = b""
         self.board = EmulatedBoard()
         self._host: _Host | None = None
         self._silent_hosts: dict[int, _Host] = {}
@@ -373,16 +374,21 @@ class _Server:
                 self._send(host, framing.WRITE, framing.REPLY, sequence, address, b"")
             if board.done != done or board.running:
                 self._starts += 1
+                if self._wrong(MisbehaviourKind.DONE_EARLY):
+                    self._interrupt(host)
                 self._interrupt_if_done()
         else:
             raise FramingError(f"the register port does not support operation {operation}")
 
     def _interrupt_if_done(self) -> None:
         board, host = self.board, self._host
-        if board.running or host is None or not board.interrupt_enabled:
-            return
+        if not board.running and host is not None and board.interrupt_enabled:
+            self._interrupt(host)
+
+    def _interrupt(self, host: _Host) -> None:
         host.interrupts = (host.interrupts + 1) & ALL_ONES
-        self._send(host, framing.IRQ, 0, host.interrupts, register_map.DONE, board.interrupt_words())
+        words = self.board.interrupt_words()
+        self._send(host, framing.IRQ, 0, host.interrupts, register_map.DONE, words)
 
     def _drop_host(self, host: _Host) -> None:
         if host is self._host:
@@ -418,6 +424,10 @@ class _Server:
         if self._wrong(MisbehaviourKind.STALL):
             host.stalled = True
             return
+        if operation == framing.IRQ:
+            last, self._last_results = self._last_results, words
+            if last and self._wrong(MisbehaviourKind.STALE_RESULT):
+                words = last
         if words and self._wrong(MisbehaviourKind.SHORT_READ):
             words = words[:-4]
         if words and self._wrong(MisbehaviourKind.ALL_ONES):

@@ -310,6 +310,8 @@ OWN = {"stop": "own"}
         ("wrong-sequence", BoardLinkError, True),
         ("wrong-crc", BoardLinkError, True),
         ("done-twice", BoardLinkError, False),
+        ("done-early", BoardLinkError, False),
+        ("stale-result", BoardLinkError, False),
         ("all-ones", BoardGoneError, True),
     ],
 )
