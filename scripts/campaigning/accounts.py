@@ -56,6 +56,13 @@ IN_FLIGHT = 1.0
 """Seconds that a reading may have been on its way when a fault began."""
 
 
+def in_transit(added: Counters, readings: Iterable[Reading]) -> tuple[int, int]:
+    """Return the readings and the results that no counter knows of: those between two processes when they were cut."""
+    given = [each for each in readings if each.forwarded]
+    arrived = sum(each.arrived is not None for each in given)
+    return max(0, len(given) - added.completed - added.losses), max(0, added.completed - arrived)
+
+
 def judge(added: Counters, readings: Iterable[Reading], excuses: Excuses, now: float) -> list[Finding]:
     """Compare what the master counted with the readings of the same time, when nothing is in flight."""
     findings = []

@@ -29,7 +29,7 @@ from scripts.campaigning.wire import TOPIC, TYPE
 from scripts.processes import ROOT, Process, run_script
 
 FRAMES = 100_000
-SHORT_SECONDS = 150.0
+SHORT_SECONDS = 120.0
 STEPS = 10
 """Steps of a round."""
 SHRINKING = 300.0
@@ -86,6 +86,7 @@ class Report:
     rounds: int = 0
     faults: Counter[str] = field(default_factory=Counter)
     losses: Counter[str] = field(default_factory=Counter)
+    transit: Counter[str] = field(default_factory=Counter)
     findings: list[Finding] = field(default_factory=list)
     recoveries: list[Recovery] = field(default_factory=list)
     slopes: dict[str, tuple[float, float]] = field(default_factory=dict)
@@ -99,6 +100,7 @@ class Report:
         done = steps if result.failed_step < 0 else steps[: result.failed_step + 1]
         self.faults.update(f"{fault.kind}: {fault.what}" for step in done for fault in step)
         self.losses.update(result.losses)
+        self.transit.update(dict(zip(("readings", "results"), result.transit, strict=True)))
         self.findings += result.findings
         self.recoveries += result.recoveries
 
@@ -111,6 +113,7 @@ class Report:
             "faults: " + ", ".join(f"{name} {number}" for name, number in sorted(self.faults.items())),
             "counted losses: "
             + (", ".join(f"{why} {n}" for why, n in sorted(self.losses.items())) or "none"),
+            f"cut off between two processes: {self.transit['readings']} readings, {self.transit['results']} results",
             "wrong: " + (", ".join(f"{flaw} {number}" for flaw, number in flaws.items()) or "nothing"),
         ]
         if self.recoveries:
@@ -222,6 +225,7 @@ class Campaign:
                 "rounds": report.rounds,
                 "faults": report.faults,
                 "losses": report.losses,
+                "in_transit": report.transit,
                 "findings": Counter(str(each.flaw) for each in report.findings),
                 "recoveries": [[each.step, each.seconds, each.slowness] for each in report.recoveries],
                 "slopes": report.slopes,

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 from enum import StrEnum
 
 from scripts.campaigning.accounts import Excuses
-from scripts.campaigning.stack import BOARD_NAMES, SERVICES, Topology
+from scripts.campaigning.stack import BOARD_NAMES, BOARDS_PARENT, SERVICES, Topology
 
 
 class Kind(StrEnum):
@@ -36,20 +36,22 @@ class Fault:
     number: int = 0
 
     def __str__(self) -> str:
+        if self.what == "misbehave":
+            return f"{self.target} misbehaves: {MISBEHAVIOURS[self.number]}"
         parts = [self.what, self.target, f"{self.seconds:.2f} s" if self.seconds else ""]
         return " ".join(part for part in (*parts, str(self.number or "")) if part)
 
 
 Step = tuple[Fault, ...]
 """Faults that begin at the same time."""
-BOARD_ENDS = 2
-"""Steps of a round that may fail frames on boards: the fourth failed frame within a minute ends a master by design."""
+BOARD_ENDS = 3
+"""Frames of a round that may fail on boards: the fourth within a minute ends a master by design."""
 ENDS = {"master": 1, "hub": 2, "boards": BOARD_ENDS}
 MOST_ENDS = 2
 """Times that a round may end a process, or its connection to the master, of each other role."""
 MISBEHAVIOURS = (
     *("drop", "stall", "short-read", "endless", "wrong-sequence"),
-    *("wrong-crc", "all-ones", "wrong-map", "never-done", "done-twice"),
+    *("wrong-crc", "all-ones", "never-done", "done-twice", "done-early", "stale-result"),
 )
 _FAILS = {"kill", "corrupt", "repeat", "cut", "finish", "cut-inside", "misbehave"}
 _ENDS_LINK = {"kill", "corrupt", "repeat", "cut", "finish", "cut-inside", "memory"}
@@ -57,8 +59,12 @@ _CUTS_ROSBRIDGE = {"gone", "finish", "nonsense", "cut-inside", "files"}
 
 
 def ended_roles(fault: Fault) -> tuple[str, ...]:
-    """Return the roles that a fault costs one of the ends that the master forgives."""
-    if fault.what == "misbehave" or (fault.target in BOARD_NAMES and fault.what in {*_FAILS, "stop", "hold"}):
+    """Return the roles that a fault costs one of the ends that the master forgives; a frame of a board is one too."""
+    if fault.target == BOARDS_PARENT and fault.what == "kill":
+        return ("boards",)
+    if fault.what == "misbehave":
+        return ("boards", "boards")  # it is killed before
+    if fault.target in BOARD_NAMES and fault.what in {*_FAILS, "stop", "hold"}:
         return ("boards",)
     return (fault.target,) if fault.what in _ENDS_LINK and fault.target != "rosbridge" else ()
 
@@ -85,7 +91,8 @@ class Schedule:
         self._rng = rng
         self._topology = topology
         services = () if topology.fused else SERVICES
-        self._roles = ("hub", *BOARD_NAMES, *services, "master")
+        parent = () if topology.apart else (BOARDS_PARENT,)
+        self._roles = ("hub", *parent, *BOARD_NAMES, *services, "master")
         self._makers: list[tuple[Kind, Callable[[], Step]]] = [
             (Kind.SIGNALS, self._kill),
             (Kind.SIGNALS, self._stop),
@@ -114,7 +121,7 @@ class Schedule:
             if len(steps) == count or not self._makers:
                 break
             step = self._rng.choice(self._makers)[1]()
-            cost = Counter({role for fault in step for role in ended_roles(fault)})
+            cost = Counter(role for fault in step for role in ended_roles(fault))
             if all(ends[role] + cost[role] <= ENDS.get(role, MOST_ENDS) for role in cost):
                 ends += cost
                 steps.append(step)
@@ -146,8 +153,11 @@ class Schedule:
 
     def _rosbridge(self) -> Step:
         what = self._rng.choice(["gone", "hold", "slow", "delay", "nonsense", "cut-inside", "finish"])
+        longest = 4.0 if self._rng.random() < 0.9 else 20.0
         return (
-            Fault(Kind.ROSBRIDGE, what, "rosbridge", self._seconds(4), self._rng.randrange(len(NONSENSE))),
+            Fault(
+                Kind.ROSBRIDGE, what, "rosbridge", self._seconds(longest), self._rng.randrange(len(NONSENSE))
+            ),
         )
 
     def _link(self) -> Step:
@@ -168,7 +178,7 @@ class Schedule:
 
     def _resource(self) -> Step:
         what = self._rng.choice(["files", "memory", "disk"])
-        roles = [role for role in self._roles if role not in BOARD_NAMES]
+        roles = [role for role in self._roles if role not in {*BOARD_NAMES, BOARDS_PARENT}]
         target = "master" if what == "disk" else self._rng.choice(roles)
         return (Fault(Kind.RESOURCES, what, target, self._seconds(2)),)
 

@@ -8,12 +8,12 @@ from collections.abc import Iterable
 from scripts.campaigning.observer import Finding, Flaw
 from scripts.campaigning.round import RoundResult
 
-FEWEST = 4
+FEWEST = 3
 """Samples of a process below which it says nothing."""
 MOST_DESCRIPTORS = 8
 """Descriptors that a process may have more than at first, at rest."""
 MOST_KIB = 32 * 1024
-"""Memory that a process may gain after its second sample."""
+"""Memory that a process may gain in its second half."""
 
 
 def growth(results: Iterable[RoundResult]) -> tuple[dict[str, tuple[float, float]], list[Finding]]:
@@ -22,8 +22,8 @@ def growth(results: Iterable[RoundResult]) -> tuple[dict[str, tuple[float, float
     findings = []
     for result in results:
         for (role, pid), samples in result.resources.items():
-            steady = samples[1:]  # buffers and caches are filled by then
-            if len(samples) < FEWEST:
+            steady = samples[len(samples) // 2 :]  # buffers and caches are filled by then
+            if len(steady) < FEWEST:
                 continue
             frames, memory, descriptors = zip(*steady, strict=True)
             if frames[-1] == frames[0]:

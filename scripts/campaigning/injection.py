@@ -13,8 +13,12 @@ from pathlib import Path
 from scripts.campaigning.faults import MISBEHAVIOURS, NONSENSE, Fault
 from scripts.campaigning.stack import Stack
 
-_ROOM = 4 << 20
-"""Bytes of memory that a process may still take under a limit."""
+_FEWEST = 3
+"""Limit of descriptors under which a process can open nothing more."""
+_STARTS_BEFORE = 20
+_MISBEHAVING = 20.0
+"""Seconds in which a board should have misbehaved; one that lies in its greeting is not asked for another."""
+_FAILED = "failed on a board"
 _CLOCK_FILE = "clock"
 
 
@@ -82,11 +86,23 @@ class Injector:
         return killed
 
     async def _misbehave(self, fault: Fault) -> None:
-        """Start a board again as one that misbehaves once, after a few frames; it remains, and behaves from then on."""
+        """Start a board again as one that misbehaves once, after some frames, and wait until one has failed for it."""
         os.kill(await self._stack.pid(fault.target), signal.SIGKILL)
         await self._stack.ended(fault.target)
-        await self._stack.start_part(fault.target, f"{MISBEHAVIOURS[fault.number]}:20:1")
-        await asyncio.sleep(fault.seconds)
+        kind = MISBEHAVIOURS[fault.number]
+        await self._stack.start_part(fault.target, f"{kind}:{_STARTS_BEFORE}:1")
+        deadline = asyncio.get_running_loop().time() + _MISBEHAVING
+        back = failed = -1
+        while asyncio.get_running_loop().time() < deadline:
+            await asyncio.sleep(0.1)
+            counters = await self._stack.counters()
+            if counters is None:
+                continue
+            now_failed = counters.lost.get(_FAILED, 0)
+            if back < 0 or (failed != now_failed and counters.completed == back):
+                back, failed = counters.completed, now_failed  # the board is not back yet
+            elif failed != now_failed:
+                return
 
     async def _weather(self, fault: Fault) -> None:
         link = self._stack.links[fault.target]
@@ -135,7 +151,7 @@ class Injector:
             "memory": resource.RLIMIT_AS,
             "disk": resource.RLIMIT_FSIZE,
         }[fault.what]
-        least = {"files": used[1], "memory": _size(pid) + _ROOM, "disk": 0}[fault.what]
+        least = {"files": _FEWEST, "memory": _size(pid) // 2, "disk": 0}[fault.what]
         try:
             former = resource.prlimit(pid, which)
             resource.prlimit(pid, which, (least, former[1]))
@@ -172,4 +188,5 @@ def steppable_clock(folder: Path) -> dict[str, str]:
     """Return the variables under which processes have a clock that can be stepped."""
     path = folder / _CLOCK_FILE
     Injector.set_clock(path, 0)
-    return {"PYTHONPATH": str(Path(__file__).with_name("clock")), "CAMPAIGN_CLOCK": str(path)}
+    paths = [str(Path(__file__).with_name("clock")), *filter(None, [os.environ.get("PYTHONPATH")])]
+    return {"PYTHONPATH": os.pathsep.join(paths), "CAMPAIGN_CLOCK": str(path)}

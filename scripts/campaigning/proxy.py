@@ -22,7 +22,7 @@ class Weather:
         delay: Seconds by which each piece is late.
         rate: Bytes per second; 0 for no limit.
         spoil: Pieces that will have a changed byte.
-        repeat: Pieces that will be sent twice.
+        repeat: Pieces that will be sent again, before the next one.
         cut_inside: Whether the next piece is cut in its middle, and its connection with it.
         insert: Bytes that go to each client before its next message.
     """
@@ -128,6 +128,7 @@ class Proxy:
                 if not to_client:  # without compression, messages can be read here
                     head = re.sub(rb"(?i)sec-websocket-extensions:[^\r]*\r\n", b"", head)
                 writer.write(head)
+            former = b""
             while True:
                 if to_client and self.on_reading is not None:
                     piece = await _websocket_frame(reader)
@@ -135,10 +136,13 @@ class Proxy:
                     piece = await reader.read(CHUNK)
                 if not piece:
                     return
-                if not await self._give(piece, writer, to_client=to_client):
+                if not await self._give(piece, former, writer, to_client=to_client):
                     return
+                former = piece
 
-    async def _give(self, piece: bytes, writer: asyncio.StreamWriter, *, to_client: bool) -> bool:
+    async def _give(
+        self, piece: bytes, former: bytes, writer: asyncio.StreamWriter, *, to_client: bool
+    ) -> bool:
         """Pass a piece on as the weather has it; return whether the connection lasts."""
         weather = self.weather
         if weather.delay:
@@ -157,7 +161,7 @@ class Proxy:
             piece = piece[:at] + bytes([piece[at] ^ (1 << self._rng.randrange(8))]) + piece[at + 1 :]
         if weather.repeat:
             weather.repeat -= 1
-            piece += piece
+            piece = former + piece
         if rate := weather.rate:
             for start in range(0, len(piece), 256):
                 writer.write(piece[start : start + 256])

@@ -22,6 +22,8 @@ from scripts.processes import Process
 
 SERVICES = ("subscriber", "publisher", "pcie-app")
 BOARD_NAMES = tuple(f"board{at}" for at in range(BOARDS))
+BOARDS_PARENT = "boards"
+"""The process from which a master's boards are forked."""
 START_LIMIT = 120.0
 """Seconds until a process must be there, on a busy machine."""
 END_LIMIT = 30.0
@@ -47,6 +49,14 @@ class Topology(StrEnum):
     def apart(self) -> bool:
         """Whether the boards are not the master's own."""
         return self in {Topology.APART, Topology.FUSED_APART}
+
+
+def _parent(pid: int) -> int:
+    """Return the parent of a process; 0 if it has ended."""
+    try:
+        return int(Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[1])
+    except OSError:
+        return 0
 
 
 class NotThereError(Exception):
@@ -104,7 +114,8 @@ class Stack:
     def roles(self) -> tuple[str, ...]:
         """All roles that are processes in this topology."""
         services = () if self.topology.fused else SERVICES
-        return ("hub", *BOARD_NAMES, *services, "master")
+        parent = () if self.topology.apart else (BOARDS_PARENT,)
+        return ("hub", *parent, *BOARD_NAMES, *services, "master")
 
     async def start(self, on_reading: Callable[[int], None]) -> None:
         """Start everything; the master may not be ready yet when this returns.
@@ -123,6 +134,7 @@ class Stack:
         rosbridge = ["--uri", self._uri, "--connect-timeout", "60", "--ros-version", "1"]
         outside = [f"tcp://127.0.0.1:{outer}" for outer, _ in self._board_ports.values()]
         boards = ["--boards", ",".join(outside)]
+        limits = ["--peer-timeout", "60", "--board-timeout", "2"]
         listen = ["--listen", f"unix:{folder}/real-{role}.sock"]
         if role == "hub":
             return ["hub", "--port", str(self.hub_port)]
@@ -131,10 +143,10 @@ class Stack:
             listen = ["--listen", f"tcp://127.0.0.1:{self._board_ports[role][1]}"]
             return ["board", *listen, *index, *(["--misbehave", misbehave] if misbehave else [])]
         if role == "pcie-app":
-            return [role, *deployment, *listen, *boards, "--peer-timeout", "60"]
+            return [role, *deployment, *listen, *boards, *limits]
         if role in SERVICES:
             return [role, *deployment, *listen, *rosbridge]
-        master = ["master", "--loop", *deployment, *rosbridge, "--peer-timeout", "60", "--board-timeout", "2"]
+        master = ["master", "--loop", *deployment, *rosbridge, *limits]
         if self.topology is Topology.APART:
             return [*master, "--connect", str(folder)]
         fused = ["--fused"] if self.topology.fused else []
@@ -193,8 +205,9 @@ class Stack:
         """Return the number of a role's process; 0 if it cannot be found."""
         if role in self._parts:
             return 0 if self.is_over(role) else self._parts[role].pid
-        status = await self.status(role)
-        return 0 if status is None else int(str(status["pid"]))
+        status = await self.status(BOARD_NAMES[0] if role == BOARDS_PARENT else role)
+        pid = 0 if status is None else int(str(status["pid"]))
+        return _parent(pid) if role == BOARDS_PARENT and pid else pid
 
     async def status(self, role: str) -> dict[str, object] | None:
         """Return what a process says of itself; None if it does not answer."""
