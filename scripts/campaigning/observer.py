@@ -19,8 +19,8 @@ OLDEST = 5.0
 """Seconds after which a result is too late, outside a fault."""
 SETTLING = 5.0
 """Seconds that a fault may delay results beyond its end."""
-REMEMBERED = 2000
-"""Settled readings by which a repeated result is recognised."""
+REMEMBERED = 20_000
+"""Readings by which a repeated result is recognised."""
 LAYOUT = {"dim": [{"label": "x", "size": LINES, "stride": LINES}], "data_offset": 0}
 
 
@@ -67,6 +67,7 @@ class Reading:
     published: float
     forwarded: bool = False
     arrived: float | None = None
+    settled: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +93,6 @@ class Observer:
         self._expected = expected
         self._deployments = {0: {deployment}}
         self._readings: dict[int, Reading] = {}
-        self._settled = 0
         self._announced: _Announced | None = None
         self._last_number = 0
         self._last_index = -1
@@ -152,14 +152,15 @@ class Observer:
         return sum(each.forwarded for each in self.pending_readings())
 
     def pending_readings(self) -> list[Reading]:
-        """Return the readings since the last `settle`."""
-        return [each for each in self._readings.values() if each.index >= self._settled]
+        """Return the readings since the last `settle`, and older ones that had not reached the stack then."""
+        return [each for each in self._readings.values() if not each.settled]
 
     def settle(self) -> None:
         """Take note that nothing is in flight, and forget the readings of long ago."""
-        oldest = self._settled - REMEMBERED
-        self._settled = self.tally["readings"]
-        self._readings = {stamp: each for stamp, each in self._readings.items() if each.index >= oldest}
+        for reading in self.pending_readings():
+            reading.settled = reading.forwarded
+        newest = self.tally["readings"] - REMEMBERED
+        self._readings = {stamp: each for stamp, each in self._readings.items() if each.index >= newest}
 
     # --- what arrived --------------------------------------------------------------------------
 

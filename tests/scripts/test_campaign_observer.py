@@ -361,6 +361,16 @@ def test_a_fault_excuses_only_readings_of_its_time():
     assert run.play() == {Flaw.UNCOUNTED}
 
 
+def test_a_reading_that_comes_after_the_counters_were_read_is_counted_next_time():
+    observer = Observer(outcome, NAMES[0])
+    observer.published(stamp(0), (0, 0), 0.0)
+    observer.settle()
+    observer.forwarded(stamp(0))
+    assert judge(Counters(1, 0, {"passed over": 1}), observer.pending_readings(), Excuses(), 1.0) == []
+    observer.settle()
+    assert not observer.pending_readings()
+
+
 def test_results_of_a_killed_publisher_may_arrive():
     run = Recording()
     run.counters = Counters(8, 7, {"lost with the publisher": 1})
