@@ -200,7 +200,7 @@ NONSENSE = (
     _text(b"[1, 2, 3]"),
     _text(b"null"),
     _text(b'{"op": "publish", "topic": "/campaign/readings"}'),
-    _text(b'{"op": "publish", "topic": "/campaign/readings", "msg": {"near": "five", "far": []}}'),
+    _text(b'{"op": "publish", "topic": "/campaign/others", "msg": {"near": "five", "far": []}}'),
     _text(b'{"op": "fragment", "id": "x", "data": "aaa", "num": 7, "total": 3}'),
     _text(b'{"op": "png", "data": "bm90IGEgcGljdHVyZQ=="}'),
     _text(b"\xa1\x62op\x18", 0x82),
