@@ -1,8 +1,8 @@
 """Access control: tokens, origins of web pages, and the certificate that the hub presents.
 
-A token arrives in the header `Authorization: Bearer TOKEN`. Browsers cannot set that header: they offer the
-subprotocols `rosbridge` and `bearer.TOKEN`, of which the hub chooses the first, so that the token is not sent back.
-Tokens are compared in constant time, and appear in no log, no error and no `repr`.
+A token arrives in the header `Authorization: Bearer TOKEN`. Browsers cannot set that header; they offer the
+subprotocols `rosbridge` and `bearer.TOKEN`, and the hub chooses the first, so the token is not sent back.
+Tokens are compared in constant time and never appear in a log, an error or a `repr`.
 """
 
 import hmac
@@ -22,13 +22,13 @@ from websockets.typing import Origin, Subprotocol
 from bridge.hub.errors import HubError
 
 SUBPROTOCOL: Final = Subprotocol("rosbridge")
-"""The hub's subprotocol, for clients that ask for one."""
+"""The hub's subprotocol, for clients that request one."""
 _BEARER: Final = "bearer."
 _TOKEN: Final = re.compile(r"[A-Za-z0-9._~-]{16,1024}")
-"""Characters that both a header and a subprotocol accept."""
+"""Tokens of characters that both a header and a subprotocol accept."""
 _LOCAL: Final = r"(localhost|127\.\d+\.\d+\.\d+|\[::1\])(:\d+)?"
 LOCAL_ORIGIN: Final = re.compile(f"https?://{_LOCAL}")
-"""Web pages of this machine; pages from elsewhere could control a robot through their visitor's browser."""
+"""Web pages of this machine; any other page could control a robot through its visitor's browser."""
 _LOCAL_HOST: Final = re.compile(_LOCAL)
 _MAX_TOKENS: Final = 1000
 
@@ -49,7 +49,7 @@ class AccessPolicy:
     tls: ssl.SSLContext | None = None
 
     def __post_init__(self) -> None:
-        """Refuse tokens that cannot be sent, or could be guessed.
+        """Refuse tokens that cannot be sent or are easy to guess.
 
         Raises:
             HubError: A token is too short, or has characters that a header does not accept.
@@ -63,14 +63,15 @@ class AccessPolicy:
 
     @property
     def allowed_origins(self) -> list[Origin | re.Pattern[str] | None]:
-        """Return the origins for the WebSocket handshake; None stands for programs, which send none."""
+        """Return the origins that the handshake accepts; None stands for programs, which do not send one."""
         return [None, LOCAL_ORIGIN, *map(Origin, self.origins)]
 
     def refusal(self, request: Request, *, loopback: bool) -> HTTPStatus | None:
         """Return the status that refuses a request, or None to admit it.
 
-        On a loopback address, the request must be for this machine or the host of an allowed page: a web page that reaches
-        the hub under another name has had its name resolved to this machine (DNS rebinding).
+        On a loopback address, the request's host must be this machine or the host of an allowed page. A web
+        page that reaches the hub under another name has made that name resolve to this machine (DNS
+        rebinding).
         """
         if loopback and not self._is_for_this_machine(request):
             return HTTPStatus.FORBIDDEN
@@ -78,7 +79,8 @@ class AccessPolicy:
             return None
         matches = False
         for candidate in _presented(request):
-            for token in self.tokens:  # all of them, even after a match: the time must reveal nothing
+            # compare all of them, even after a match, because the time must not reveal anything
+            for token in self.tokens:
                 matches |= hmac.compare_digest(candidate.encode("utf-8", "replace"), token.encode())
         return None if matches else HTTPStatus.UNAUTHORIZED
 
@@ -95,7 +97,7 @@ def _presented(request: Request) -> list[str]:
         scheme, _, token = request.headers.get("Authorization", "").partition(" ")
         if scheme.lower() == "bearer":
             presented.append(token.strip())
-    except MultipleValuesError:  # no client sends that header twice
+    except MultipleValuesError:  # legitimate clients send this header only once
         return []
     for line in request.headers.get_all("Sec-WebSocket-Protocol"):
         names = (name.strip() for name in line.split(","))
@@ -104,15 +106,15 @@ def _presented(request: Request) -> list[str]:
 
 
 def choose_subprotocol(offered: Sequence[Subprotocol]) -> Subprotocol | None:
-    """Choose our subprotocol if it is offered, else none, which clients that offered others refuse."""
+    """Return the hub's subprotocol if it is offered, or None, upon which the client disconnects."""
     return SUBPROTOCOL if SUBPROTOCOL in offered else None
 
 
 def read_tokens(path: Path) -> tuple[str, ...]:
-    """Read a file of tokens, one a line; empty lines and lines that begin with # are ignored.
+    """Read a file of tokens, one per line; empty lines and lines that begin with # are ignored.
 
     Raises:
-        HubError: The file cannot be read, other users may read it, or it has no tokens.
+        HubError: The file cannot be read, can be read by other users, or has no tokens.
     """
     try:
         mode = path.stat().st_mode
@@ -125,13 +127,13 @@ def read_tokens(path: Path) -> tuple[str, ...]:
     tokens = tuple(line.strip() for line in lines if line.strip() and not line.startswith("#"))
     if not 1 <= len(tokens) <= _MAX_TOKENS:
         raise HubError(
-            f"{path} has {len(tokens)} tokens for the hub, expected 1 to {_MAX_TOKENS}, one a line"
+            f"{path} has {len(tokens)} tokens for the hub, expected 1 to {_MAX_TOKENS}, one per line"
         )
     return tokens
 
 
 def tls_context(certificate: Path, key: Path) -> ssl.SSLContext:
-    """Make the context for TLS 1.2 or later of the hub's certificate and its key, which has no passphrase (both PEM).
+    """Return the context for TLS 1.2 or later from the hub's certificate and its key without passphrase.
 
     Raises:
         HubError: A file cannot be read, or the two do not belong together.
@@ -153,7 +155,7 @@ def tls_context(certificate: Path, key: Path) -> ssl.SSLContext:
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether only this machine reaches an address to listen on."""
+    """Return whether an address to listen on can be reached only from this machine."""
     if host == "localhost":
         return True
     try:

@@ -1,15 +1,15 @@
-"""The rosbridge server without sockets: messages of clients in, messages for clients out.
+"""The rosbridge server without sockets, which turns messages from clients into messages for clients.
 
 The owner of sockets and clocks calls `Broker.connect`, `Broker.receive_turn`, `Broker.wake` and
-`Broker.disconnect`, then drains the outboxes of the clients that `Broker.take_ready` returns. The broker never waits,
-does not read the monotonic clock, and does not raise for anything that a client sends.
+`Broker.disconnect`, then drains the outboxes of the clients that `Broker.take_ready` returns. The broker
+never waits, never reads the monotonic clock, and never raises because of data from a client.
 
-Errors are refused as on the reference server: without an answer, unless the client asked for status messages
-(`set_level`); with a line in the log, and on `/rosout` for its subscribers. Only calls and goals are answered,
-with `result: false` and a sentence in `values`. A client continues to be served, whatever it sent before.
+Invalid operations are refused as on the reference server: with a line in the log and on `/rosout`, but
+without an answer unless the client requested status messages (`set_level`). Only calls and goals are
+answered, with `result: false` and a sentence in `values`. The client is served further.
 
-Messages are not checked against their types, but all output is strict JSON, with `null` for every NaN and infinity
-that was received.
+Messages are not checked against their types, but all output is strict JSON, with `null` for every NaN and
+infinity received.
 """
 
 import contextlib
@@ -121,7 +121,7 @@ class Broker:
         return client
 
     def disconnect(self, client: Client) -> None:
-        """Forget a client, and fail the calls and goals that it had yet to answer. Repeating it does nothing."""
+        """Remove a client, if that was not done yet, and fail the calls and goals that it had yet to answer."""
         if self.graph.clients.pop(client.number, None) is None:
             return
         dropped = sum(subscription.lane.dropped for subscription in client.subscriptions.values())
@@ -140,7 +140,7 @@ class Broker:
         self._reassembling.discard(client)
 
     def receive(self, client: Client, data: bytes, now: float) -> None:
-        """Perform one message of a client.
+        """Perform the operation in one message of a client.
 
         Args:
             client: Its sender.
@@ -166,8 +166,9 @@ class Broker:
             now: Monotonic seconds.
 
         Returns:
-            How many were performed. The others need another turn, once the client has read its answers if its outbox is
-            congested, and once the definitions are loaded if `definitions.pending` is true.
+            The number of messages performed. The others need another turn: after the client has read its
+            answers if its outbox is congested, and after the definitions are loaded if `definitions.pending`
+            is true.
         """
         self._now, self._operation_id = now, None
         dispatcher, publish_again, outbox = self._dispatcher, self._topics.publish_again, client.outbox
@@ -192,7 +193,7 @@ class Broker:
                 operation = orjson.loads(data)
             except orjson.JSONDecodeError:
                 operation = None
-        if type(operation) is not dict:  # `decode` reads NaN, and raises for everything else
+        if type(operation) is not dict:  # `decode` accepts NaN, and raises for everything else
             operation = decode(data, max_size=self.limits.message_bytes, max_depth=self.limits.depth)
             raw = None
         elif is_deeper(data, self.limits.depth):
@@ -210,7 +211,7 @@ class Broker:
             handler(client, operation, now)
 
     def wake(self, now: float) -> None:
-        """Do what is due at `now`: release throttled messages, fail calls, give up incomplete messages."""
+        """Release throttled messages, fail calls and drop incomplete messages that are due at `now`."""
         self._dispatcher.release(now)
         self._calls.expire(now)
         if now >= self._fragment_deadline:
@@ -221,7 +222,7 @@ class Broker:
             self._fragment_deadline = min(map(_fragment_deadline, self._reassembling), default=inf)
 
     def take_ready(self) -> list[Client]:
-        """Return the clients with output or a reason to be closed since the last call."""
+        """Return the clients that have output or must be closed, if they were not returned before."""
         return self._dispatcher.take_ready()
 
     def _take_fragment(self, client: Client, operation: Operation, now: float) -> None:
@@ -238,7 +239,7 @@ class Broker:
                 raise DefinitionsPendingError(message) from None
 
     def _note_fragments(self, client: Client) -> None:
-        """Note when a client's incomplete messages expire."""
+        """Schedule the expiry of a client's incomplete messages."""
         if client.fragments:
             self._reassembling.add(client)
             self._fragment_deadline = min(self._fragment_deadline, client.fragments.deadline)

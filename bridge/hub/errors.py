@@ -1,4 +1,4 @@
-"""Errors of the hub: one that ends it, and two about single operations, which it handles itself."""
+"""Errors of the hub: one that ends it, and two of single operations, which it handles itself."""
 
 from bridge.errors import BridgeError
 

@@ -1,8 +1,8 @@
-"""State of the hub: its clients, and the topics, services and actions between them.
+"""State of the hub: its clients, topics, services and actions.
 
-The graph keeps its parts consistent; handlers decide what clients may do. Topics, services and actions are stored
-under their absolute name. A client that omits the leading slash means the same topic, and receives messages under the
-name that it used.
+The graph keeps its parts consistent; handlers decide which operations are allowed. Topics, services and
+actions are stored under their absolute names. A client may omit the leading slash, and receives messages
+under the name that it used.
 """
 
 from dataclasses import dataclass, field
@@ -18,9 +18,9 @@ class Client:
     """One connection."""
 
     number: int
-    """1, 2, ... in the order of connecting."""
+    """1, 2, ... in the order of connection."""
     address: str
-    """Its network address, for the log and `service_host`."""
+    """Network address, for the log and `service_host`."""
     outbox: Outbox
     advertisements: dict[str, "Advertisement"] = field(default_factory=dict)
     """By the topic's absolute name."""
@@ -31,45 +31,45 @@ class Client:
     open_subscriptions: int = 0
     """Open subscribe operations, over all topics."""
     services: set[str] = field(default_factory=set)
-    """Absolute names of the services that it offers."""
+    """Absolute names of the services that the client offers."""
     calls: set[str] = field(default_factory=set)
-    """Keys of the calls whose answers it waits for."""
+    """Keys of the calls that the client made and that are not answered yet."""
     requests: set[str] = field(default_factory=set)
-    """Keys of the calls that it has yet to answer."""
+    """Keys of the calls that the client has yet to answer."""
     actions: set[str] = field(default_factory=set)
-    """Absolute names of the actions that it offers."""
+    """Absolute names of the actions that the client offers."""
     goals: dict[OperationId, str] = field(default_factory=dict)
-    """Keys of the goals whose end it waits for, by its own id."""
+    """Keys of the goals that the client sent and that have not ended, by its own ids."""
     tasks: set[str] = field(default_factory=set)
-    """Keys of the goals that it works on."""
+    """Keys of the goals that the client executes."""
     refused: int = 0
-    """Operations of it that were refused."""
+    """Number of the client's operations that were refused."""
     takeovers: int = 0
-    """Services and actions that it took over from other clients."""
+    """Number of services and actions that the client took over from others."""
     fragments: Reassembler | None = None
-    """Its incomplete messages, once it sent a fragment."""
+    """The client's incomplete messages, once it has sent a fragment."""
     wants_status: bool = False
-    """Whether it asked for status messages about refusals."""
+    """Whether the client requested status messages about refusals."""
     status_lane: Lane | None = None
-    """The queue of its status messages, once there was one."""
+    """The queue of the client's status messages, once there was one."""
     last_published: "Advertisement | None" = None
-    """The last advertisement that it published on with a known envelope."""
+    """The advertisement of the client's last message with a known envelope."""
     envelopes: dict[bytes, "Advertisement"] = field(default_factory=dict)
-    """Its advertisements by their known envelopes (see `bridge.codecs.envelope`)."""
+    """The client's advertisements by known envelope (see `bridge.codecs.envelope`)."""
     close_reason: str = ""
-    """Why it must be disconnected, empty while it may stay."""
+    """Reason why the client must be disconnected, or empty."""
     is_ready: bool = False
-    """Whether it is in the dispatcher's list of clients with output."""
+    """Whether the client is in the dispatcher's list of those with output."""
 
     @property
     def node(self) -> str:
-        """Return its name as a ROS node."""
+        """Return the client's name as a ROS node."""
         return f"/client_{self.number}"
 
 
 @dataclass(eq=False, slots=True)
 class Advertisement:
-    """A client's publishing on one topic, over all its advertise operations."""
+    """A client's publication on one topic, from all its advertise operations."""
 
     client: Client
     topic: "Topic"
@@ -77,7 +77,7 @@ class Advertisement:
     ids: set[OperationId] = field(default_factory=set)
     """Ids of the advertise operations."""
     envelope: bytes = b""
-    """The bytes before its messages, once they are known."""
+    """The bytes before the message in a publish operation, once they are known."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +94,7 @@ class SubscribeOptions:
 
 @dataclass(eq=False, slots=True)
 class Subscription:
-    """A client's subscription to one topic, over all its subscribe operations."""
+    """A client's subscription to one topic, from all its subscribe operations."""
 
     client: Client
     topic: "Topic"
@@ -105,19 +105,19 @@ class Subscription:
     lane: Lane = field(default_factory=Lane)
     compression: Compression = Compression.NONE
     typed: bool = False
-    """Whether it named the type, and so fixes the topic's."""
+    """Whether the client named a type, which fixes the topic's."""
     options: dict[OperationId, SubscribeOptions] = field(default_factory=dict)
-    """By operation; the least of each applies, as on the reference server."""
+    """Options by operation; the least of each applies, as on the reference server."""
 
 
 @dataclass(eq=False, slots=True)
 class Topic:
-    """A topic that somebody publishes or subscribes to."""
+    """A topic that has publishers or subscribers."""
 
     name: str
     """Absolute."""
     type: str = ""
-    """As this hub's ROS version writes it; empty while nobody named it."""
+    """Type as this hub's ROS version writes it; empty until a client names it."""
     advertisements: dict[Client, Advertisement] = field(default_factory=dict)
     subscriptions: dict[Client, Subscription] = field(default_factory=dict)
     latching: bool = False
@@ -152,7 +152,7 @@ class Graph:
         topic.latched = message
 
     def tidy(self, topic: Topic) -> None:
-        """Drop the latched message, the type and the topic itself as soon as nobody keeps them."""
+        """Drop the latched message, the type and the topic itself once no client needs them."""
         topic.latching = any(advertisement.latching for advertisement in topic.advertisements.values())
         if not topic.latching:
             self.latch(topic, None)

@@ -1,6 +1,6 @@
 """Validation of the fields of an operation that a client sent.
 
-Every function raises `RefusedError` if the field is not what it returns; the broker logs that, or answers a call.
+Every function raises a `RefusedError` for an invalid field, which the broker logs or, for a call, answers.
 """
 
 import re
@@ -14,11 +14,11 @@ OperationId = str | int | None
 """rosbridge's optional `id`, which distinguishes operations of one client."""
 
 _NAME: Final = re.compile(r"[~/]?[A-Za-z0-9_]+(?:/[A-Za-z0-9_]+)*")
-"""Names of ROS 1 and ROS 2, and also parts that start with a digit (`/camera/0`)."""
+"""Names of ROS 1 and ROS 2, and names with parts that start with a digit (`/camera/0`)."""
 _LONGEST_ID: Final = 1024
-"""Maximum of characters in an id, because the hub stores those of open operations."""
+"""Maximum number of characters in an id, because the hub stores ids of open operations."""
 _HUGE: Final = 1e12
-"""No rate, length or time is as large."""
+"""Upper bound of every rate, length and time."""
 _POLICIES: Final = {
     "durability": ("volatile", "transient_local"),
     "reliability": ("reliable", "best_effort"),
@@ -49,7 +49,7 @@ def optional_text(operation: Operation, field: str) -> str | None:
 
 
 def flag(operation: Operation, field: str) -> bool:
-    """Return true or false; false if it is left out."""
+    """Return a boolean; False if it is left out."""
     value = operation.get(field)
     if value is not None and not isinstance(value, bool):
         raise RefusedError(f"{field} of {operation['op']} must be true or false")
@@ -59,7 +59,8 @@ def flag(operation: Operation, field: str) -> bool:
 def number(operation: Operation, field: str) -> float:
     """Return a number that is not negative; 0 if it is left out.
 
-    The reference server accepts integers alone and ignores the whole operation for `0.0`; no client relies on that.
+    The reference server accepts only integers, and ignores a whole operation with `0.0`; no client relies on
+    that.
     """
     value = operation.get(field)
     if value is None:
@@ -95,5 +96,5 @@ def quality(operation: Operation) -> Operation:
 
 
 def is_logged(count: int) -> bool:
-    """Return whether to log the occurrence of this number: the 1st, 10th, 100th and so on."""
+    """Return whether to log the occurrence with this number: the 1st, 10th, 100th and so on."""
     return str(count).strip("0") == "1"

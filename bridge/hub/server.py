@@ -1,9 +1,11 @@
-"""The hub on a socket: a thin shell of WebSockets around the broker.
+"""The hub's socket: a thin layer of WebSockets around the broker.
 
-A connection has no task: messages are read, brokered and written to all their subscribers within one callback of the event
-loop, with one write for each subscriber. Nothing is compressed: on loopback that costs more than it saves.
+Connections do not have tasks: messages are read, brokered and written to all subscribers within one callback
+of the event loop, with one write per subscriber. Data is not compressed, because on loopback that costs more
+than it saves.
 
-Messages that a socket does not accept wait in its client's outbox, which drops the oldest; no other client waits for it.
+Messages that a socket does not accept wait in its client's outbox, which drops the oldest; other clients are
+not delayed.
 """
 
 import asyncio
@@ -32,24 +34,24 @@ from bridge.transport.websocket import WebSocketTransport
 log = logging.getLogger(__name__)
 
 _WRITE_BUFFER: Final = 64 * 1024
-"""Bytes that wait in the process for one socket before its client's outbox fills."""
+"""Bytes that wait in the process for one socket before its client's outbox is used."""
 _SEND_BUFFER: Final = 256 * 1024
-"""Bytes that wait in the kernel for one socket: more would only be older when they arrive."""
+"""Bytes that wait in the kernel for one socket; with more, data would only arrive later."""
 _TURN_FRAMES: Final = 64
 _TURN_BYTES: Final = 64 * 1024
 _SLICE_BYTES: Final = 4 * 1024
 """One client's share of a turn (see `WebSocketTransport`)."""
 _RETAINED_BYTES: Final = 4 * 1024 * 1024
-"""Half of the freed memory that the process keeps for the next messages."""
+"""Half of the freed memory that the process retains for the next messages."""
 _SWEEP: Final = 1.0
 """Seconds between two checks for silent and stuck clients."""
 _CLOSE_TIMEOUT: Final = 2.0
 """Seconds that a client has to end a connection which the hub closed."""
 _HANDSHAKES: Final = 64
-"""Connections in their opening or closing handshake; the oldest is aborted for another."""
+"""Maximum number of connections in a handshake; the oldest is aborted to admit another."""
 _LOG_LINES: Final = 10
 _LOG_PERIOD: Final = 10.0
-"""Seconds in which at most `_LOG_LINES` lines are logged about refused and closed connections."""
+"""Period, in seconds, in which at most `_LOG_LINES` lines about refused and closed connections are logged."""
 _LAST_PORT: Final = 65535
 
 
@@ -68,11 +70,11 @@ async def serve_hub(
 
     Args:
         host: the address to listen on. Without tokens and TLS give a loopback address, unless everybody who
-            reaches the address may publish to your robot.
+            can reach the address may publish to your robot.
         port: 0 for any free one.
         limits: bounds on clients and messages.
         access: access control and TLS; by default every program may connect, and web pages of this machine.
-        ros_version: the ROS version that the hub speaks for.
+        ros_version: the ROS version that the hub emulates.
         on_ready: called with the port once clients can connect.
         on_graph: called before that with the graph of clients and topics, which it may read but not change.
         stop: event that ends the hub.
@@ -104,7 +106,7 @@ async def serve_hub(
     except OSError as error:
         raise HubError(
             f"the hub cannot listen on {host} port {port} ({error.strerror or error}): "
-            "end what listens there already, or choose another host or port"
+            "end the process that listens there, or choose another host or port"
         ) from None
     try:
         hub.sweep()
@@ -119,10 +121,10 @@ async def serve_hub(
 
 
 def _retain_memory() -> None:
-    """Have the C library keep the memory of large messages for the next ones.
+    """Make the C library retain the memory of large messages for the next ones.
 
-    glibc gives memory back after each burst, and takes it again page by page, which is a fifth of the hub's time with
-    messages of 17 kB. Once a block of this size was freed it keeps twice as many bytes.
+    glibc returns memory after each burst and acquires it again page by page, which takes a fifth of the hub's
+    time with messages of 17 kB. After a block of this size has been freed, it retains twice as many bytes.
     """
     bytes(_RETAINED_BYTES)
 
@@ -138,7 +140,7 @@ class _Hub:
         self.broker = Broker(limits, ros_version=ros_version)
         self.access = access
         self.connections: set[_Connection] = set()
-        self.handshakes: dict[_Connection, None] = {}  # in the order in which they began
+        self.handshakes: dict[_Connection, None] = {}  # in the order of their beginning
         self._by_client: dict[Client, _Connection] = {}
         self._timer: asyncio.TimerHandle | None = None
         self._timer_deadline = inf
@@ -175,11 +177,11 @@ class _Hub:
             self._nobody_left.set()
 
     def warn(self, message: str, *args: object) -> None:
-        """Log a line about a connection, unless there were many lately."""
+        """Log a line about a connection, unless many were logged recently."""
         now = time.monotonic()
         if now > self._log_since + _LOG_PERIOD:
             if self._log_lines > _LOG_LINES:
-                log.warning("%d more lines about connections were left out", self._log_lines - _LOG_LINES)
+                log.warning("%d more lines about connections were suppressed", self._log_lines - _LOG_LINES)
             self._log_lines, self._log_since = 0, now
         self._log_lines += 1
         if self._log_lines <= _LOG_LINES:
@@ -205,7 +207,7 @@ class _Hub:
         self._sweeper = asyncio.get_running_loop().call_later(_SWEEP, self.sweep)
 
     async def close(self) -> None:
-        """End all connections, with a closing handshake where the client takes part in it."""
+        """End all connections, with a closing handshake if the client takes part in it."""
         if self._sweeper is not None:
             self._sweeper.cancel()
         for connection in list(self.connections):
@@ -269,7 +271,7 @@ class _Connection(WebSocketTransport):
 
     @property
     def is_blocked(self) -> bool:
-        """Return whether the client must read its answers first, or needs definitions that are being loaded."""
+        """Return whether the client must first read its answers, or needs definitions that are being loaded."""
         client = self._client
         return client is not None and (
             client.outbox.congested
@@ -277,7 +279,7 @@ class _Connection(WebSocketTransport):
             or (bool(self._postponed) and self._hub.broker.definitions.pending)
         )
 
-    # --- calls of the event loop
+    # --- called by the event loop
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Start waiting for the handshake."""
@@ -300,7 +302,7 @@ class _Connection(WebSocketTransport):
         super().resume_writing()
         self.flush()
 
-    # --- calls of the transport
+    # --- called by the transport
 
     def handshake_received(self, event: Request | Response) -> None:
         """Admit the client, or refuse it."""
@@ -309,14 +311,14 @@ class _Connection(WebSocketTransport):
         if response.status_code == HTTPStatus.SWITCHING_PROTOCOLS:
             refusal = self._hub.access.refusal(request, loopback=self._hub.loopback)
             if refusal is HTTPStatus.FORBIDDEN:
-                response = protocol.reject(refusal, "The hub is known by another name.\n")
+                response = protocol.reject(refusal, "The hub does not have this host name.\n")
             elif refusal is not None:
-                response = protocol.reject(refusal, "The hub expects a token.\n")
+                response = protocol.reject(refusal, "The hub requires a token.\n")
                 response.headers["WWW-Authenticate"] = "Bearer"
             elif self._hub.broker.full:
                 response = protocol.reject(
                     HTTPStatus.SERVICE_UNAVAILABLE,
-                    f"The hub has {self._hub.limits.clients} clients already.\n",
+                    f"The hub already has {self._hub.limits.clients} clients.\n",
                 )
         protocol.send_response(response)
         if response.status_code == HTTPStatus.SWITCHING_PROTOCOLS:
@@ -335,7 +337,7 @@ class _Connection(WebSocketTransport):
             self._hub.serve()
 
     def close_expected(self) -> None:
-        """Give the client a limited time to end the connection."""
+        """Give the client limited time to end the connection."""
         error = self._server_protocol.parser_exc
         if error is not None and self._client is not None and not isinstance(error, EOFError):
             self._hub.warn("the connection from %s is closed: %s", self._address, error)
@@ -343,14 +345,14 @@ class _Connection(WebSocketTransport):
         self._leave()
 
     def ended(self, _exc: Exception | None) -> None:
-        """Forget the client."""
+        """Remove the client."""
         self._leave()
         self._hub.forget(self)
 
-    # --- calls of the hub
+    # --- called by the hub
 
     def flush(self) -> None:
-        """Write the client's queue, as far as the socket accepts it, in one piece where it is small."""
+        """Write as much of the client's queue as the socket accepts, in one piece if it is small."""
         client = self._client
         if client is None or not self.is_open or self.is_closing:
             return
@@ -366,7 +368,7 @@ class _Connection(WebSocketTransport):
         self.proceed()
 
     def _flush_backlog(self, outbox: Outbox) -> None:
-        """Write a turn's worth of the queue, and leave the rest until other tasks had their turn."""
+        """Write one turn's share of the queue, and the rest after other tasks have had their turn."""
         messages: list[bytes] = []
         size = 0
         while not self.paused and size < _TURN_BYTES and (message := outbox.pop()) is not None:
@@ -387,7 +389,7 @@ class _Connection(WebSocketTransport):
         self.flush()
 
     def sweep(self, now: float) -> None:
-        """Close the connection if it is too silent or too slow at `now`."""
+        """Close the connection if it has been silent or stuck for too long at `now`."""
         limits = self._hub.limits
         if now > self._close_by:
             self.abort()
@@ -397,7 +399,7 @@ class _Connection(WebSocketTransport):
         elif self._stuck_since is not None and now > self._stuck_since + limits.stuck_timeout:
             self._give_up(f"its socket accepted nothing for {limits.stuck_timeout:g} s")
         elif self.is_blocked:
-            self.last_heard = now  # nothing is read from it
+            self.last_heard = now  # the hub does not read from it
         elif self._pinged_at is None:
             if now > self.last_heard + limits.ping_interval and self.is_open:
                 self._pinged_at = now

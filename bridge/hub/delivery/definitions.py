@@ -1,10 +1,10 @@
-"""Message definitions from `rosbags`, where that is installed: the fields of each type.
+"""Message definitions (the fields of each type) from `rosbags`, if it is installed.
 
-The hub passes JSON on without them. They serve typed encodings: CBOR with typed arrays, the serialised message
-(cbor-raw), and rosapi's descriptions of types. `rosbags` is imported with the first operation that needs it;
-without it CBOR packs floats alone, and the others are refused.
+The hub forwards JSON without them. They are needed for CBOR with typed arrays, for serialised messages
+(cbor-raw) and for rosapi's descriptions of types. `rosbags` is imported by the first operation that needs it;
+without it CBOR packs only floats, and the other two are refused.
 
-Every conversion checks the type, the range and the number of values before it allocates anything for them.
+Every conversion checks the type, range and number of values before it allocates memory for them.
 """
 
 from base64 import b64decode
@@ -51,7 +51,8 @@ _TIMES: Final = {"builtin_interfaces/msg/Time": "time", "builtin_interfaces/msg/
 _ROS1_TIME: Final = {"sec": "secs", "nanosec": "nsecs"}
 """Fields of a time in ROS 1, by their names in rosbags, which are ROS 2's."""
 _BYTES_A_VALUE: Final = 16
-"""Bytes of the size limit for each value of a serialised message: `{}` in an array can stand for dozens of them."""
+"""Bytes of the size limit per value of a serialised message; `{}` in an array can stand for dozens of values.
+"""
 _MISSING: Final = (
     "the hub has no message definitions: install rosbags (pip install rosbags) and start the hub again"
 )
@@ -85,7 +86,7 @@ class Definitions:
         self.pending = False
 
     def require(self) -> None:
-        """See that the definitions are loaded before an operation is done that needs them.
+        """Load the definitions for an operation that needs them.
 
         Raises:
             DefinitionsPendingError: They are being loaded in the background; repeat the operation afterwards.
@@ -131,7 +132,7 @@ class Definitions:
             raise RefusedError(f"a message does not fit its type {self.name(type_name)}: {error}") from None
 
     def full_text(self, type_name: str) -> str:
-        """Return a type's definition and those of its parts, as bag files have them; a RefusedError for an unknown one."""
+        """Return the definitions of a type and of its parts, as in bag files, or raise a RefusedError."""
         text = self._texts.get(type_name)
         if text is None:
             store, known = self._known(type_name)
@@ -140,7 +141,7 @@ class Definitions:
         return text
 
     def details(self, type_name: str) -> list[dict[str, Any]]:
-        """Return a type's fields and those of its parts, as `rosapi_msgs/TypeDef`; a RefusedError for an unknown one."""
+        """Return the fields of a type and of its parts, as `rosapi_msgs/TypeDef`, or raise a RefusedError."""
         store, known = self._known(type_name)
         found: dict[str, dict[str, Any]] = {}
         waiting = [known]
@@ -188,7 +189,7 @@ class Definitions:
 
 
 class _Builder:
-    """Builds rosbags' objects from JSON; fields that are left out have their default."""
+    """Builder of rosbags' objects from JSON; fields that are left out get their default."""
 
     def __init__(self, store: "Typestore", max_values: int) -> None:
         self._store = store
@@ -238,7 +239,7 @@ class _Builder:
         ]
 
     def _count(self, values: int) -> None:
-        """Refuse a message of too many values before they are built."""
+        """Count values, and refuse a message with too many before they are built."""
         self._values += max(values, 1)
         if self._values > self._max_values:
             raise ValueError(f"it has more than {self._max_values} values")
@@ -295,7 +296,7 @@ def _numbers(values: Any, element: str, length: int, place: str) -> list[Any] | 
 
 
 def _typed_converter(store: "Typestore", name: str, known: dict[str, _Convert]) -> _Convert:
-    """Make the function that converts a message's arrays of numbers; other fields pass unchanged."""
+    """Return the function that converts a message's arrays of numbers and leaves other fields unchanged."""
     converts: dict[str, _Convert] = {}
 
     def convert(message: dict[str, Any]) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Dispatch of messages into clients' outboxes, and the clients that have output or a throttle pending."""
+"""Dispatch of messages to clients' outboxes, with lists of the clients that have output or pending throttles."""
 
 from math import inf
 from typing import Final
@@ -12,13 +12,13 @@ from bridge.hub.graph import Client
 from bridge.hub.limits import HubLimits
 
 SMALLEST_FRAGMENT: Final = 256
-"""Minimum of bytes in a fragment: smaller ones would be little but their own frames."""
+"""Minimum size of a fragment in bytes; smaller ones would consist mostly of framing."""
 _STATUS_QUEUE: Final = 20
 """Maximum of status messages queued for a client."""
 
 
 class Dispatcher:
-    """The way to all clients of one hub."""
+    """Output to all clients of one hub."""
 
     def __init__(self, limits: HubLimits) -> None:
         """Start without output."""
@@ -30,13 +30,13 @@ class Dispatcher:
         """Units of work in the current turn (see `bridge.hub.broker.TURN_WORK`)."""
 
     def mark_ready(self, client: Client) -> None:
-        """Put a client on the list of those with output."""
+        """Add a client to those with output."""
         if not client.is_ready:
             client.is_ready = True
             self._ready.append(client)
 
     def take_ready(self) -> list[Client]:
-        """Return the clients with output or a reason to be closed since the last call."""
+        """Return the clients that have output or must be closed, if they were not returned before."""
         ready, self._ready = self._ready, []
         for client in ready:
             client.is_ready = False
@@ -57,7 +57,8 @@ class Dispatcher:
         self.work += len(payload) >> 6
         if png:
             wrapped = as_png(payload)
-            # A picture beyond the limit, which hardly occurs, is replaced by the plain answer: none may be lost.
+            # No answer may be lost, so one that is too large as a picture, which is rare, is sent as plain
+            # JSON.
             payload = wrapped if len(wrapped) <= self._limits.message_bytes else payload
         client.outbox.put(payload, fragment_size)
         if client.outbox.overflowed:
@@ -65,7 +66,7 @@ class Dispatcher:
         self.mark_ready(client)
 
     def offer(self, client: Client, lane: Lane, payload: bytes, now: float) -> None:
-        """Queue a message that newer ones of its lane may replace."""
+        """Queue a message that newer messages of its lane may replace."""
         outbox = client.outbox
         outbox.offer(lane, payload, now)
         if outbox.deadline != inf:
@@ -74,7 +75,7 @@ class Dispatcher:
             self.mark_ready(client)
 
     def schedule_release(self, client: Client) -> None:
-        """Note when a client's throttles admit a held message."""
+        """Schedule the release of a client's held messages."""
         deadline = client.outbox.deadline
         if deadline != inf:
             self.throttled.add(client)
@@ -92,7 +93,7 @@ class Dispatcher:
         self.deadline = min((client.outbox.deadline for client in self.throttled), default=inf)
 
     def send_status(self, client: Client, sentence: str, operation_id: object, now: float) -> None:
-        """Send a status message about an error; a client that does not read loses the oldest."""
+        """Send a status message about an error, and drop the oldest of a client that does not read."""
         status: dict[str, object] = {"op": "status", "level": "error", "msg": sentence}
         if isinstance(operation_id, str | int) and not isinstance(operation_id, bool):
             status["id"] = operation_id

@@ -1,6 +1,6 @@
-"""Encodings of a published message for its subscribers: JSON, PNG, CBOR, or CBOR around the serialised message.
+"""Encodings of a published message: JSON, PNG, CBOR, and CBOR with the serialised message.
 
-A message is encoded once in each form, however many subscribers want it.
+A message is encoded only once for all subscribers with the same encoding.
 """
 
 from dataclasses import dataclass, field
@@ -17,7 +17,7 @@ from bridge.hub.errors import RefusedError
 
 
 class Compression(StrEnum):
-    """Encodings, in ascending priority where subscriptions of one client differ, as on the reference server."""
+    """Encodings, in ascending priority if a client's subscriptions differ, as on the reference server."""
 
     NONE = "none"
     PNG = "png"
@@ -46,7 +46,7 @@ def json_prefix(name: str) -> bytes:
 
 
 _DEEPEST: Final = 256
-"""Maximum depth of what the hub itself has read."""
+"""Maximum depth of JSON that the hub itself has read."""
 AROUND: Final = len(json_prefix("")) + 1
 """Bytes around a topic's name and a message's JSON."""
 

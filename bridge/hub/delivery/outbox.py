@@ -1,11 +1,11 @@
-"""The queue of everything that waits for one client: ordered, bounded, throttled where requested.
+"""The queue of output for one client: ordered, bounded, and throttled if requested.
 
-Whoever owns the socket drains the outbox as fast as the socket accepts data. While it accepts none, messages of topics
-replace older ones here and nothing else in the hub slows down. Answers and requests of services are never
-dropped: a client that lets them accumulate beyond the bound has *overflowed*.
+The owner of the socket drains the outbox as fast as the socket accepts data. While it accepts none, newer
+messages of a topic replace older ones here, and nothing else in the hub slows down. Answers and requests of
+services are never dropped: a client that lets them accumulate beyond the bound has *overflowed*.
 
-A dropped message leaves a gap in the order, so that dropping costs as little as sending. A message that a client
-wants in fragments is queued whole, and counts towards the bound until its last fragment has left.
+A dropped message leaves a gap in the queue, so dropping costs no more than sending. A message for a client
+that requested fragments is queued whole, and counts towards the bound until its last fragment is sent.
 """
 
 import itertools
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 _GAPS: Final = 64
-"""Gaps in a queue before it is packed, beyond as many as there are messages."""
+"""Number of gaps by which a queue may exceed its messages before it is packed."""
 _BRACE: Final = ord("{")
 
 
@@ -31,7 +31,7 @@ def is_text(payload: bytes) -> bool:
 
 @dataclass(eq=False, slots=True)
 class _Entry:
-    """One message in the order; a `payload` of None is a gap."""
+    """One message in the queue; a `payload` of None is a gap."""
 
     payload: bytes | None
     lane: "Lane | None"
@@ -39,7 +39,7 @@ class _Entry:
 
 
 class Lane:
-    """The share of one subscription in its client's outbox, which alone changes it."""
+    """The messages of one subscription in its client's outbox; only the outbox changes it."""
 
     __slots__ = ("dropped", "fragment_size", "held", "next_time", "queue_length", "queued", "throttle")
 
@@ -61,7 +61,7 @@ class Lane:
 
 
 class Outbox:
-    """Everything that waits for one client."""
+    """The queue of output for one client."""
 
     __slots__ = (
         "_cutting",
@@ -92,13 +92,14 @@ class Outbox:
         self._cutting = 0
         self._numbers = itertools.count(1)
         self.wire: list[bytes] | None = None
-        """Payloads of this turn for the socket; None while it accepts nothing, so that everything is queued."""
+        """Payloads of this turn for the socket; None while it accepts nothing, when everything is queued."""
         self.size = 0
         """Bytes in the queue."""
         self.undroppable = 0
         """Bytes of answers and requests in the queue."""
         self.overflowed = False
-        """Whether something that cannot be dropped exceeded the bound: the client does not read its answers."""
+        """Whether output that cannot be dropped exceeded the bound: the client does not read its answers.
+        """
         self.deadline = inf
         """When `release` may have something to do (monotonic seconds), infinity for never."""
 
@@ -112,7 +113,7 @@ class Outbox:
 
     @property
     def congested(self) -> bool:
-        """Return whether one more answer could overflow it, so that its client must read before it asks again."""
+        """Return whether one more answer could exceed the bound, so the client must read first."""
         return self.undroppable > 0 and self.undroppable + self._largest > self._max_bytes
 
     def put(self, payload: bytes, fragment_size: int = 0) -> None:
@@ -130,7 +131,7 @@ class Outbox:
         """Queue a topic's message, hold it until its throttle admits it, or drop it.
 
         Args:
-            lane: The subscription's.
+            lane: The lane of the subscription.
             payload: The message as it goes onto the wire.
             now: Monotonic seconds.
         """
@@ -140,7 +141,7 @@ class Outbox:
                     self._hold(lane, payload)
                 return
             lane.next_time = now + lane.throttle
-        wire = self.wire  # as `_bypass`, without its call: most messages go this way
+        wire = self.wire  # `_bypass` inlined, because most messages take this path
         if wire is None or lane.fragment_size or self._entries or self._fragments is not None:
             self._queue(lane, payload)
         else:
@@ -163,7 +164,7 @@ class Outbox:
             if entry.lane is None:
                 self.undroppable -= len(payload)
             else:
-                entry.lane.queued.popleft()  # this very entry: a lane has the outbox's order
+                entry.lane.queued.popleft()  # this entry, because a lane has the outbox's order
                 entry.payload = None
                 while self._droppable and self._droppable[0].payload is None:
                     self._droppable.popleft()
@@ -176,7 +177,7 @@ class Outbox:
         return None
 
     def accepts(self, lane: Lane, now: float) -> bool:
-        """Return whether `offer` would keep a message, so that it is worth encoding."""
+        """Return whether `offer` would keep a message, which is then worth encoding."""
         return not lane.throttle or bool(lane.queue_length) or (now >= lane.next_time and not lane.held)
 
     def release(self, now: float) -> None:
@@ -187,7 +188,7 @@ class Outbox:
         self.deadline = min((lane.next_time for lane in self._holding), default=inf)
 
     def adjust(self, lane: Lane, throttle: float, queue_length: int) -> None:
-        """Change a lane's throttle and length, and queue or drop what need not be held any more."""
+        """Change a lane's throttle and length, and queue or drop messages that are no longer held."""
         lane.next_time += throttle - lane.throttle
         lane.throttle, lane.queue_length = throttle, queue_length
         while lane.held and not throttle:
@@ -200,7 +201,7 @@ class Outbox:
             self.deadline = min(self.deadline, lane.next_time)
 
     def forget(self, lane: Lane) -> None:
-        """Drop everything of a subscription that ended."""
+        """Drop all messages of a subscription that ended."""
         while lane.queued:
             self._drop_queued(lane)
         while lane.held:
@@ -218,7 +219,7 @@ class Outbox:
             self._queue(lane, payload)
 
     def _queue(self, lane: Lane, payload: bytes) -> None:
-        self._shorten(lane, max(lane.queue_length, 1) - 1)  # with a throttle 0 means: one at a time
+        self._shorten(lane, max(lane.queue_length, 1) - 1)  # with a throttle, 0 means one at a time
         if not self._make_room(len(payload)):
             lane.dropped += 1
             return
@@ -263,7 +264,7 @@ class Outbox:
         return payload
 
     def _make_room(self, size: int) -> bool:
-        """Drop topics' oldest messages until `size` more bytes fit; return False if they never will."""
+        """Drop the oldest messages of topics until `size` more bytes fit; return False if they cannot."""
         while self.size + size > self._max_bytes and self._droppable:
             entry = self._droppable.popleft()
             if entry.payload is not None and entry.lane is not None:

@@ -1,1 +1,1 @@
-"""Operations of clients, with one module for each kind."""
+"""Operations of clients, one module for each kind."""

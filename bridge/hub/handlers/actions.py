@@ -1,4 +1,4 @@
-"""Actions between clients, as in ROS 2: goals with feedback, cancellation, and exactly one result each."""
+"""Actions between clients, as in ROS 2: goals with feedback, cancellation and exactly one result each."""
 
 import itertools
 from dataclasses import dataclass, field
@@ -24,7 +24,7 @@ _RESULT: Final = ("action_result", "action")
 
 @dataclass(eq=False, slots=True)
 class _Goal:
-    """A goal under way."""
+    """A goal that has not ended."""
 
     key: str
     caller: Caller
@@ -35,7 +35,7 @@ class _Goal:
 
 
 class Actions:
-    """The actions of one hub, and the goals under way."""
+    """The actions of one hub, and the goals that have not ended."""
 
     def __init__(self, graph: Graph, limits: HubLimits, dispatcher: Dispatcher) -> None:
         """Start without actions."""
@@ -49,7 +49,7 @@ class Actions:
         self.goals: dict[str, _Goal] = {}
 
     def leave(self, client: Client) -> None:
-        """Cancel the goals that a client which left wanted, and abort those that it worked on."""
+        """Cancel the goals that a disconnected client sent, and abort those that it executed."""
         self._offers.leave(client)
         for key in list(client.goals.values()):
             self._send_cancel(self._take(key))
@@ -62,7 +62,7 @@ class Actions:
         self._offers.add(client, operation, ros2_type(text(operation, "type"), "action"))
 
     def unadvertise(self, client: Client, operation: Operation, _now: float) -> None:
-        """Perform `unadvertise_action`. Goals under way may still be ended."""
+        """Perform `unadvertise_action`; goals that it executes may still be ended."""
         self._offers.remove(client, operation)
 
     def send_goal(self, client: Client, operation: Operation, _now: float) -> None:
@@ -83,11 +83,11 @@ class Actions:
             raise RefusedError(f"{name} is of type {action.type}, not {type_name}")
         server = action.client
         if caller.id in client.goals:
-            raise RefusedError(f"this client has a goal with the id {str(caller.id)[:80]!r} already")
+            raise RefusedError(f"this client already has a goal with the id {str(caller.id)[:80]!r}")
         if len(client.goals) >= self._limits.goals_per_client:
-            raise RefusedError(f"this client waits for {len(client.goals)} goals already")
+            raise RefusedError(f"this client already waits for {len(client.goals)} goals")
         if len(server.tasks) >= self._limits.goals_per_client:
-            raise RefusedError(f"{name} works on {len(server.tasks)} goals already")
+            raise RefusedError(f"{name} already executes {len(server.tasks)} goals")
         wants_feedback = flag(operation, "feedback")
         key = f"action_goal:{action.name}:{next(self._numbers)}"
         request = {
@@ -127,7 +127,7 @@ class Actions:
         return {"return_code": 0, "goals_canceling": []}
 
     def feed_back(self, client: Client, operation: Operation, now: float) -> None:
-        """Perform `action_feedback`; a slow client loses the oldest."""
+        """Perform `action_feedback`; the oldest feedback for a slow client is dropped."""
         goal = self._goal_of(client, operation)
         values = operation.get("values", {})
         if not isinstance(values, dict):
@@ -162,7 +162,7 @@ class Actions:
     def _goal_of(self, client: Client, operation: Operation) -> _Goal:
         key = operation.get("id")
         if not isinstance(key, str) or key not in client.tasks:
-            raise RefusedError(f"this client does not work on a goal {str(key)[:80]!r}")
+            raise RefusedError(f"this client does not execute a goal {str(key)[:80]!r}")
         return self.goals[key]
 
     def _take(self, key: str) -> _Goal:
@@ -176,7 +176,7 @@ class Actions:
         self._dispatcher.send(goal.server, orjson.dumps(cancel))
 
     def _fail(self, caller: Caller, reason: str, status: int = GoalStatus.ABORTED) -> None:
-        # A character can take six bytes as JSON, and a failure must always get through.
+        # A character can take six bytes in JSON, and a failure must never be too large to send.
         reason = reason[: self._limits.message_bytes // 8]
         payload = caller.operation(*_RESULT, values=reason, status=status, result=False)
         self._dispatcher.send(caller.client, payload)

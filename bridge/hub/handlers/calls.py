@@ -20,13 +20,13 @@ from bridge.hub.operations import Operation, number, text
 from bridge.names import absolute
 
 _ANSWERED: Final = 64
-"""Deadlines of answered calls to keep in the queue, beyond as many as there are calls."""
+"""Number of deadlines of answered calls by which the queue may exceed the open calls."""
 _RESPONSE: Final = ("service_response", "service")
 
 
 @dataclass(frozen=True, slots=True)
 class _Call:
-    """A call under way."""
+    """A call that is not answered yet."""
 
     caller: Caller
     server: Client
@@ -34,7 +34,7 @@ class _Call:
 
 
 class Calls:
-    """The services of one hub, and the calls under way."""
+    """The services of one hub, and the calls that are not answered yet."""
 
     def __init__(
         self,
@@ -44,7 +44,7 @@ class Calls:
         rosapi: Rosapi,
         answer_here: Callable[[Client, str], dict[str, Any] | None],
     ) -> None:
-        """Start without services; `answer_here` returns the values of others that the hub answers for a client, or None."""
+        """Start without services; `answer_here` returns an answer for the hub's own services only."""
         self._graph = graph
         self._limits = limits
         self._dispatcher = dispatcher
@@ -63,7 +63,7 @@ class Calls:
         return self._deadlines[0][0] if self._deadlines else inf
 
     def leave(self, client: Client) -> None:
-        """Forget a client that left, and fail the calls that it had yet to answer."""
+        """Remove a disconnected client, and fail the calls that it had yet to answer."""
         self._offers.leave(client)
         for key in list(client.calls):
             self._take(key)
@@ -114,9 +114,9 @@ class Calls:
             return
         client, server = caller.client, service.client
         if len(client.calls) >= self._limits.calls_per_client:
-            raise RefusedError(f"this client waits for {len(client.calls)} calls already")
+            raise RefusedError(f"this client already waits for {len(client.calls)} calls")
         if len(server.requests) >= self._limits.calls_per_client:
-            raise RefusedError(f"{name} has {len(server.requests)} calls to answer already")
+            raise RefusedError(f"{name} already has {len(server.requests)} calls to answer")
         deadline = now + min(number(operation, "timeout") or inf, self._limits.call_timeout)
         request_id = f"service_request:{key}:{next(self._numbers)}"
         payload = orjson.dumps({"op": "call_service", "id": request_id, "service": key, "args": args})
@@ -138,10 +138,10 @@ class Calls:
         """Perform `service_response`."""
         key = operation.get("id")
         if not isinstance(key, str) or key not in client.requests:
-            raise RefusedError(f"nobody waits for the answer {str(key)[:80]!r}")
+            raise RefusedError(f"no client waits for the answer {str(key)[:80]!r}")
         caller = self._take(key).caller
         values, result = operation.get("values", {}), operation.get("result", True)
-        # In ROS 1 the reference server passes an answer on, whatever its result; roslibpy's tests rely on it.
+        # In ROS 1 the reference server forwards an answer whatever its result; roslibpy's tests rely on this.
         if isinstance(values, dict) and (
             result is True or (self._rosapi.ros_version == 1 and "values" in operation)
         ):
@@ -152,7 +152,7 @@ class Calls:
         elif result is True:
             self._fail(caller, f"{caller.name} answered with values that are not a JSON object")
         else:
-            # The wire has a string here; anything else is passed on as JSON.
+            # The wire has a string here; anything else is sent as JSON.
             self._fail(caller, values if isinstance(values, str) else orjson.dumps(values).decode())
 
     def _take(self, key: str) -> _Call:
@@ -165,7 +165,7 @@ class Calls:
         caller.answer(self._dispatcher, caller.operation(*_RESPONSE, values=values, result=True))
 
     def _fail(self, caller: Caller, reason: str) -> None:
-        # A character can take six bytes as JSON, and a failure must always get through.
+        # A character can take six bytes in JSON, and a failure must never be too large to send.
         reason = reason[: self._limits.message_bytes // 8]
         payload = caller.operation(*_RESPONSE, values=reason, result=False)
         self._dispatcher.send(caller.client, payload)

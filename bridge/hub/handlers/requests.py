@@ -1,4 +1,4 @@
-"""Parts that services and actions share: who offers them, who waits for an answer, and in which encoding."""
+"""Servers and callers, common to services and actions."""
 
 import logging
 from collections.abc import Callable
@@ -19,7 +19,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Caller:
-    """A client that waits for an answer, under which id and name, and in which encoding."""
+    """A client that waits for an answer, with its id, name and encoding."""
 
     client: Client
     id: OperationId
@@ -39,18 +39,18 @@ class Caller:
         )
 
     def operation(self, op: str, kind: str, **fields: object) -> bytes:
-        """Return an operation for this client about the `kind` that it named."""
+        """Return an operation for this client about the `kind` (service or action) that it named."""
         identity = {} if self.id is None else {"id": self.id}
         return orjson.dumps({"op": op, kind: self.name, **fields, **identity})
 
     def answer(self, dispatcher: Dispatcher, payload: bytes) -> None:
-        """Send an answer as requested; a RefusedError if it is too large."""
+        """Send an answer in the requested encoding, or raise a RefusedError if it is too large."""
         dispatcher.checked(payload, f"the answer of {self.name}")
         dispatcher.send(self.client, payload, fragment_size=self.fragment_size, png=self.png)
 
 
 class Offers:
-    """Services or actions by name; the last client to offer one serves it."""
+    """Services or actions by name; the last client to offer a name serves it."""
 
     def __init__(
         self, offers: dict[str, Offer], names_of: Callable[[Client], set[str]], limit: int, kind: str
@@ -66,7 +66,7 @@ class Offers:
         name = checked_name(text(operation, self._kind))
         key, names = absolute(name), self._names_of(client)
         if key not in names and len(names) >= self._limit:
-            raise RefusedError(f"this client offers {len(names)} {self._kind}s already")
+            raise RefusedError(f"this client already offers {len(names)} {self._kind}s")
         before = self._offers.get(key)
         if before is not None and before.client is not client:
             client.takeovers += 1
@@ -77,7 +77,7 @@ class Offers:
         names.add(key)
 
     def remove(self, client: Client, operation: Operation) -> None:
-        """Withdraw an offer; requests under way may still be answered."""
+        """Withdraw an offer; open requests may still be answered."""
         name = text(operation, self._kind)
         names = self._names_of(client)
         if absolute(name) not in names:
@@ -86,6 +86,6 @@ class Offers:
         del self._offers[absolute(name)]
 
     def leave(self, client: Client) -> None:
-        """Remove the offers of a client that left."""
+        """Remove the offers of a disconnected client."""
         for name in self._names_of(client):
             self._offers.pop(name, None)

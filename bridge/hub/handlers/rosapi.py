@@ -1,12 +1,12 @@
-"""The services of ROS's `rosapi` node, answered from the state of the hub.
+"""Services of ROS's `rosapi` node, answered from the state of the hub.
 
-Clients call them for diagnosis (topics, their types and publishers), for parameters and for the fields of messages.
-Names, fields and types are those of the ROS version that the hub emulates (http://wiki.ros.org/rosapi, rosapi_msgs);
-services that only one version has are answered in both. Times have the fields of both (`secs`, `nsecs` and `sec`,
-`nanosec`).
+Clients call them for diagnosis (topics, their types and publishers), for parameters and for the fields of
+messages. Names, fields and types are those of the emulated ROS version (http://wiki.ros.org/rosapi,
+rosapi_msgs); services that exist in only one version are answered in both. Times have the fields of both
+(`secs`, `nsecs` and `sec`, `nanosec`).
 
-Parameters are a flat dictionary of the hub: a name is a string, its value is JSON. A failure with one is an
-answer in ROS 2 (`successful`, `reason`), and a failed call in ROS 1.
+Parameters are a flat dictionary of the hub from names to JSON. A failure with a parameter is an answer in ROS
+2 (`successful`, `reason`), and a failed call in ROS 1.
 """
 
 from collections.abc import Callable, Iterable
@@ -25,7 +25,7 @@ from bridge.names import MAX_NAME, absolute, ros1_type, ros2_type
 NODE: Final = "/rosapi"
 """The node that offers these services."""
 PREFIX: Final = NODE + "/"
-"""The beginning of their names, which no client can use."""
+"""The prefix of their names, which clients cannot use."""
 ROSOUT: Final = "/rosout"
 """The topic of ROS's log, which carries the hub's refusals."""
 _ACTIONLIB: Final = ("goal", "cancel", "status", "feedback", "result")
@@ -54,7 +54,7 @@ class Rosapi:
         self.ros_version = definitions.ros_version
         self._parameters: dict[str, bytes] = {}
         self._parameter_bytes = 0
-        # Short name -> type, arguments (all strings) in their order, function.
+        # short name -> type, arguments (all strings) in order, function
         self._services: dict[str, tuple[str, tuple[str, ...], Answer]] = {
             "action_servers": ("GetActionServers", (), self._action_servers),
             "action_type": ("ActionType", ("action",), self._action_type),
@@ -91,7 +91,8 @@ class Rosapi:
     def call(self, service: str, args: object) -> Values:
         """Answer one call of a service for which `offers` returned true, and return the answer's `values`.
 
-        `args` is an object, or a list in the order of the service's fields; a field left out is the empty string, as in ROS.
+        `args` is an object, or a list in the order of the service's fields; an omitted field is an empty
+        string, as in ROS.
 
         Raises:
             RefusedError: The arguments are wrong, or a limit is reached.
@@ -117,7 +118,7 @@ class Rosapi:
     # --- topics
 
     def _all_topics(self) -> dict[str, str]:
-        """Return every topic's type, the hub's own included."""
+        """Return the types of all topics, including the hub's own."""
         topics = {topic.name: topic.type for topic in self._graph.topics.values()}
         return topics | {ROSOUT: rosout_type(self.ros_version)}
 
@@ -188,7 +189,7 @@ class Rosapi:
         }
 
     def _server(self, name: str) -> tuple[str, str]:
-        """Return the node that serves a service and its host, or empty text."""
+        """Return the node that serves a service and its host, or empty strings."""
         service = self._graph.services.get(absolute(name))
         if service:
             return service.client.node, service.client.address
@@ -285,7 +286,7 @@ class Rosapi:
         if size > self._limits.parameter_bytes:
             return self._outcome(f"all parameters together may have {self._limits.parameter_bytes} bytes")
         if key not in self._parameters and len(self._parameters) >= self._limits.parameters:
-            return self._outcome(f"there are {self._limits.parameters} parameters already")
+            return self._outcome(f"there are already {self._limits.parameters} parameters")
         self._parameters[key] = data
         self._parameter_bytes = size
         return self._outcome()
@@ -296,7 +297,7 @@ class Rosapi:
 
 
 def _of_type(types: Iterable[tuple[str, str]], type_name: str, normalise: Callable[[str], str]) -> list[str]:
-    """Return the names whose type is the one in question, in either form of its name."""
+    """Return the names that have this type, in either form of the type's name."""
     try:
         wanted = normalise(type_name)
     except NameFormError:

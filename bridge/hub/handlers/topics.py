@@ -1,4 +1,4 @@
-"""Topics: advertising, publishing, subscribing, latching; each message is encoded once for all subscribers."""
+"""Topics: advertising, publishing, subscribing, latching; a message is encoded once for all subscribers."""
 
 import time
 from collections.abc import Callable
@@ -40,12 +40,14 @@ from bridge.names import absolute, same_type, split_type
 _ENVELOPE_KEYS: Final = 3
 """Keys of an operation with a reusable envelope: op, topic and msg."""
 _WORTH_CUTTING: Final = 512
-"""Bytes from which on a message is cut out of the received operation; smaller ones are rewritten as quickly."""
+"""Minimum bytes of a message that is cut out of the received operation; smaller ones are rewritten as fast.
+"""
 _KEY: Final = b'"msg"'
 _QUOTES: Final = 200
-"""Maximum of quotes in a message that is cut out: checking more takes as long as rewriting it."""
+"""Maximum number of quotes in a message that is cut out; checking more takes as long as rewriting it."""
 _SHORT: Final = 4096
-"""Bytes up to which the key is searched at once; longer messages are mostly numbers, where quotes are found faster."""
+"""Bytes up to which the key itself is searched; in longer messages, mostly numbers, quotes are found faster.
+"""
 _MESSAGE_WORK: Final = 20
 """Units of work of one message, besides those for each subscriber."""
 _PLAIN: Final = Compression.NONE
@@ -62,7 +64,7 @@ class Topics:
         definitions: Definitions,
         refuse: Callable[[Client, str, OperationId], None],
     ) -> None:
-        """Start without topics; `refuse` reports a message that a subscriber cannot get."""
+        """Start without topics; `refuse` reports a message that cannot be encoded for a subscriber."""
         self._graph = graph
         self._limits = limits
         self._dispatcher = dispatcher
@@ -70,7 +72,7 @@ class Topics:
         self._refuse = refuse
 
     def leave(self, client: Client) -> None:
-        """Forget a client that left."""
+        """Remove a disconnected client."""
         for subscription in list(client.subscriptions.values()):
             self._end_subscription(subscription)
         for advertisement in list(client.advertisements.values()):
@@ -103,7 +105,7 @@ class Topics:
         Args:
             client: The publisher.
             operation: The operation.
-            raw: The same as received, if that was strict JSON.
+            raw: The operation as received, if it was strict JSON.
             now: Monotonic seconds.
         """
         name, parsed = text(operation, "topic"), operation.get("msg", {})
@@ -111,7 +113,8 @@ class Topics:
             raise RefusedError(f"the message for {name} is not a JSON object")
         advertisement = client.advertisements.get(name if name[0] == "/" else "/" + name)
         if advertisement is None:
-            # As on the reference server, publishing advertises, if the type is given here or known already.
+            # As on the reference server, publishing also advertises, if the type is given here or already
+            # known.
             advertisement = self._start_publishing(
                 client,
                 name,
@@ -126,7 +129,7 @@ class Topics:
             self.distribute(topic, parsed, _cut_out(operation, raw), now)
 
     def publish_again(self, client: Client, data: bytes, now: float) -> bool:
-        """Perform a `publish` with a known envelope: only its message is parsed, and passed on as received.
+        """Perform a `publish` with a known envelope: only its message is parsed, and forwarded as received.
 
         Args:
             client: The publisher.
@@ -134,7 +137,7 @@ class Topics:
             now: Monotonic seconds.
 
         Returns:
-            Whether it was one. If not, nothing was done, and the data needs a full look.
+            Whether it was one. If not, nothing was done, and the data must be parsed in full.
         """
         advertisement = client.last_published
         if advertisement is None:
@@ -172,12 +175,12 @@ class Topics:
         """Deliver a message to all subscribers of its topic.
 
         Args:
-            topic: Its topic.
+            topic: The topic.
             parsed: The message.
-            data: The same as JSON, or None if it has to be written.
+            data: The message as JSON, or None if it must be written.
             now: Monotonic seconds.
-            prefix: The bytes before the message, if it was received ready for the wire.
-            payload: The message as received then.
+            prefix: The bytes before the message, if it can be forwarded as received.
+            payload: In this case, the operation as received.
         """
         data = orjson.dumps(parsed) if data is None else data
         # Rewriting can lengthen a message (1e15 becomes 1000000000000000.0).
@@ -214,7 +217,7 @@ class Topics:
         try:
             payload = message.payload(subscription.compression, subscription.name)
         except BridgeError as error:
-            if lane.dropped == 0:  # reported once: the topic's next message fails in the same way
+            if lane.dropped == 0:  # reported once, because the topic's next messages fail in the same way
                 self._refuse(client, str(error), next(iter(subscription.options)))
             lane.dropped += 1
             return
@@ -241,7 +244,7 @@ class Topics:
         subscription = client.subscriptions.get(absolute(name))
         is_new = subscription is None or own_id not in subscription.options
         if is_new and client.open_subscriptions >= self._limits.subscriptions_per_client:
-            raise RefusedError(f"this client has {client.open_subscriptions} subscriptions already")
+            raise RefusedError(f"this client already has {client.open_subscriptions} subscriptions")
         topic = self._join(name, type_name, type_needed=False)
         if subscription is None:
             subscription = topic.subscriptions[client] = Subscription(client, topic, json_prefix(name), name)
@@ -283,7 +286,7 @@ class Topics:
     # --- joining and leaving
 
     def _join(self, name: str, type_name: str | None, *, type_needed: bool) -> Topic:
-        """Return the topic, created if it is new, after all checks that can refuse it."""
+        """Return the topic, created if it is new, after all checks."""
         if type_name is not None:
             split_type(type_name)
             type_name = self._definitions.name(type_name)
@@ -299,7 +302,7 @@ class Topics:
         if topic is None:
             checked_name(name)
             if len(self._graph.topics) >= self._limits.topics:
-                raise RefusedError(f"the hub has {self._limits.topics} topics already")
+                raise RefusedError(f"the hub already has {self._limits.topics} topics")
             topic = self._graph.topics[key] = Topic(key)
         topic.type = known or type_name or ""
         return topic
@@ -310,7 +313,7 @@ class Topics:
         advertisement = client.advertisements.get(absolute(name))
         is_new = advertisement is None or own_id not in advertisement.ids
         if is_new and client.open_advertisements >= self._limits.advertisements_per_client:
-            raise RefusedError(f"this client has {client.open_advertisements} advertisements already")
+            raise RefusedError(f"this client already has {client.open_advertisements} advertisements")
         topic = self._join(name, type_name, type_needed=True)
         if advertisement is None:
             advertisement = topic.advertisements[client] = Advertisement(client, topic)
@@ -339,7 +342,7 @@ class Topics:
 
 
 def _learn_envelope(advertisement: Advertisement, name: str, raw: bytes) -> None:
-    """Remember the bytes before a topic's messages, if they suffice to recognise the next publish."""
+    """Store the bytes before a topic's messages, if they suffice to recognise its next publish operations."""
     client, envelope = advertisement.client, envelope_of(raw)
     if envelope and topic_of(envelope) == name:
         _forget_envelope(advertisement)
@@ -356,10 +359,11 @@ def _forget_envelope(advertisement: Advertisement) -> None:
 
 
 def _cut_out(operation: Operation, raw: bytes | None) -> bytes | None:
-    """Return a large message's own bytes in the received operation, or None where it must be rewritten.
+    """Return a large message's own bytes in the received operation, or None if it must be rewritten.
 
-    They are certain only if the operation is JSON without escapes and with the key once, so that this is the
-    message's own, and if it ends with two braces and only the message is an object, so that the message is last.
+    Their position is certain only if the operation is JSON without escapes that has the key once, so the key
+    is not part of the message, and if it ends with two braces and only the message is an object, so the
+    message is last.
     """
     if raw is None or len(raw) < _WORTH_CUTTING or raw[-2:] != b"}}" or b"\\" in raw:
         return None
