@@ -21,8 +21,9 @@ from pathlib import Path
 from scripts.campaigning.expected import BANKS, BUILD_OPTIONS, Addresses, Expected, Outcome
 from scripts.campaigning.faults import Kind, Schedule, Step, step_as_json
 from scripts.campaigning.growth import growth
+from scripts.campaigning.measures import Recovery, RoundResult
 from scripts.campaigning.observer import Finding
-from scripts.campaigning.round import POOL, Recovery, Round, RoundResult
+from scripts.campaigning.round import POOL, Round
 from scripts.campaigning.shrinking import shrink
 from scripts.campaigning.stack import Topology
 from scripts.campaigning.wire import TOPIC, TYPE

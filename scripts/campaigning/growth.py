@@ -5,8 +5,8 @@ from __future__ import annotations
 import statistics
 from collections.abc import Iterable
 
+from scripts.campaigning.measures import RoundResult
 from scripts.campaigning.observer import Finding, Flaw
-from scripts.campaigning.round import RoundResult
 
 FEWEST = 3
 """Samples of a process below which it says nothing."""

@@ -45,6 +45,8 @@ class Flaw(StrEnum):
     SLOW = "slow recovery"
     ENDED = "ended"
     """A process ended that should not have."""
+    REFUSED = "refused"
+    """A reload was refused that nothing disturbed."""
     GROWTH = "growth"
     """A process holds more and more memory or descriptors."""
 

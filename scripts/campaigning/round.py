@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import os
 import random
-import subprocess
-import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -19,6 +16,7 @@ from scripts.campaigning.accounts import Counters, Excuses, in_transit, judge
 from scripts.campaigning.expected import Addresses, Outcome, UnusableError, addresses_of
 from scripts.campaigning.faults import Kind, Step, excuses_of
 from scripts.campaigning.injection import Injector, steppable_clock
+from scripts.campaigning.measures import Recovery, RoundResult, slowness
 from scripts.campaigning.observer import OLDEST, Finding, Flaw, Observer
 from scripts.campaigning.stack import NotThereError, Stack, Topology
 from scripts.campaigning.wire import REPORTS, Client, now
@@ -36,41 +34,6 @@ _SETTLE_LIMIT = 15.0
 _QUIET = 0.6
 """Seconds without a change after which nothing is in flight any more."""
 _stamps = count(time.time_ns() // 10**9 * 10**9, 1_000_000)
-
-
-@dataclass(slots=True)
-class Recovery:
-    """How long results took to come back after a step's end, and how slow the machine was then."""
-
-    step: str
-    seconds: float
-    slowness: float
-
-
-@dataclass(slots=True)
-class RoundResult:
-    """What a round found and measured."""
-
-    findings: list[Finding] = field(default_factory=list)
-    frames: int = 0
-    readings: int = 0
-    losses: dict[str, int] = field(default_factory=dict)
-    recoveries: list[Recovery] = field(default_factory=list)
-    transit: tuple[int, int] = (0, 0)
-    """Readings and results that were between two processes when they were cut."""
-    resources: dict[tuple[str, int], list[tuple[int, int, int]]] = field(default_factory=dict)
-    """By role and process: frames so far, resident KiB and descriptors."""
-    failed_step: int = -1
-    words: str = ""
-
-
-def slowness() -> float:
-    """Return how many times longer a small process takes than its own CPU time: 1 on an idle machine."""
-    begun = time.monotonic()
-    process = subprocess.Popen([sys.executable, "-S", "-c", "pass"])
-    _, _, usage = os.wait4(process.pid, 0)
-    process.returncode = 0
-    return max(1.0, (time.monotonic() - begun) / max(usage.ru_utime + usage.ru_stime, 0.005))
 
 
 class Round:
@@ -98,6 +61,7 @@ class Round:
         self._client = Client(self.stack.hub_port, self._take, self.observer.reconnected)
         self._result = RoundResult()
         self._base = Counters()
+        self._reloads = 0
         self._master = 0
         self._news = asyncio.Event()
         self._paused = False
@@ -166,6 +130,7 @@ class Round:
         generation = await self.stack.reload(new)
         if generation >= 0:
             self.observer.reloaded(generation, new.name)
+            self._reloads += 1
         else:
             self.stack.deployment = former
 
@@ -208,7 +173,7 @@ class Round:
 
     async def _take_step(self, step: Step) -> None:
         name = " + ".join(map(str, step))
-        begun = now()
+        begun, reloads = now(), self._reloads
         self.observer.fault(begun)
         results = await asyncio.gather(
             *(self._injector.inject(fault) for fault in step), return_exceptions=True
@@ -218,6 +183,8 @@ class Round:
                 raise error
         if "master" in await self._injector.restart():
             self._begin_master()
+        if [fault.what for fault in step] == ["reload"] and self._reloads == reloads:
+            self._find(Flaw.REFUSED, "a reload without another fault")
         await self._recover(name, judged=True)
         excuses = replace(excuses_of(step, self.stack.topology), since=begun, until=now())
         self.observer.calm(now())
