@@ -34,8 +34,10 @@ PATIENCE = 180.0
 """Seconds for what happens within one where nothing else runs."""
 PID_MAX = int(Path("/proc/sys/kernel/pid_max").read_text())
 LOOP = ("master", "--loop", "--connect-timeout", "30")
+PROGRAMMED = "pcie-app: 4 boards"
+"""Part of the line that is printed once the boards are ready."""
 READING = {"D1": 71, "D2": 50, "D3": 50, "B1": 45, "B2": 0, "B3": 90}
-"""What a boat in the middle of the map sees."""
+"""Readings of a boat in the middle of the map."""
 
 
 async def until(true: Callable[[], Any], why: Callable[[], str] = str) -> Any:

@@ -8,7 +8,7 @@ import pytest
 
 from services.commands import master
 from tests.command_runner import invoke
-from tests.integration.conftest import READING, Robot, only_error, until, until_subscribed
+from tests.integration.conftest import PROGRAMMED, READING, Robot, only_error, until, until_subscribed
 
 
 async def once(stage, deployment, uri, *options) -> tuple[int, str]:
@@ -78,7 +78,7 @@ async def test_in_a_loop_unusable_messages_are_counted_and_reported_once(stage, 
         *("master", "--loop", "-d", str(boat), "--uri", uri, "--count", "3"),
         environment={"BM_RUN_DIRECTORY": str(stage.runs)},
     )
-    await looping.says("pcie-app: 4 boards")
+    await looping.says(PROGRAMMED)
     await until_subscribed(uri, "/boat/sensors")
     readings = (
         *(WITHOUT_D2, READING | {"D2": "50"}, READING | {"D2": float("nan")}, READING | {"D2": None}),

@@ -14,7 +14,7 @@ from casestudies.boat.correctness import correctness
 from casestudies.boat.geometry import map_grid
 from casestudies.boat.messages import SENSOR_NAMES
 from casestudies.boat.model import model as boat_model
-from tests.integration.conftest import build_boat, stamp_of
+from tests.integration.conftest import PROGRAMMED, build_boat, stamp_of
 from toolchain.deployment import load_deployment
 from toolchain.deployment.address import to_address
 from toolchain.models.fusion import exact_posterior
@@ -44,7 +44,7 @@ async def test_frames_are_as_good_as_float64_fusion(stage, whole_boat, tmp_path)
         *("master", "--loop", "--count", str(FRAMES), "--queue", "all", "-d", str(whole_boat), "--uri", uri)
     )
     await listener.says("listening")
-    await master.says("pcie-app: 4 boards")
+    await master.says(PROGRAMMED)
     stage.start("boat-normaliser", "--uri", uri)
     stage.start("boat-simulator", "--uri", uri, "--rate", "40", "--seed", str(SEED))
     assert await master.end() == 0, master.err

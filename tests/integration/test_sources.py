@@ -162,7 +162,7 @@ async def test_clocks_that_disagree_are_named_and_what_is_unpaired_is_counted(st
     robots.late_s = 5.0
     async with connect(robots.uris[0]) as ros, posteriors(ros) as heard:
         master = stage.start("master", "--loop", "--count", "3", "-d", str(deployment))
-        await master.says("messages come on all topics but make no frame")
+        await master.says(r"\b[45](\.\d+)? s .*--tolerance")
         await asyncio.sleep(1)
         robots.late_s = 0.0
         for _ in range(3):
@@ -184,15 +184,15 @@ async def test_one_server_may_go_and_come(stage, deployment, robots):
         (second,) = (hub for hub in stage.running if hub.name == "hub" and f":{port}" in hub.err)
         second.send(signal.SIGKILL)
         await second.end()
-        await master.says(rf"rosbridge at ws://127.0.0.1:{port} is gone")
+        await master.says(rf"warning: .*:{port} ")
         with contextlib.suppress(BridgeError):  # what was under way
             while True:
                 await heard.next(1.0)
         await stage.hub(port)
-        await master.says(rf"rosbridge at ws://127.0.0.1:{port} is connected again")
+        await master.says(rf"(?s)warning: [^\n]*:{port} .*\n(?![^\n]*warning)[^\n]*:{port} ")
         for _ in range(3):
             assert (await heard.next(PATIENCE)).best() == {"s": 2}
         master.send(signal.SIGINT)
         assert await master.end() == 130
-    assert "make no frame" not in master.err
+    assert "--tolerance" not in master.err
     await stage.nothing_left("hub")

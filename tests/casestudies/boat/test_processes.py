@@ -223,11 +223,10 @@ async def test_a_normaliser_says_what_went_wrong_once():
         code, _out, err = await normaliser.ended()
     assert sent["msg"] == {"D1": 1, "D2": 2, "D3": 3, "B1": 0, "B2": 0, "B3": 0}
     assert err.count("B2") == 1
-    lost, restored = [line for line in err.splitlines() if "rosbridge at" in line]
+    lost, restored = [line for line in err.splitlines()[1:] if fake.uri in line]
     assert lost.startswith("warning: ")
-    assert fake.uri in lost
-    assert fake.uri in restored
-    assert (code, err.splitlines()[-1]) == (143, "asked to end (SIGTERM)")
+    assert not restored.startswith("warning: ")
+    assert code == 143
 
 
 async def test_a_viewer_says_which_results_never_came():

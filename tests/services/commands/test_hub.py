@@ -31,7 +31,7 @@ TOKEN = "correct-horse-battery-staple"
         (("--origin", "robot.example"), "--origin robot.example"),
         (("--origin", "https://robot.example/page"), "expected for example"),
         (("--host", "192.0.2.77", "--insecure"), "192.0.2.77"),
-        (("--announce", "a.b", "--port", "0"), "cannot be the name of a robot"),
+        (("--announce", "a.b", "--port", "0"), "a.b"),
     ],
 )
 def test_what_the_hub_refuses_is_one_sentence(arguments: tuple[str, ...], said: str) -> None:

@@ -1,6 +1,7 @@
 """A model built into a deployment: the boards together are the machine, and the same input gives the same bytes."""
 
 import os
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -141,7 +142,7 @@ def test_a_model_larger_than_the_register_map(tmp_path):
 def test_a_folder_that_cannot_be_written(tmp_path):
     (tmp_path / "file").write_text("")
     for folder in (tmp_path / "file", tmp_path / "file" / "below"):
-        with pytest.raises(BuildError, match="cannot be written: .*; choose another folder"):
+        with pytest.raises(BuildError, match=rf"^{re.escape(str(folder))} .* -o$"):
             build_deployment(model(), folder, OPTIONS)
 
 
@@ -153,7 +154,7 @@ def test_a_build_over_another_leaves_nothing_of_it_even_if_it_fails_half_way(tmp
     load_deployment(tmp_path)
     (tmp_path / "boards" / "board1.bm").unlink()
     (tmp_path / "boards" / "board1.bm" / "in the way").mkdir(parents=True)
-    with pytest.raises(BuildError, match="cannot be written"):
+    with pytest.raises(BuildError, match=r"boards/board1\.bm "):
         build_deployment(model(), tmp_path, replace(OPTIONS, partitions=2))
     with pytest.raises(DeploymentError, match="deployment.toml"):
         load_deployment(tmp_path)

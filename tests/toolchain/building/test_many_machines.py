@@ -214,7 +214,7 @@ CALLED_REPLICA = replace(model(), searched=(dimension(REPLICA, size=6),))
         (model(), replace(CELL, scale=Scale.ADDRESS), {"scale": Scale.COLUMN}, "--scale"),
         (model(), replace(THRESHOLD, scale=Scale.ADDRESS), {"scale": Scale.COLUMN}, "--scale"),
         (model(), replace(CELL, replicas=3, interface=(35, 18)), {"interface": (36, 18)}, "36x18"),
-        (model(), replace(OPTIONS, replicas=3, interface=(9000, 18)), {"interface": (9, 18)}, "register map"),
+        (model(), replace(OPTIONS, replicas=3, interface=(9000, 18)), {"interface": (9, 18)}, "9000x18"),
         (model(40), replace(CELL, replicas=200), {"partitions": 2}, "2 or more, or fewer --replicas"),
         (CALLED_REPLICA, replace(OPTIONS, replicas=2), {"replicas": 1}, "'replica'"),
     ],
@@ -281,7 +281,7 @@ def test_a_device_gets_as_many_boards_as_the_register_map_needs():
     count, why = boards_needed(parameters, device)
     assert count == 2
     assert " 20 lines " in why
-    with pytest.raises(BuildError, match="not even one line of 256 replicas fits the register map"):
+    with pytest.raises(BuildError, match="256 replicas .* --replicas$"):
         boards_needed(replace(parameters, replicas=256, sensor_bits=(3,) * 40), device)
 
 
