@@ -308,3 +308,5 @@ class Subscriber:
             self._completed += 1
             self._passed_over_sent, self._unpaired_sent = passed_over, unpaired
             self._once = False  # the reading has been sent: a later failure must not end the service
+        else:
+            self._passed_over += 1  # without a master: the next one hears of it with its first reading

@@ -29,6 +29,16 @@ def test_passed_over_readings_are_reported_once_and_counted_in_all(boat, link):
     assert (frames.completed, frames.lost) == (3, {LossReason.PASSED_OVER: 5})
 
 
+def test_readings_without_a_master_are_counted_as_passed_over(boat, link, monkeypatch):
+    subscriber = Subscriber(Settings(), boat, link.make)
+    with monkeypatch.context() as away:
+        away.setattr(link, "send", lambda _record: False)
+        subscriber._read(0, Message("/boat/sensors", dict(READING), 1, 2))
+    assert subscriber.status().frames.lost == {LossReason.PASSED_OVER: 1}
+    subscriber._read(0, Message("/boat/sensors", dict(READING), 1, 2))
+    assert [reading.passed_over for reading in link.sent] == [1]
+
+
 def test_an_unusable_message_is_reported_by_its_cause(boat, link):
     subscriber = Subscriber(Settings(), boat, link.make)
     for value in ("x", "y"):
