@@ -9,6 +9,8 @@ from scripts.campaigning.observer import Finding, Flaw, Reading
 
 WITH_PUBLISHER = "lost with the publisher"
 """These may have arrived: the publisher was killed before it could say so."""
+MOST_IN_TRANSIT = 5
+"""Readings, and results, that a step may cut off between two processes."""
 NOT_LOST = "on some topics only"
 
 
@@ -42,12 +44,14 @@ class Excuses:
     Attributes:
         readings: Readings on their way to the master (a killed subscriber or master, a cut connection).
         results: Results on their way from the publisher.
+        most: How many of each; more only where a process or connection was held before.
         since: When the fault began (seconds); readings from shortly before it on are excused.
         until: When the stack had recovered.
     """
 
     readings: bool = False
     results: bool = False
+    most: int = MOST_IN_TRANSIT
     since: float = 0.0
     until: float = 0.0
 
@@ -74,14 +78,15 @@ def judge(added: Counters, readings: Iterable[Reading], excuses: Excuses, now: f
         for each in given
         if each.arrived is None and excuses.since - IN_FLIGHT <= each.published <= excuses.until
     ]
+    most = min(len(excusable), excuses.most)
     figures = f"{len(given)} readings, {arrived} results; counted: {added}"
     uncounted = len(given) - added.completed - added.losses
-    if uncounted > (len(excusable) if excuses.readings else 0):
+    if uncounted > (most if excuses.readings else 0):
         findings.append(Finding(Flaw.UNCOUNTED, f"{uncounted} readings: {figures}", now))
     if uncounted < 0:
         findings.append(Finding(Flaw.MISCOUNTED, f"{-uncounted} too many: {figures}", now))
     astray = added.completed - arrived
-    if astray > (len(excusable) if excuses.results else 0):
+    if astray > (most if excuses.results else 0):
         findings.append(Finding(Flaw.UNCOUNTED, f"{astray} results are counted as published: {figures}", now))
     if -astray > doubtful:
         findings.append(Finding(Flaw.MISCOUNTED, f"{-astray} results nobody counted: {figures}", now))

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import random
+import sys
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from enum import StrEnum
 
-from scripts.campaigning.accounts import Excuses
+from scripts.campaigning.accounts import MOST_IN_TRANSIT, Excuses
 from scripts.campaigning.stack import BOARD_NAMES, BOARDS_PARENT, SERVICES, Topology
 
 
@@ -80,7 +81,8 @@ def excuses_of(step: Step, topology: Topology) -> Excuses:
         results |= cut or fused or ended in {"hub", "master", "publisher"}
         if fault.what == "files":
             readings = results = True
-    return Excuses(readings=readings, results=results)
+    held = any(fault.what in {"stop", "hold", "slow", "delay", "burst"} for fault in step)
+    return Excuses(readings=readings, results=results, most=sys.maxsize if held else MOST_IN_TRANSIT)
 
 
 class Schedule:

@@ -123,6 +123,8 @@ class Observer:
         self._deployments = {0: {deployment}}
         self._last_number = self._last_generation = 0
         self._announced = None
+        for reading in self.pending_readings():  # the former master counted them, and its counters are gone
+            reading.settled = reading.arrived is not None
 
     def reloaded(self, generation: int, *deployments: str) -> None:
         """Take note of the deployment of a generation; several if a fault has hidden which it is."""

@@ -193,7 +193,6 @@ class Round:
 
     def _begin_master(self) -> None:
         self._base = Counters()
-        self.observer.settle()  # the counters of the former master's readings have gone with it
         self.observer.master_started(self.stack.deployment.name)
 
     async def _recover(self, name: str, *, judged: bool) -> None:
