@@ -62,6 +62,7 @@ class Round:
         self._result = RoundResult()
         self._base = Counters()
         self._reloads = 0
+        self._arrived = now()
         self._master = 0
         self._news = asyncio.Event()
         self._paused = False
@@ -71,6 +72,7 @@ class Round:
     # --- readings and results ------------------------------------------------------------------
 
     def _take(self, topic: str, message: Any) -> None:
+        self._arrived = now()
         (self.observer.report if topic == REPORTS else self.observer.result)(message, now())
         self._news.set()
 
@@ -261,7 +263,13 @@ class Round:
         while self.observer.tally["results"] < wanted and now() < deadline and not self.observer.findings:
             await self._some_news()
         if self.observer.tally["results"] < wanted and not self.observer.findings:
-            self._find(Flaw.SLOW, f"{self._calm_frames} frames without a fault took too long")
+            done = self._calm_frames - wanted + self.observer.tally["results"]
+            slow, last = await asyncio.to_thread(slowness), now() - self._arrived
+            self._find(
+                Flaw.SLOW,
+                f"{done} of {self._calm_frames} results without a fault, the last one {last:.1f} s ago; "
+                f"counted: {await self.stack.counters()} (machine slower by {slow:.1f})",
+            )
         await self._settle(Excuses())
         await self._sample()
 
