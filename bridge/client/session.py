@@ -415,7 +415,7 @@ class Session:
             self._schedule_look()
 
     async def _renew(self, topics: list[str]) -> None:
-        """Subscribe anew to those of the topics that somebody publishes."""
+        """Renew the subscriptions of those topics that somebody publishes."""
         for topic in topics:
             answer = await self.ask_rosapi("publishers", {"topic": topic}, _ROSAPI_TIMEOUT)
             if not answer.get("publishers") or not self.is_open:

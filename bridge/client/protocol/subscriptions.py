@@ -215,7 +215,7 @@ class Subscriptions:
         return [s.topic for s in self._subscribed.values() if s.type is not None and not s.has_messages]
 
     def renew(self, topic: str) -> bool:
-        """Subscribe anew to a topic that is silent although somebody publishes it; return whether it gives up CBOR.
+        """Renew the subscription of a topic that is silent although published; return whether it gives up CBOR.
 
         rosbridge for ROS 2 fixes the quality of service when it subscribes, so that a best-effort publisher which starts
         later is not heard. Servers fail to write some types as CBOR: from the second renewal on, JSON is asked for.
