@@ -25,9 +25,11 @@ RUN with-kernels --compile && \
     --uri ws://hub:9090 --topic /boat/sensors --type boat_msgs/Sensors
 
 FROM ${PYTHON_IMAGE}
+# a deployment is mounted at its path on the host, which may be a folder of root's
 RUN groupadd --gid 10001 rosbayes && \
     useradd --uid 10001 --gid 10001 --no-create-home --home-dir /tmp --shell /usr/sbin/nologin rosbayes && \
-    install --directory --owner 10001 --group 10001 --mode 700 /run/rosbayes /run/rosbayes/sockets /run/rosbayes/status
+    install --directory --owner 10001 --group 10001 --mode 700 /run/rosbayes && \
+    chmod 711 /root
 COPY --from=build /opt/rosbayes /opt/rosbayes
 COPY --from=build /deployment /deployment
 ENV PATH=/opt/rosbayes/bin:$PATH PYTHONUNBUFFERED=1 PYTHONDONTWRITEBYTECODE=1 HOME=/tmp BM_DEPLOYMENT=/deployment

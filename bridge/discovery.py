@@ -17,6 +17,7 @@ import ipaddress
 import re
 import socket
 from collections.abc import AsyncIterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Final, Literal
@@ -29,6 +30,8 @@ if TYPE_CHECKING:
 SERVICE_TYPE: Final = "_rosbridge._tcp.local."
 MAX_ROBOTS: Final = 256
 """Maximum number of listed robots."""
+ROBOT: Final = "robot:"
+"""Prefix of a URI that names a robot instead of an address."""
 _LONGEST_NAME: Final = 63
 """Maximum length of a name in bytes (RFC 6763, section 4.1.1)."""
 _PATH: Final = re.compile(r"/[A-Za-z0-9._~/-]{0,200}")
@@ -132,6 +135,19 @@ async def resolve(
             "do, and ws://HOST:PORT reaches one that does not"
         )
     return robot.uri
+
+
+async def announced_uri(uri: str) -> str:
+    """Return a URI unchanged, or for `robot:NAME` that of the robot's server; errors are those of `resolve`."""
+    return await resolve(uri.removeprefix(ROBOT)) if uri.startswith(ROBOT) else uri
+
+
+def find_uri(uri: str) -> str:
+    """Return the same as `announced_uri`, for a caller that does not await, even inside an event loop."""
+    if not uri.startswith(ROBOT):
+        return uri
+    with ThreadPoolExecutor(1) as pool:
+        return pool.submit(lambda: asyncio.run(announced_uri(uri))).result()
 
 
 @asynccontextmanager

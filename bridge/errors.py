@@ -43,8 +43,24 @@ class ConcurrentReadError(UsageError):
     """Raised when two tasks wait for one subscription, because each message would reach only one of them."""
 
 
+class WrongThreadError(UsageError):
+    """Raised when a client is used from another thread than that of its event loop, or a blocking one from its own."""
+
+
 class EncodeError(UsageError):
     """Raised when an object cannot be encoded: its type, a NaN, an infinity, its depth or its size."""
+
+
+class MessageTooLargeError(EncodeError):
+    """Raised when a message has more bytes than this client, or the server as far as known, accepts."""
+
+
+class MessageTypeError(EncodeError):
+    """Raised when a message does not fit its type: a misspelt field, or an array of another shape."""
+
+
+class TopicLeftOutError(BridgeError):
+    """Raised when a topic is left out, because its messages are too large for the connection."""
 
 
 class DecodeError(BridgeError):
@@ -79,6 +95,10 @@ class NoAnswerError(BridgeError):
     """Raised when a service did not answer in time."""
 
 
+class ParamError(BridgeError):
+    """Raised when a parameter does not exist, or the server refuses to change it."""
+
+
 class SlowPeerError(BridgeError):
     """Raised when the server does not accept messages in time, or too many are waiting."""
 
@@ -108,6 +128,22 @@ class GoalError(BridgeError):
     def __init__(self, reason: str, action: str) -> None:
         self.reason = reason
         super().__init__(f"action {action} has no result: {reason or 'it gave no reason'}")
+
+
+class TransformError(BridgeError):
+    """Base class of errors of coordinate transforms."""
+
+
+class FrameUnknownError(TransformError):
+    """Raised when no transform with this frame is known."""
+
+
+class FramesUnconnectedError(TransformError):
+    """Raised when two frames have no common ancestor."""
+
+
+class ExtrapolationError(TransformError):
+    """Raised when a transform is not known at a time, which is before the oldest or after the newest."""
 
 
 class DefinitionError(UsageError):

@@ -5,9 +5,11 @@ import json
 import os
 import time
 from collections.abc import AsyncIterator
+from pathlib import Path
 from typing import Final
 
-from terminal.health import serve_health
+from terminal.health import resources, serve_health
+from terminal.private_directory import own_directory
 
 RECENT_S: Final = 10.0
 """Seconds without work after which a process is not ready."""
@@ -37,14 +39,17 @@ class Readiness:
 
 @contextlib.asynccontextmanager
 async def serve_readiness(name: str, readiness: Readiness) -> AsyncIterator[None]:
-    """Report the readiness on a socket in the folder that BM_RUN_DIRECTORY names, if any, within the context."""
+    """Report the readiness within the context, on a socket in BM_RUN_DIRECTORY or in a private directory."""
     started = time.monotonic()
 
     def answer() -> bytes:
         ready, why = readiness.state()
         uptime = round(time.monotonic() - started, 3)
         status = {"ready": ready, "why": why, "name": name, "pid": os.getpid(), "uptime_s": uptime}
+        status |= resources()
         return json.dumps(status).encode()
 
-    async with serve_health(os.environ.get("BM_RUN_DIRECTORY") or None, name, answer):
-        yield
+    given = os.environ.get("BM_RUN_DIRECTORY")
+    with own_directory(Path(given) if given else None, name) as directory:
+        async with serve_health(directory, name, answer):
+            yield

@@ -25,7 +25,7 @@ _BOARD: Final = b"rosbayes board"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Credentials:
-    """What a host or a board uses on links over TCP.
+    """Credentials of a host or a board for links over TCP.
 
     Attributes:
         key: The shared key; empty for none.

@@ -116,8 +116,11 @@ def listen(endpoint: Endpoint) -> socket.socket:
             server.bind(endpoint.path)
         server.listen()
     except OSError as error:
-        taken = error.errno == errno.EADDRINUSE
-        reason = "another process listens there" if taken else (error.strerror or str(error))
+        reasons = {
+            errno.EADDRINUSE: "another process listens there",
+            errno.ENOENT: f"the folder {Path(endpoint.path).parent} does not exist; create it",
+        }
+        reason = reasons.get(error.errno or 0, error.strerror or str(error))
         raise EndpointError(f"Nothing can be served at {endpoint}: {reason}") from error
     return server
 

@@ -53,7 +53,7 @@ def _print_version(wanted: bool) -> None:
 def rosbayes(
     _version: Annotated[
         bool,
-        typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and end."),
+        typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit."),
     ] = False,
 ) -> None:
     """Bayesian machines for any ROS robot.

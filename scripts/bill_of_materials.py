@@ -1,4 +1,4 @@
-"""The bill of materials: every package of the lock files with its version, hashes and licence, as CycloneDX 1.6."""
+"""Bill of materials: every package of the lock files with version, hashes and licence, as CycloneDX 1.6."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def locked(path: Path) -> list[Package]:
 
 
 def licence_of(package: Package, known: dict[str, str]) -> str:
-    """Return a package's licence as an SPDX expression: its own statement, or `known`, which a person has read.
+    """Return a package's licence as an SPDX expression: the package's, or `known`, which a person checked.
 
     Raises:
         LicenceError: Neither has it, or both and they differ.
@@ -74,7 +74,7 @@ def licence_of(package: Package, known: dict[str, str]) -> str:
 
 
 def check(package: Package, licence: str, allowed: set[str]) -> None:
-    """Check that a licence allows a package to be shipped beside this project.
+    """Check that a licence allows a package to be shipped with this project.
 
     Raises:
         LicenceError: No choice of the expression's licences is allowed.
@@ -82,7 +82,7 @@ def check(package: Package, licence: str, allowed: set[str]) -> None:
     spdx = get_spdx_licensing()
     parsed = spdx.parse(licence, validate=True)
     unknown = {str(each) for each in spdx.license_symbols(parsed, decompose=False)} - allowed
-    # what is not allowed counts as false: an OR with an allowed side stays true
+    # licences that are not allowed count as false, so an OR with an allowed side is true
     values = {each: spdx.TRUE if str(each) in allowed else spdx.FALSE for each in parsed.symbols}
     if parsed.subs(values).simplify() != spdx.TRUE:
         raise LicenceError(
@@ -91,7 +91,7 @@ def check(package: Package, licence: str, allowed: set[str]) -> None:
 
 
 def bill(lock: Path, dev_lock: Path) -> Bom:
-    """Return the bill: what users install is required, what only tests need is excluded from what is shipped.
+    """Return the bill: packages that users install are required, packages only for tests are excluded.
 
     Raises:
         LicenceError: A required package's licence is unknown, or not allowed.
@@ -127,7 +127,7 @@ def bill(lock: Path, dev_lock: Path) -> Bom:
         bom_ref=project["name"],
         licenses=[LicenseExpression(project["license"])],
     )
-    # the same lock files give the same bill
+    # so that the same lock files always give the same bill
     serial = uuid.uuid5(_NAMESPACE, lock.read_text() + dev_lock.read_text())
     whole = Bom(components=components, metadata=BomMetaData(component=own), serial_number=serial)
     direct = {re.split(r"[\[<>=;~! ]", each, maxsplit=1)[0] for each in project["dependencies"]}

@@ -1,4 +1,4 @@
-"""The demo's processes, started in order and ended together: see scripts/demo."""
+"""The demo: processes that are started in order and ended together (see scripts/demo)."""
 
 from __future__ import annotations
 
@@ -9,16 +9,17 @@ import sys
 import time
 from pathlib import Path
 
+from bridge.discovery import announced_uri
 from scripts.processes import BOAT_TOPIC, BOAT_TYPE, ROOT, Process, Screen, build, run_script
 
 LIMIT = 180.0
-"""Seconds after which the demo gives up, whatever it waits for."""
+"""Time limit of the demo, in seconds."""
 PORT = "9090"
-"""Of the hub of a demo that goes on until Ctrl-C."""
+"""Port of the hub in a demo that runs until Ctrl-C."""
 
 
 async def demo(arguments: argparse.Namespace) -> int:
-    """Build, start everything, wait for the viewer's last picture, end everything."""
+    """Build, start everything, wait for the viewer's last picture, and end everything."""
     started = time.monotonic()
     out: Path = arguments.out
     out.mkdir(parents=True, exist_ok=True)  # noqa: ASYNC240 - nothing else runs yet
@@ -42,10 +43,11 @@ async def demo(arguments: argparse.Namespace) -> int:
             await hub.start("hub", "--port", PORT if arguments.stay else "0")
             uri = (await hub.line(r"ws://\S+"))[0]
         else:
+            uri = await announced_uri(uri)  # once, instead of in each process
             screen.show(f"using the rosbridge server at {uri}, building the boat's deployment ...")
         count = () if arguments.stay else ("--count", str(arguments.count))
         await viewer.start("boat-viewer", "--uri", uri, *count, "--out", str(out))
-        # a real server knows installed message types only, so there the readings travel as plain arrays
+        # a real server accepts only installed message types, so the readings are sent as plain arrays there
         array = [] if arguments.uri is None else ["--array"]
         type_ = "std_msgs/Float64MultiArray" if array else BOAT_TYPE
         options = ("--set", "array=true") if array else ()
@@ -67,17 +69,21 @@ async def demo(arguments: argparse.Namespace) -> int:
 
 
 def main() -> int:
-    """Read the flags and run the demo."""
-    parser = argparse.ArgumentParser(prog="scripts/demo", description="The boat case, end to end.")
-    parser.add_argument("--uri", help="a rosbridge server, instead of the embedded hub (ws://HOST:PORT)")
-    parser.add_argument("--count", type=int, default=25, help="frames (25)")
-    parser.add_argument(
-        "--stay", action="store_true", help=f"go on until Ctrl-C, with the hub on port {PORT}, for listeners"
+    """Parse the flags and run the demo."""
+    parser = argparse.ArgumentParser(
+        prog="scripts/demo", description="Run the boat case study from end to end, without a robot."
     )
-    parser.add_argument("--rate", type=float, default=10.0, help="readings a second (10)")
     parser.add_argument(
-        "--seed", type=int, help="of the boat's way and its sensors' noise (a new one each time)"
+        "--uri", help="a rosbridge server, instead of the embedded hub (ws://HOST:PORT or robot:NAME)"
     )
+    parser.add_argument("--count", type=int, default=25, help="number of frames (25)")
+    parser.add_argument(
+        "--stay",
+        action="store_true",
+        help=f"run until Ctrl-C, with the hub on port {PORT}, so that `listen` and others can connect",
+    )
+    parser.add_argument("--rate", type=float, default=10.0, help="readings per second (10)")
+    parser.add_argument("--seed", type=int, help="seed of the route and of the noise (a new one each time)")
     parser.add_argument("--out", type=Path, default=ROOT / "out", help="folder for pictures and logs (out)")
     arguments = parser.parse_args()
     if arguments.count < 1:

@@ -1,4 +1,4 @@
-"""Processes that a script starts, listens to and ends: for the demo and the benches."""
+"""Processes that a script starts, follows and ends, for the demo and the benches."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from toolchain.errors import ToolchainError
 
 ROOT = Path(__file__).resolve().parent.parent
 SILENCE = 1.5
-"""Seconds without a line on a `Screen`."""
+"""Seconds without a line, after which a `Screen` prints one."""
 BOAT_TOPIC, BOAT_TYPE = "/boat/sensors", "boat_msgs/Sensors"
 
 
 class Process:
-    """One process of a script: its lines go to a log, and to `show` if they are meant for the screen."""
+    """One process of a script, whose lines go to a log, and to `show` if they are meant for the screen."""
 
     def __init__(self, name: str, log: Path, *, show: Callable[[str], None] | None = None) -> None:
         self.name = name
@@ -39,7 +39,7 @@ class Process:
         self._news = asyncio.Event()
 
     async def start(self, *command: str) -> None:
-        """Start it in a session of its own, so that Ctrl-C reaches the script alone."""
+        """Start the process in its own session, so that Ctrl-C reaches only the script."""
         self._process = await asyncio.create_subprocess_exec(
             *own_command(command[0]),
             *command[1:],
@@ -53,7 +53,7 @@ class Process:
 
     @property
     def pid(self) -> int:
-        """Its process number; 0 before its start."""
+        """The process number; 0 before the start."""
         return 0 if self._process is None else self._process.pid
 
     async def _read(self) -> None:
@@ -66,7 +66,7 @@ class Process:
                 log.flush()
                 self._lines.append(text)
                 self._news.set()
-                # `failure` reports errors, with the path of the log
+                # `failure` reports errors with the path of the log
                 if self._show is not None and not text.startswith("error: "):
                     self._show(text)
         self._news.set()
@@ -75,7 +75,7 @@ class Process:
         """Wait for a line that matches.
 
         Raises:
-            StackError: the process ended before it printed one.
+            StackError: The process ended before it printed one.
         """
         seen = 0
         while True:
@@ -89,30 +89,30 @@ class Process:
             await self._news.wait()
 
     def failure(self, code: int) -> StackError:
-        """Its end as an error, in its own last words."""
+        """Return the end of the process as an error, with its last line."""
         said = self._lines[-1].removeprefix("error: ") if self._lines else "it said nothing"
         error = StackError(f"{self.name}: {said} (all that it said is in {self._log})")
         error.exit_code = code if code > 0 else ExitCode.CHILD
         return error
 
     async def wait(self) -> int:
-        """Its exit code, once it has ended and all its lines are read."""
+        """Wait until the process has ended and all its lines are read, and return its exit code."""
         assert self._process is not None
         if self._reader is not None:
             await self._reader
         return await self._process.wait()
 
     async def succeed(self) -> None:
-        """Wait for its end.
+        """Wait for the successful end of the process.
 
         Raises:
-            StackError: it did not exit 0.
+            StackError: Its exit code is not 0.
         """
         if code := await self.wait():
             raise self.failure(code)
 
     async def end(self) -> None:
-        """End it: SIGTERM, and SIGKILL after 6 s."""
+        """End the process by SIGTERM, and by SIGKILL after 6 s."""
         if self._process is None:
             return
         if self._process.returncode is None:
@@ -128,11 +128,11 @@ class Process:
 
 
 class Screen:
-    """The lines of a script, and between them, when nothing else comes, a line that says what it waits for."""
+    """The lines of a script and, during silence, lines that name the work it waits for."""
 
     def __init__(self) -> None:
         self.waits_for = "starting"
-        """The work in hand, such as "building"."""
+        """The current work, such as "building"."""
         self._began = time.monotonic()
         self._newest = self._began
 
@@ -153,7 +153,7 @@ async def build(case_study: str, deployment: Path, uri: str, topic: str, type_: 
     """Build a case study's deployment for four boards; the report goes to DEPLOYMENT.log.
 
     Raises:
-        StackError: the toolchain refuses.
+        StackError: The toolchain failed.
     """
     toolchain = Process("toolchain", deployment.with_name(deployment.name + ".log"))
     await toolchain.start(
@@ -164,7 +164,7 @@ async def build(case_study: str, deployment: Path, uri: str, topic: str, type_: 
 
 
 def run_script(work: Callable[[], Awaitable[int]], limit: float) -> int:
-    """Run a script's coroutine with an end to its patience; one sentence for an error.
+    """Run a script's coroutine with a time limit, and report an error in one sentence.
 
     Returns:
         The exit code.

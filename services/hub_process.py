@@ -9,10 +9,12 @@ from bridge.hub.access import AccessPolicy
 from bridge.hub.graph import Graph
 from bridge.hub.limits import HubLimits
 from bridge.hub.server import serve_hub
-from services.settings import load_settings
-from services.sockets.status import HubStatus, ProcessStatus, serve_status
+from services.settings import Settings
+from services.sockets.reporting import serve_status
+from services.sockets.status import HubStatus, ProcessStatus
 from terminal.logs import log_libraries
 from terminal.output import say
+from terminal.private_directory import own_directory
 
 
 async def serve(
@@ -24,6 +26,7 @@ async def serve(
     clients: int,
     ros_version: Literal[1, 2],
     announce: str | None,
+    settings: Settings,
 ) -> int:
     """Serve rosbridge until cancelled; `port` 0 selects a free one, `announce` is the name on the network."""
     # a refused client gets no explanation, as from the reference server; the reason is only in the log
@@ -52,7 +55,6 @@ async def serve(
             say(f"hub: announced as robot:{name}")
             await asyncio.Event().wait()
 
-    run_directory = load_settings().run_directory
     hub = serve_hub(
         host,
         port,
@@ -65,15 +67,16 @@ async def serve(
         on_graph=graphs.append,
         stop=asyncio.Event(),
     )
-    async with serve_status(run_directory, "hub", status):
-        announcing = None if announce is None else asyncio.ensure_future(announce_once_ready(announce))
-        tasks = [asyncio.ensure_future(hub), *([announcing] if announcing else [])]
-        try:
-            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-            for task in done:
-                task.result()
-        finally:
-            for task in tasks:
-                task.cancel()
-            await asyncio.gather(*tasks, return_exceptions=True)
+    with own_directory(settings.run_directory, "hub") as directory:
+        async with serve_status(directory, "hub", status, metrics=settings.metrics):
+            announcing = None if announce is None else asyncio.ensure_future(announce_once_ready(announce))
+            tasks = [asyncio.ensure_future(hub), *([announcing] if announcing else [])]
+            try:
+                done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+                for task in done:
+                    task.result()
+            finally:
+                for task in tasks:
+                    task.cancel()
+                await asyncio.gather(*tasks, return_exceptions=True)
     return 0

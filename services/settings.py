@@ -1,9 +1,7 @@
 """Settings of all services: flags override `BM_*` variables, the deployment and the defaults, in this order."""
 
-import asyncio
 import difflib
 import os
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -13,6 +11,8 @@ from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 from pcie_shim.endpoint import Endpoint, parse_endpoint
 from pcie_shim.errors import PcieShimError
 from services.errors import SettingsError
+from terminal.log_line import LogFormat, use_log_format
+from toolchain.deployment.fields import TOPIC_BYTES_MAX, TOPIC_BYTES_MIN
 
 SHORTEST_S, LONGEST_S = 0.001, 86_400.0
 """Minimum and maximum timeout in seconds."""
@@ -36,8 +36,14 @@ class Settings(BaseSettings):
         default=None, description="readings that wait while a frame is computed"
     )
     stop: Literal["slices", "own"] | None = Field(default=None, description="when the boards stop")
+    integrity: Literal["off", "canary", "twice"] | None = Field(
+        default=None, description="detection of silently wrong counts"
+    )
+    integrity_frames: int | None = Field(
+        default=None, ge=1, le=2**63 - 1, description="frames within which canaries find a flipped bit"
+    )
     boards: Annotated[tuple[str, ...], NoDecode] = Field(
-        default=(), description="endpoints of running boards, comma-separated"
+        default=(), description="endpoints of running boards, comma-separated, or the folder of their sockets"
     )
     ca: Path | None = Field(
         default=None,
@@ -63,6 +69,12 @@ class Settings(BaseSettings):
     message_bytes: int = Field(
         default=16 << 20, ge=1 << 10, le=1 << 28, description="largest message of a topic, in bytes"
     )
+    topic_bytes: int | None = Field(
+        default=None,
+        ge=TOPIC_BYTES_MIN,
+        le=TOPIC_BYTES_MAX,
+        description="largest message of each topic that is read, in bytes",
+    )
     fused: bool = Field(
         default=False, description="subscriber, publisher and pcie-app inside the master's process"
     )
@@ -73,9 +85,14 @@ class Settings(BaseSettings):
     ready_timeout: Seconds = Field(
         default=10, description="seconds without a frame after which a process is not ready"
     )
+    metrics: str = Field(
+        default="",
+        description="TCP address for metrics and health, tcp://HOST:PORT, besides the run directory",
+    )
     log_level: Literal["debug", "info", "warning"] = Field(
         default="info", description="log level; debug logs one line per frame"
     )
+    log_format: LogFormat = Field(default=LogFormat.TEXT, description="lines on standard error")
 
     @field_validator(
         "deployment", "ca", "key_file", "board_ca", "run_directory", "control_directory", mode="before"
@@ -100,7 +117,14 @@ class Settings(BaseSettings):
             )
         return value
 
-    @field_validator("boards", "subscriber", "publisher", "pcie_app")
+    @field_validator("metrics")
+    @classmethod
+    def _metrics(cls, value: str) -> str:
+        if value and not value.startswith("tcp://"):
+            raise ValueError("expected tcp://HOST:PORT, for example tcp://127.0.0.1:9400")
+        return value
+
+    @field_validator("boards", "subscriber", "publisher", "pcie_app", "metrics")
     @classmethod
     def _endpoints(cls, value: str | tuple[str, ...]) -> str | tuple[str, ...]:
         for text in (value,) if isinstance(value, str) else value:
@@ -140,8 +164,12 @@ def load_settings(**flags: Any) -> Settings:
         )
         reason = _expected(name, str(first["msg"]))
         raise SettingsError(f"{where}: {reason} (got {first.get('input')!r})") from error
+    if "log_format" in given:
+        use_log_format(settings.log_format)
     if "uri" in flags and settings.uri is not None and settings.uri.startswith(ROBOT):
-        return settings.model_copy(update={"uri": _found(settings.uri.removeprefix(ROBOT))})
+        from bridge.discovery import find_uri
+
+        return settings.model_copy(update={"uri": find_uri(settings.uri)})
     return settings
 
 
@@ -151,15 +179,6 @@ def _expected(name: str, message: str) -> str:
     if known is not None and known.annotation is float:
         return f"expected seconds from {SHORTEST_S:g} to {LONGEST_S:g}"
     return message.removeprefix("Value error, ").replace("Input should be", "expected", 1)
-
-
-def _found(robot: str) -> str:
-    """Return the announced URI of a robot, or raise a BridgeError."""
-    from bridge.discovery import resolve
-
-    # in a thread, because the caller may run an event loop
-    with ThreadPoolExecutor(1) as pool:
-        return pool.submit(lambda: asyncio.run(resolve(robot))).result()
 
 
 def endpoint_in(directory: Path, name: str) -> Endpoint:

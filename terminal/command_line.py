@@ -14,11 +14,11 @@ from typer.main import get_command
 
 from terminal.ending import outcome
 from terminal.errors import ReaderGoneError
-from terminal.help_page import WIDTH, write_help
+from terminal.help.help_page import WIDTH, write_help
+from terminal.help.usage import RefusedValueError, metavar
 from terminal.logs import escape_last_resort
 from terminal.output import open_standard_streams
 from terminal.signals import raise_on_signals
-from terminal.usage import RefusedValueError, metavar
 
 _COMPLETION: Final = frozenset({"install_completion", "show_completion"})
 

@@ -10,12 +10,10 @@ from typing import Final
 import typer
 
 from terminal.errors import ExitCode, ReaderGoneError, StoppedError, exit_code_of
+from terminal.help.usage import usage_sentence
+from terminal.log_line import PARENT_VARIABLE
 from terminal.output import discard_output, say, say_lines
 from terminal.signals import check_signals, ignore_signals
-from terminal.usage import usage_sentence
-
-PARENT_VARIABLE: Final = "ROSBAYES_PARENT"
-"""Environment variable that a process sets for its children, which exit with it and report nothing."""
 
 _NO_SPACE: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO})
 _TOO_MANY_FILES: Final = frozenset({errno.EMFILE, errno.ENFILE})
@@ -28,14 +26,16 @@ def outcome(command: Callable[[], object]) -> int:
     afterwards.
     """
     try:
-        code = command()
-        check_signals()
-        sys.stdout.flush()  # a failure at exit could no longer be reported
-        result = int(code) if isinstance(code, int) else ExitCode.DONE
+        try:
+            code = command()
+            check_signals()
+            sys.stdout.flush()  # a failure at exit could no longer be reported
+            result = int(code) if isinstance(code, int) else ExitCode.DONE
+        finally:
+            ignore_signals()
     except BaseException as error:
-        ignore_signals()
+        ignore_signals()  # again, because the first signal may have interrupted the call above
         return report(error)
-    ignore_signals()
     return result
 
 

@@ -17,6 +17,8 @@ import socket
 import threading
 import time
 from collections.abc import AsyncIterator, Callable, Iterator
+from concurrent.futures import Future
+from contextlib import AbstractAsyncContextManager
 from enum import StrEnum
 from typing import TYPE_CHECKING
 
@@ -27,8 +29,7 @@ SUFFIX = ".status.sock"
 ANSWER_LIMIT = 1 << 20
 """Maximum size of an answer in bytes."""
 
-_SAMPLE_EVERY = 1.0
-_SEND_TIMEOUT = 0.5
+_END_TIMEOUT = 2.0
 
 
 class Silence(StrEnum):
@@ -102,6 +103,13 @@ def is_ready(path: str, timeout: float) -> tuple[bool, str]:
         raise foreign_socket_error(path) from None
 
 
+def resources() -> dict[str, float]:
+    """Return the user and system time and the resident memory of this process."""
+    with open("/proc/self/statm", encoding="ascii") as statm:  # noqa: PTH123 - see above
+        pages = int(statm.read().split()[1])
+    return {"cpu_s": round(time.process_time(), 3), "memory_bytes": pages * os.sysconf("SC_PAGESIZE")}
+
+
 # --- answering -------------------------------------------------------------------------------------
 
 
@@ -147,15 +155,11 @@ def _listening(directory: str | os.PathLike[str] | None, name: str) -> Iterator[
 
 @contextlib.asynccontextmanager
 async def serve_health(
-    directory: str | os.PathLike[str] | None,
-    name: str,
-    answer: Callable[[], bytes],
-    sample: Callable[[], None] | None = None,
+    directory: str | os.PathLike[str] | None, name: str, answer: Callable[[], bytes]
 ) -> AsyncIterator[None]:
     """Answer in the running event loop within the context, so an answer proves that the loop is not blocked.
 
-    `answer` returns the JSON object, and `sample` is called once per second. Without a directory nothing is
-    served.
+    `answer` returns the JSON object. Without a directory nothing is served.
     """
     import asyncio
 
@@ -163,71 +167,52 @@ async def serve_health(
         writer.write(answer())
         writer.close()
 
-    async def keep_sampling(sample: Callable[[], None]) -> None:
-        while True:
-            sample()
-            await asyncio.sleep(_SAMPLE_EVERY)
-
     with _listening(directory, name) as listener:
         if listener is None:
             yield
             return
         server = await asyncio.start_unix_server(connected, sock=listener)
-        sampling = None if sample is None else asyncio.ensure_future(keep_sampling(sample))
         try:
             yield
         finally:
-            if sampling is not None:
-                sampling.cancel()
             server.close()
 
 
 @contextlib.contextmanager
-def serve_health_in_thread(
-    directory: str | os.PathLike[str] | None,
-    name: str,
-    answer: Callable[[], bytes],
-    sample: Callable[[], None],
-) -> Iterator[None]:
-    """Answer from a thread within the context, for a process whose main thread blocks.
+def in_thread(serving: Callable[[], AbstractAsyncContextManager[None]]) -> Iterator[None]:
+    """Enter a context in the event loop of a thread, for a process whose main thread blocks."""
+    import asyncio
 
-    The arguments are those of `serve_health`; `answer` and `sample` run in the thread.
-    """
-    with _listening(directory, name) as listener:
-        if listener is None:
-            yield
-            return
-        over = threading.Event()
-        thread = threading.Thread(
-            target=_answer_all, args=(listener, answer, sample, over), name="status", daemon=True
-        )
-        # signals must go to the main thread: a blocking call there would not return otherwise
-        mask = signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())
+    entered: Future[None] = Future()
+    loop = asyncio.new_event_loop()
+    over = asyncio.Event()
+
+    async def serve() -> None:
         try:
-            thread.start()
+            async with serving():
+                entered.set_result(None)
+                await over.wait()
+        except BaseException as error:
+            if entered.done():
+                raise
+            entered.set_exception(error)
+
+    def run() -> None:
+        try:
+            loop.run_until_complete(serve())
         finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-        try:
-            yield
-        finally:
-            over.set()
+            loop.close()
 
-
-def _answer_all(
-    listener: socket.socket, answer: Callable[[], bytes], sample: Callable[[], None], over: threading.Event
-) -> None:
-    sampled = 0.0
-    while not over.is_set():
-        if time.monotonic() >= sampled + _SAMPLE_EVERY:
-            sample()
-            sampled = time.monotonic()
-        try:
-            listener.settimeout(_SAMPLE_EVERY)
-            connection, _ = listener.accept()
-        except TimeoutError:
-            continue
-        except OSError:  # the context has ended
-            return
-        with connection, contextlib.suppress(OSError):
-            connection.settimeout(_SEND_TIMEOUT)
-            connection.sendall(answer())
+    thread = threading.Thread(target=run, name="status", daemon=True)
+    # signals must go to the main thread: a blocking call there would not return otherwise
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())
+    try:
+        thread.start()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+    entered.result()
+    try:
+        yield
+    finally:
+        loop.call_soon_threadsafe(over.set)
+        thread.join(_END_TIMEOUT)

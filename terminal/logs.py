@@ -1,6 +1,5 @@
 """Logging to standard error, in one line format for every process."""
 
-import json
 import logging
 import sys
 from typing import Any
@@ -8,6 +7,7 @@ from typing import Any
 import structlog
 from structlog.typing import FilteringBoundLogger
 
+from terminal.log_line import LogFormat, json_line, log_format, logged, now
 from terminal.one_line import lines_of, one_line
 from terminal.output import SurvivingStream
 
@@ -17,6 +17,15 @@ class _OneLine(logging.Formatter):
 
     def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802 - the name in logging
         return one_line(super().formatMessage(record))
+
+    def format(self, record: logging.LogRecord) -> str:
+        if log_format() is not LogFormat.JSON:
+            text = super().format(record)
+            return f"{now()} {text}" if log_format() is LogFormat.DATED else text
+        fields = {"logger": record.name}
+        if record.exc_info:
+            fields["traceback"] = super().formatException(record.exc_info)
+        return json_line(record.levelname.lower(), record.getMessage(), **fields)
 
     def formatException(self, ei: Any) -> str:  # noqa: N802 - the name in logging
         return lines_of(super().formatException(ei))
@@ -51,9 +60,7 @@ def get_logger(role: str, level: str = "info") -> FilteringBoundLogger:
 def _configure(level: str) -> None:
     structlog.configure(
         processors=[
-            structlog.processors.add_log_level,
-            structlog.processors.TimeStamper(fmt="%H:%M:%S.%f", utc=False),
-            _one_line,
+            _line,
         ],
         wrapper_class=structlog.make_filtering_bound_logger(logging.getLevelNamesMapping()[level.upper()]),
         logger_factory=structlog.PrintLoggerFactory(file=SurvivingStream(sys.stderr)),  # type: ignore[arg-type]  # only write and flush are used
@@ -61,20 +68,5 @@ def _configure(level: str) -> None:
     )
 
 
-def _one_line(_: Any, level: str, event: structlog.typing.EventDict) -> str:
-    """Format `12:00:00.123 master: warning: frame=7 the event cycles=512`, without the level if it is info.
-
-    The frame precedes the sentence and is followed by a space, so `grep 'frame=7 '` does not find frame 70.
-    """
-    time, process, sentence = str(event.pop("timestamp"))[:12], event.pop("process"), event.pop("event")
-    event.pop("level", None)
-    frame = f"frame={event.pop('frame')} " if "frame" in event else ""
-    rest = "".join(f" {key}={_value(value)}" for key, value in event.items())
-    prefix = "" if level == "info" else f"{level}: "
-    return one_line(f"{time} {process}: {prefix}{frame}{sentence}{rest}")
-
-
-def _value(value: Any) -> str:
-    """Return a value in logfmt: quoted if it contains spaces."""
-    text = str(value)
-    return json.dumps(text) if not text or set(text) & set(' ="') else text
+def _line(_: Any, level: str, event: structlog.typing.EventDict) -> str:
+    return logged(level, event.pop("process"), event.pop("event"), event)

@@ -5,14 +5,27 @@ import json
 import os
 import sys
 import tempfile
-from collections.abc import Mapping
+import threading
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any, Final, TextIO
 
 import orjson
 
 from terminal.errors import OutputError
-from terminal.one_line import lines_of, one_line
+from terminal.log_line import LogFormat, log_format, relayed, said
+from terminal.one_line import one_line
+
+_CLEAR_LINE: Final = "\r\x1b[K"
+
+
+class _Progress:
+    """Whether the last line of the terminal shows the progress, which the next line replaces."""
+
+    shown = False
+
+
+_progress = _Progress()
 
 
 class SurvivingStream:
@@ -22,8 +35,11 @@ class SurvivingStream:
         self._stream = stream
 
     def write(self, text: str) -> int:
-        """Write a text if the stream still accepts it."""
+        """Write a text if the stream still accepts it, in place of the progress."""
         try:
+            if _progress.shown:
+                _progress.shown = False
+                self._stream.write(_CLEAR_LINE)
             return self._stream.write(text)
         except (OSError, ValueError):
             return len(text)
@@ -36,12 +52,43 @@ class SurvivingStream:
 
 def say(text: str) -> None:
     """Print one line for the user on standard error, even if that has been closed."""
-    _write(one_line(text))
+    _write(said(one_line(text)))
+
+
+def show_progress(text: str) -> None:
+    """Show the progress of this command in one line of the terminal, which the next line replaces.
+
+    In another format than text, it is a line of its own.
+    """
+    if log_format() is not LogFormat.TEXT:
+        say(text)
+        return
+    stream = SurvivingStream(sys.stderr)
+    stream.write(one_line(text))
+    stream.flush()
+    _progress.shown = True
+
+
+@contextlib.contextmanager
+def say_if_slow(text: str, *, after_s: float = 2.0) -> Iterator[None]:
+    """Print one line for the user if the block takes longer than `after_s`."""
+    timer = threading.Timer(after_s, say, (text,))
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
 
 
 def say_lines(text: str) -> None:
     """Print a text of several lines, such as a traceback, on standard error."""
-    _write(lines_of(text))
+    _write(said(text))
+
+
+def relay(line: str, process: str) -> None:
+    """Print a line that a child has printed on standard error."""
+    _write(relayed(line, process))
 
 
 def _write(text: str) -> None:

@@ -81,6 +81,7 @@ class FakeRosbridge:
         silent: reads everything and answers pings, but sends nothing else.
         delay: seconds by which everything that it sends is late.
         refuses: an HTTP status with which new connections are refused, None to take them.
+        max_size: the largest message that it takes; a larger one ends the connection with 1009.
         received: all that clients sent, in order.
         connections: how many connections were ever made.
     """
@@ -100,6 +101,7 @@ class FakeRosbridge:
         silent: bool = False,
         delay: float = 0.0,
         refuses: int | None = None,
+        max_size: int | None = None,
     ) -> None:
         self.port = port
         self.ros = ros
@@ -113,6 +115,7 @@ class FakeRosbridge:
         self.silent = silent
         self.delay = delay
         self.refuses = refuses
+        self.max_size = max_size
         self.received: list[Received] = []
         self.connections = 0
         self.types: dict[str, str] = {}
@@ -162,7 +165,7 @@ class FakeRosbridge:
             self.port,
             compression=None,
             ping_interval=None,
-            max_size=None,
+            max_size=self.max_size,
             process_request=self._answer_http,
             server_header=SERVER,
             reuse_address=True,
@@ -204,7 +207,7 @@ class FakeRosbridge:
             return None
         return connection.respond(HTTPStatus(self.refuses), "the fake refuses\n")
 
-    # What a test asks and says
+    # Queries and messages of a test
 
     def start_best_effort(self, topic: str, type_name: str) -> None:
         """Begin publishing a topic best-effort: only subscriptions made from now on hear it."""
@@ -438,10 +441,19 @@ class FakeRosbridge:
                 return
         await self._respond(client, op, f"Service {service} does not exist", ok=False)
 
-    async def _op_service_response(self, _client: _Client, op: dict[str, Any]) -> None:
+    async def _op_service_response(self, client: _Client, op: dict[str, Any]) -> None:
+        """Pass an answer on like the reference server, in rosbridge_library/capabilities/service_response.py.
+
+        `service_response_msg_fields` there requires `result`, and `values` that are an object; an answer without
+        them is dropped, so the caller waits. Whatever `result` is, the object becomes the service's response.
+        """
+        values, result = op.get("values"), op.get("result")
+        if not isinstance(values, dict) or not isinstance(result, bool):
+            await self._complain(client, "service_response: values is not a dict, or result not a bool")
+            return
         caller, call = self._calls.pop(op.get("id") or "", (None, {}))
         if caller is not None:
-            await self._respond(caller, call, op.get("values"), ok=op.get("result") is True)
+            await self._respond(caller, call, values, ok=True)
 
     async def _respond(self, client: _Client, call: dict[str, Any], values: Any, *, ok: bool) -> None:
         answer = {"op": "service_response", "service": call.get("service"), "values": values, "result": ok}

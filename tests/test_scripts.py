@@ -25,6 +25,13 @@ def test_a_script_prints_its_usage(script, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def test_mutants_of_a_module_that_does_not_exist_are_a_mistake():
+    command = [ROOT / "scripts" / "mutants", "--only", "publsher"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 2
+    assert "services/pipeline/publisher.py" in done.stderr
+
+
 async def test_a_screen_says_what_it_waits_for_when_nothing_else_comes(capsys, monkeypatch):
     monkeypatch.setattr(processes, "SILENCE", 0.2)
     screen = processes.Screen()

@@ -19,6 +19,7 @@ from bridge.errors import (
     OptionError,
     ServiceError,
     SlowPeerError,
+    TopicLeftOutError,
 )
 from bridge.names import absolute, same_type
 from bridge.qos import Qos
@@ -35,10 +36,11 @@ Handler = Callable[[dict[str, Any]], Awaitable[Mapping[str, Any] | None]]
 _log = logging.getLogger("bridge")
 
 
-class _Handle:
+class Handle:
     """Base of handles, which are closed once: explicitly, by leaving their `async with`, or with the client."""
 
     def __init__(self, session: Session) -> None:
+        session.check_thread()
         if session.state is State.CLOSED:
             raise DisconnectedError(f"the client of {session.uri} was closed: connect() makes a new one")
         self._session = session
@@ -59,6 +61,7 @@ class _Handle:
 
     async def close(self) -> None:
         """Withdraw this from the server. Further calls have no effect."""
+        self._session.check_thread()
         if not self._closed:
             self.end()
             self._session.on_closed.discard(self.end)
@@ -78,15 +81,17 @@ def _check_queue_size(size: int, topic: str) -> int:
     return size
 
 
-class Subscription(_Handle):
+class Subscription(Handle):
     """The messages of one topic, to be read by one task: `async for message in subscription`.
 
     If the reader is too slow, the oldest messages are dropped; the connection is not affected. The iteration
-    continues after a lost connection, and ends when the subscription or the client is closed.
+    continues after a lost connection, and ends when the subscription or the client is closed. If the topic is
+    left out, because its messages are too large for the connection, reading raises `TopicLeftOutError`.
 
     Attributes:
         topic: Name of the topic.
         lost: Number of messages dropped because the queue was full.
+        discarded: Number of messages above the topic's limit (`max_bytes`).
         blind_seconds: Total time without a connection; each message has the time just before it.
     """
 
@@ -105,6 +110,7 @@ class Subscription(_Handle):
         self.topic = topic
         self._size = _check_queue_size(queue_size, topic)
         self.lost = 0
+        self.discarded = 0
         self.blind_seconds = 0.0
         self._blind = 0.0
         self._begun = time.monotonic()
@@ -118,7 +124,9 @@ class Subscription(_Handle):
             topic, type_name, throttle_rate=throttle_rate, queue_length=queue_length, delivery=delivery
         )
         session.receivers[self._number] = self._receive
-        session.on_blind.add(self._note_blind)
+        session.watchers[self._number] = self
+        self._left_out = session.why_left_out() if session.core.subscriptions.has_left_out(topic) else ""
+        session.on_blind.add(self._add_blind_seconds)
         self._register()
         session.watch_silence()
 
@@ -130,17 +138,27 @@ class Subscription(_Handle):
         if len(queue) == self._size:
             self.lost += 1
             if queue[0].blind_seconds:
-                message = self._keep_blind(message)
+                message = self._pass_on_blind_seconds(message)
         queue.append(message)
         if self._waiter is not None:
             self._wake()
 
-    def _note_blind(self, seconds: float) -> None:
+    def discard(self) -> None:
+        """Count a message above the topic's limit."""
+        self.discarded += 1
+
+    def leave_out(self, reason: str) -> None:
+        """Raise an error in the reader, after the queued messages, because the topic is left out."""
+        _log.warning("%s %s", self.topic, reason)
+        self._left_out = reason
+        self._wake()
+
+    def _add_blind_seconds(self, seconds: float) -> None:
         seconds = min(seconds, time.monotonic() - self._begun)
         self._blind += seconds
         self.blind_seconds += seconds
 
-    def _keep_blind(self, message: Message) -> Message:
+    def _pass_on_blind_seconds(self, message: Message) -> Message:
         """Add the blind seconds of the message to drop to those of the next message."""
         queue = self._queue
         blind = queue[0].blind_seconds
@@ -162,6 +180,8 @@ class Subscription(_Handle):
 
     async def _wait(self) -> None:
         self._check_alone()
+        if self._left_out:
+            raise TopicLeftOutError(f"{self.topic} {self._left_out}")
         self._waiter = asyncio.get_running_loop().create_future()
         try:
             await self._waiter
@@ -169,6 +189,7 @@ class Subscription(_Handle):
             self._waiter = None
 
     def _check_alone(self) -> None:
+        self._session.check_thread()
         if self._waiter is not None:
             raise ConcurrentReadError(
                 f"another task is already waiting for messages of {self.topic}: give each reader its "
@@ -206,6 +227,7 @@ class Subscription(_Handle):
         Raises:
             NoMessageError: None arrived in time; the sentence names topic, server and time, and information
                 about the topic from rosapi, if any (which takes up to half a second more).
+            TopicLeftOutError: The topic's messages are too large for the connection.
             DisconnectedError: The subscription or the client is closed.
             ConcurrentReadError: Another task is already waiting.
         """
@@ -235,6 +257,8 @@ class Subscription(_Handle):
     async def _why_silent(self, begun: float) -> str:
         """Return the end of an error's sentence: the reason why the topic has been silent."""
         session = self._session
+        if self.discarded:
+            return f"; {self.discarded} messages of the topic were larger than its limit, and were discarded"
         if session.state is not State.CONNECTED:
             return f"; the connection is {session.state}: {session.last_error}"
         try:
@@ -263,12 +287,12 @@ class Subscription(_Handle):
         self._wake()
 
     def _withdraw(self) -> None:
-        del self._session.receivers[self._number]
-        self._session.on_blind.discard(self._note_blind)
+        del self._session.receivers[self._number], self._session.watchers[self._number]
+        self._session.on_blind.discard(self._add_blind_seconds)
         self._session.core.subscriptions.unsubscribe(self._number)
 
 
-class Publication(_Handle):
+class Publication(Handle):
     """One advertised topic.
 
     Attributes:
@@ -304,6 +328,9 @@ class Publication(_Handle):
         Raises:
             DisconnectedError: There is no connection now, or the publication or the client is closed.
             SlowPeerError: The server did not accept it in time, or `queue_size` messages are already waiting.
+            MessageTooLargeError: It is larger than `max_size`, or than the server accepts, as far as known: the
+                hub announces its limit, and others close the connection once, which reconnects.
+            MessageTypeError: It has a field that its type does not have, or an array of another shape.
             EncodeError: It cannot be sent as JSON; for a NaN or infinity, the sentence gives its path.
         """
         session = self._session
@@ -349,7 +376,7 @@ class Publication(_Handle):
         self._publications.unadvertise(self._number)
 
 
-class Service(_Handle):
+class Service(Handle):
     """One service that this client serves.
 
     Attributes:

@@ -7,14 +7,19 @@
 Every wait has a timeout, every queue has a size, and losses are counted (`docs/how-to/bridge.md`).
 """
 
-import asyncio
+import time
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from ssl import SSLContext
-from typing import Any, Final, Literal, Self
+from typing import TYPE_CHECKING, Any, Final, Literal, Self
 
-from bridge.client.goals import Goal
+from bridge.client.actions.actionlib import base_type, is_actionlib_type
+from bridge.client.actions.actionlib_goals import ActionlibSender
+from bridge.client.actions.actionlib_server import ActionlibServer
+from bridge.client.actions.goals import Goal, OperationGoal
+from bridge.client.actions.server import ActionServer, GoalHandler, GoalRequest
+from bridge.client.graph import NodeDetails, Params, ask_definitions, ask_names, ask_node, ask_text
 from bridge.client.handles import (
     PUBLISH_QUEUE_SIZE,
     QUEUE_SIZE,
@@ -30,11 +35,26 @@ from bridge.client.session import Message, Session, State, StateCallback
 from bridge.client.websocket import Limits, check_uri
 from bridge.codecs.cbor_codec import Arrays
 from bridge.codecs.json_codec import MAX_SIZE
+from bridge.codecs.message_check import Definitions
 from bridge.errors import OptionError
-from bridge.names import ros_version_of_type
+from bridge.names import absolute, ros_version_of_type, split_type
 from bridge.qos import Qos
 
-__all__ = ["Goal", "Message", "Publication", "Qos", "Ros", "Service", "State", "Subscription", "connect"]
+if TYPE_CHECKING:
+    from bridge.client.tf import Transforms
+
+__all__ = [
+    "Goal",
+    "GoalRequest",
+    "Message",
+    "Publication",
+    "Qos",
+    "Ros",
+    "Service",
+    "State",
+    "Subscription",
+    "connect",
+]
 
 DETECT_TIMEOUT: Final = 2.0
 """Timeout in seconds for detecting the ROS version of the server."""
@@ -43,11 +63,18 @@ FAREWELL_TIMEOUT: Final = 0.3
 
 
 class Ros:
-    """A client of one rosbridge server, created by `connect`, and opened and closed once by `async with`."""
+    """A client of one rosbridge server, created by `connect`, and opened and closed once by `async with`.
 
-    def __init__(self, session: Session) -> None:
+    Attributes:
+        params: The parameters of the ROS system.
+    """
+
+    def __init__(self, session: Session, *, check_types: bool = True) -> None:
         self._session = session
+        self._check_types = check_types
+        self.params = Params(session)
         self._publishes = False
+        self._senders: dict[tuple[str, str], ActionlibSender] = {}
 
     async def __aenter__(self) -> Self:
         await self._session.open()
@@ -134,6 +161,9 @@ class Ros:
     ) -> Publication:
         """Advertise a topic.
 
+        If the type is known to rosapi, or to rosbags for a known ROS version, the topic's messages are
+        checked before they are sent (`connect(..., check_types=True)`). This asks the server once for each type.
+
         A ROS server must first announce the topic to its network: subscribers there may miss messages in the
         first tenths of a second.
 
@@ -153,7 +183,10 @@ class Ros:
             DisconnectedError: The client was closed.
         """
         self._publishes = True
-        return Publication(self._session, topic, type, latch=latch, queue_size=queue_size, qos=qos)
+        publication = Publication(self._session, topic, type, latch=latch, queue_size=queue_size, qos=qos)
+        if self._check_types:
+            await self._session.learn_type(type)
+        return publication
 
     def subscribe(
         self,
@@ -167,6 +200,7 @@ class Ros:
         arrays: Arrays = "list",
         fragment_size: int | None = None,
         qos: Qos | None = None,
+        max_bytes: int | None = None,
     ) -> Subscription:
         """Subscribe to a topic.
 
@@ -183,6 +217,8 @@ class Ros:
             arrays: Python type of arrays of numbers: `list`, or `numpy` for NumPy arrays, read-only from CBOR.
             fragment_size: Maximum number of characters that the server sends in one fragment.
             qos: Quality of service in ROS 2; older servers ignore it.
+            max_bytes: Maximum size of a message in bytes; a larger one is discarded and counted
+                (`Subscription.discarded`).
 
         Raises:
             NameFormError: The name or the type is malformed.
@@ -197,8 +233,20 @@ class Ros:
             throttle_rate=throttle_rate,
             queue_length=queue_length,
             queue_size=queue_size,
-            delivery=Delivery(compression=compression, arrays=arrays, fragment_size=fragment_size, qos=qos),
+            delivery=Delivery(
+                compression=compression,
+                arrays=arrays,
+                fragment_size=fragment_size,
+                qos=qos,
+                max_bytes=max_bytes,
+            ),
         )
+
+    def transforms(self) -> "Transforms":
+        """Return the transforms of `/tf` and `/tf_static`, which `async with` subscribes to."""
+        from bridge.client.tf import Transforms  # needs NumPy
+
+        return Transforms(self)
 
     # Services
 
@@ -263,14 +311,19 @@ class Ros:
         feedback: bool = True,
         timeout: float = 5.0,  # noqa: ASYNC109  # part of the error
     ) -> Goal:
-        """Send a goal to an action of ROS 2.
+        """Send a goal to an action of ROS 2, or of ROS 1 (actionlib).
+
+        A known ROS version decides. If it is unknown, `pkg/action/Name` is an action of ROS 2. For another type,
+        the version is detected (`detect_ros_version`); if it stays unknown, `pkg/NameAction` and the types of
+        packages whose name begins with actionlib are actions of ROS 1.
 
         Args:
             action: Name of the action.
-            type: Its type: `example_interfaces/action/Fibonacci`, or without the middle.
+            type: Its type: `example_interfaces/action/Fibonacci`, or without the middle; in ROS 1
+                `actionlib_tutorials/FibonacciAction`, or without the ending.
             goal: Fields of the goal.
             feedback: Whether to receive feedback.
-            timeout: Timeout in seconds for a slow server.
+            timeout: Timeout in seconds for a slow server, and in ROS 1 for the first status of the action's server.
 
         Returns:
             The active goal: `async for feedback in goal`, `await goal.result(timeout)`, and `async with goal`, which
@@ -280,11 +333,57 @@ class Ros:
             NameFormError: The name or the type is malformed.
             SlowPeerError: The server did not accept it in time, or too many goals are active.
             DisconnectedError: There is no connection.
-            EncodeError: The goal cannot be sent as JSON.
+            EncodeError: The goal cannot be sent as JSON, or in ROS 1 does not fit its type.
         """
         if self._session.must_wait():
             await self._session.wait_turn(f"a goal of {action}", timeout)
-        return Goal(self._session, action, type, goal or {}, feedback=feedback)
+        if self.ros_version is not None or split_type(type)[1] != "action":
+            deadline = time.monotonic() + timeout
+            if await self._uses_actionlib(type, min(timeout, DETECT_TIMEOUT)):
+                sender = await self._sender(action, type)
+                return await sender.send(goal or {}, max(0.0, deadline - time.monotonic()), feedback=feedback)
+        return OperationGoal(self._session, action, type, goal or {}, feedback=feedback)
+
+    async def _uses_actionlib(self, type_name: str, limit: float) -> bool:
+        version = await self.detect_ros_version(limit)
+        return version == 1 or (version is None and is_actionlib_type(type_name))
+
+    async def _sender(self, action: str, type_name: str) -> ActionlibSender:
+        key = absolute(action), base_type(type_name)
+        if key not in self._senders:
+            self._publishes = True
+            self._senders[key] = await ActionlibSender(self, self._session, action, type_name).start()
+        return self._senders[key]
+
+    async def advertise_action(
+        self,
+        action: str,
+        type: str,  # noqa: A002  # ROS's word
+        handler: GoalHandler,
+    ) -> ActionServer | ActionlibServer:
+        """Serve an action of ROS 2, or of ROS 1 (actionlib) if the server is known to be one (`detect_ros_version`).
+
+        If the version stays unknown, the type decides as in `send_goal`.
+
+        Args:
+            action: Name of the action.
+            type: Its type: `example_interfaces/action/Fibonacci`, or without the middle; in ROS 1
+                `actionlib_tutorials/FibonacciAction`, or without the ending.
+            handler: Coroutine function that is called with each goal, and executes it: it may send feedback,
+                and should watch whether the goal is to be cancelled. The goal succeeds with the fields that it
+                returns, or is cancelled with them if the sender asked for that, unless the handler has ended
+                the goal differently. If it raises an error, the goal is aborted, and the error is logged. Up to
+                64 goals are executed concurrently. It is cancelled when the connection is lost (ROS 2).
+
+        Raises:
+            NameFormError: The name or the type is malformed.
+            TypeConflictError: This client already serves this action.
+            DisconnectedError: The client was closed.
+        """
+        if await self._uses_actionlib(type, DETECT_TIMEOUT):
+            self._publishes = True
+            return await ActionlibServer(self, self._session, action, type, handler).start()
+        return ActionServer(self._session, action, type, handler)
 
     # Information about the server
 
@@ -297,58 +396,84 @@ class Ros:
         """Detect the ROS version of the server, if possible.
 
         The sources are, in this order: the option of `connect`, the stamps of received messages, and rosapi
-        (the version, or the spelling of the type of `/rosout`). Later advertisements and subscriptions, and
+        (the spelling of the type of `/rosout`, or the version). Later advertisements and subscriptions, and
         those restored after a reconnection, use type names of the detected version.
 
         Returns:
             1 or 2; None if there is neither rosapi nor a message with a header, or after `timeout` seconds.
         """
         if self.ros_version is None:
-            asked = (self._ask_version(timeout), self._ask_rosout_type(timeout))
-            questions = [asyncio.create_task(question) for question in asked]
-            try:
-                for answer in asyncio.as_completed(questions):
-                    self._session.core.wire.ros_version = await answer
-                    if self.ros_version is not None:
-                        break
-            finally:
-                for question in questions:
-                    question.cancel()
+            # a ROS 1 server without `get_ros_version` logs an error when it is asked
+            ends = time.monotonic() + timeout
+            version, has_rosapi = await self._ask_rosout_type(timeout)
+            if version is None and has_rosapi and self.ros_version is None:
+                version = await self._ask_version(max(0.0, ends - time.monotonic()))
+            self._session.core.wire.ros_version = version
         self._session.core.wire.ros_version = self.ros_version
         return self.ros_version
 
     async def topic_type(self, topic: str, timeout: float = 1.0) -> str | None:  # noqa: ASYNC109  # as above
         """Return the type of a topic at the server: empty if it does not know the topic, None without rosapi."""
-        known = (await self._session.ask_rosapi("topic_type", {"topic": topic}, timeout)).get("type")
-        return known if isinstance(known, str) else None
+        return await ask_text(self._session, "topic_type", {"topic": topic}, "type", timeout)
 
     async def topics(self, timeout: float = 1.0) -> list[str] | None:  # noqa: ASYNC109  # as above
         """Return the names of all topics at the server; None without rosapi."""
-        return await self._names("topics", {}, timeout)
+        return await ask_names(self._session, "topics", {}, "topics", timeout)
 
     async def publishers(self, topic: str, timeout: float = 1.0) -> list[str] | None:  # noqa: ASYNC109  # as above
         """Return the names of the nodes that publish a topic; None without rosapi."""
-        return await self._names("publishers", {"topic": topic}, timeout)
+        return await ask_names(self._session, "publishers", {"topic": topic}, "publishers", timeout)
+
+    async def subscribers(self, topic: str, timeout: float = 1.0) -> list[str] | None:  # noqa: ASYNC109  # as above
+        """Return the names of the nodes that subscribe to a topic; None without rosapi."""
+        return await ask_names(self._session, "subscribers", {"topic": topic}, "subscribers", timeout)
+
+    async def topics_for_type(self, type: str, timeout: float = 1.0) -> list[str] | None:  # noqa: A002, ASYNC109  # as above
+        """Return the names of the topics of a type; None without rosapi."""
+        await self.detect_ros_version()  # rosapi compares names of types as they are spelt
+        args = {"type": self._session.core.wire.type_name(type)}
+        return await ask_names(self._session, "topics_for_type", args, "topics", timeout)
+
+    async def message_details(self, type: str, timeout: float = 1.0) -> Definitions:  # noqa: A002, ASYNC109  # as above
+        """Return the fields of a message type and of its parts, by type in the form of ROS 1; empty if unknown."""
+        return await ask_definitions(self._session, type, timeout)
 
     async def nodes(self, timeout: float = 1.0) -> list[str] | None:  # noqa: ASYNC109  # as above
         """Return the names of all nodes; None without rosapi."""
-        return await self._names("nodes", {}, timeout)
+        return await ask_names(self._session, "nodes", {}, "nodes", timeout)
+
+    async def node_details(self, node: str, timeout: float = 1.0) -> NodeDetails | None:  # noqa: ASYNC109  # as above
+        """Return the topics and services of a node, none if it is unknown; None without rosapi."""
+        return await ask_node(self._session, node, timeout)
 
     async def services(self, timeout: float = 1.0) -> list[str] | None:  # noqa: ASYNC109  # as above
         """Return the names of all services; None without rosapi."""
-        return await self._names("services", {}, timeout)
+        return await ask_names(self._session, "services", {}, "services", timeout)
 
-    async def _names(self, question: str, args: dict[str, Any], limit: float) -> list[str] | None:
-        names = (await self._session.ask_rosapi(question, args, limit)).get(question)
-        return [name for name in names if isinstance(name, str)] if isinstance(names, list) else None
+    async def service_type(self, service: str, timeout: float = 1.0) -> str | None:  # noqa: ASYNC109  # as above
+        """Return the type of a service: empty if the server does not know it, None without rosapi."""
+        return await ask_text(self._session, "service_type", {"service": service}, "type", timeout)
+
+    async def service_node(self, service: str, timeout: float = 1.0) -> str | None:  # noqa: ASYNC109  # as above
+        """Return the name of the node that serves a service, empty if none does; None without rosapi."""
+        return await ask_text(self._session, "service_node", {"service": service}, "node", timeout)
+
+    async def service_providers(self, type: str, timeout: float = 1.0) -> list[str] | None:  # noqa: A002, ASYNC109  # as above
+        """Return the names of the nodes that serve services of a type; None without rosapi."""
+        await self.detect_ros_version()  # as for topics
+        args = {"service": self._session.core.wire.type_name(type, "srv")}
+        return await ask_names(self._session, "service_providers", args, "providers", timeout)
 
     async def _ask_version(self, limit: float) -> RosVersion | None:
         version = (await self._session.ask_rosapi("get_ros_version", {}, limit)).get("version")
         return 1 if version == 1 else 2 if version == 2 else None
 
-    async def _ask_rosout_type(self, limit: float) -> RosVersion | None:
+    async def _ask_rosout_type(self, limit: float) -> tuple[RosVersion | None, bool]:
+        """Return the version according to the type of `/rosout`, and whether there is rosapi."""
         rosout_type = (await self._session.ask_rosapi("topic_type", {"topic": "/rosout"}, limit)).get("type")
-        return ros_version_of_type(rosout_type) if isinstance(rosout_type, str) else None
+        if not isinstance(rosout_type, str):
+            return None, False
+        return ros_version_of_type(rosout_type), True
 
 
 def connect(
@@ -367,6 +492,7 @@ def connect(
     fragment_size: int | None = None,
     ping_interval: float = 5.0,
     ping_timeout: float = 5.0,
+    check_types: bool = True,
     on_state: StateCallback | None = None,
 ) -> Ros:
     """Create a client of a rosbridge server, which `async with` opens and closes.
@@ -390,11 +516,13 @@ def connect(
         proxy: `http://proxy:3128`, `https://` or `socks5h://` (with the package python-socks), or
             `environment` for the proxy in HTTPS_PROXY etc.; None for a direct connection.
         max_size: Maximum size of a message in bytes, in both directions. A larger inbound message ends the
-            connection.
+            connection; a topic with a second one is left out of the next (`TopicLeftOutError`).
         fragment_size: Maximum number of characters of a message before it is sent in fragments; None for no
             limit.
         ping_interval: Seconds of silence after which the server is pinged.
         ping_timeout: Seconds to wait for data after a ping before the connection counts as lost.
+        check_types: Whether messages with a misspelt field or an array of another shape are refused before they
+            are sent, if their type is known.
         on_state: Callback for each new state and its reason.
 
     Raises:
@@ -422,4 +550,5 @@ def connect(
     )
     core = ClientCore(ros_version=configured_version, max_size=max_size, fragment_size=fragment_size)
     parsed = replace(parsed, username=None, password=None)  # the credentials are in the route
-    return Ros(Session(parsed, shown(uri), core, limits, on_state, route=route, retry=retry))
+    session = Session(parsed, shown(uri), core, limits, on_state, route=route, retry=retry)
+    return Ros(session, check_types=check_types)

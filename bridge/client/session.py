@@ -8,6 +8,7 @@ from collections import deque
 from collections.abc import Callable, Coroutine, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from enum import StrEnum
+from threading import get_ident
 from typing import Any, Final, NamedTuple, Protocol
 
 from websockets.uri import WebSocketURI
@@ -15,16 +16,25 @@ from websockets.uri import WebSocketURI
 from bridge.client.protocol import ClientCore
 from bridge.client.protocol.events import (
     CallAnswered,
+    CancelRequested,
     Event,
     GoalEnded,
     GoalFeedback,
+    GoalRequested,
+    MessageDiscarded,
     MessageReceived,
     ServiceRequested,
     StatusReceived,
     Unusable,
 )
 from bridge.client.route import Route
-from bridge.client.websocket import CLOSE_TIMEOUT, Limits, WebSocket, open_websocket
+from bridge.client.websocket import CLOSE_TIMEOUT, Limits, Loss, WebSocket, open_websocket
+from bridge.codecs.envelope import topic_in
+from bridge.codecs.message_check import (
+    Definitions,
+    bundled_definitions,
+    definitions_from_rosapi,
+)
 from bridge.errors import (
     BridgeError,
     DecodeError,
@@ -34,6 +44,7 @@ from bridge.errors import (
     SlowPeerError,
     StateTimeoutError,
     UnreachableError,
+    WrongThreadError,
 )
 
 FIRST_DELAY: Final = 0.1
@@ -77,6 +88,26 @@ class GoalReceiver(Protocol):
 
     def fail(self, reason: str) -> None:
         """End the goal without a result."""
+
+
+class GoalExecutor(Protocol):
+    """Server of an action of this client."""
+
+    def receive(self, event: GoalRequested | CancelRequested) -> None:
+        """Start a goal, or ask to cancel it."""
+
+    def lost(self) -> None:
+        """Give up the goals of a lost connection."""
+
+
+class TopicWatcher(Protocol):
+    """Subscription that is told about messages that it does not get."""
+
+    def discard(self) -> None:
+        """Count a message above the topic's limit."""
+
+    def leave_out(self, reason: str) -> None:
+        """End, because the topic's messages are too large for the connection."""
 
 
 class Message(NamedTuple):
@@ -125,8 +156,10 @@ class Session:
         unusable: Number of unusable messages received.
         statuses: Latest status messages of the server, newest last.
         receivers: Callbacks for messages, by number of the subscription.
+        watchers: Subscriptions by their numbers.
         on_blind: Callbacks for the seconds without connection, after a reconnection.
         servers: Handlers of requests, by service of this client.
+        action_servers: Servers of goals, by action of this client.
         goals: Receivers of events, by id of the goal.
         on_closed: Callbacks for the final close.
     """
@@ -153,10 +186,12 @@ class Session:
         self._lost_at = 0.0
         self._status_count = 0
         self.receivers: dict[int, Callable[[Message], None]] = {}
+        self.watchers: dict[int, TopicWatcher] = {}
         self.on_blind: set[Callable[[float], None]] = set()
         self.servers: dict[str, Server] = {}
+        self.action_servers: dict[str, GoalExecutor] = {}
         self.goals: dict[str, GoalReceiver] = {}
-        self.on_closed: set[Callable[[], None]] = set()
+        self.on_closed: set[Callable[[], object]] = set()
         self._parsed_uri = uri
         self._route = route
         self._retry = retry
@@ -164,14 +199,18 @@ class Session:
         self._limits = limits
         self._on_state = on_state
         self._entered = False
+        self._thread: int | None = None
         self._websocket: WebSocket | None = None
         self._connected_at = 0.0
         self._delay = FIRST_DELAY
         self._reconnecting: asyncio.Task[None] | None = None  # the last one, done or not
         self._pause: asyncio.Future[None] | None = None
         self._retry_timer: asyncio.TimerHandle | None = None
-        self._next_look = SILENCE
+        self._renewal_delay = SILENCE
         self._looking: asyncio.Task[None] | None = None
+        self._probe_timer: asyncio.TimerHandle | None = None
+        self._largest_sent = 0
+        self._types_unanswered = False
         self._burst = 0
         self._turn = asyncio.Lock()  # fair: first in, first out
         self._waiting = 0
@@ -188,6 +227,7 @@ class Session:
                 f"this client of {self.uri} was already opened: connect() creates a new one"
             )
         self._entered = True
+        self._thread = get_ident()
         try:
             await self._open(self._limits.connect_timeout)
         except BaseException as error:
@@ -198,7 +238,7 @@ class Session:
         deadline, delay = time.monotonic() + limit, FIRST_DELAY
         while True:
             try:
-                await self._connect(limit)
+                await self._connect(min(limit, ATTEMPT_TIMEOUT) if self._retry else limit)
             except UnreachableError as error:
                 if not self._retry or time.monotonic() + delay >= deadline:
                     raise
@@ -213,13 +253,15 @@ class Session:
 
     async def close(self, reason: str = "closed by this client") -> None:
         """Close the connection after all sent messages, and end everything that waits."""
+        self.check_thread()
         if self.state is State.CLOSED:
             return
         websocket, self._websocket = self._websocket, None
         self.core.lost()
         # except the current task: a service's handler may close the client
-        if self._retry_timer is not None:
-            self._retry_timer.cancel()
+        for timer in (self._retry_timer, self._probe_timer):
+            if timer is not None:
+                timer.cancel()
         ending = {*self._serving, *(each for each in (self._reconnecting, self._looking) if each is not None)}
         ending -= {asyncio.current_task()}
         for task in ending:
@@ -253,8 +295,14 @@ class Session:
             self.reconnections += 1
             for callback in self.on_blind:
                 callback(self._connected_at - self._blind_since)
+        self._largest_sent = 0
+        if websocket.largest_accepted is not None:
+            self.core.wire.limit(websocket.largest_accepted)
         self.core.restore()
-        self.flush()
+        for message in self.core.data_to_send():
+            if self.is_open:
+                self.send_now(message)
+        self._release_suspect()
         self.watch_silence()
         self._set_state(State.CONNECTED, "")
 
@@ -263,7 +311,13 @@ class Session:
             return
         self._websocket = None
         self._blind_since = websocket.last_heard
+        if websocket.loss is Loss.SENT_TOO_LARGE:
+            self.core.wire.limit(self._largest_sent - 1)
+        elif websocket.loss is Loss.RECEIVED_TOO_LARGE:
+            self._blame_topic(topic_in(websocket.refused))
         self.core.lost()
+        for server in self.action_servers.values():
+            server.lost()
         self.last_error = reason
         self._lost_at = now = time.monotonic()
         _log.warning("the connection to %s is lost: %s", self.uri, reason)
@@ -273,8 +327,33 @@ class Session:
         self._reconnecting = asyncio.get_running_loop().create_task(self._reconnect())
         self._set_state(State.RECONNECTING, reason)
 
+    def _blame_topic(self, named: str | None) -> None:
+        """Find out which topic had the message that was too large for the connection."""
+        only_topics = not self.core.calls and not self.core.goals
+        left_out = self.core.subscriptions.blame(named, only_topics=only_topics)
+        for number in left_out:
+            self.watchers[number].leave_out(self.why_left_out())
+
+    def why_left_out(self) -> str:
+        """Return the end of an error's sentence: the reason why a topic is left out."""
+        return (
+            f"is left out: its messages have more than the {self.core.wire.max_size} bytes (max_size) that this "
+            f"client of {self.uri} accepts"
+        )
+
+    def _release_suspect(self) -> None:
+        """Subscribe to the next topic that is held back because a message was too large."""
+        if self._probe_timer is not None:
+            self._probe_timer.cancel()
+            self._probe_timer = None
+        if self.is_open and self.core.subscriptions.release():
+            self.flush()
+            patience = self.core.subscriptions.probation.patience
+            self._probe_timer = asyncio.get_running_loop().call_later(patience, self._release_suspect)
+
     def reconnect_now(self) -> None:
         """Do not wait before the next attempt to reconnect, if the connection is lost."""
+        self.check_thread()
         self._delay = FIRST_DELAY
         if self._pause is not None:
             self._pause.cancel()
@@ -323,6 +402,7 @@ class Session:
 
     async def wait_for_state(self, state: State, limit: float) -> None:
         """Wait until the connection is in a state (see `bridge.client.Ros.wait_for_state`)."""
+        self.check_thread()
         try:
             async with asyncio.timeout(limit):
                 while self.state is not state:
@@ -342,8 +422,17 @@ class Session:
         """Whether there is a connection that accepts messages."""
         return self._websocket is not None and self._websocket.is_open
 
+    def check_thread(self) -> None:
+        """Raise an error if this is another thread than that of the event loop, whose data is not locked."""
+        if get_ident() != self._thread and self._thread is not None:
+            raise WrongThreadError(
+                f"the client of {self.uri} belongs to the thread of its event loop: call it there with "
+                "asyncio.run_coroutine_threadsafe, or use bridge.client.blocking"
+            )
+
     def must_wait(self) -> bool:
         """Return whether a message must wait for its turn; raise an error without a connection."""
+        self.check_thread()
         return self._connected().paused or self._waiting > 0
 
     def _connected(self) -> WebSocket:
@@ -357,6 +446,7 @@ class Session:
     def send_now(self, data: bytes) -> None:
         """Write a message to the socket; raise an error without a connection."""
         self._connected().send(tuple(self.core.wire.pieces(data)))
+        self._largest_sent = max(self._largest_sent, len(data))
 
     def should_yield(self) -> bool:
         """Count a sent message, and return whether other tasks should get their turn."""
@@ -368,6 +458,7 @@ class Session:
 
     def together(self) -> AbstractContextManager[None]:
         """Write everything sent inside the block at once (see `bridge.client.Ros.together`)."""
+        self.check_thread()
         websocket = self._websocket
         return nullcontext() if websocket is None else websocket.together()
 
@@ -384,23 +475,27 @@ class Session:
             self._waiting -= 1
 
     def flush(self) -> None:
-        """Send the output of the core, which is too small and rare to wait."""
+        """Send the output of the core, which is too small and rare to wait, unless a server causes it and never reads."""
         for message in self.core.data_to_send():
-            if self.is_open:
+            websocket = self._websocket
+            if websocket is not None and websocket.is_open:
                 self.send_now(message)
+                websocket.count_unread(len(message))
 
     def watch_silence(self) -> None:
         """Look after silent subscriptions from now on, until all have had a message on this connection."""
-        self._next_look = SILENCE
+        self._renewal_delay = SILENCE
         if self._websocket is not None:
-            self._schedule_look()
+            self._schedule_renewal()
 
-    def _schedule_look(self) -> None:
+    def _schedule_renewal(self) -> None:
         if self._retry_timer is not None:
             self._retry_timer.cancel()
-        self._retry_timer = asyncio.get_running_loop().call_later(self._next_look, self._look)
+        self._retry_timer = asyncio.get_running_loop().call_later(
+            self._renewal_delay, self._renew_subscriptions
+        )
 
-    def _look(self) -> None:
+    def _renew_subscriptions(self) -> None:
         """Repeat subscriptions to topics of unknown type, and renew those that should have messages."""
         self._retry_timer = None
         if not self.is_open:
@@ -411,8 +506,8 @@ class Session:
         if silent and (self._looking is None or self._looking.done()):
             self._looking = asyncio.get_running_loop().create_task(self._renew(silent))
         if untyped or silent:
-            self._next_look = SILENCE if untyped else min(2 * self._next_look, LONGEST_SILENCE)
-            self._schedule_look()
+            self._renewal_delay = SILENCE if untyped else min(2 * self._renewal_delay, LONGEST_SILENCE)
+            self._schedule_renewal()
 
     async def _renew(self, topics: list[str]) -> None:
         """Renew the subscriptions of those topics that somebody publishes."""
@@ -435,6 +530,25 @@ class Session:
         except BridgeError:
             return {}
         return answer if isinstance(answer, dict) else {}
+
+    async def learn_type(self, type_name: str) -> None:
+        """Ask for the definition of a type, unless it is known, to check messages before they are sent."""
+        if self.core.publications.is_known(type_name) or self._types_unanswered or not self.is_open:
+            return
+        definitions: Definitions = {}
+        try:
+            args = {"type": self.core.wire.type_name(type_name)}
+            definitions = definitions_from_rosapi(
+                await self.call("/rosapi/message_details", args, _ROSAPI_TIMEOUT)
+            )
+        except NoAnswerError:
+            self._types_unanswered = True
+        except BridgeError as error:
+            _log.debug("the definition of %s is unknown: %s", type_name, error)
+        version = self.core.ros_version
+        if not definitions and version is not None:
+            definitions = await asyncio.to_thread(bundled_definitions, type_name, version)
+        self.core.publications.define(type_name, definitions)
 
     async def call(self, service: str, args: Mapping[str, Any], limit: float) -> Any:
         """Call a service and wait for its answer (see `bridge.client.Ros.call`)."""
@@ -480,9 +594,19 @@ class Session:
                     receivers[number](message)
             else:
                 self._take_other(event)
+        if self._probe_timer is not None and self.core.subscriptions.probation.is_settled:
+            self._release_suspect()
 
     def _take_other(self, event: Event | None) -> None:
         match event:
+            case MessageDiscarded():
+                for number in event.subscriptions:
+                    self.watchers[number].discard()
+                if event.count & (event.count - 1) == 0:
+                    _log.warning(
+                        "a message of %s has %d bytes, more than its limit of %d, and was discarded; %d so far",
+                        *(event.topic, event.size, event.limit, event.count),
+                    )
             case CallAnswered():
                 future = self._calls.pop(event.call, None)
                 if future is not None and not future.done():
@@ -496,6 +620,8 @@ class Session:
                 goal = self.goals.pop(event.goal, None) if ended else self.goals.get(event.goal)
                 if goal is not None:
                     goal.receive(event)
+            case GoalRequested() | CancelRequested():
+                self.action_servers[event.action].receive(event)
             case StatusReceived():
                 self.statuses.append(event)
                 self._status_at = time.monotonic()

@@ -8,12 +8,14 @@ after `ping_interval + ping_timeout`.
 
 import asyncio
 import logging
+import re
 import socket
 import ssl
 import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, fields
+from enum import Enum, auto
 from http import HTTPStatus
 from typing import Final
 
@@ -33,7 +35,7 @@ from bridge.errors import (
     UnreachableError,
     UriError,
 )
-from bridge.transport.websocket import WebSocketTransport
+from bridge.transport.websocket import MESSAGE_BYTES_HEADER, WebSocketTransport
 
 WRITE_LIMIT: Final = 1 << 16
 """Maximum number of bytes that wait for the server before publishers must wait too."""
@@ -41,6 +43,8 @@ CLOSE_TIMEOUT: Final = 1.0
 """Timeout in seconds of the closing handshake."""
 _OVERSLEPT: Final = 0.5
 """Delay of the watchdog in seconds that means that this process was suspended, not the server."""
+_SIZE: Final = re.compile("[1-9][0-9]{2,17}")
+"""A limit that a server may announce: less than 100 bytes could not even be an operation."""
 
 
 class _NoDebug(logging.LoggerAdapter[logging.Logger]):
@@ -87,10 +91,21 @@ class Limits:
                 raise OptionError(f"{limit.name} must be more than 0, not {value!r}")
 
 
+class Loss(Enum):
+    """Cause of the end of a connection, as far as it matters to the next one."""
+
+    RECEIVED_TOO_LARGE = auto()
+    """The server sent a message above `max_size`."""
+    SENT_TOO_LARGE = auto()
+    """This client sent a message above the limit of the server."""
+    OTHER = auto()
+
+
 class WebSocket(WebSocketTransport):
     """A WebSocket client connection with callbacks for messages and for its end.
 
     Attributes:
+        largest_accepted: maximum size of a message in bytes, as the server announced in its handshake; None if it did not.
         opened: whether `begin` was called after the handshake; only then are callbacks called.
     """
 
@@ -104,6 +119,7 @@ class WebSocket(WebSocketTransport):
         protocol = ClientProtocol(uri, max_size=limits.max_size, logger=_log)
         super().__init__(protocol, max_size=limits.max_size, write_limit=WRITE_LIMIT)
         self.opened = False
+        self.largest_accepted: int | None = None
         self._client_protocol = protocol
         self._answered = asyncio.Event()
         self._early: list[bytes] = []
@@ -151,8 +167,11 @@ class WebSocket(WebSocketTransport):
 
     # Calls of the transport
 
-    def handshake_received(self, _event: Request | Response) -> None:
+    def handshake_received(self, event: Request | Response) -> None:
         """Wake `handshake`."""
+        announced = event.headers.get(MESSAGE_BYTES_HEADER, "")
+        if _SIZE.fullmatch(announced):
+            self.largest_accepted = int(announced)
         self._answered.set()
 
     def messages_received(self, messages: list[bytes]) -> None:
@@ -169,22 +188,34 @@ class WebSocket(WebSocketTransport):
         else:
             self.abort()  # a peer with another protocol may never close the connection
 
-    def ended(self, exc: Exception | None) -> None:
+    def connection_ended(self, exc: Exception | None) -> None:
         """Report the end."""
         self._answered.set()
         self._cancel_watchdog()
         if self.opened:
             self._on_lost(self, self._why_lost(exc))
 
+    @property
+    def loss(self) -> Loss:
+        """Cause of the end of the connection."""
+        closed = self._protocol.close_exc
+        if isinstance(closed.__cause__, PayloadTooBig):
+            return Loss.RECEIVED_TOO_LARGE
+        if closed.rcvd is not None and closed.rcvd.code == CloseCode.MESSAGE_TOO_BIG:
+            return Loss.SENT_TOO_LARGE
+        return Loss.OTHER
+
     def _why_lost(self, exc: Exception | None) -> str:
         if self._silent_for:
             return f"no data came from the server for {self._silent_for:.3g} s"
-        closed = self._protocol.close_exc
-        if isinstance(closed.__cause__, PayloadTooBig):
+        if self.never_reads:
+            return "the server causes answers and does not read them"
+        closed, loss = self._protocol.close_exc, self.loss
+        if loss is Loss.RECEIVED_TOO_LARGE:
             return (
                 f"the server sent a message of more than {self._max_size} bytes (max_size allows larger ones)"
             )
-        if closed.rcvd is not None and closed.rcvd.code == CloseCode.MESSAGE_TOO_BIG:
+        if loss is Loss.SENT_TOO_LARGE:
             return "the server closed it: a message was too large for it (code 1009)"
         if closed.rcvd is not None:
             return f"the server closed it (code {closed.rcvd.code})"

@@ -5,11 +5,16 @@ an envelope is proven, any data that starts with it, continues with one JSON obj
 operation on that topic, and only the message itself has to be parsed.
 """
 
+import re
 from typing import Any, Final
 
 import orjson
 
 _KEY: Final = b'"msg":'
+_JSON_TOPIC: Final = re.compile(rb'"topic":\s*"([^"]+)"')
+_CBOR_TOPIC: Final = re.compile(rb"etopic(?:x(.)|[\x61-\x77])", re.DOTALL)
+"""The key `topic` and the header of the text after it: its length is in the low bits, or in a byte of its own."""
+_CBOR_LENGTH: Final = 0x1F
 LONGEST: Final = 512
 """Maximum length of an envelope in bytes."""
 BRACE: Final = ord("}")
@@ -38,3 +43,15 @@ def topic_of(envelope: bytes) -> str | None:
         return None
     topic = operation.get("topic")
     return topic if type(topic) is str and operation.get("msg") == {} else None
+
+
+def topic_in(beginning: bytes) -> str | None:
+    """Return the topic of a publish operation in JSON or CBOR of which only the beginning is known."""
+    match = _JSON_TOPIC.search(beginning.split(b'"msg"', 1)[0])
+    if match is not None:
+        return match[1].replace(b"\\/", b"/").decode(errors="replace")
+    match = _CBOR_TOPIC.search(beginning.split(b"cmsg", 1)[0])
+    if match is None:
+        return None
+    length = match[1][0] if match[1] else match[0][-1] & _CBOR_LENGTH
+    return beginning[match.end() : match.end() + length].decode(errors="replace")

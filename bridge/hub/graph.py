@@ -5,10 +5,12 @@ actions are stored under their absolute names. A client may omit the leading sla
 under the name that it used.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from bridge.codecs.fragments import Reassembler
 from bridge.hub.delivery.encodings import Compression
+from bridge.hub.delivery.filling import Filler
 from bridge.hub.delivery.outbox import Lane, Outbox
 from bridge.hub.operations import OperationId
 
@@ -73,6 +75,8 @@ class Advertisement:
 
     client: Client
     topic: "Topic"
+    filler: Filler | None
+    """Fills the absent fields of its messages, if their type is known."""
     latching: bool = False
     ids: set[OperationId] = field(default_factory=set)
     """Ids of the advertise operations."""
@@ -133,6 +137,8 @@ class Offer:
     name: str
     type: str
     client: Client
+    fillers: Mapping[str, Filler]
+    """Fills the absent fields of its parts, such as `Request`, if their type is known."""
 
 
 class Graph:

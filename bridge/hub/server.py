@@ -11,6 +11,7 @@ not delayed.
 import asyncio
 import contextlib
 import logging
+import os
 import socket
 import time
 from collections.abc import Callable
@@ -29,7 +30,7 @@ from bridge.hub.delivery.outbox import Outbox
 from bridge.hub.errors import HubError
 from bridge.hub.graph import Client, Graph
 from bridge.hub.limits import HubLimits
-from bridge.transport.websocket import WebSocketTransport
+from bridge.transport.websocket import MESSAGE_BYTES_HEADER, WebSocketTransport
 
 log = logging.getLogger(__name__)
 
@@ -39,6 +40,8 @@ _SEND_BUFFER: Final = 256 * 1024
 """Bytes that wait in the kernel for one socket; with more, data would only arrive later."""
 _TURN_FRAMES: Final = 64
 _TURN_BYTES: Final = 64 * 1024
+_TURN_MESSAGES: Final = 32
+"""Number of queued messages or fragments written to one client before other tasks get their turn."""
 _SLICE_BYTES: Final = 4 * 1024
 """One client's share of a turn (see `WebSocketTransport`)."""
 _RETAINED_BYTES: Final = 4 * 1024 * 1024
@@ -105,11 +108,12 @@ async def serve_hub(
         ) from None
     except OSError as error:
         raise HubError(
-            f"the hub cannot listen on {host} port {port} ({error.strerror or error}): "
+            f"the hub cannot listen on {host} port {port} ({os.strerror(error.errno) if error.errno else error}): "
             "end the process that listens there, or choose another host or port"
         ) from None
     try:
         hub.sweep()
+        hub.broker.definitions.preload()
         if on_graph is not None:
             on_graph(hub.broker.graph)
         if on_ready is not None:
@@ -320,6 +324,7 @@ class _Connection(WebSocketTransport):
                     HTTPStatus.SERVICE_UNAVAILABLE,
                     f"The hub already has {self._hub.limits.clients} clients.\n",
                 )
+        response.headers[MESSAGE_BYTES_HEADER] = str(self._hub.limits.message_bytes)
         protocol.send_response(response)
         if response.status_code == HTTPStatus.SWITCHING_PROTOCOLS:
             self._client = self._hub.admit(self, self._address)
@@ -344,7 +349,7 @@ class _Connection(WebSocketTransport):
         self._close_by = time.monotonic() + _CLOSE_TIMEOUT
         self._leave()
 
-    def ended(self, _exc: Exception | None) -> None:
+    def connection_ended(self, _exc: Exception | None) -> None:
         """Remove the client."""
         self._leave()
         self._hub.forget(self)
@@ -371,7 +376,10 @@ class _Connection(WebSocketTransport):
         """Write one turn's share of the queue, and the rest after other tasks have had their turn."""
         messages: list[bytes] = []
         size = 0
-        while not self.paused and size < _TURN_BYTES and (message := outbox.pop()) is not None:
+        while not self.paused and size < _TURN_BYTES and len(messages) < _TURN_MESSAGES:
+            message = outbox.pop()
+            if message is None:
+                break
             messages.append(message)
             size += len(message)
         if messages:

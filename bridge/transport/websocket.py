@@ -25,6 +25,11 @@ from bridge.transport import frames
 QUICK_FRAMES = os.environ.get("ROSBAYES_QUICK_FRAMES", "1") != "0"
 """Whether new connections read and write whole messages without the library; 0 disables this."""
 
+MESSAGE_BYTES_HEADER: Final = "Rosbridge-Message-Bytes"
+"""Header of the hub's handshake: maximum size in bytes of the messages that it accepts."""
+_MAX_UNREAD: Final = 4
+"""Maximum size of the unread answers to a peer, in messages of the maximum size."""
+_BEGINNING: Final = 512
 _OPEN: Final = State.OPEN
 """Looking up a module-level name is faster than looking up an enumeration member."""
 _END_OF_HEADERS: Final = b"\r\n\r\n"
@@ -40,6 +45,7 @@ class WebSocketTransport(asyncio.Protocol):
         is_open: whether messages can be sent.
         first_bytes: the beginning of the peer's answer, for error messages.
         paused: whether so much data waits for the peer that writers should wait too (see `drain`).
+        refused: the beginning of a frame that was invalid or too large, with its header.
     """
 
     turn_frames: ClassVar[int] = sys.maxsize
@@ -54,6 +60,7 @@ class WebSocketTransport(asyncio.Protocol):
         self.last_heard = time.monotonic()
         self.is_open = False
         self.first_bytes = b""
+        self.refused = b""
         self.paused = False
         self._protocol = protocol
         self._transport: asyncio.Transport | None = None
@@ -72,6 +79,8 @@ class WebSocketTransport(asyncio.Protocol):
         self._postponed: list[bytes] = []
         self._interrupted: tuple[bytes, int] | None = None
         self._pongs_unread = False
+        self._is_answering = False
+        self._unread = 0
         self._is_scheduled = False
         self._ends = False
         self._writable = asyncio.Event()
@@ -92,7 +101,7 @@ class WebSocketTransport(asyncio.Protocol):
         """Limit the time in which the peer must end the connection."""
         raise NotImplementedError
 
-    def ended(self, exc: Exception | None) -> None:
+    def connection_ended(self, exc: Exception | None) -> None:
         """Handle the end of the connection."""
         raise NotImplementedError
 
@@ -130,6 +139,18 @@ class WebSocketTransport(asyncio.Protocol):
             else:
                 self._protocol.send_text(message)
         self._flush()
+
+    def count_unread(self, size: int) -> None:
+        """Count bytes that the peer has caused, and end the connection if it reads none of very many."""
+        self._unread = self._unread + size if self.paused else 0
+        if self.never_reads:
+            self.is_open = False
+            self.abort()
+
+    @property
+    def never_reads(self) -> bool:
+        """Whether the connection was ended because the peer read none of very many answers."""
+        return self._unread > _MAX_UNREAD * self._max_size
 
     def ping(self) -> None:
         """Send a ping."""
@@ -183,6 +204,8 @@ class WebSocketTransport(asyncio.Protocol):
             if not data[-1]:
                 # Closing both halves could lose the last frame on its way, but TLS cannot close one half.
                 (transport.write_eof if transport.can_write_eof() else transport.close)()
+            elif self._is_answering:
+                self.count_unread(len(whole))
 
     # Calls of the event loop
 
@@ -227,7 +250,7 @@ class WebSocketTransport(asyncio.Protocol):
         self.is_open = False
         self._lost.set()
         self._writable.set()
-        self.ended(exc)
+        self.connection_ended(exc)
 
     def pause_writing(self) -> None:
         """Make writers wait, because the socket accepts nothing now."""
@@ -320,6 +343,7 @@ class WebSocketTransport(asyncio.Protocol):
             )
             if end == frames.UNSOUND:
                 self._quick = False  # the library refuses it before it has arrived completely
+                self.refused = data[at : at + _BEGINNING]
             elif end == frames.UNKNOWN or end > size:
                 self._rest += data[at:]
                 self._wanted = end - at if end else 0
@@ -341,7 +365,9 @@ class WebSocketTransport(asyncio.Protocol):
                 messages.append(message)
         if messages:
             self.messages_received(messages)
+        self._is_answering = True
         self._flush()
+        self._is_answering = False
         if not self.is_open:
             self._quick = False
         if not self._ends and self._protocol.close_expected():

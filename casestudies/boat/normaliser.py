@@ -1,5 +1,6 @@
 """Normaliser of the boat's raw readings to whole numbers in the machine's ranges (thesis chapter 4)."""
 
+import asyncio
 import math
 from typing import Annotated
 
@@ -19,6 +20,7 @@ from casestudies.boat.messages import (
     read_raw,
     readings_message,
 )
+from casestudies.server import DEFAULT_URI, Uri
 from terminal.command_line import CommandLine
 from terminal.connection import report_connection
 from terminal.output import say
@@ -52,7 +54,7 @@ async def serve(uri: str, *, raw_topic: str, sensors_topic: str, array: bool) ->
         BridgeError: No rosbridge server answers at the URI.
     """
     from bridge.client import connect
-    from casestudies.boat.lossy import LossyPublication
+    from casestudies.boat.lossy import LossyPublication, report_refused
     from casestudies.readiness import Readiness, serve_readiness
 
     reported: set[str] = set()
@@ -61,7 +63,9 @@ async def serve(uri: str, *, raw_topic: str, sensors_topic: str, array: bool) ->
         serve_readiness("boat-normaliser", readiness),
         connect(uri, retry=True, on_state=report_connection(uri)) as ros,
     ):
-        sensors = LossyPublication(await ros.advertise(sensors_topic, ARRAY_TYPE if array else SENSORS_TYPE))
+        type_ = ARRAY_TYPE if array else SENSORS_TYPE
+        sensors = LossyPublication(await ros.advertise(sensors_topic, type_))
+        refused = asyncio.ensure_future(report_refused(ros, sensors_topic, type_))
         raw = ros.subscribe(raw_topic, ARRAY_TYPE if array else RAW_TYPE)
         async for message in raw:
             try:
@@ -73,6 +77,7 @@ async def serve(uri: str, *, raw_topic: str, sensors_topic: str, array: bool) ->
                 continue
             if await sensors.publish(readings_message(normalise(values), head, array=array)):
                 readiness.record()
+        refused.cancel()
 
 
 app = CommandLine()
@@ -80,9 +85,7 @@ app = CommandLine()
 
 @app.command(epilog="`boat-normaliser --uri ws://127.0.0.1:9090`")
 def boat_normaliser(
-    uri: Annotated[
-        str, typer.Option(envvar="BM_URI", help="The rosbridge server.", metavar="ws://HOST:PORT")
-    ] = "ws://127.0.0.1:9090",
+    uri: Uri = DEFAULT_URI,
     raw_topic: Annotated[str, typer.Option(help="Topic of the raw readings.", metavar="TOPIC")] = RAW_TOPIC,
     sensors_topic: Annotated[
         str, typer.Option(help="Topic of the normalised readings.", metavar="TOPIC")
@@ -91,7 +94,7 @@ def boat_normaliser(
         bool, typer.Option("--array", help="std_msgs/Float64MultiArray in and out instead of boat_msgs.")
     ] = False,
     print_msg: Annotated[
-        bool, typer.Option("--print-msg", help="Print boat_msgs' two .msg files and end.")
+        bool, typer.Option("--print-msg", help="Print the two .msg files of boat_msgs and exit.")
     ] = False,
 ) -> int:
     """Turn the boat's raw readings into whole numbers in range: distances 0..100, bearings 0..359 degrees."""

@@ -27,6 +27,7 @@ from casestudies.boat.messages import (
     readings_message,
     true_pose,
 )
+from casestudies.server import DEFAULT_URI, Uri
 from terminal.command_line import CommandLine
 from terminal.connection import report_connection
 from terminal.output import say
@@ -100,7 +101,7 @@ async def simulate(
     """
     from bridge.client import connect
     from bridge.stamps import header
-    from casestudies.boat.lossy import LossyPublication
+    from casestudies.boat.lossy import LossyPublication, report_refused
     from casestudies.readiness import Readiness, serve_readiness
 
     readiness = Readiness("a reading was published")
@@ -110,7 +111,9 @@ async def simulate(
     ):
         ros_version = await ros.detect_ros_version()
         poses = LossyPublication(await ros.advertise(TRUE_POSE_TOPIC, TRUE_POSE_TYPE))
-        readings = LossyPublication(await ros.advertise(topic, ARRAY_TYPE if array else RAW_TYPE))
+        type_ = ARRAY_TYPE if array else RAW_TYPE
+        readings = LossyPublication(await ros.advertise(topic, type_))
+        refused = asyncio.ensure_future(report_refused(ros, topic, type_))
         begin = time.monotonic()
         step = 0
         while count is None or step < count:
@@ -121,6 +124,7 @@ async def simulate(
             step += 1
             boat.sail(1 / rate)
             await asyncio.sleep(begin + step / rate - time.monotonic())
+        refused.cancel()
 
 
 app = CommandLine()
@@ -128,17 +132,15 @@ app = CommandLine()
 
 @app.command(epilog="`boat-simulator --uri ws://127.0.0.1:9090 --seed 7 --rate 10`")
 def boat_simulator(
-    uri: Annotated[
-        str, typer.Option(envvar="BM_URI", help="The rosbridge server.", metavar="ws://HOST:PORT")
-    ] = "ws://127.0.0.1:9090",
+    uri: Uri = DEFAULT_URI,
     seed: Annotated[
         int | None,
         typer.Option(min=0, help="Seed of route and noise.", show_default="one is chosen and printed"),
     ] = None,
-    rate: Annotated[float, typer.Option(min=0.01, max=10_000, help="Readings a second.")] = 10.0,
+    rate: Annotated[float, typer.Option(min=0.01, max=10_000, help="Readings per second.")] = 10.0,
     topic: Annotated[str, typer.Option(help="Topic of the raw readings.", metavar="TOPIC")] = RAW_TOPIC,
     speed: Annotated[float, typer.Option(min=0.0, help="The boat's speed, in map units per second.")] = 60.0,
-    count: Annotated[int | None, typer.Option(min=1, help="End after this many readings.")] = None,
+    count: Annotated[int | None, typer.Option(min=1, help="Exit after this many readings.")] = None,
     array: Annotated[
         bool, typer.Option("--array", help="Publish std_msgs/Float64MultiArray instead of boat_msgs/Raw.")
     ] = False,

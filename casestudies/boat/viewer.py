@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Final, Self
 import typer
 
 from casestudies.boat.messages import TRUE_POSE_TOPIC
+from casestudies.server import DEFAULT_URI, Uri
 from posteriors.errors import NoResultError
 from terminal.command_line import CommandLine
 from terminal.connection import report_connection
@@ -282,14 +283,12 @@ app = CommandLine()
 
 @app.command(epilog="`boat-viewer --uri ws://127.0.0.1:9090 --count 25 --out out`")
 def boat_viewer(
-    uri: Annotated[
-        str, typer.Option(envvar="BM_URI", help="The rosbridge server.", metavar="ws://HOST:PORT")
-    ] = "ws://127.0.0.1:9090",
+    uri: Uri = DEFAULT_URI,
     count: Annotated[
         int | None,
         typer.Option(
             min=1,
-            help="End after this many results.",
+            help="Exit after this many results.",
             show_default=f"at Ctrl-C, with the last {KEPT} in pictures and numbers",
         ),
     ] = None,

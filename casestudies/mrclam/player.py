@@ -26,6 +26,7 @@ from casestudies.mrclam.recording import (
     read_recording,
     sightings_message,
 )
+from casestudies.server import DEFAULT_URI, Uri
 from posteriors.errors import BadResultError, NoResultError
 from posteriors.posterior import Posterior
 from terminal.command_line import CommandLine
@@ -208,9 +209,7 @@ def player(
     recording: Annotated[
         Path | None, typer.Argument(help="A file like ds1_robot3.csv.", show_default=False)
     ] = None,
-    uri: Annotated[
-        str, typer.Option(envvar="BM_URI", help="The rosbridge server.", metavar="ws://HOST:PORT")
-    ] = "ws://127.0.0.1:9090",
+    uri: Uri = DEFAULT_URI,
     topic: Annotated[str, typer.Option(help="Topic of the sightings.", metavar="TOPIC")] = SIGHTINGS_TOPIC,
     count: Annotated[
         int | None, typer.Option(min=1, help="Play this many frames.", show_default="all")
@@ -221,7 +220,7 @@ def player(
         Path | None, typer.Option("--json", help="Write the numbers to this file, as one JSON object.")
     ] = None,
     print_msg: Annotated[
-        bool, typer.Option("--print-msg", help="Print the .msg file of mrclam_msgs/Sightings and end.")
+        bool, typer.Option("--print-msg", help="Print the .msg file of mrclam_msgs/Sightings and exit.")
     ] = False,
 ) -> None:
     """Play a recorded robot's sightings of landmarks, and compare each posterior's mean with the reference.
@@ -238,14 +237,14 @@ def player(
         check_writable(numbers.parent)
     played: list[PlayedFrame] = []
 
-    def heard(frame: PlayedFrame) -> None:
+    def show(frame: PlayedFrame) -> None:
         played.append(frame)
         print(_line(frame), flush=True)
 
     async def body() -> None:
         say(f"player: {len(frames)} frames of {recording} to {topic}, {uri}")
         print(_HEADING, flush=True)
-        await play(uri, frames, topic=topic, first_timeout_s=first_timeout, timeout_s=timeout, on_frame=heard)
+        await play(uri, frames, topic=topic, first_timeout_s=first_timeout, timeout_s=timeout, on_frame=show)
 
     run_async(body())
     without = sum(frame.posterior is None for frame in played)

@@ -15,7 +15,7 @@ architecture block_memory of bm1_table is
   signal memory : memory_t;
   signal word   : std_logic_vector(WORD_BITS - 1 downto 0);
 
-  -- Bits of a word that nobody reads are removed by the synthesis.
+  -- Bits of a word that are never read are removed by the synthesis.
   attribute ram_init_file : string;
   attribute ram_init_file of memory : signal is FILE_NAME;
 

@@ -296,7 +296,7 @@ class Session:
         for at in range(5):
             due = next_doorbell(both.board.done)
             if not await both.write(doorbell, due):
-                return  # the frame is over: nobody can go on
+                return  # the frame has ended, so no replica can continue
             await both.finish()
             end += self.pick([1, 2, 9])
             await both.write_long(rm.RUN_UNTIL, end)

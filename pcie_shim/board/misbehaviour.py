@@ -41,6 +41,10 @@ class MisbehaviourKind(StrEnum):
     """An interrupt is sent while the machine is still running."""
     STALE_RESULT = "stale-result"
     """An interrupt has the doorbell number and the results of the one before."""
+    FLIP_TABLE = "flip-table"
+    """A bit of a running table is inverted, in the line that counted most in the frame before."""
+    FLIP_COUNTER = "flip-counter"
+    """The highest bit of the counter that counted most is inverted in the last interrupt of a frame."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -259,7 +259,8 @@ class _Server:
         try:
             while True:
                 computing = board.running and not board.stuck
-                wait = 0.0 if computing else (1.0 if self._loader is not None else -1.0)
+                wait = 0.0 if computing else 1.0
+                board.turned = time.monotonic()
                 for descriptor, _ in epoll.poll(wait):
                     if descriptor == self._stop.fileno():
                         return
@@ -317,7 +318,7 @@ class _Server:
         if host is None:
             return False
         if host.stalled:
-            host.open = not _has_left(host.socket)
+            host.open = not _is_closed_by_peer(host.socket)
         while host.open and host.receive():
             host.answer(partial(self._access, host))
         if not host.open:
@@ -327,7 +328,7 @@ class _Server:
     def _serve_host(self, host: _Host) -> None:
         if host.stalled:
             # misbehaving: do not read the host's frames, but notice when it disconnects
-            host.open = not _has_left(host.socket)
+            host.open = not _is_closed_by_peer(host.socket)
             time.sleep(0.01)
         else:
             host.receive()
@@ -337,7 +338,7 @@ class _Server:
 
     def _greeting(self, token: bytes) -> bytes:
         map_hash = register_map.MAP_SHA256
-        if self._wrong(MisbehaviourKind.WRONG_MAP):
+        if self._misbehaves(MisbehaviourKind.WRONG_MAP):
             map_hash = hashlib.sha256(b"another map").hexdigest()
         return framing.encode_greeting(
             framing.Greeting(
@@ -367,14 +368,16 @@ class _Server:
             done = board.done
             if self._misbehaviour is not None and not board.running:
                 rings = address <= register_map.RESUME and address + 4 * count > register_map.START
-                board.stuck = rings and self._wrong(MisbehaviourKind.NEVER_DONE, ahead=1)
+                board.stuck = rings and self._misbehaves(MisbehaviourKind.NEVER_DONE, ahead=1)
+                if rings and self._misbehaves(MisbehaviourKind.FLIP_TABLE, ahead=1):
+                    board.flip_used_bit()
             board.write(address, payload)
             # acknowledge before the interrupt that the write may cause
             if not flags & framing.POSTED:
                 self._send(host, framing.WRITE, framing.REPLY, sequence, address, b"")
             if board.done != done or board.running:
                 self._starts += 1
-                if self._wrong(MisbehaviourKind.DONE_EARLY):
+                if self._misbehaves(MisbehaviourKind.DONE_EARLY):
                     self._interrupt(host)
                 self._interrupt_if_done()
         else:
@@ -402,7 +405,7 @@ class _Server:
 
     # ---- misbehaving ----------------------------------------------------------------------------------
 
-    def _wrong(self, kind: MisbehaviourKind, *, ahead: int = 0) -> bool:
+    def _misbehaves(self, kind: MisbehaviourKind, *, ahead: int = 0) -> bool:
         """Return whether this fault occurs now, with `ahead` more starts than counted so far, and count it."""
         wanted = self._misbehaviour
         if wanted is None or wanted.kind is not kind:
@@ -419,28 +422,30 @@ class _Server:
         if self._misbehaviour is None:
             host.send(framing.encode(operation, flags, sequence, address, len(words) // 4, words))
             return
-        if self._wrong(MisbehaviourKind.DROP):
+        if self._misbehaves(MisbehaviourKind.DROP):
             return
-        if self._wrong(MisbehaviourKind.STALL):
+        if self._misbehaves(MisbehaviourKind.STALL):
             host.stalled = True
             return
         if operation == framing.IRQ:
             last, self._last_results = self._last_results, words
-            if last and self._wrong(MisbehaviourKind.STALE_RESULT):
+            if last and self._misbehaves(MisbehaviourKind.STALE_RESULT):
                 words = last
-        if words and self._wrong(MisbehaviourKind.SHORT_READ):
+            if not self.board.is_sliced and self._misbehaves(MisbehaviourKind.FLIP_COUNTER):
+                words = self.board.with_flipped_counter(words)
+        if words and self._misbehaves(MisbehaviourKind.SHORT_READ):
             words = words[:-4]
-        if words and self._wrong(MisbehaviourKind.ALL_ONES):
+        if words and self._misbehaves(MisbehaviourKind.ALL_ONES):
             words = b"\xff" * len(words)
-        if self._wrong(MisbehaviourKind.WRONG_SEQUENCE):
+        if self._misbehaves(MisbehaviourKind.WRONG_SEQUENCE):
             sequence = (sequence + 1) & ALL_ONES
         data = framing.encode(operation, flags, sequence, address, len(words) // 4, words)
-        if operation == framing.IRQ and self._wrong(MisbehaviourKind.DONE_TWICE):
+        if operation == framing.IRQ and self._misbehaves(MisbehaviourKind.DONE_TWICE):
             host.interrupts = (host.interrupts + 1) & ALL_ONES
             data += framing.encode(operation, flags, host.interrupts, address, len(words) // 4, words)
-        if self._wrong(MisbehaviourKind.WRONG_CRC):
+        if self._misbehaves(MisbehaviourKind.WRONG_CRC):
             data = data[:16] + bytes(byte ^ 0xFF for byte in data[16:20]) + data[20:]
-        if self._wrong(MisbehaviourKind.ENDLESS):
+        if self._misbehaves(MisbehaviourKind.ENDLESS):
             data = data[:-2]
             host.stalled = True
         host.send(data)
@@ -554,7 +559,7 @@ def _refuse(connection: socket.socket, endpoint: Endpoint, detail: str) -> None:
     connection.close()
 
 
-def _has_left(connection: socket.socket) -> bool:
+def _is_closed_by_peer(connection: socket.socket) -> bool:
     """Return whether the peer has closed the connection, without reading from it."""
     poll = select.poll()
     poll.register(connection, select.POLLRDHUP)

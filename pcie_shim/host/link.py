@@ -82,7 +82,7 @@ class Link(Protocol):
     def fileno(self) -> int:
         """Return a descriptor that is readable when data has arrived."""
 
-    def late(self, timeout: float, what: str) -> LinkTimeoutError:
+    def timeout_error(self, timeout: float, what: str) -> LinkTimeoutError:
         """Return the error that the board did not `what` within `timeout` seconds."""
 
     def close(self, reason: str = "it was closed") -> None:

@@ -129,6 +129,10 @@ class MiniCluster:
         """
         self._open(self._boards[board], self._timeout if timeout is None else timeout)
 
+    def give_up(self, board: int, reason: str) -> None:
+        """Close the link to a board, which must then be reopened."""
+        self._close(self._boards[board], reason)
+
     def close(self) -> None:
         """Close all links; running boards stop."""
         self._progress = None
@@ -232,7 +236,9 @@ class MiniCluster:
                 if remaining <= 0:
                     late = next(board for board in progress.running if board.waiting)
                     assert late.link is not None  # noqa: S101 - it is waited for
-                    self._fail(late, late.link.late(progress.limit, f"finish {progress.cycles} cycles"))
+                    self._fail(
+                        late, late.link.timeout_error(progress.limit, f"finish {progress.cycles} cycles")
+                    )
                 return False
             for descriptor, _ in events:
                 board = self._by_descriptor[descriptor]
@@ -300,7 +306,7 @@ class MiniCluster:
         """Drop the frame, and stop the boards that are still computing it by closing their links."""
         self._progress = None
         for board in self._boards:
-            if board.waiting and board.link is not None:
+            if board.waiting:
                 self._close(board, "another board failed the frame")
                 self._interrupted.append(board)
 
@@ -337,14 +343,11 @@ class MiniCluster:
     def _close(self, board: DrivenBoard, reason: str) -> None:
         if board in self._interrupted:
             self._interrupted.remove(board)
-        if board.link is not None and (descriptor := self._descriptor(board)) is not None:
+        # its link does not know the descriptor any more if it has closed itself; none if its opening was interrupted
+        for descriptor in [known for known, owner in self._by_descriptor.items() if owner is board]:
             self._poll.unregister(descriptor)
             del self._by_descriptor[descriptor]
         board.close(reason)
-
-    def _descriptor(self, board: DrivenBoard) -> int | None:
-        """Return the descriptor to poll for a board, even if its link has closed itself."""
-        return next((known for known, owner in self._by_descriptor.items() if owner is board), None)
 
 
 def _check_images(boards: int, images: Sequence[Image]) -> None:

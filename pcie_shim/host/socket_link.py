@@ -262,15 +262,15 @@ class SocketLink(Link):
         """Return the next frame of any kind; the timeout of the socket bounds each receive."""
         while (frame := self._decoder.next_frame()) is None:
             if time.monotonic() > deadline:
-                raise self.late(timeout, what)
+                raise self.timeout_error(timeout, what)
             try:
                 count = self._socket.recv_into(self._decoder.room())
             except BlockingIOError:
-                raise self.late(timeout, what) from None
+                raise self.timeout_error(timeout, what) from None
             except OSError as error:
-                raise self._gone(error.strerror or str(error)) from error
+                raise self._closed_error(error.strerror or str(error)) from error
             if count == 0:
-                raise self._gone("it closed the link")
+                raise self._closed_error("it closed the link")
             self._decoder.received(count)
         return frame
 
@@ -281,9 +281,9 @@ class SocketLink(Link):
         except BlockingIOError:
             return
         except OSError as error:
-            self._give_up(self._gone(error.strerror or str(error)))
+            self._give_up(self._closed_error(error.strerror or str(error)))
         if count == 0:
-            self._give_up(self._gone("it closed the link"))
+            self._give_up(self._closed_error("it closed the link"))
         self._decoder.received(count)
 
     def _interrupt(self, frame: Frame) -> Done:
@@ -329,7 +329,7 @@ class SocketLink(Link):
 
     def _broken_send(self, error: OSError) -> NoReturn:
         if isinstance(error, BlockingIOError):
-            self._give_up(self.late(self.timeout, "accept the data"))
+            self._give_up(self.timeout_error(self.timeout, "accept the data"))
         # A board sends the reason before it closes: an ERROR may be in the buffer.
         frame = None
         with suppress(LinkError):
@@ -339,16 +339,16 @@ class SocketLink(Link):
         if frame is not None and frame.operation == framing.ERROR:
             self.close("the board closed it")
             self._refused(frame)
-        self._give_up(self._gone(error.strerror or str(error)))
+        self._give_up(self._closed_error(error.strerror or str(error)))
 
-    def late(self, timeout: float, what: str) -> LinkTimeoutError:
+    def timeout_error(self, timeout: float, what: str) -> LinkTimeoutError:
         """Return the error that the board did not `what` within `timeout` seconds."""
         rest = ": a frame is incomplete" if self._decoder.inside_frame else ""
         return LinkTimeoutError(
             f"The board at {self.endpoint} did not {what} within {timeout:.3g} s{rest}: the link is closed"
         )
 
-    def _gone(self, reason: str) -> LinkClosedError:
+    def _closed_error(self, reason: str) -> LinkClosedError:
         return LinkClosedError(f"The board at {self.endpoint} is gone: {reason}")
 
     def _give_up(self, error: LinkError) -> NoReturn:

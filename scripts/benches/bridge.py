@@ -1,8 +1,8 @@
-"""rosbridge clients beside each other on one hub, and the hub beside a double of the reference server's design.
+"""Comparison of rosbridge clients on one hub, and of the hub with a server of the reference server's design.
 
-A bare socket, which encodes and decodes nothing, is at the other end of whatever is measured:
+The peer of each measured client or server is a bare socket, which does not encode or decode:
 published: client -> hub -> bare socket.   received: bare socket -> hub -> client.   round trip: client -> hub -> client.
-All in one run and in turns, so that a noisy machine is noisy for all.
+Everything is measured in turns within one run, so that noise on the machine affects all alike.
 """
 
 from __future__ import annotations
@@ -38,18 +38,19 @@ SMALL, LARGE = 6, 1024
 SIZES = (1, 4, 16, 64, 256, 1024, 4096)
 TURNS = 3
 IN_FLIGHT = 32
-"""Messages under way when servers are compared."""
+"""Number of messages in flight when servers are compared."""
 WINDOW = {SMALL: 400, LARGE: 100}
-"""Messages that a receiving client may be behind, by their values: less than the hub would drop for it."""
+"""Messages by which a receiving client may lag, by their number of values: fewer than the hub would drop."""
 COUNTS = {SMALL: (12_000, 12_000, 600), LARGE: (1_000, 2_000, 200)}
-"""By values of a message: how many are published, received and sent round in a turn; the fastest client takes 50 ms."""
+"""Messages to publish, receive and send in round trips per turn, by number of values (50 ms or more).
+"""
 PER_SIZE = 40
 SERVER_MESSAGES = {"hub": 100_000, "Tornado double": 8_000}
 SERVER_TURNS = 5
 
 
 class Bare(asyncio.Protocol):
-    """A WebSocket client that costs next to nothing: frames are made once, and only counted when they come."""
+    """A WebSocket client with negligible cost: frames are encoded once, and only counted when received."""
 
     def __init__(self) -> None:
         self.ready: asyncio.Future[None] = asyncio.get_running_loop().create_future()
@@ -59,7 +60,7 @@ class Bare(asyncio.Protocol):
         self._transport: asyncio.Transport
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Ask for a WebSocket."""
+        """Request a WebSocket."""
         self._transport = cast("asyncio.Transport", transport)
         key = base64.b64encode(os.urandom(16)).decode()
         lines = ["GET / HTTP/1.1", "Host: localhost", "Upgrade: websocket", "Connection: Upgrade"]
@@ -67,7 +68,7 @@ class Bare(asyncio.Protocol):
         self._transport.write("\r\n".join(lines).encode())
 
     def data_received(self, data: bytes) -> None:
-        """Count whole frames; ``on_frames`` gets how many came and the last one's payload."""
+        """Count whole frames, and call `on_frames` with their number and the last one's payload."""
         data = self._rest + data
         if not self.ready.done():
             head, separator, data = data.partition(b"\r\n\r\n")
@@ -94,7 +95,7 @@ class Bare(asyncio.Protocol):
             self.on_frames(came, last)
 
     def send(self, frames: bytes) -> None:
-        """Send frames made before."""
+        """Send encoded frames."""
         self._transport.write(frames)
 
     def pause(self) -> None:
@@ -102,19 +103,19 @@ class Bare(asyncio.Protocol):
         self._transport.pause_reading()
 
     def resume(self) -> None:
-        """Read on."""
+        """Resume reading."""
         self._transport.resume_reading()
 
     def close(self) -> None:
-        """Hang up."""
+        """Close the connection."""
         self._transport.abort()
 
 
 async def soon(awaited: Awaitable[Result], what: str) -> Result:
-    """Wait for it, with an end to patience.
+    """Wait for an awaitable, for a limited time.
 
     Raises:
-        StackError: it did not come.
+        StackError: It did not complete in time.
     """
     try:
         async with asyncio.timeout(PATIENCE):
@@ -149,7 +150,7 @@ async def bare(uri: str) -> Any:
 
 
 async def settled(client: Bare) -> None:
-    """Back when the server has done all that this client sent before."""
+    """Return when the server has processed everything that this client sent."""
     answered: asyncio.Future[None] = asyncio.get_running_loop().create_future()
     client.on_frames = lambda _count, _last: None if answered.done() else answered.set_result(None)
     client.send(frame({"op": "call_service", "id": "s", "service": "/rosapi/get_time", "args": {}}))
@@ -158,7 +159,7 @@ async def settled(client: Bare) -> None:
 
 
 def message_of(values: int) -> dict[str, list[float]]:
-    """Numbers as sensors have them, all digits used."""
+    """Return a message of numbers such as sensors measure, with all digits significant."""
     return {"data": [(at + 1) / 7.0 for at in range(values)]}
 
 
@@ -166,7 +167,7 @@ def message_of(values: int) -> dict[str, list[float]]:
 
 
 async def server_rate(uri: str, count: int) -> float:
-    """Messages of 64 bytes a second from one bare client to another, 32 in flight."""
+    """Return messages of 64 bytes per second from one bare client to another, with 32 in flight."""
     loop = asyncio.get_running_loop()
     async with bare(uri) as publisher, bare(uri) as subscriber:
         subscriber.send(frame({"op": "subscribe", "topic": "/load", "type": TYPE, "queue_length": 1000}))
@@ -198,7 +199,7 @@ async def server_rate(uri: str, count: int) -> float:
 
 @dataclass(frozen=True)
 class Kind:
-    """A client to be measured: its name, how it is started, in which forms it takes messages."""
+    """A client to be measured: its name, its command, and the forms in which it takes messages."""
 
     name: str
     command: tuple[str, ...]
@@ -207,21 +208,21 @@ class Kind:
 
 
 class Rate(NamedTuple):
-    """Messages a second, and microseconds of the client's CPU for each."""
+    """Messages per second, and microseconds of the client's CPU time for each."""
 
     per_s: float
     cpu_us: float
 
 
 class Child:
-    """A client under measurement, in a process of its own."""
+    """A client under measurement, in its own process."""
 
     def __init__(self, kind: Kind, process: asyncio.subprocess.Process) -> None:
         self.kind = kind
         self._process = process
 
     async def answer(self) -> Any:
-        """Return the next line that is an answer."""
+        """Return the next answer."""
         assert self._process.stdout is not None
         while True:
             line = await soon(self._process.stdout.readline(), f"an answer of {self.kind.name}")
@@ -230,17 +231,17 @@ class Child:
             try:
                 return json.loads(line)
             except ValueError:
-                continue  # what the library itself prints
+                continue  # printed by the library itself
 
-    def tell(self, **command: Any) -> None:
-        """Begin a measurement."""
+    def send(self, **command: Any) -> None:
+        """Start a measurement."""
         assert self._process.stdin is not None
         self._process.stdin.write(json.dumps(command).encode() + b"\n")
 
 
 @asynccontextmanager
 async def child_of(kind: Kind, uri: str) -> Any:
-    """Start a client, and end it."""
+    """Run a client within the context."""
     process = await asyncio.create_subprocess_exec(
         *kind.command,
         uri,
@@ -267,12 +268,12 @@ async def published(child: Child, uri: str, topic: str, values: int, count: int)
         last: asyncio.Future[float] = asyncio.get_running_loop().create_future()
 
         def look(_came: int, payload: bytes) -> None:
-            if b"-1" in payload[-16:] and not last.done():
+            if b"[-1" in payload and not last.done():
                 last.set_result(time.perf_counter())
 
         counter.on_frames, counter.count = look, 0
         started = time.perf_counter()
-        child.tell(do="publish", topic=topic, values=values, count=count)
+        child.send(do="publish", topic=topic, values=values, count=count)
         ended = await soon(last, f"the last message that {child.kind.name} published")
         cpu = (await child.answer())["cpu_s"]
         return Rate(float(counter.count / (ended - started)), 1e6 * cpu / count)
@@ -284,7 +285,7 @@ async def received(child: Child, uri: str, topic: str, values: int, count: int, 
         publisher.send(frame({"op": "advertise", "topic": topic, "type": TYPE}))
         publisher.send(frame({"op": "subscribe", "topic": f"{topic}/heard", "type": TYPE}))
         await settled(publisher)
-        child.tell(do="receive", topic=topic, count=count, compression=form)
+        child.send(do="receive", topic=topic, count=count, compression=form)
         await child.answer()
         one, sent = frame({"op": "publish", "topic": topic, "msg": message_of(values)}), 0
 
@@ -305,14 +306,14 @@ async def received(child: Child, uri: str, topic: str, values: int, count: int, 
 
 
 async def round_trips(child: Child, topic: str, values: int, count: int, form: str) -> list[float]:
-    """Microseconds of round trips, one after the other."""
-    child.tell(do="round_trip", topic=topic, values=values, count=count, compression=form)
+    """Return the microseconds of consecutive round trips."""
+    child.send(do="round_trip", topic=topic, values=values, count=count, compression=form)
     times: list[float] = (await child.answer())["us"]
-    return times[count // 10 :]  # the first ones warm up
+    return times[count // 10 :]  # the first ones are warm-up
 
 
 def kinds() -> list[Kind]:
-    """All clients; installs those of other projects where they are missing."""
+    """Return all clients, and install those of other projects that are missing."""
     python = str(install_roslibpy() / "venv" / "bin" / "python")
     roslibpy = (python, str(SIDES / "roslibpy_client.py"))
     return [
@@ -333,11 +334,11 @@ def topics() -> Iterator[str]:
         yield f"/bench/turn{number}"
 
 
-# --- everything
+# --- the bench
 
 
 def codec() -> dict[str, float]:
-    """Microseconds to write and read 1024 doubles: the standard library's JSON, and CBOR as client and hub have it."""
+    """Return the microseconds to encode and decode 1024 doubles as JSON (standard library) and CBOR (ours)."""
     import numpy as np
 
     from bridge.codecs import cbor_codec
@@ -360,7 +361,7 @@ def codec() -> dict[str, float]:
 
 
 async def bench(arguments: argparse.Namespace) -> int:
-    """Measure everything, print the tables, write the picture and the JSON."""
+    """Measure everything, print the tables, and write the picture and the JSON file."""
     clients, found = kinds(), Figures()
     with tempfile.TemporaryDirectory(prefix="bench-rosbayes-") as folder:
         hub, tornado = (Process(name, Path(folder, name)) for name in ("hub", "tornado"))
@@ -391,7 +392,7 @@ async def bench(arguments: argparse.Namespace) -> int:
 
 @dataclass
 class Figures:
-    """All that was measured, by client, form and number of values."""
+    """All measurements, by client, form and number of values."""
 
     servers: dict[str, list[float]] = field(default_factory=dict)
     published: dict[tuple[str, int], list[Rate]] = field(default_factory=dict)
@@ -401,7 +402,7 @@ class Figures:
     codec: dict[str, float] = field(default_factory=dict)
 
     def summary(self) -> dict[str, Any]:
-        """Medians, and the ratios that were aimed at."""
+        """Return the medians and the ratios that have targets."""
         median = statistics.median
         rows = [
             {
@@ -472,7 +473,7 @@ def middle(rates: list[Rate]) -> Rate:
 
 
 async def measure_clients(clients: list[Kind], uri: str, found: Figures) -> None:
-    """All measurements of clients, in turns; a client's process lives for one turn."""
+    """Measure all clients in turns; the process of a client lives for one turn."""
     names = topics()
     for turn in range(TURNS):
         for kind in clients:
@@ -540,7 +541,7 @@ def show(summary: dict[str, Any]) -> None:
 
 
 def draw(by_values: dict[str, dict[str, float]], path: Path) -> bool:
-    """Round-trip time against message size, as a picture; False without matplotlib."""
+    """Draw round-trip time against message size; return False without matplotlib."""
     try:
         import matplotlib as mpl
     except ImportError:
@@ -570,9 +571,10 @@ def draw(by_values: dict[str, dict[str, float]], path: Path) -> bool:
 
 
 def main() -> int:
-    """Read the flags and measure."""
+    """Parse the flags and measure."""
     parser = argparse.ArgumentParser(
-        prog="scripts/bench bridge", description="rosbridge clients and servers side by side."
+        prog="scripts/bench bridge",
+        description="Compare rosbridge clients on the hub, and the hub with a model of the reference server.",
     )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all figures")
     arguments = parser.parse_args()

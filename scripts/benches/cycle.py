@@ -1,4 +1,4 @@
-"""From a reading's publication to its result's arrival, beside the floor of the same client, hub and message sizes.
+"""Cycle time, from a reading's publication to its result's arrival, compared with an echo's (the floor).
 
 processes  client --reading--> hub --> subscriber -> master -> pcie-app -> 4 boards -> pcie-app -> master -> publisher --> hub --> client
 fused      client --reading--> hub --> master --------------> 4 boards --------------> master -----------------------> hub --> client
@@ -42,15 +42,15 @@ STAGES = (
 _TICKS = os.sysconf("SC_CLK_TCK")
 LINES = 32 * 32
 BOUND = 2.5
-"""Bound of a cycle's time, as a multiple of floor plus computing on the boards."""
+"""Limit of the cycle time, as a multiple of the floor plus computing on the boards."""
 WINDOW = 4
-"""Readings under way at once when frames per second are measured."""
+"""Number of readings in flight when frames per second are measured."""
 TOPICS = {"processes": BOAT_TOPIC, "fused": BOAT_TOPIC + "_fused"}
 
 
 @dataclass
 class Measured:
-    """Microseconds of each cycle, and of each of its stages; CPU microseconds of a frame by command; frames a second."""
+    """Microseconds of each cycle and its stages, CPU microseconds per frame by command, frames per second."""
 
     cycle: list[float] = field(default_factory=list)
     stages: dict[str, list[float]] = field(default_factory=lambda: {name: [] for name in STAGES})
@@ -59,7 +59,7 @@ class Measured:
 
 
 def readings(seed: int, count: int) -> list[dict[str, int]]:
-    """Return readings of boats at random places, without noise but rounded, as the normaliser publishes them."""
+    """Return readings of boats at random positions, without noise, rounded as by the normaliser."""
     import math
 
     chance = random.Random(seed)
@@ -82,7 +82,7 @@ def message(reading: dict[str, int]) -> dict[str, object]:
 async def one_by_one(
     publication: Publication, answers: Subscription, some: list[dict[str, int]], times: list[float]
 ) -> None:
-    """Publish, wait for the answer, note the time; a lost answer fails the bench."""
+    """Publish readings, each after the answer to the one before, and record the times."""
     for reading in some:
         started = time.perf_counter_ns()
         await publication.publish(message(reading))
@@ -91,7 +91,7 @@ async def one_by_one(
 
 
 async def per_second(publication: Publication, answers: Subscription, some: list[dict[str, int]]) -> float:
-    """Answers per second with WINDOW readings under way."""
+    """Return answers per second with WINDOW readings in flight."""
     started = time.perf_counter()
     under_way = 0
     for reading in some:
@@ -106,13 +106,13 @@ async def per_second(publication: Publication, answers: Subscription, some: list
 
 
 def cpu_seconds(pid: int) -> float:
-    """User and system time of a process so far."""
+    """Return the user and system time of a process so far."""
     fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
     return (int(fields[11]) + int(fields[12])) / _TICKS
 
 
 def cpu_of(pids: dict[str, list[int]]) -> dict[str, float]:
-    """User and system time so far of all processes, by command."""
+    """Return the user and system time of all processes so far, by command."""
     return {command: sum(map(cpu_seconds, all_)) for command, all_ in pids.items()}
 
 
@@ -144,8 +144,9 @@ async def collect_stages(
 ) -> None:
     """Return the stages of some frames.
 
-    The wire's stages are seen from this client, whose clock the host shares: from the reading's stamp to its
-    receipt by the subscriber, and from the publisher's beginning to publish to the result's arrival here.
+    The stages on the wire are measured with this client's clock, which the host shares: from the reading's
+    stamp to its receipt by the subscriber, and from the start of the publication to the result's arrival
+    here.
     """
     frames = ros.subscribe("/bm/frame", "diagnostic_msgs/DiagnosticArray")
     await asyncio.sleep(0.05)
@@ -166,7 +167,7 @@ async def collect_stages(
 
 
 def quantile(values: list[float], share: float) -> float:
-    """Return the value below which a share of them lies."""
+    """Return the quantile of the values."""
     return sorted(values)[min(len(values) - 1, int(share * len(values)))]
 
 
@@ -179,10 +180,10 @@ async def measure(
     floor: list[float],
     each_turn: int,
 ) -> float:
-    """Give the echo and the stacks their turns; what is found goes into `stacks` and `floor` (us).
+    """Measure the echo and the stacks in turns, and append the microseconds to `stacks` and `floor`.
 
     Returns:
-        How many answers the echo gives in a second.
+        Answers of the echo per second.
     """
     to_echo = await ros.advertise("/bench/reading", BOAT_TYPE)
     publications = {name: await ros.advertise(TOPICS[name], BOAT_TYPE) for name in stacks}
@@ -203,7 +204,7 @@ async def measure(
         await one_by_one(to_echo, echoes, turn, floor)
         for name, measured in stacks.items():
             await one_by_one(publications[name], results, turn, measured.cycle)
-        # not in the timed turns: to hear /bm/frame too is work for hub and client
+        # not in the timed turns, because subscribing to /bm/frame is work for the hub and the client
         for name, measured in stacks.items():
             await collect_stages(ros, publications[name], results, turn[: len(turn) // 4 + 1], measured)
     for name, measured in stacks.items():
@@ -221,7 +222,7 @@ async def measure(
 
 
 async def bench(arguments: argparse.Namespace) -> int:
-    """Measure in turns, so that a noisy machine is noisy for all; print the table, write the JSON."""
+    """Measure in turns, so that noise affects all alike; print the table and write the JSON file."""
     console = Console(stderr=True)
     seed = arguments.seed if arguments.seed is not None else random.randrange(2**32)
     some = readings(seed, arguments.frames)
@@ -265,7 +266,7 @@ async def bench(arguments: argparse.Namespace) -> int:
 
 
 def summary(measured: Measured, floor: float) -> dict[str, Any]:
-    """One stack's figures: microseconds, frames per second, and its ratio to the floor beyond the boards' computing."""
+    """Return a stack's microseconds, frames per second, and ratio to the floor without computing."""
     cycle = statistics.median(measured.cycle)
     compute = statistics.median(measured.stages["compute"])
     return {
@@ -324,11 +325,19 @@ def show(figures: dict[str, Any]) -> None:
 
 
 def main() -> int:
-    """Read the flags and measure."""
-    parser = argparse.ArgumentParser(prog="scripts/bench cycle", description="One cycle beside its floor.")
-    parser.add_argument("--frames", type=int, default=1000, help="readings (1000)")
-    parser.add_argument("--turn", type=int, default=50, help="readings before the other one's turn (50)")
-    parser.add_argument("--seed", type=int, help="of the boat's places (a new one each time)")
+    """Parse the flags and measure."""
+    parser = argparse.ArgumentParser(
+        prog="scripts/bench cycle",
+        description="Compare the time from a reading to its result with that of an echo.",
+    )
+    parser.add_argument("--frames", type=int, default=1000, help="number of readings (1000)")
+    parser.add_argument(
+        "--turn",
+        type=int,
+        default=50,
+        help="readings of one turn, after which another alternative is measured (50)",
+    )
+    parser.add_argument("--seed", type=int, help="seed of the positions of the boat (a new one each time)")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all figures")
     arguments = parser.parse_args()
     if min(arguments.frames, arguments.turn) < 1:

@@ -1,4 +1,4 @@
-"""The floor under a cycle: answers every reading at once with a message of a result's size."""
+"""An echo, the floor of a cycle: it answers every reading at once with a message of a result's size."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from bridge.client import connect
 
 
 async def echo(uri: str, lines: int) -> None:
-    """Answer on /bench/echo until the process is ended; the message is made once, its encoding is the client's."""
+    """Answer on /bench/echo until the process is ended, always with the same message."""
     answer = {
         "layout": {"dim": [{"label": "line", "size": lines, "stride": lines}], "data_offset": 0},
         "data": [(at + 0.5) * 2 / lines**2 for at in range(lines)],

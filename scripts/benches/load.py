@@ -1,7 +1,8 @@
 """The hub under load: hundreds of clients, some of which read slowly, and clients that attack it.
 
-Every message carries its time of sending, and quick subscribers in this process take its delay. The clients are bare sockets
-(see `scripts.benches.bridge`) and share the machine with the hub, so the figures are those of both.
+Every message contains its time of sending, from which fast subscribers in this process compute its delay. The
+clients are bare sockets (see `scripts.benches.bridge`) and share the machine with the hub, so the figures are
+those of both.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ TOPICS = 200
 PUBLISHERS = 50
 SLOW = 50
 RATE = 2000
-"""Messages a second, over all topics."""
+"""Messages per second over all topics."""
 SLOT = 0.01
 PROBE_HZ = 100
 MEGABYTE = 1 << 20
@@ -45,7 +46,7 @@ def _resident(process: int) -> int:
 
 @dataclass
 class Delays:
-    """Delays of a phase, in milliseconds, and messages that were delivered in a second."""
+    """Delays of a phase, in milliseconds, and messages delivered per second."""
 
     milliseconds: list[float] = field(default_factory=list)
     per_second: float = 0.0
@@ -80,7 +81,7 @@ async def publish_for(publishers: list[Bare], seconds: float) -> None:
 
 
 async def phase(readers: list[Bare], publishers: list[Bare], seconds: float) -> Delays:
-    """Measure the quick readers while everything is published."""
+    """Measure the fast readers while messages are published on all topics."""
     delays = Delays()
     for reader in readers:
         reader.on_frames = lambda _count, last: _take(delays, last)
@@ -99,7 +100,7 @@ def _take(delays: Delays, last: bytes) -> None:
 
 
 async def crowd(uri: str, hub: int, clients: int, seconds: float) -> dict[str, Any]:
-    """Measure the quick clients alone, and beside clients that read almost nothing."""
+    """Measure the fast clients alone, and with clients that read almost nothing."""
     numbers = random.Random(1)
     before = _resident(hub)
     async with AsyncExitStack() as stack:
@@ -131,7 +132,7 @@ async def crowd(uri: str, hub: int, clients: int, seconds: float) -> dict[str, A
 
 
 async def _read_slowly(readers: list[Bare]) -> None:
-    """Let each reader read for a moment in a second."""
+    """Let each reader read for a moment every second."""
     for reader in readers:
         reader.pause()
     while True:
@@ -146,7 +147,7 @@ async def _read_slowly(readers: list[Bare]) -> None:
 
 @asynccontextmanager
 async def probed(uri: str) -> AsyncIterator[Delays]:
-    """Exchange messages of two well-behaved clients, and take their delays."""
+    """Measure the delays of messages between two well-behaved clients."""
     delays = Delays()
     async with bare(uri) as publisher, bare(uri) as subscriber:
         topic = f"/probe/{time.perf_counter_ns()}"
@@ -171,7 +172,7 @@ async def probed(uri: str) -> AsyncIterator[Delays]:
 
 
 async def _sized_arrays(uri: str, stack: AsyncExitStack) -> Callable[[], Awaitable[None]]:
-    """Publish numbers where a type has bytes, beside a CBOR subscriber."""
+    """Publish numbers where the type has bytes, with a CBOR subscriber."""
     reader = await stack.enter_async_context(bare(uri))
     kind = "sensor_msgs/Image"
     reader.send(frame({"op": "subscribe", "topic": "/image", "type": kind, "compression": "cbor"}))
@@ -182,7 +183,7 @@ async def _sized_arrays(uri: str, stack: AsyncExitStack) -> Callable[[], Awaitab
 
 
 async def _small_fragments(uri: str, stack: AsyncExitStack) -> Callable[[], Awaitable[None]]:
-    """Publish large messages to readers that ask for tiny fragments."""
+    """Publish large messages to readers that request tiny fragments."""
     for _ in range(20):
         reader = await stack.enter_async_context(bare(uri))
         options = {"type": TYPE, "fragment_size": 16}
@@ -194,7 +195,7 @@ async def _small_fragments(uri: str, stack: AsyncExitStack) -> Callable[[], Awai
 
 
 async def _unread_answers(uri: str, stack: AsyncExitStack) -> Callable[[], Awaitable[None]]:
-    """Ask for large parameters again and again without reading the answers."""
+    """Request large parameters repeatedly without reading the answers."""
     attackers = [await stack.enter_async_context(bare(uri)) for _ in range(20)]
     value = json.dumps("x" * 500_000)
     set_param = {"op": "call_service", "service": "/rosapi/set_param", "args": {"name": "/p", "value": value}}
@@ -213,7 +214,7 @@ async def _unread_answers(uri: str, stack: AsyncExitStack) -> Callable[[], Await
 
 
 async def _brackets(uri: str, stack: AsyncExitStack) -> Callable[[], Awaitable[None]]:
-    """Publish many empty arrays, which take long to look at."""
+    """Publish many empty arrays, which take long to parse."""
     attacker = await stack.enter_async_context(bare(uri))
     attacker.send(frame({"op": "advertise", "topic": "/deep", "type": TYPE}))
     payload = b'{"op":"publish","topic":"/deep","msg":{"data":[' + b"[]," * 300_000 + b"[]]}}"
@@ -222,7 +223,7 @@ async def _brackets(uri: str, stack: AsyncExitStack) -> Callable[[], Awaitable[N
 
 
 async def _resubscriptions(uri: str, stack: AsyncExitStack) -> Callable[[], Awaitable[None]]:
-    """Repeat one of thousands of subscriptions."""
+    """Repeat one of thousands of subscribe operations."""
     attacker = await stack.enter_async_context(bare(uri))
     for at in range(4000):
         attacker.send(frame({"op": "subscribe", "id": str(at), "topic": "/many", "type": TYPE}))
@@ -240,7 +241,7 @@ async def _listings(uri: str, stack: AsyncExitStack) -> Callable[[], Awaitable[N
 
 
 async def _silent_connections(uri: str, stack: AsyncExitStack) -> Callable[[], Awaitable[None]]:
-    """Hold hundreds of connections that never speak."""
+    """Hold hundreds of silent connections."""
     host, _, port = uri.removeprefix("ws://").rpartition(":")
     for _ in range(300):
         _, writer = await asyncio.open_connection(host, int(port))
@@ -272,7 +273,7 @@ ATTACKS = {
 
 
 async def attacked(uri: str, hub: int, seconds: float) -> dict[str, dict[str, float]]:
-    """Measure the delays of two other clients during each attack, and the hub's growth."""
+    """Measure the delays of two other clients and the hub's memory growth during each attack."""
     found = {}
     async with probed(uri) as quiet:
         await asyncio.sleep(seconds)
@@ -292,7 +293,7 @@ async def attacked(uri: str, hub: int, seconds: float) -> dict[str, dict[str, fl
 
 
 async def bench(arguments: argparse.Namespace) -> int:
-    """Measure, print the tables, and write the JSON."""
+    """Measure, print the tables, and write the JSON file."""
     with tempfile.TemporaryDirectory(prefix="bench-rosbayes-") as folder:
         hub = Process("hub", Path(folder, "hub"))
         try:
@@ -332,10 +333,13 @@ def show(found: dict[str, Any]) -> None:
 
 
 def main() -> int:
-    """Read the flags and measure."""
-    parser = argparse.ArgumentParser(prog="scripts/bench load", description="The hub under load and attack.")
-    parser.add_argument("--clients", type=int, default=500, help="clients in all (500)")
-    parser.add_argument("--seconds", type=float, default=10.0, help="seconds of each phase (10)")
+    """Parse the flags and measure."""
+    parser = argparse.ArgumentParser(
+        prog="scripts/bench load",
+        description="Measure the hub with many clients, with slow readers, and under attack.",
+    )
+    parser.add_argument("--clients", type=int, default=500, help="number of clients (500)")
+    parser.add_argument("--seconds", type=float, default=10.0, help="duration of each phase in seconds (10)")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all figures")
     arguments = parser.parse_args()
     return run_script(lambda: bench(arguments), 600)

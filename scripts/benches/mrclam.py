@@ -1,4 +1,4 @@
-"""Real robot data through the whole stack: how far the posterior's mean is from the reference, beside float64 fusion.
+"""Real robot data through the whole stack: distances of posteriors' means from the reference.
 
 recording --> player --> hub --> master and its processes, one deployment for both robots --> hub --> player
 """
@@ -31,15 +31,16 @@ from toolchain.models import Model, exact_posterior
 TOPIC, TYPE = "/mrclam/sightings", "mrclam_msgs/Sightings"
 RECORDINGS = ("ds1_robot3.csv", "ds1_robot5.csv")
 BOUND = 1.15
-"""The stack's median distance may be this much of float64's."""
+"""Limit of the stack's median distance, as a multiple of float64 fusion's."""
 
 MAX_CYCLES = 2**22
-"""In frames with three wild readings the best line counts once in 4e5 cycles; the default 2^17 would lose them."""
+"""Cycle limit; in frames with three outliers the best line counts once in 4e5 cycles, more than 2^17.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Figures:
-    """One robot's run with one model; distances in metres. The exact ones are float64 inference without a machine."""
+    """One robot's run with one model; distances are in metres, the exact ones from float64 inference."""
 
     recording: str
     model: str
@@ -55,7 +56,7 @@ class Figures:
 
 @dataclass(frozen=True, kw_only=True)
 class Fitted:
-    """A model whose tables were learnt, and the option of `toolchain build` that takes them."""
+    """A model with learned tables, and the option of `toolchain build` that names them."""
 
     option: str
     model: Model
@@ -64,7 +65,7 @@ class Fitted:
 def by_hand_distances(
     frames: tuple[RecordedFrame, ...], landmarks: tuple[Landmark, ...], cells: int
 ) -> list[float]:
-    """Distances of unquantised float64 fusion's mean to the reference, in metres."""
+    """Return the distances, in metres, of unquantised float64 fusion's mean from the reference."""
     distances = []
     for frame in frames:
         seen = {sighting.landmark: sighting for sighting in frame.sightings}
@@ -80,7 +81,7 @@ def by_hand_distances(
 
 
 def fitted_distances(frames: tuple[RecordedFrame, ...], model: Model, cells: int) -> list[float]:
-    """Distances of the exact posterior's mean to the reference, in metres: the model's own tables, no codes."""
+    """Return the distances, in metres, of the exact posterior's mean from the reference, without codes."""
     distances = []
     for frame in frames:
         readings = {
@@ -101,10 +102,10 @@ def _distance(posterior: NDArray[np.float64], frame: RecordedFrame, cells: int) 
 
 
 async def fit(arguments: argparse.Namespace) -> Fitted:
-    """Take the tables that were learnt, or learn them from robot 3 where the file is not there yet.
+    """Return the learned tables, which are first learned from robot 3 if the file does not exist.
 
     Raises:
-        StackError: the toolchain refuses.
+        StackError: The toolchain failed.
     """
     landmarks = arguments.data / "landmarks.csv"
     if not arguments.fit.exists():
@@ -125,7 +126,7 @@ async def fit(arguments: argparse.Namespace) -> Fitted:
 async def run_stack(
     where: Path, uri: str, arguments: argparse.Namespace, names: tuple[str, ...], fitted: Fitted | None
 ) -> list[Figures]:
-    """Build one model, and play recordings through a stack that runs it."""
+    """Build a model, and play recordings through a stack that runs it."""
     landmarks_file = arguments.data / "landmarks.csv"
     landmarks = read_landmarks(landmarks_file)
     title = "by hand" if fitted is None else "fitted"
@@ -171,9 +172,9 @@ async def run_stack(
 
 
 async def bench(arguments: argparse.Namespace) -> int:
-    """Play recordings through running stacks; 1 when a robot is beyond the bound, or a fit is not better."""
+    """Play recordings through stacks; return 1 if a robot exceeds the bound or a fit is not better."""
     for name in RECORDINGS:
-        read_recording(arguments.data / name)  # refuse a bad recording before anything starts
+        read_recording(arguments.data / name)  # refuse an invalid recording before anything starts
     fitted = None if arguments.fit is None else await fit(arguments)
     names = RECORDINGS if fitted is None else RECORDINGS[1:]
     found = []
@@ -204,7 +205,7 @@ async def bench(arguments: argparse.Namespace) -> int:
     if arguments.json is not None:
         arguments.json.write_text(json.dumps([asdict(each) for each in found], indent=2) + "\n")
     if fitted is not None:
-        return _told_of_fit(*found)
+        return _report_fit(*found)
     beyond = [each.recording for each in found if each.ratio > BOUND]
     print(
         f"bound: {BOUND} of float64's" + (f"; beyond it: {', '.join(beyond)}" if beyond else "; held by both")
@@ -212,7 +213,7 @@ async def bench(arguments: argparse.Namespace) -> int:
     return 1 if beyond else 0
 
 
-def _told_of_fit(by_hand: Figures, fitted: Figures) -> int:
+def _report_fit(by_hand: Figures, fitted: Figures) -> int:
     better = fitted.stack_mean_m < by_hand.stack_mean_m
     print(
         f"learnt on {RECORDINGS[0]}, judged on {RECORDINGS[1]}: mean {by_hand.stack_mean_m:.3f} m by hand, "
@@ -223,9 +224,10 @@ def _told_of_fit(by_hand: Figures, fitted: Figures) -> int:
 
 
 def main() -> int:
-    """Read the flags and play."""
+    """Parse the flags and play."""
     parser = argparse.ArgumentParser(
-        prog="scripts/bench mrclam", description="Real robot data through the whole stack."
+        prog="scripts/bench mrclam",
+        description="Replay the data of recorded robots through the whole stack, and compare with float64.",
     )
     parser.add_argument(
         "data", type=Path, help="folder with landmarks.csv and ds1_robot3.csv, ds1_robot5.csv"
@@ -234,10 +236,10 @@ def main() -> int:
         "--fit",
         type=Path,
         metavar="FILE",
-        help="on robot 5, the model by hand beside tables that `toolchain fit` learnt on robot 3; they are learnt "
-        "now if FILE is not there",
+        help="on robot 5, compare tables set by hand with tables learnt on robot 3; if FILE does not exist, they are "
+        "learnt now and written to it",
     )
-    parser.add_argument("--cells", type=int, default=32, help="cells along x and along y (32)")
+    parser.add_argument("--cells", type=int, default=32, help="number of cells along x, and along y (32)")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all figures")
     arguments = parser.parse_args()
     if not 1 <= arguments.cells <= 128:  # four boards hold 4096 lines each

@@ -1,4 +1,4 @@
-"""The campaign: rounds of faults until enough frames are judged; see scripts/campaign."""
+"""The campaign: rounds of faults until enough frames are judged (see scripts/campaign)."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from scripts.campaigning.expected import BANKS, BUILD_OPTIONS, Addresses, Expected, Outcome
 from scripts.campaigning.faults import Kind, Schedule, Step, step_as_json
-from scripts.campaigning.growth import growth
-from scripts.campaigning.measures import Recovery, RoundResult
-from scripts.campaigning.observer import Finding
+from scripts.campaigning.judging.expected import BANKS, BUILD_OPTIONS, Addresses, Expected, Outcome
+from scripts.campaigning.judging.growth import growth
+from scripts.campaigning.judging.measures import Recovery, RoundResult
+from scripts.campaigning.judging.observer import Finding
 from scripts.campaigning.round import POOL, Round
 from scripts.campaigning.shrinking import shrink
 from scripts.campaigning.stack import Topology
@@ -32,9 +32,9 @@ from scripts.processes import ROOT, Process, run_script
 FRAMES = 100_000
 SHORT_SECONDS = 120.0
 STEPS = 10
-"""Steps of a round."""
+"""Number of steps in a round."""
 SHRINKING = 300.0
-"""Seconds for the search for the shortest schedule that still fails."""
+"""Seconds for the search for the shortest failing schedule."""
 OUT = ROOT / "out" / "campaign"
 LIMIT = 24 * 3600.0
 
@@ -56,7 +56,7 @@ async def deployments(folder: Path) -> list[Path]:
 
 
 def expected_of(folders: list[Path]) -> Callable[[str, Addresses, int], Outcome]:
-    """Return the right outcomes of all readings, which are kept in out/campaign for other runs."""
+    """Return the correct outcomes of all readings, which are stored in out/campaign for other runs."""
     known: dict[tuple[str, Addresses, int], Outcome] = {}
     of_deployment = {folder.name: Expected(folder) for folder in folders}
     for folder, expected in zip(folders, of_deployment.values(), strict=True):
@@ -106,7 +106,7 @@ class Report:
         self.recoveries += result.recoveries
 
     def lines(self) -> list[str]:
-        """Return what the campaign prints at its end."""
+        """Return the lines that the campaign prints at its end."""
         flaws = Counter(str(finding.flaw) for finding in self.findings)
         number = sum(self.faults.values())
         lines = [
@@ -143,14 +143,15 @@ class Campaign:
         self._rounds = 0
 
     async def run(self) -> int:
-        """Run rounds until there are enough frames, or the time is over; return the exit code."""
+        """Run rounds until enough frames are judged or the time is over, and return the exit code."""
         options = self._options
         folders = await deployments(self._folder)
         expected = await asyncio.to_thread(expected_of, folders)
         kinds = [Kind(each) for each in options.only] if options.only else list(Kind)
         begun = time.monotonic()
         calm = 60 if options.short else options.calm
-        topologies = [Topology[name] for name in options.topology] if options.topology else list(Topology)
+        everywhere = [each for each in Topology if each is not Topology.CONTAINERS]
+        topologies = [Topology[name] for name in options.topology] if options.topology else everywhere
 
         async def play(topology: Topology, seed: int, steps: list[Step]) -> RoundResult:
             self._rounds += 1
@@ -238,18 +239,36 @@ class Campaign:
 def main() -> int:
     """Run the command."""
     parser = argparse.ArgumentParser(
-        prog="scripts/campaign", description="Faults against the running stack (see the head of the script)."
+        prog="scripts/campaign",
+        description="Run the stack, inject faults, and judge every result (docs/how-to/verify.md).",
     )
-    parser.add_argument("--frames", type=int, default=FRAMES, help=f"results to judge ({FRAMES})")
-    parser.add_argument("--seed", type=int, default=1, help="of the first round (1)")
-    parser.add_argument("--only", action="append", choices=list(Kind), help="a kind of fault; repeatable")
-    parser.add_argument("--topology", action="append", choices=[each.name for each in Topology])
-    parser.add_argument("--steps", type=int, default=STEPS, help=f"of a round ({STEPS})")
+    parser.add_argument("--frames", type=int, default=FRAMES, help=f"number of results to judge ({FRAMES})")
+    parser.add_argument("--seed", type=int, default=1, help="seed of the first round (1)")
+    parser.add_argument(
+        "--only",
+        action="append",
+        choices=[str(kind) for kind in Kind],
+        help="inject only this kind of fault; repeatable",
+    )
+    parser.add_argument(
+        "--topology",
+        action="append",
+        choices=[each.name for each in Topology],
+        help="run only this topology; repeatable",
+    )
+    parser.add_argument("--steps", type=int, default=STEPS, help=f"steps of a round ({STEPS})")
     parser.add_argument("--calm", type=int, default=200, help="results between two steps (200)")
-    parser.add_argument("--short", action="store_true", help="three minutes at most")
-    parser.add_argument("--keep-going", action="store_true", help="go on after a failed round")
-    parser.add_argument("--shrink", type=float, default=SHRINKING, help=f"seconds to shorten ({SHRINKING:g})")
-    parser.add_argument("--json", type=Path, help="a file for the figures")
+    parser.add_argument(
+        "--short", action="store_true", help="run the same schedule each time, for at most three minutes"
+    )
+    parser.add_argument("--keep-going", action="store_true", help="continue after a failed round")
+    parser.add_argument(
+        "--shrink",
+        type=float,
+        default=SHRINKING,
+        help=f"seconds in which to shorten a failed schedule ({SHRINKING:g})",
+    )
+    parser.add_argument("--json", type=Path, help="write the figures to this file")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="bmc") as folder:
         return run_script(lambda: Campaign(options, Path(folder)).run(), LIMIT)

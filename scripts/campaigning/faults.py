@@ -1,4 +1,4 @@
-"""Faults of a campaign: which there are, what each may cost, and seeded schedules of them."""
+"""Faults of a campaign: their kinds, their permitted losses, and seeded schedules."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from enum import StrEnum
 
-from scripts.campaigning.accounts import MOST_IN_TRANSIT, Excuses
+from scripts.campaigning.judging.accounts import MOST_IN_TRANSIT, Excuses
 from scripts.campaigning.stack import BOARD_NAMES, BOARDS_PARENT, SERVICES, Topology
 
 
 class Kind(StrEnum):
-    """A family of faults, as `--only` names it."""
+    """A kind of fault, as named with `--only`."""
 
     SIGNALS = "signals"
     RELOAD = "reload"
@@ -24,11 +24,14 @@ class Kind(StrEnum):
     RESOURCES = "resources"
     CLOCK = "clock"
     INPUT = "input"
+    INTEGRITY = "integrity"
+    CONTAINERS = "containers"
+    """Faults of containers alone: without network, restarted, or with full run directories."""
 
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """One fault: a kind, what is done, to whom, for how long, and a number whose meaning depends on what is done."""
+    """One fault: kind, action, target, duration, and a number whose meaning depends on the action."""
 
     kind: str
     what: str
@@ -37,6 +40,8 @@ class Fault:
     number: int = 0
 
     def __str__(self) -> str:
+        if self.what == "flip":
+            return f"a bit flips in a table of {self.target} after {self.number} starts"
         if self.what == "misbehave":
             return f"{self.target} misbehaves: {MISBEHAVIOURS[self.number]}"
         parts = [self.what, self.target, f"{self.seconds:.2f} s" if self.seconds else ""]
@@ -49,29 +54,42 @@ BOARD_ENDS = 3
 """Frames of a round that may fail on boards: the fourth within a minute ends a master by design."""
 ENDS = {"master": 1, "hub": 2, "boards": BOARD_ENDS}
 MOST_ENDS = 2
-"""Times that a round may end a process, or its connection to the master, of each other role."""
+"""How often a round may end a process of another role, or its connection to the master."""
 MISBEHAVIOURS = (
     *("drop", "stall", "short-read", "endless", "wrong-sequence"),
     *("wrong-crc", "all-ones", "never-done", "done-twice", "done-early", "stale-result"),
 )
 _FAILS = {"kill", "corrupt", "repeat", "cut", "finish", "cut-inside", "misbehave"}
-_ENDS_LINK = {"kill", "corrupt", "repeat", "cut", "finish", "cut-inside", "memory"}
+_ENDS_LINK = {
+    "kill",
+    "corrupt",
+    "repeat",
+    "cut",
+    "finish",
+    "cut-inside",
+    "memory",
+    "restart",
+    "full",
+    "cut-off",
+}
 _CUTS_ROSBRIDGE = {"gone", "finish", "nonsense", "cut-inside", "files"}
 
 
 def ended_roles(fault: Fault) -> tuple[str, ...]:
-    """Return the roles that a fault costs one of the ends that the master forgives; a frame of a board is one too."""
-    if fault.target == BOARDS_PARENT and fault.what == "kill":
+    """Return the roles whose limit of ends a fault uses up by one; a board's failed frame is such an end."""
+    if fault.target == BOARDS_PARENT and fault.what in {"kill", "restart", "full"}:
         return ("boards",)
+    if fault.what == "flip":
+        return ("boards",)  # it has been killed before; the flip itself fails no frame
     if fault.what == "misbehave":
-        return ("boards", "boards")  # it is killed before
+        return ("boards", "boards")  # it has been killed before
     if fault.target in BOARD_NAMES and fault.what in {*_FAILS, "stop", "hold"}:
         return ("boards",)
     return (fault.target,) if fault.what in _ENDS_LINK and fault.target != "rosbridge" else ()
 
 
 def excuses_of(step: Step, topology: Topology) -> Excuses:
-    """Return what a step may lose without the stack's knowledge: what no process of it had when it was cut."""
+    """Return the losses of a step that the stack cannot count, because no process had the message."""
     readings = results = False
     for fault in step:
         cut = fault.target == "rosbridge" and fault.what in _CUTS_ROSBRIDGE
@@ -81,20 +99,21 @@ def excuses_of(step: Step, topology: Topology) -> Excuses:
         results |= cut or fused or ended in {"hub", "master", "publisher"}
         if fault.what == "files":
             readings = results = True
-    held = any(fault.what in {"stop", "hold", "slow", "delay", "burst"} for fault in step)
+    held = any(fault.what in {"stop", "hold", "slow", "delay", "burst", "cut-off"} for fault in step)
     return Excuses(readings=readings, results=results, most=sys.maxsize if held else MOST_IN_TRANSIT)
 
 
 class Schedule:
-    """Makes the steps of a round, within the ends that a master forgives."""
+    """Generator of a round's steps, within the limits of ends that a master tolerates."""
 
     def __init__(self, rng: random.Random, topology: Topology, kinds: list[Kind]) -> None:
-        """Draw from the generator, for a topology, among kinds."""
+        """Draw faults of these kinds for a topology from the random generator."""
         self._rng = rng
         self._topology = topology
         services = () if topology.fused else SERVICES
         parent = () if topology.apart else (BOARDS_PARENT,)
-        self._roles = ("hub", *parent, *BOARD_NAMES, *services, "master")
+        boards = () if topology is Topology.CONTAINERS else BOARD_NAMES
+        self._roles = ("hub", *parent, *boards, *services, "master")
         self._makers: list[tuple[Kind, Callable[[], Step]]] = [
             (Kind.SIGNALS, self._kill),
             (Kind.SIGNALS, self._stop),
@@ -110,13 +129,19 @@ class Schedule:
                 (Kind.LINKS, self._link),
                 (Kind.LINKS, self._link),
                 (Kind.BOARDS, self._misbehave),
+                (Kind.INTEGRITY, self._flip),
             ]
+        if topology is Topology.CONTAINERS:
+            # processes of containers cannot be limited from outside, and the engine mounts one deployment only
+            without = {Kind.RELOAD, Kind.RESOURCES}
+            self._makers = [(kind, maker) for kind, maker in self._makers if kind not in without]
+            self._makers += 2 * [(Kind.CONTAINERS, self._contain)]
         self._makers = [(kind, maker) for kind, maker in self._makers if kind in kinds]
-        if Kind.CLOCK in kinds:
+        if Kind.CLOCK in kinds and topology is not Topology.CONTAINERS:
             self._makers.append((Kind.CLOCK, self._clock))
 
     def steps(self, count: int) -> list[Step]:
-        """Return the steps of a round: fewer than `count` if no others are forgiven."""
+        """Return the steps of a round, fewer than `count` if the limits do not allow more."""
         steps: list[Step] = []
         ends: Counter[str] = Counter()
         for _ in range(20 * count):
@@ -174,6 +199,10 @@ class Schedule:
         kind = self._rng.randrange(len(MISBEHAVIOURS))
         return (Fault(Kind.BOARDS, "misbehave", self._rng.choice(BOARD_NAMES), 0.5, kind),)
 
+    def _flip(self) -> Step:
+        starts = self._rng.randrange(30, 300)
+        return (Fault(Kind.INTEGRITY, "flip", self._rng.choice(BOARD_NAMES), 0.0, starts),)
+
     def _input(self) -> Step:
         what = self._rng.choice(["burst", "nan", "huge", "unusable", "disorder"])
         return (Fault(Kind.INPUT, what, "readings", 0.0, 10_000 if what == "burst" else 50),)
@@ -183,6 +212,13 @@ class Schedule:
         roles = [role for role in self._roles if role not in {*BOARD_NAMES, BOARDS_PARENT}]
         target = "master" if what == "disk" else self._rng.choice(roles)
         return (Fault(Kind.RESOURCES, what, target, self._seconds(2)),)
+
+    def _contain(self) -> Step:
+        what = self._rng.choice(["cut-off", "restart", "full"])
+        roles = {"cut-off": ("subscriber", "publisher"), "full": (BOARDS_PARENT, *SERVICES)}
+        longest = 12 if what == "cut-off" else 2
+        target = self._rng.choice(roles.get(what, self._roles))
+        return (Fault(Kind.CONTAINERS, what, target, self._seconds(longest)),)
 
     def _clock(self) -> Step:
         return (Fault(Kind.CLOCK, "clock", "all", 1.0, self._rng.choice([-3600, 3600])),)
@@ -215,5 +251,5 @@ NONSENSE = (
 
 
 def step_as_json(step: Step) -> list[dict[str, object]]:
-    """Return a step for a file."""
+    """Return a step as JSON for a file."""
     return [asdict(fault) for fault in step]

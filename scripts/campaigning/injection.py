@@ -1,15 +1,15 @@
-"""Injection of faults into a stack: each begins, lasts, and is taken back."""
+"""Injection of faults into a stack, each of which begins, lasts and is undone."""
 
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import os
 import resource
 import signal
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 
+from scripts.campaigning.containers import ContainerStack
 from scripts.campaigning.faults import MISBEHAVIOURS, NONSENSE, Fault
 from scripts.campaigning.stack import Stack
 
@@ -18,12 +18,14 @@ _FEWEST = 3
 _STARTS_BEFORE = 20
 _MISBEHAVING = 20.0
 """Seconds in which a board should have misbehaved; one that lies in its greeting is not asked for another."""
+_FINDING = 20.0
+"""Seconds in which a flipped bit should have been found; the observer judges frames, not this time."""
 _FAILED = "failed on a board"
 _CLOCK_FILE = "clock"
 
 
 class Injector:
-    """Does faults to a stack. Processes that the campaign supervises are started again at once."""
+    """Injector of faults into a stack; processes that the campaign supervises are restarted at once."""
 
     def __init__(
         self,
@@ -32,23 +34,29 @@ class Injector:
         *,
         publish: Callable[[str, int], Awaitable[None]],
         reload: Callable[[], Awaitable[None]],
+        flip: Callable[[], None],
     ) -> None:
-        """Take how special readings are published (what, how many), and how a reload is ordered."""
+        """Store functions that publish special readings (kind, number), order a reload and announce a flip."""
         self._stack = stack
         self._clock = folder / _CLOCK_FILE
         self._publish = publish
         self._reload = reload
+        self._flip = flip
         self.killed: set[str] = set()
-        """Roles whose processes were ended by a fault since the last look."""
+        """Roles whose processes were ended by a fault since the last restart."""
 
     async def inject(self, fault: Fault) -> None:
-        """Begin a fault, and return when it has been taken back."""
+        """Begin a fault, and return after it has been undone."""
         if fault.what in {"kill", "stop"}:
             await self._signal(fault)
+        elif fault.kind == "containers":
+            await self._contain(fault)
         elif fault.what == "reload":
             await self._reload()
         elif fault.what == "misbehave":
             await self._misbehave(fault)
+        elif fault.what == "flip":
+            await self._damage(fault)
         elif fault.what in {"files", "memory", "disk"}:
             await self._limit(fault)
         elif fault.what == "clock":
@@ -59,36 +67,44 @@ class Injector:
             await self._weather(fault)
 
     async def _signal(self, fault: Fault) -> None:
-        pid = await self._stack.pid(fault.target)
-        if not pid:
-            return  # the other fault of the step has ended it already
-        with contextlib.suppress(ProcessLookupError):
-            if fault.what == "kill":
-                os.kill(pid, signal.SIGKILL)
-                self.killed.add(fault.target)
-                return
-            os.kill(pid, signal.SIGSTOP)
-            try:
+        if fault.what == "stop":
+            async with self._stack.paused(fault.target):
                 await asyncio.sleep(fault.seconds)
-            finally:
-                os.kill(pid, signal.SIGCONT)
+        elif await self._stack.kill(fault.target):  # or the other fault of the step has ended it already
+            self.killed.add(fault.target)
+
+    async def _contain(self, fault: Fault) -> None:
+        """Apply a fault that only containers have."""
+        stack = self._stack
+        assert isinstance(stack, ContainerStack)
+        if fault.what == "cut-off":
+            async with stack.cut_off(fault.target):
+                await asyncio.sleep(fault.seconds)
+        elif fault.what == "restart":
+            await stack.stop_part(fault.target)
+            self.killed.add(fault.target)
+        else:
+            with stack.full():
+                await stack.stop_part(fault.target)
+                await stack.start_part(fault.target)
+                await asyncio.sleep(fault.seconds)
 
     async def restart(self) -> set[str]:
-        """Start killed processes of the campaign's own again, in their order; return the roles that were killed."""
+        """Restart killed processes that the campaign supervises, in order, and return the killed roles."""
         killed, self.killed = self.killed, set()
         for role in self._stack.own_parts:
             if role not in killed:
                 continue
-            await self._stack.ended(role)
+            await self._stack.wait(role)
             if role == "master":
                 await self._stack.forget_run()
             await self._stack.start_part(role)
         return killed
 
     async def _misbehave(self, fault: Fault) -> None:
-        """Start a board again as one that misbehaves once, after some frames, and wait until one has failed for it."""
+        """Restart a board that misbehaves once after some frames, and wait until a frame has failed on it."""
         os.kill(await self._stack.pid(fault.target), signal.SIGKILL)
-        await self._stack.ended(fault.target)
+        await self._stack.wait(fault.target)
         kind = MISBEHAVIOURS[fault.number]
         await self._stack.start_part(fault.target, f"{kind}:{_STARTS_BEFORE}:1")
         deadline = asyncio.get_running_loop().time() + _MISBEHAVING
@@ -100,9 +116,28 @@ class Injector:
                 continue
             now_failed = counters.lost.get(_FAILED, 0)
             if back < 0 or (failed != now_failed and counters.completed == back):
-                back, failed = counters.completed, now_failed  # the board is not back yet
+                back, failed = counters.completed, now_failed  # the board is not ready yet
             elif failed != now_failed:
                 return
+
+    async def _damage(self, fault: Fault) -> None:
+        """Restart a board in which a bit of a table flips once, and wait until pcie-app has found it."""
+        os.kill(await self._stack.pid(fault.target), signal.SIGKILL)
+        await self._stack.wait(fault.target)
+        found = await self._damages()
+        self._flip()
+        await self._stack.start_part(fault.target, f"flip-table:{fault.number}:1")
+        deadline = asyncio.get_running_loop().time() + _FINDING
+        while asyncio.get_running_loop().time() < deadline:
+            await asyncio.sleep(0.05)
+            if await self._damages() > found:
+                return
+
+    async def _damages(self) -> int:
+        """Return how many damaged boards pcie-app has found, by its own account."""
+        status = await self._stack.status("pcie-app")
+        integrity = None if status is None else status.get("integrity")
+        return int(integrity["damaged"]) if isinstance(integrity, dict) else 0
 
     async def _weather(self, fault: Fault) -> None:
         link = self._stack.links[fault.target]
@@ -141,7 +176,7 @@ class Injector:
                 await link.start()
 
     async def _limit(self, fault: Fault) -> None:
-        """Take descriptors, memory or the disk from a process, while connections are made again."""
+        """Limit a process's descriptors, memory or disk space, while connections are restored."""
         pid = await self._stack.pid(fault.target)
         used = self._stack.resources(pid)
         if not pid or used is None:
@@ -173,7 +208,7 @@ class Injector:
 
     @staticmethod
     def set_clock(path: Path, seconds: int) -> None:
-        """Write by how many seconds the clock is moved."""
+        """Write the number of seconds by which the clock is stepped."""
         new = path.with_suffix(".new")
         new.write_text(f"{seconds:+d}\n")
         new.replace(path)

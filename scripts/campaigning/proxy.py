@@ -1,4 +1,4 @@
-"""A proxy between two parts of the stack, which delays, holds, cuts, repeats and spoils what passes."""
+"""A proxy between two parts of the stack, which delays, holds, cuts, repeats and corrupts data."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ _STAMP = re.compile(rb'"secs":\s*(\d+),\s*"nsecs":\s*(\d+)')
 
 @dataclass(slots=True)
 class Weather:
-    """How a proxy treats what passes.
+    """The treatment of data by a proxy.
 
     Attributes:
-        open: Whether bytes pass at all; connections stay, silently, while they do not.
-        delay: Seconds by which each piece is late.
+        open: Whether data is forwarded; otherwise connections remain open and silent.
+        delay: Seconds by which each piece is delayed.
         rate: Bytes per second; 0 for no limit.
-        spoil: Pieces that will have a changed byte.
-        repeat: Pieces that will be sent again, before the next one.
+        spoil: Number of next pieces in which a byte is changed.
+        repeat: Number of pieces to send again before the next one.
         cut_inside: Whether the next piece is cut in its middle, and its connection with it.
-        insert: Bytes that go to each client before its next message.
+        insert: Bytes to send to each client before its next message.
     """
 
     open: asyncio.Event = field(default_factory=asyncio.Event)
@@ -37,11 +37,13 @@ class Weather:
 
 
 class Proxy:
-    """A listener that passes each connection on; `to_client` may look at the stream from the server."""
+    """A listener that forwards each connection; `to_client` may inspect the stream from the server."""
 
     def __init__(self, listen: str | int, connect: str | int, rng: random.Random) -> None:
-        """Take two places, each the path of a Unix socket or a port of this machine."""
+        """Store two addresses, each the path of a Unix socket or a port of this machine."""
         self._listen, self._connect = listen, connect
+        self.host = "127.0.0.1"
+        """Address to listen on, if `listen` is a port."""
         self._rng = rng
         self._server: asyncio.Server | None = None
         self._writers: set[asyncio.StreamWriter] = set()
@@ -49,12 +51,12 @@ class Proxy:
         self.weather = Weather()
         self.weather.open.set()
         self.on_reading: Callable[[int], None] | None = None
-        """Called with the stamp of each reading that has been given to a client; the streams are WebSockets then."""
+        """Function to call with the stamp of each reading sent to a client; requires WebSockets."""
 
     async def start(self) -> None:
-        """Listen."""
+        """Start to listen."""
         if isinstance(self._listen, int):
-            self._server = await asyncio.start_server(self._serve, "127.0.0.1", self._listen)
+            self._server = await asyncio.start_server(self._serve, self.host, self._listen)
         else:
             self._server = await asyncio.start_unix_server(self._serve, self._listen)
 
@@ -70,13 +72,13 @@ class Proxy:
             writer.transport.abort()
 
     def finish(self) -> None:
-        """Close all connections in order, after what has been given to them."""
+        """Close all connections properly, after all their data."""
         for writer in self._writers:
             with contextlib.suppress(OSError, RuntimeError):
                 writer.write_eof()
 
     async def end(self) -> None:
-        """Cut everything and wait for the tasks."""
+        """Cut all connections and wait for the tasks."""
         self.vanish()
         for task in self._tasks:
             task.cancel()
@@ -143,7 +145,7 @@ class Proxy:
     async def _give(
         self, piece: bytes, former: bytes, writer: asyncio.StreamWriter, *, to_client: bool
     ) -> bool:
-        """Pass a piece on as the weather has it; return whether the connection lasts."""
+        """Forward a piece according to the weather, and return whether the connection remains."""
         weather = self.weather
         if weather.delay:
             await asyncio.sleep(weather.delay)
@@ -175,7 +177,7 @@ class Proxy:
 
 
 async def _websocket_frame(reader: asyncio.StreamReader) -> bytes:
-    """Return the next frame of a server, header and all."""
+    """Return the next WebSocket frame of a server, including its header."""
     head = await reader.readexactly(2)
     size = head[1] & 0x7F
     if size >= 126:

@@ -1,4 +1,4 @@
-"""One round of a campaign: a stack is started, takes faults one after the other, and is judged after each."""
+"""One round of a campaign: a stack that is subjected to one fault after the other, and judged after each."""
 
 from __future__ import annotations
 
@@ -12,12 +12,13 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
-from scripts.campaigning.accounts import Counters, Excuses, in_transit, judge
-from scripts.campaigning.expected import Addresses, Outcome, UnusableError, addresses_of
+from scripts.campaigning.containers import ContainerStack, EngineError
 from scripts.campaigning.faults import Kind, Step, excuses_of
 from scripts.campaigning.injection import Injector, steppable_clock
-from scripts.campaigning.measures import Recovery, RoundResult, slowness
-from scripts.campaigning.observer import OLDEST, Finding, Flaw, Observer
+from scripts.campaigning.judging.accounts import Counters, Excuses, in_transit, judge
+from scripts.campaigning.judging.expected import Addresses, Outcome, UnusableError, addresses_of
+from scripts.campaigning.judging.measures import Recovery, RoundResult, slowness
+from scripts.campaigning.judging.observer import OLDEST, Finding, Flaw, Observer
 from scripts.campaigning.stack import NotThereError, Stack, Topology
 from scripts.campaigning.wire import REPORTS, Client, now
 
@@ -25,19 +26,21 @@ POOL = (
     *((0, 0), (2, 1), (3, 2), (5, 3), (6, 4), (3, None), (None, 2), (None, None)),
     *((4, 1), (5, 1), (6, 1), (0, 3)),  # sensors that contradict each other need several slices
 )
-"""Readings of a campaign; few, because the reference kernel is slow."""
+"""Number of different readings in a campaign; few, because the reference kernel is slow."""
+INTEGRITY_FRAMES = 100
+"""Frames within which the stack promises to find a flipped bit, in rounds in which one flips."""
 _ANSWER = 0.1
-"""Seconds that the publisher waits for a result before it publishes the next reading."""
+"""Seconds to wait for a result before the next reading is published."""
 _RECOVERY_LIMIT = 60.0
 _SETTLE_LIMIT = 15.0
-"""Seconds for what is in flight: a frame on a board that does not answer, and more on a busy machine."""
+"""Seconds until nothing is in flight, even if a board does not answer or the machine is busy."""
 _QUIET = 0.6
 """Seconds without a change after which nothing is in flight any more."""
 _stamps = count(time.time_ns() // 10**9 * 10**9, 1_000_000)
 
 
 class Round:
-    """Runs steps against one stack."""
+    """Runner of steps against one stack."""
 
     def __init__(
         self,
@@ -49,15 +52,21 @@ class Round:
         *,
         calm_frames: int,
     ) -> None:
-        """Take an empty folder, and the frames to be computed between two steps."""
+        """Store an empty folder, and the number of frames to compute between two steps."""
         rng = random.Random(seed)
         self._rng = rng
         self._folder = folder
         self._deployments = deployments
         self._calm_frames = calm_frames
-        self.stack = Stack(folder, topology, deployments[0], rng)
+        self.stack = (
+            ContainerStack(folder, deployments[0], rng)
+            if topology is Topology.CONTAINERS
+            else Stack(folder, topology, deployments[0], rng)
+        )
         self.observer = Observer(expected, deployments[0].name)
-        self._injector = Injector(self.stack, folder, publish=self._special, reload=self._reload)
+        self._injector = Injector(
+            self.stack, folder, publish=self._special, reload=self._reload, flip=self._flip
+        )
         self._client = Client(self.stack.hub_port, self._take, self.observer.reconnected)
         self._result = RoundResult()
         self._base = Counters()
@@ -91,7 +100,7 @@ class Round:
         return dict(zip(("near", "far"), near_far, strict=True))
 
     async def _drive(self) -> None:
-        """Publish readings, each when the result of the one before is there or late."""
+        """Publish readings, each after the result of the one before has arrived or is late."""
         while self._driving:
             if self._paused or not self._client.connected.is_set():
                 await asyncio.sleep(0.01)
@@ -103,14 +112,14 @@ class Round:
                 await self._some_news(max(0.0, deadline - now()))
 
     async def _some_news(self, seconds: float = _ANSWER) -> None:
-        """Wait for a message to the observer, for some seconds at most."""
+        """Wait some seconds for a message to the observer."""
         self._news.clear()
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(seconds):
                 await self._news.wait()
 
     async def _special(self, what: str, number: int) -> None:
-        """Publish readings that are unlike others."""
+        """Publish special readings."""
         stamps = [next(_stamps) for _ in range(number)]
         if what == "disorder":
             self._rng.shuffle(stamps)
@@ -136,13 +145,21 @@ class Round:
         else:
             self.stack.deployment = former
 
+    def _flip(self) -> None:
+        self.observer.flip(INTEGRITY_FRAMES)
+
     # --- a round -------------------------------------------------------------------------------
 
     async def run(self, steps: list[Step]) -> RoundResult:
-        """Run all steps, or up to the first one after which something is wrong."""
+        """Run all steps, or up to the first one with findings."""
         result, observer = self._result, self.observer
         if any(fault.kind == Kind.CLOCK for step in steps for fault in step):
             self.stack.environment = steppable_clock(self._folder)
+        if any(fault.kind == Kind.INTEGRITY for step in steps for fault in step):
+            self.stack.environment |= {
+                "BM_INTEGRITY": "canary",
+                "BM_INTEGRITY_FRAMES": str(INTEGRITY_FRAMES),
+            }
         driver = None
         try:
             await self.stack.start(observer.forwarded)
@@ -158,7 +175,7 @@ class Round:
                 if observer.findings:
                     result.failed_step = number
                     break
-        except NotThereError as error:
+        except (NotThereError, EngineError) as error:
             observer.findings.append(Finding(Flaw.ENDED, str(error), now()))
         finally:
             self._driving = False
@@ -198,7 +215,7 @@ class Round:
         self.observer.master_started(self.stack.deployment.name)
 
     async def _recover(self, name: str, *, judged: bool) -> None:
-        """Wait for a result of a reading that was published from now on."""
+        """Wait for the result of a reading that is published from now on."""
         begun = now()
         first = self.observer.tally["readings"]
         slow = [await asyncio.to_thread(slowness)]
@@ -207,7 +224,7 @@ class Round:
                 self._find(Flaw.SLOW, f"no result {_RECOVERY_LIMIT:.0f} s after: {name}")
                 return
             if self.stack.is_over("master"):
-                words = await self.stack.ended("master")
+                words = await self.stack.wait("master")
                 self._find(Flaw.ENDED, f"the master ended after: {name}: {words}")
                 return
             if now() - begun > len(slow):
@@ -224,7 +241,7 @@ class Round:
         self.observer.findings.append(Finding(flaw, sentence, now()))
 
     async def _settle(self, excuses: Excuses) -> None:
-        """Publish nothing until nothing is in flight, and compare the counters with what was published."""
+        """Stop publishing until nothing is in flight, and compare the counters with the published readings."""
         self._paused = True
         try:
             deadline, changed = now() + _SETTLE_LIMIT + _QUIET, now()
@@ -243,7 +260,7 @@ class Round:
                     if (not findings and now() - changed > _QUIET) or now() > deadline:
                         break
                 elif now() > deadline:
-                    return  # the master is gone, which is a finding of its own
+                    return  # the master has ended, which is a separate finding
                 await asyncio.sleep(0.02)
             self.observer.findings += findings
             cut = in_transit(added, readings)
@@ -256,7 +273,7 @@ class Round:
             self._paused = False
 
     async def _calm(self) -> None:
-        """Compute frames without a fault, and settle strictly."""
+        """Compute frames without faults, and then settle strictly."""
         self.observer.calm(now())
         wanted = self.observer.tally["results"] + self._calm_frames
         deadline = now() + _RECOVERY_LIMIT + self._calm_frames * _ANSWER

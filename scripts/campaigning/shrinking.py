@@ -1,4 +1,4 @@
-"""The shortest schedule that still fails, by delta debugging (Zeller and Hildebrandt's ddmin), within a time."""
+"""Search for the shortest failing schedule by delta debugging (Zeller and Hildebrandt's ddmin)."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ Part = TypeVar("Part")
 async def shrink(
     parts: list[Part], fails: Callable[[list[Part]], Awaitable[bool]], *, seconds: float
 ) -> list[Part]:
-    """Return the shortest list found in this time that fails; the last part is tried alone first.
+    """Return the shortest failing list found within the time; the last part is first tried alone.
 
     Args:
         parts: A list that failed.
-        fails: Whether another one fails.
+        fails: Function that tells whether a list fails.
         seconds: Time after which no further list is tried.
     """
     deadline = time.monotonic() + seconds

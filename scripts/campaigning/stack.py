@@ -1,4 +1,4 @@
-"""The stack under fault: its processes, the proxies between them, and what they say of themselves."""
+"""The stack under test: its processes, the proxies between them, and their status."""
 
 from __future__ import annotations
 
@@ -8,14 +8,15 @@ import json
 import os
 import random
 import shutil
+import signal
 import socket
 import sys
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
 from enum import StrEnum
 from pathlib import Path
 
-from scripts.campaigning.accounts import Counters
-from scripts.campaigning.expected import BOARDS
+from scripts.campaigning.judging.accounts import Counters
+from scripts.campaigning.judging.expected import BOARDS
 from scripts.campaigning.proxy import Proxy
 from scripts.campaigning.wire import process_status
 from scripts.processes import Process
@@ -25,20 +26,22 @@ BOARD_NAMES = tuple(f"board{at}" for at in range(BOARDS))
 BOARDS_PARENT = "boards"
 """The process from which a master's boards are forked."""
 START_LIMIT = 120.0
-"""Seconds until a process must be there, on a busy machine."""
+"""Seconds until a process must have started, even on a busy machine."""
 END_LIMIT = 30.0
 
 
 class Topology(StrEnum):
-    """Who starts the processes, and so where proxies stand."""
+    """The starter of the processes, which determines the places of proxies."""
 
     OWN = "processes"
     """The master starts services and boards; a proxy stands between them and rosbridge."""
     FUSED = "fused"
-    """The services are inside the master; the rest as above."""
+    """The services are inside the master; otherwise as above."""
     APART = "apart"
     """The campaign starts services and boards; proxies stand between all parts."""
     FUSED_APART = "fused, boards apart"
+    CONTAINERS = "containers"
+    """Everything runs in containers of the compose file; only with `--topology`, because it needs the engine."""
 
     @property
     def fused(self) -> bool:
@@ -47,7 +50,7 @@ class Topology(StrEnum):
 
     @property
     def apart(self) -> bool:
-        """Whether the boards are not the master's own."""
+        """Whether the campaign starts the boards, instead of the master."""
         return self in {Topology.APART, Topology.FUSED_APART}
 
 
@@ -60,11 +63,11 @@ def _parent(pid: int) -> int:
 
 
 class NotThereError(Exception):
-    """A process that did not come up in time."""
+    """A process did not start in time."""
 
 
 def free_port() -> int:
-    """Return a port that nobody listens on, nor on the next one."""
+    """Return a port that is free, as is the next one."""
     while True:
         with socket.socket() as probe, socket.socket() as following, contextlib.suppress(OSError):
             probe.bind(("127.0.0.1", 0))
@@ -74,25 +77,26 @@ def free_port() -> int:
 
 
 class Stack:
-    """A run of the stack in a folder of its own.
+    """A run of the stack in its own folder.
 
     Attributes:
         hub_port: Port of the hub itself, for the campaign's own client.
-        links: The proxies by name: `rosbridge`, and where parts are apart each service and board.
-        expected_ends: Roles whose processes have been told to end, or were killed.
+        proxied_port: Port of the hub for the stack.
+        links: Proxies by name: `rosbridge`, and each service and board if the campaign starts them.
+        expected_ends: Roles whose processes were asked to end or were killed.
     """
 
     def __init__(self, folder: Path, topology: Topology, deployment: Path, rng: random.Random) -> None:
-        """Take an empty folder with a short path, and the deployment to begin with."""
+        """Store an empty folder with a short path, and the first deployment."""
         self._folder = folder
         self.topology = topology
         self.deployment = deployment
         self.environment: dict[str, str] = {}
         self._parts: dict[str, Process] = {}
         self._runs = folder / "run"
-        self.hub_port, proxied = free_port(), free_port()
-        self._uri = f"ws://127.0.0.1:{proxied}"
-        self.links = {"rosbridge": Proxy(proxied, self.hub_port, rng)}
+        self.hub_port, self.proxied_port = free_port(), free_port()
+        self._uri = f"ws://127.0.0.1:{self.proxied_port}"
+        self.links = {"rosbridge": Proxy(self.proxied_port, self.hub_port, rng)}
         self._runs.mkdir(mode=0o700, parents=True)
         (folder / "tmp").mkdir(mode=0o700)
         for name in SERVICES if topology is Topology.APART else ():
@@ -118,10 +122,10 @@ class Stack:
         return ("hub", *parent, *BOARD_NAMES, *services, "master")
 
     async def start(self, on_reading: Callable[[int], None]) -> None:
-        """Start everything; the master may not be ready yet when this returns.
+        """Start everything, but do not wait until the master is ready.
 
         Raises:
-            NotThereError: The hub or a board does not come up.
+            NotThereError: The hub or a board does not start.
         """
         self.links["rosbridge"].on_reading = on_reading
         for link in self.links.values():
@@ -153,10 +157,10 @@ class Stack:
         return [*master, *fused, *(boards if self.topology.apart else [])]
 
     async def start_part(self, role: str, misbehave: str = "") -> None:
-        """Start a process that the campaign supervises, and wait until a server serves.
+        """Start a process that the campaign supervises, and wait until it is ready if it is a server.
 
         Raises:
-            NotThereError: It does not.
+            NotThereError: It does not become ready.
         """
         self._starts += 1
         process = Process(role, self._folder / f"{self._starts:03}-{role}.log")
@@ -174,7 +178,7 @@ class Stack:
                 raise NotThereError(f"{role} did not come up: {error}") from error
 
     def is_over(self, role: str) -> bool:
-        """Return whether a process of the campaign's own has ended."""
+        """Return whether a process that the campaign supervises has ended."""
         process = self._parts.get(role)
         if process is None or not process.pid:
             return True
@@ -183,8 +187,8 @@ class Stack:
         except OSError:
             return True
 
-    async def ended(self, role: str) -> str:
-        """Wait for the end of a process of the campaign's own, and return its exit code and last words."""
+    async def wait(self, role: str) -> str:
+        """Wait for the end of a process that the campaign supervises, and return its exit code and last line."""
         try:
             async with asyncio.timeout(END_LIMIT):
                 code = await self._parts[role].wait()
@@ -193,7 +197,7 @@ class Stack:
         return str(self._parts[role].failure(code)) if code else "exit code 0"
 
     async def forget_run(self) -> None:
-        """Wait until the children of a master that was killed have ended, and remove their status sockets."""
+        """Wait until the children of a killed master have ended, and remove their status sockets."""
         left = [role for role in (*SERVICES, *BOARD_NAMES) if role not in self.own_parts]
         deadline = asyncio.get_running_loop().time() + END_LIMIT
         while asyncio.get_running_loop().time() < deadline:
@@ -202,15 +206,37 @@ class Stack:
             await asyncio.sleep(0.05)
 
     async def pid(self, role: str) -> int:
-        """Return the number of a role's process; 0 if it cannot be found."""
+        """Return the PID of a role's process; 0 if it cannot be found."""
         if role in self._parts:
             return 0 if self.is_over(role) else self._parts[role].pid
         status = await self.status(BOARD_NAMES[0] if role == BOARDS_PARENT else role)
         pid = 0 if status is None else int(str(status["pid"]))
         return _parent(pid) if role == BOARDS_PARENT and pid else pid
 
+    async def kill(self, role: str) -> bool:
+        """Kill a role's process, and return whether it was found."""
+        return self._signal(await self.pid(role), signal.SIGKILL)
+
+    @contextlib.asynccontextmanager
+    async def paused(self, role: str) -> AsyncIterator[None]:
+        """Stop a role's process within the context, if it is found."""
+        pid = await self.pid(role)
+        self._signal(pid, signal.SIGSTOP)
+        try:
+            yield
+        finally:
+            self._signal(pid, signal.SIGCONT)
+
+    @staticmethod
+    def _signal(pid: int, number: signal.Signals) -> bool:
+        with contextlib.suppress(ProcessLookupError):
+            if pid:
+                os.kill(pid, number)
+                return True
+        return False
+
     async def status(self, role: str) -> dict[str, object] | None:
-        """Return what a process says of itself; None if it does not answer."""
+        """Return the status of a process; None if it does not answer."""
         return await process_status(f"{self._runs}/{role}.status.sock")
 
     async def counters(self) -> Counters | None:
@@ -222,7 +248,7 @@ class Stack:
         return Counters(frames["received"], frames["completed"], frames["lost"])
 
     async def reload(self, deployment: Path) -> int:
-        """Order the master to take another deployment; return the new generation, or -1 if it stays with the old one."""
+        """Order the master to load another deployment, and return the new generation, or -1 if it refuses."""
         answer = await self._order(deployment)
         if answer != 0:
             return -1
@@ -231,7 +257,7 @@ class Stack:
         return -1 if status is None else int(str(status["generation"]))
 
     async def _order(self, deployment: Path) -> int | None:
-        """Give the order on the master's control socket; return the exit code, or None without an answer."""
+        """Send the order to the master's control socket, and return the exit code, or None without an answer."""
         with contextlib.suppress(OSError, TimeoutError, ValueError):
             async with asyncio.timeout(END_LIMIT):
                 reader, writer = await asyncio.open_unix_connection(f"{self._runs}/master.control.sock")

@@ -1,4 +1,4 @@
-"""The campaign's own rosbridge client: publishes readings and receives results, with `websockets` and `json` alone."""
+"""The campaign's rosbridge client for readings and results, which uses only `websockets` and `json`."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ TOPIC, TYPE = "/campaign/readings", "campaign_msgs/Reading"
 RESULTS, REPORTS = "/BMresults", "/bm/frame"
 QUEUE = 1000
 _ANSWER = 1.0
-"""Seconds that a process has to say its status."""
+"""Seconds within which a process must answer with its status."""
 _AGAIN = 0.05
 """Seconds between two attempts to connect."""
 
 
 class Client:
-    """A connection to the hub that is made again whenever it is lost."""
+    """A connection to the hub that is restored whenever it is lost."""
 
     def __init__(self, port: int, take: Callable[[str, Any], None], lost: Callable[[], None]) -> None:
-        """Take functions for messages, by topic, and for the loss of a connection."""
+        """Store functions to call with messages, by topic, and at the loss of a connection."""
         self._uri = f"ws://127.0.0.1:{port}"
         self._take, self._lost = take, lost
         self._connection: ClientConnection | None = None
@@ -33,7 +33,7 @@ class Client:
         self.connected = asyncio.Event()
 
     async def start(self) -> None:
-        """Begin to connect."""
+        """Start to connect."""
         self._task = asyncio.create_task(self._keep())
 
     async def end(self) -> None:
@@ -43,7 +43,7 @@ class Client:
             await asyncio.gather(self._task, return_exceptions=True)
 
     async def publish(self, stamp: int, values: dict[str, object]) -> bool:
-        """Publish a reading; return whether it was given to a connection."""
+        """Publish a reading, and return whether it was written to a connection."""
         secs, nsecs = divmod(stamp, 10**9)
         message = {"header": {"stamp": {"secs": secs, "nsecs": nsecs}, "frame_id": ""}, **values}
         if self._connection is None:
@@ -84,7 +84,7 @@ class Client:
 
 
 async def process_status(path: str) -> dict[str, Any] | None:
-    """Return the JSON object that a process gives at its status socket, or None without an answer."""
+    """Return the JSON object from a process's status socket, or None without an answer."""
     try:
         async with asyncio.timeout(_ANSWER):
             reader, writer = await asyncio.open_unix_connection(path)

@@ -1,4 +1,4 @@
-"""Fuzzing of the bridge with atheris: see scripts/fuzz.
+"""Fuzzing of the bridge with atheris (see scripts/fuzz).
 
 atheris is not a dependency of the project: it is installed from atheris.lock into a separate environment, which also
 sees the project's packages.
@@ -27,7 +27,7 @@ OUT = ROOT / "out" / "fuzz"
 SECONDS = 600.0
 LONGEST_INPUT = 4096
 SLOWEST_INPUT = 10
-"""Seconds after which one input counts as endless."""
+"""Seconds after which an input is considered endless."""
 MEMORY = 2048
 """MiB that a target may occupy."""
 INSTALL_LIMIT = 600.0
@@ -125,7 +125,7 @@ def start(target: str, seconds: float, interpreter: Path, scratch: Path) -> Run:
 
 
 def finish(run: Run, limit: float) -> list[Path]:
-    """Wait for a target's end, and store the inputs that it failed on where the tests find them.
+    """Wait until a target ends, and store the inputs on which it failed where the tests find them.
 
     Raises:
         FuzzError: It ended for another reason.
@@ -159,7 +159,7 @@ def finish(run: Run, limit: float) -> list[Path]:
 
 
 def fuzz(targets: list[str], seconds: float) -> int:
-    """Run all targets, as many at a time as there are processors; return exit code 1 if one failed."""
+    """Run all targets, one per processor at a time, and return exit code 1 if one failed."""
     interpreter = python()
     OUT.mkdir(parents=True, exist_ok=True)
     at_once = min(len(targets), os.cpu_count() or 1)
@@ -189,12 +189,14 @@ def fuzz(targets: list[str], seconds: float) -> int:
 def main() -> int:
     """Run the command."""
     parser = argparse.ArgumentParser(
-        prog="scripts/fuzz", description="Fuzzes the bridge (see the head of the script)."
+        prog="scripts/fuzz", description="Fuzz the codecs and the protocol cores of client and hub."
     )
     parser.add_argument(
-        "targets", nargs="*", metavar="TARGET", help=f"of {', '.join(TARGETS)} (default: all)"
+        "targets", nargs="*", metavar="TARGET", help=f"one of {', '.join(TARGETS)} (default: all)"
     )
-    parser.add_argument("--seconds", type=float, default=SECONDS, help=f"for all of it ({SECONDS:g})")
+    parser.add_argument(
+        "--seconds", type=float, default=SECONDS, help=f"total duration in seconds ({SECONDS:g})"
+    )
     options = parser.parse_args()
     unknown = [target for target in options.targets if target not in TARGETS]
     if unknown:

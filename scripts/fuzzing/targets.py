@@ -1,8 +1,9 @@
-"""Fuzzing targets: each takes any bytes and fails if the bridge violates an invariant.
+"""Fuzzing targets, each of which takes any bytes and fails if the bridge violates an invariant.
 
-A target reads its input as a small program (`Source`): one input determines the requests to the client, the operations of
-a server, their encodings, and when the connection breaks. `scripts/fuzz` plays them under atheris; tests/bridge
-plays them with generated input, and every input that ever failed (tests/bridge/findings).
+A target reads its input as a small program (`Source`): one input determines the requests to the client, the
+operations of a server, their encodings, and when the connection breaks. `scripts/fuzz` runs them under
+atheris; tests/bridge runs them with generated input, and with every input that ever failed
+(tests/bridge/findings).
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ from bridge.hub.limits import HubLimits
 from bridge.qos import Qos
 
 LONGEST_SENTENCE = 700
-"""Maximum of characters in an error's sentence, which quotes received data and does not repeat all of it."""
+"""Maximum number of characters in an error message, which quotes only part of the received data."""
 MAX_SIZE, MAX_DEPTH = 4096, 8
 TOPICS = ("/a", "b", "/a/b")
 DELIVERIES = (
@@ -134,7 +135,7 @@ TYPES = ("sensor_msgs/LaserScan", "std_msgs/String", "std_msgs/Float64MultiArray
 
 
 class Source:
-    """Bytes as a program: choices, numbers and pieces until they end; then everything is 0 and empty."""
+    """A program of bytes: choices, numbers and pieces; after its end all of them are 0 or empty."""
 
     def __init__(self, data: bytes) -> None:
         self._data = data
@@ -149,7 +150,7 @@ class Source:
         return self._data[self._at - 1] if self._at <= len(self._data) else 0
 
     def pick(self, choices: Any) -> Any:
-        """Return one of some choices."""
+        """Return one of the choices."""
         return choices[self.byte() % len(choices)]
 
     def piece(self) -> bytes:
@@ -165,7 +166,7 @@ class Source:
 
 
 def check_sentence(error: BridgeError) -> None:
-    """Check that an error is one short line, whatever caused it."""
+    """Check that the text of an error is one short line."""
     said = str(error)
     assert said
     assert "\n" not in said
@@ -173,7 +174,7 @@ def check_sentence(error: BridgeError) -> None:
 
 
 def check_plain(value: Any, *, finite: bool, depth: int) -> None:
-    """Check that a message has no types but those of ROS messages."""
+    """Check that a message has only types of ROS messages."""
     assert depth >= 0
     if isinstance(value, dict):
         for key, part in value.items():
@@ -189,7 +190,7 @@ def check_plain(value: Any, *, finite: bool, depth: int) -> None:
 
 
 def fuzz_json(data: bytes) -> None:
-    """Decode JSON: to an object of plain values that survives a round trip, or to one sentence."""
+    """Decode JSON to an object of plain values that survives a round trip, or to one error."""
     try:
         message = json_codec.decode(data, max_size=MAX_SIZE, max_depth=MAX_DEPTH)
     except DecodeError as error:
@@ -206,7 +207,7 @@ def fuzz_json(data: bytes) -> None:
 
 
 def fuzz_cbor(data: bytes) -> None:
-    """Decode CBOR: to a map of plain values, as lists and as arrays alike, or to one sentence; and encode it."""
+    """Decode CBOR to a map of plain values, alike as lists and as arrays, or to one error, and encode it."""
     forms: dict[str, Any] = {}
     for arrays in ("list", "numpy"):
         try:
@@ -228,7 +229,7 @@ def fuzz_cbor(data: bytes) -> None:
 
 
 def fuzz_png(data: bytes) -> None:
-    """Decode a picture: to bytes within the limit, or to one sentence; and every message from its own picture."""
+    """Decode a picture to bytes within the limit, or to one error, and every message from its own picture."""
     try:
         found = png.decode(data.decode("latin-1"), max_size=MAX_SIZE)
         assert len(found) <= 16 * MAX_SIZE
@@ -261,7 +262,7 @@ def fuzz_fragments(data: bytes) -> None:
 
 
 def fuzz_fields(data: bytes) -> None:
-    """Look up any path in any message: to a value, or to a sentence with the reason."""
+    """Look up any path in any message, and find a value or an error with the reason."""
     source = Source(data)
     name = source.piece().decode("utf-8", "replace")
     try:
@@ -283,7 +284,7 @@ _TYPES = MessageTypes()
 
 
 def fuzz_serialised(data: bytes) -> None:
-    """Decode serialised bytes: to a message of the type, or to one sentence."""
+    """Decode serialised bytes to a message of the type, or to one error."""
     source = Source(data)
     name = source.pick(TYPES)
     try:
@@ -295,7 +296,7 @@ def fuzz_serialised(data: bytes) -> None:
 
 
 class Play:
-    """A client's core between a user and a server, both of which may do anything."""
+    """A client's core between a user and a server that both may do anything."""
 
     def __init__(self, source: Source) -> None:
         self.source = source
@@ -312,10 +313,10 @@ class Play:
     def run(self) -> None:
         """Run until the input ends."""
         steps: tuple[Callable[[], None], ...] = (
-            self.hear_raw,
-            self.hear,
-            self.hear,
-            self.hear,
+            self.receive_raw,
+            self.receive,
+            self.receive,
+            self.receive,
             self.connect,
             self.core.lost,
             self.subscribe,
@@ -327,7 +328,7 @@ class Play:
             self.send_goal,
             self.serve,
             self.answer,
-            self.look,
+            self.pass_time,
         )
         while self.source:
             self.now += 0.5
@@ -353,14 +354,14 @@ class Play:
         assert len(core.goals) <= MAX_GOALS
         assert core._fragments.waiting_bytes <= 4 * (MAX_SIZE + 128)  # noqa: SLF001  # no one else can see it
 
-    def hear_raw(self) -> None:
+    def receive_raw(self) -> None:
         """Receive any data from the server."""
         data = self.source.piece()
         self.take(data)
         with contextlib.suppress(UnicodeDecodeError):
             self.take(data.decode())
 
-    def hear(self) -> None:
+    def receive(self) -> None:
         """Receive an operation with any of its fields right or wrong, in any encoding."""
         source = self.source
         operation: dict[str, Any] = {"op": source.pick(OPS)}
@@ -385,7 +386,7 @@ class Play:
             elif choice < 240:
                 operation[name] = source.pick(ODD)
         if operation.get("level") == "\ud800" or "\ud800" in map(str, operation.values()):
-            return  # no server can write half a character
+            return  # a server cannot send half a character
         form = source.pick(("json", "json", "cbor", "fragments", "png", "both"))
         text = json.dumps(operation).encode()
         if form == "cbor":
@@ -402,7 +403,7 @@ class Play:
                 self.take(piece)
 
     def take(self, data: bytes | str) -> None:
-        """Hand something to the core; whatever it is, one event or none comes of it."""
+        """Pass input to the core, which must cause at most one event."""
         event = self.core.receive(data, self.now)
         assert event is None or type(event) in EVENTS
         if type(event) is MessageReceived:
@@ -416,7 +417,7 @@ class Play:
             assert "\n" not in event.reason
 
     def connect(self) -> None:
-        """Establish a connection, or another one."""
+        """Establish a first or a further connection."""
         self.core.lost()
         self.core.restore()
 
@@ -492,19 +493,19 @@ class Play:
             ticket = self.tickets.pop(self.source.byte() % len(self.tickets))
             self.core.services.answer(ticket, {"x": self.source.pick(ODD)}, ok=self.source.byte() % 2 == 0)
 
-    def look(self) -> None:
-        """Time goes by."""
+    def pass_time(self) -> None:
+        """Let time pass."""
         self.now += 20 * (self.source.byte() % 2)
         self.core.subscriptions.retry_untyped()
 
 
 def fuzz_core(data: bytes) -> None:
-    """Any user and any server: no error but the bridge's own, nothing grows, everything sent is JSON."""
+    """Check, with any user and server, that errors are the bridge's, memory is bounded, and output is JSON."""
     Play(Source(data)).run()
 
 
 def _published(source: Source) -> bytes:
-    """Return a possible publish operation: an envelope or half of one, and anything in place of its message."""
+    """Return a possible publish operation: all or part of an envelope, and anything instead of its message."""
     message = b"".join(source.pick(PARTS) or source.piece() for _ in range(source.byte() % 6))
     return bytes(source.pick(ENVELOPES)) + message + bytes(source.pick((b"}", b"}", b"}", b"", b"} ", b"}}")))
 

@@ -1,4 +1,4 @@
-"""The hub under the tests of other projects: roslibpy's own suites, and roslib on Node. See scripts/conformance."""
+"""Tests of other projects on the hub: roslibpy's own suites, and roslib on Node (see scripts/conformance)."""
 
 from __future__ import annotations
 
@@ -20,22 +20,23 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from scripts.other_clients.fibonacci_server import fibonacci_server
 from scripts.other_clients.installation import install_roslib, install_roslibpy
 from scripts.processes import Process, run_script
 
 NODE_SCRIPT = Path(__file__).with_name("conformance_roslib.mjs")
 SUITE_LIMIT = 240
 PORT_OF_THE_SUITES = "9090"
-"""Written into the suites' files; a free port takes its place in the copies that run here."""
+"""Port in the suites' files, replaced by a free one in the copies that run here."""
 
 SUITES = {
     "1": (
         *("ros1/test_topic.py", "ros1/test_ros.py", "ros1/test_service.py", "ros1/test_param.py"),
-        *("ros1/test_rosapi.py", "ros1/test_core.py", "test_transport.py"),
+        *("ros1/test_rosapi.py", "ros1/test_core.py", "ros1/test_actionlib.py", "test_transport.py"),
     ),
     "2": (
         *("ros2/test_topic.py", "ros2/test_ros.py", "ros2/test_rosapi.py", "ros2/test_core.py"),
-        "test_transport.py",
+        *("ros2/test_actions.py", "test_transport.py"),
     ),
 }
 TRANSPORTS = ("twisted", "asyncio")
@@ -60,7 +61,7 @@ def free_port() -> int:
 
 
 async def output_of(command: list[str], environment: dict[str, str], cwd: Path) -> tuple[int, str]:
-    """Run a suite to its end, or until its time is over (then the code is -1): its code, and all it printed."""
+    """Run a suite, and return its exit code (-1 after the time limit) and its output."""
     process = await asyncio.create_subprocess_exec(
         *command,
         cwd=cwd,
@@ -96,7 +97,7 @@ def last_line(text: str) -> str:
 
 
 def cases_of(report: Path) -> Iterator[tuple[str, str, str]]:
-    """Test, outcome and reason from pytest's XML."""
+    """Return the outcome of each test from pytest's XML."""
     for case in ET.parse(report).getroot().iter("testcase"):  # noqa: S314 - pytest wrote it, here
         name = f"{case.get('classname', '').removeprefix('tests.').replace('.', '/')}::{case.get('name')}"
         outcome, why = "passed", ""
@@ -109,7 +110,7 @@ def cases_of(report: Path) -> Iterator[tuple[str, str, str]]:
 
 
 async def roslibpy_suites(folder: Path, ros_version: str, transport: str, work: Path) -> list[Outcome]:
-    """Run roslibpy's suites for one ROS version and transport on a hub of their own."""
+    """Run roslibpy's suites for one ROS version and transport on their own hub."""
     client = f"roslibpy, {transport}"
     port, copy = free_port(), work / f"suites-{ros_version}-{transport}"
     shutil.copytree(folder / "source" / "tests", copy / "tests")
@@ -122,11 +123,12 @@ async def roslibpy_suites(folder: Path, ros_version: str, transport: str, work: 
         report = copy / "report.xml"
         pytest = [str(folder / "venv" / "bin" / "python"), "-m", "pytest", "-q", "-p", "no:cacheprovider"]
         pytest += ["-c", os.devnull, "--rootdir", str(copy), "--timeout", "60", f"--junitxml={report}"]
-        code, printed = await output_of(
-            [*pytest, *(f"tests/{suite}" for suite in SUITES[ros_version])],
-            {"ROSLIBPY_TRANSPORT": transport},
-            copy,
-        )
+        async with fibonacci_server(f"ws://127.0.0.1:{port}"):
+            code, printed = await output_of(
+                [*pytest, *(f"tests/{suite}" for suite in SUITES[ros_version])],
+                {"ROSLIBPY_TRANSPORT": transport},
+                copy,
+            )
     finally:
         await hub.end()
     outcomes = [Outcome(client, ros_version, *case) for case in cases_of(report)] if report.exists() else []
@@ -136,7 +138,7 @@ async def roslibpy_suites(folder: Path, ros_version: str, transport: str, work: 
 
 
 async def roslib_script(module: Path, ros_version: str, work: Path) -> list[Outcome]:
-    """Run the checks of conformance_roslib.mjs on a hub of their own."""
+    """Run the checks of conformance_roslib.mjs on their own hub."""
     hub = Process("hub", work / f"hub-{ros_version}-roslib.log")
     try:
         await hub.start("hub", "--port", "0", "--ros-version", ros_version)
@@ -154,14 +156,14 @@ async def roslib_script(module: Path, ros_version: str, work: Path) -> list[Outc
                 outcome = "passed" if said["ok"] else "failed"
                 outcomes.append(Outcome("roslib, Node", ros_version, said["test"], outcome, said["why"]))
         except (ValueError, TypeError, KeyError):
-            continue  # what roslib itself prints
+            continue  # printed by roslib itself
     if code or not ended:
         outcomes.append(Outcome("roslib, Node", ros_version, "the run itself", "failed", last_line(printed)))
     return outcomes
 
 
 async def check(arguments: argparse.Namespace) -> int:
-    """Run everything, print the table; 1 if anything failed."""
+    """Run everything, print the table, and return 1 if a test failed."""
     versions = [arguments.ros_version] if arguments.ros_version else ["1", "2"]
     outcomes: list[Outcome] = []
     with tempfile.TemporaryDirectory(prefix="conformance-rosbayes-") as folder:
@@ -194,7 +196,7 @@ def show(outcomes: list[Outcome]) -> None:
         before = (each.client, each.ros_version)
         shown = f"[{colours[each.outcome]}]{each.outcome}[/]"
         table.add_row(each.client, each.ros_version, escape(each.test), shown, escape(each.why))
-    # to a file the table is as wide as its longest line
+    # in a file, the table is as wide as its longest line
     console = Console() if sys.stdout.isatty() else Console(width=200)
     console.print(table)
     count = {kind: sum(each.outcome == kind for each in outcomes) for kind in colours}
@@ -206,7 +208,7 @@ def show(outcomes: list[Outcome]) -> None:
 
 
 def main() -> int:
-    """Read the flags and check."""
+    """Parse the flags and run the tests."""
     parser = argparse.ArgumentParser(
         prog="scripts/conformance", description="The hub under the tests of other projects."
     )

@@ -4,7 +4,7 @@ import assert from "node:assert/strict";
 import { pathToFileURL } from "node:url";
 
 const [modulePath, uri, rosVersion] = process.argv.slice(2);
-const { Action, Param, Ros, Service, Topic } = await import(pathToFileURL(modulePath));
+const { Action, ActionClient, Goal, Param, Ros, Service, SimpleActionServer, Topic } = await import(pathToFileURL(modulePath));
 const PATIENCE = 20_000;
 const two = rosVersion === "2";
 const type = (name, kind = "msg") => (two ? name.replace("/", `/${kind}/`) : name);
@@ -234,6 +234,15 @@ const checks = {
     const wanted = await asked(ros, "getServiceType", "/rosapi/topics");
     assert.deepEqual(await asked(ros, "getServicesForType", wanted), ["/rosapi/topics"]);
   },
+  "rosapi: details of services": async () => {
+    for (const [name, fields] of [
+      ["getServiceRequestDetails", { data: "bool" }],
+      ["getServiceResponseDetails", { success: "bool", message: "string" }],
+    ]) {
+      const { typedefs } = await asked(ros, name, type("std_srvs/SetBool", "srv"));
+      assert.deepEqual(ros.decodeTypeDefs(typedefs), fields);
+    }
+  },
   "rosapi: nodes": async () => {
     const topic = new Topic({ ros, name: "/conformance/mine", messageType: text });
     topic.advertise();
@@ -283,13 +292,52 @@ const checks = {
     await settled(ros);
     await assert.rejects(finished(1), /does not exist/);
   },
+  // as in roslibjs's test/examples/fibonacci.example.js, with roslib's own server
+  "actionlib: goal, feedback, result, cancelling": async () => {
+    const options = { serverName: "/conformance/fibonacci_1", actionName: "actionlib_tutorials/FibonacciAction" };
+    const server = new SimpleActionServer({ ros, ...options });
+    server.on("goal", ({ order }) => {
+      if (order > 100) return; // until it is cancelled
+      const sequence = [0, 1];
+      while (sequence.length <= order) {
+        sequence.push(sequence.at(-1) + sequence.at(-2));
+        server.sendFeedback({ sequence: [...sequence] });
+      }
+      server.setSucceeded({ sequence });
+    });
+    server.on("cancel", () => server.setPreempted());
+    await settled(ros);
+    const actionClient = new ActionClient({ ros: other, ...options });
+    await settled(other);
+    const sent = (order) => {
+      const goal = new Goal({ actionClient, goalMessage: { order } });
+      const lengths = [];
+      goal.on("feedback", ({ sequence }) => lengths.push(sequence.length));
+      const result = within(new Promise((resolve) => goal.on("result", resolve)), "the goal's result");
+      goal.send();
+      return { goal, lengths, result };
+    };
+    const { lengths, result } = sent(4);
+    assert.deepEqual(await result, { sequence: [0, 1, 1, 2, 3] });
+    assert.deepEqual(lengths, [3, 4, 5]);
+    const long = sent(1000);
+    await settled(other);
+    long.goal.cancel();
+    assert.deepEqual(await long.result, { sequence: [] });
+    assert.equal(long.goal.status.status, 2); // preempted
+    const last = sent(1000);
+    await settled(other);
+    actionClient.cancel(); // all goals, with an empty message
+    await last.result;
+    actionClient.dispose();
+  },
   "nonsense leaves the connection served": async () => {
     for (const nonsense of [[1, 2, 3], 42, { op: "fly" }, { op: "set_level", level: "none" }]) ros.callOnConnection(nonsense);
     await settled(ros);
   },
 };
 
-if (!two) delete checks["action: goal, feedback, result"];
+delete checks[two ? "actionlib: goal, feedback, result, cancelling" : "action: goal, feedback, result"];
 
 for (const [test, check] of Object.entries(checks)) {
   let why = "";

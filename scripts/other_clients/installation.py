@@ -1,4 +1,4 @@
-"""The clients of other projects: roslibpy from PyPI and roslib from npm, installed once, pinned by hash."""
+"""Installation of other projects' clients: roslibpy from PyPI and roslib from npm, pinned by hash."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ LOCK = HERE / "roslibpy.lock"
 PACKAGES = HERE / "roslib"
 HOME_VARIABLE = "ROSBAYES_CONFORMANCE_HOME"
 LAYOUT = "1"
-"""Of the folders that are installed: rises when their content changes for the same locks."""
+"""Version of the installed folders, incremented when their content changes for the same locks."""
 DOWNLOAD_LIMIT = 600
 OLDEST_NODE = 20
 
 
 def home() -> Path:
-    """Where the clients are installed."""
+    """Return the folder in which the clients are installed."""
     if chosen := os.environ.get(HOME_VARIABLE):
         return Path(chosen).expanduser().absolute()
     cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
@@ -42,7 +42,7 @@ def run(*command: str | Path, cwd: Path | None = None) -> None:
     """Run an installer.
 
     Raises:
-        SettingsError: it fails, in its own words, or does not end in time.
+        SettingsError: It fails or does not end in time.
     """
     shown = " ".join(str(word) for word in command[:4])
     try:
@@ -56,7 +56,7 @@ def run(*command: str | Path, cwd: Path | None = None) -> None:
 
 
 def begin(folder: Path, what: str) -> None:
-    """Make an empty folder for an installation, and print a line about it."""
+    """Create an empty folder for an installation, and print a line about it."""
     print(f"installing {what} into {folder} (once) ...", file=sys.stderr)
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
@@ -71,7 +71,7 @@ def install_roslibpy() -> Path:
     run(sys.executable, "-m", "venv", folder / "venv")
     pip = (folder / "venv" / "bin" / "python", "-m", "pip", "-q", "--disable-pip-version-check")
     run(*pip, "install", "--require-hashes", "--no-deps", "-r", LOCK)
-    # the block of roslibpy alone: its hashes are those of the wheel and of the source package
+    # only the block of roslibpy, whose hashes are those of the wheel and of the source package
     block = re.search(r"^roslibpy==(?:.*\\\n)+.*\n", LOCK.read_text(), re.MULTILINE)
     assert block is not None
     (folder / "source.lock").write_text(block[0])
@@ -92,7 +92,7 @@ def install_roslib() -> Path:
     """Return the module of roslib, installed if missing.
 
     Raises:
-        SettingsError: Node is not there, or too old.
+        SettingsError: Node is missing or too old.
     """
     node, npm = shutil.which("node"), shutil.which("npm")
     if node is None or npm is None:

@@ -1,8 +1,8 @@
 """Generator of the constants module and the register documentation from the SystemRDL file (`scripts/registers`).
 
-Only development needs it: the constants module is committed, so that run time needs no SystemRDL
-tools. The hash of the map covers the definition (names, addresses, sizes, fields, access, resets,
-encodings), not the words that explain it.
+It is needed only for development: the constants module is committed, so SystemRDL tools are not needed at run
+time. The hash of the map covers the definition (names, addresses, sizes, fields, access, resets, encodings),
+but not the explanations.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class Encoding:
 
     @property
     def class_name(self) -> str:
-        """The name of its class in the constants module."""
+        """The name of the class in the constants module."""
         return "".join(word.capitalize() for word in self.name.split("_"))
 
 
@@ -291,7 +291,7 @@ def _size(block: Block) -> str:
 
 
 def generated_files(register_map: RegisterMap) -> dict[Path, str]:
-    """Return the text of every file that is made from the SystemRDL file."""
+    """Return the text of every file that is generated from the SystemRDL file."""
     registers = hardware.read_registers(SOURCE)
     return {
         MODULE: module_text(register_map),

@@ -1,14 +1,14 @@
-"""The register map for hardware and for C: a VHDL package, the VHDL register block, and the C header.
+"""Generator of the register map for hardware and C: a VHDL package, the VHDL register block, and a C header.
 
-`scripts/registers` writes all three from the SystemRDL file, beside the constants module (`generator`).
+`scripts/registers` writes all three from the SystemRDL file, as well as the constants module (`generator`).
 
-The register block is written here and not by peakrdl-regblock-vhdl, which was tried:
+The register block is generated here and not by peakrdl-regblock-vhdl, which was tried, because:
 
-- A board takes every word by itself, as the emulated one does. The exporter demands write buffers for 64-bit registers,
-  in which the low word has no effect until the high one is written.
-- A board refuses accesses by their address, its state and the value written. That takes a decoder of its own in front of
-  the exporter's block.
-- The exported text needs a VHDL package out of the exporter's wheel, which everyone who builds the hardware would need too.
+- A board accepts single words, like the emulated board. The exporter requires write buffers for 64-bit
+registers, in which the low word has no effect until the high one is written. - A board refuses accesses
+depending on their address, its state and the value written. This would need a separate decoder in front of
+the exporter's block. - The exported text needs a VHDL package from the exporter's wheel, which everyone who
+builds the hardware would also need.
 """
 
 from __future__ import annotations
@@ -36,18 +36,18 @@ library ieee;
 
 @dataclass(frozen=True)
 class Register:
-    """A register of the block, as hardware sees it.
+    """A register of the block, from the hardware's point of view.
 
     Attributes:
-        name: Lower case.
-        address: Of its first word, in bytes.
-        words: How many 32-bit words it has.
-        title: What it is.
-        stored: Mask of the bits that the block stores, within one word; 0 where hardware drives all bits.
-        pulsed: Mask of the bits that are passed on for one clock and read 0.
-        driven: Whether hardware gives what is read.
-        constant: What is read, where nobody drives it.
-        reset: Of the stored bits.
+        name: Name in lower case.
+        address: Address of the first word, in bytes.
+        words: Number of 32-bit words.
+        title: Description.
+        stored: Mask of the bits that the block stores, within one word; 0 if the hardware drives all bits.
+        pulsed: Mask of the bits that are output for one clock and read as 0.
+        driven: Whether the hardware provides the value that is read.
+        constant: Value that is read if it is neither driven nor stored.
+        reset: Reset value of the stored bits.
         latched: Whether reading the low word holds the high word for the next read.
     """
 
@@ -63,13 +63,13 @@ class Register:
     latched: bool
 
     def choice(self, word: int) -> str:
-        """Return what chooses one of its words: the word's number in the map."""
+        """Return the number in the map by which one of the words is selected."""
         more = f" + {word}" if word else ""
         return f"{self.name.upper()}_ADDRESS / 4{more}"
 
     @property
     def bits(self) -> int:
-        """Bits of all its words."""
+        """The number of bits of all words."""
         return 32 * self.words
 
     @property
@@ -79,7 +79,7 @@ class Register:
 
 
 def read_registers(source: Path) -> tuple[Register, ...]:
-    """Return the registers of a SystemRDL file, memories left out, in the order of their addresses."""
+    """Return the registers of a SystemRDL file, without memories, in the order of their addresses."""
     from systemrdl.compiler import RDLCompiler
     from systemrdl.node import RegNode
 
@@ -191,7 +191,7 @@ def _title(encoding: Encoding) -> str:
 
 
 def block_text(registers: tuple[Register, ...]) -> str:
-    """Return the VHDL entity `bm_register_block`: what software writes is stored, what it reads is selected."""
+    """Return the VHDL entity `bm_register_block`, which stores written words and selects those that are read."""
     word = "std_logic_vector(31 downto 0)"
     ports = [
         ("clk_i", "in ", "std_logic", "clock"),
@@ -274,7 +274,8 @@ def _reset(register: Register) -> str:
 def _writes(registers: tuple[Register, ...]) -> list[str]:
     """Return the process that stores written values.
 
-    Every word is decided by itself: GHDL 2.0 writes a case without what holds otherwise into its Verilog, which makes latches.
+    Every word has its own condition, because GHDL 2.0 translates a case to Verilog without the default
+    values, which infers latches.
     """
     written = [register for register in registers if register.written]
     width = max(len(register.name) for register in written)
@@ -381,7 +382,7 @@ def _runs(mask: int) -> list[tuple[int, int]]:
 
 
 def header_text(source: Path) -> str:
-    """Return the C header that PeakRDL makes of a SystemRDL file."""
+    """Return the C header that PeakRDL generates from a SystemRDL file."""
     from peakrdl_cheader.exporter import CHeaderExporter
     from systemrdl.compiler import RDLCompiler
 

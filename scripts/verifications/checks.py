@@ -1,4 +1,4 @@
-"""Verdicts, tallies and servers that the verifications share."""
+"""Verdicts, counts and servers, common to the verifications."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from scripts.processes import Process, run_script
 from scripts.verifications import real_rosbridge
 
 SERVER_LIMIT = 15.0
-"""Seconds until a server serves."""
+"""Seconds until a server must be ready."""
 
 
 class CheckError(Exception):
@@ -25,7 +25,7 @@ def expect(condition: bool, otherwise: str) -> None:
     """Raise an error unless a condition holds.
 
     Raises:
-        CheckError: It does not hold.
+        CheckError: The condition does not hold.
     """
     if not condition:
         raise CheckError(otherwise)
@@ -38,8 +38,8 @@ class Tally:
     passed: int = 0
     failed: int = 0
 
-    def tell(self, name: str, started: float, why: str | None, details: str = "") -> None:
-        """Print one check's line, and what may help under it."""
+    def report(self, name: str, started: float, why: str | None, details: str = "") -> None:
+        """Print one check's line, and details below it."""
         if why is None:
             self.passed += 1
             print(f"ok  {name} ({time.monotonic() - started:.1f} s)")
@@ -53,7 +53,7 @@ class Tally:
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """A kind of server: its command, its line when it is ready, and whether messages of two topics keep their order."""
+    """A kind of server: its command, its ready line, and whether messages of two topics keep their order."""
 
     name: str
     command: tuple[str, ...]
@@ -66,7 +66,7 @@ KINDS = {
         "real ROS 2 server",
         ("python", real_rosbridge.__file__, "serve", "PORT"),
         ready=real_rosbridge.READY,
-        keeps_order=False,  # each topic has its own way through DDS
+        keeps_order=False,  # DDS transports each topic separately
     ),
     "hub": Kind("hub", ("hub", "--host", "127.0.0.1", "--port", "PORT"), ready=r"ws://\S+", keeps_order=True),
 }
@@ -95,13 +95,14 @@ async def serving(kind: Kind, port: int, log: Path) -> Process:
 def on_servers(
     name: str, description: str, verify: Callable[[list[str]], Awaitable[int]], limit: float
 ) -> int:
-    """Read the flags of a verification and run it; with the real server, move into a network of its own first.
+    """Parse the flags of a verification and run it, with the real server in a separate network.
 
     Args:
-        name: The verification's, which is its module's.
-        description: Its docstring; the first line goes into `--help`.
-        verify: All checks on these kinds of servers, `real` or `hub`; returns the exit code.
-        limit: Seconds after which it is given up.
+        name: Name of the verification and of its module.
+        description: Docstring of the module, whose first line is shown by `--help`.
+        verify: Function that runs all checks on these kinds of servers, `real` or `hub`, and returns the exit
+            code.
+        limit: Time limit in seconds.
     """
     parser = argparse.ArgumentParser(prog=f"scripts/verify {name}", description=description.splitlines()[0])
     parser.add_argument("--server", choices=["real", "hub", "both"], default="both", help="(both)")

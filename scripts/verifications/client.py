@@ -1,7 +1,7 @@
-"""Every operation of the client on a real ROS 2 rosbridge server, then on the hub: see scripts/verify.
+"""Verification of the client on a real ROS 2 rosbridge server and on the hub (see scripts/verify).
 
-The publisher and the subscriber are both ours, so what is checked is that a server that this project did not write
-takes what the client says and says what the client reads; the codecs are checked against cbor2 and rosbags.
+Publisher and subscriber are both this project's client, so the checks show that a server of another project
+understands the client, and the client the server. The codecs are checked against cbor2 and rosbags.
 """
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ from scripts.processes import ROOT, Process
 from scripts.verifications.checks import KINDS, CheckError, Kind, Tally, expect, on_servers, serving
 
 LIMIT = 240.0
-"""Seconds after which the verification gives up, whatever it waits for."""
+"""Time limit of the verification, in seconds."""
 PATIENCE = 10.0
-"""Seconds that anything may take that is to come."""
+"""Seconds within which expected messages must arrive."""
 SILENCE = 1.0
-"""Seconds after which what has not come is not to come."""
+"""Seconds of silence that show that a message does not arrive."""
 ARRAY = "std_msgs/Float64MultiArray"
 OUT = ROOT / "out" / "verify-client"
 ULP = 1e-15
-"""The real server's JSON loses the last bit of some doubles."""
+"""Relative tolerance, because the real server's JSON loses the last bit of some doubles."""
 
 
 class Stand:
-    """One server, and clients of it."""
+    """A server and its clients."""
 
     def __init__(self, kind: Kind, port: int) -> None:
         self.kind = kind
@@ -53,7 +53,7 @@ class Stand:
 
     @property
     def uri(self) -> str:
-        """Where it serves."""
+        """The server's URI."""
         return f"ws://127.0.0.1:{self.port}"
 
     @property
@@ -70,14 +70,14 @@ class Stand:
         """Start the server, and wait until it serves.
 
         Raises:
-            CheckError: it did not.
+            CheckError: It is not ready in time.
         """
         self._started += 1
         log = OUT / f"{self.kind.name.replace(' ', '-')}-{self._started}.log"
         self._server = await serving(self.kind, self.port, log)
 
     async def stop(self, *, kill: bool = False) -> None:
-        """End the server, or kill it."""
+        """End or kill the server."""
         if self._server is not None:
             if kill:
                 os.kill(self._server.pid, signal.SIGKILL)
@@ -99,7 +99,7 @@ class Stand:
         fragments_out: int | None = None,
         **options: Any,
     ) -> Message:
-        """Return a message as it comes through the server."""
+        """Return a message as it arrives through the server."""
         topic = self.topic()
         async with self.clients(fragment_size=fragments_out) as (subscriber, publisher):
             subscription = subscriber.subscribe(topic, type_name, **options)
@@ -112,7 +112,7 @@ class Stand:
 
 
 async def settled(*clients: Ros) -> None:
-    """Wait until the server has done earlier requests, and ROS has announced them."""
+    """Wait until the server has processed earlier requests, and ROS has announced them."""
     for ros in clients:
         with contextlib.suppress(ServiceError):
             await ros.call("/rosapi/get_time", timeout=PATIENCE)
@@ -120,7 +120,7 @@ async def settled(*clients: Ros) -> None:
 
 
 def same(found: Any, wanted: Any) -> None:
-    """Numbers are the same but for the last bit."""
+    """Check that numbers are equal except for the last bit."""
     expect(np.allclose(found, wanted, rtol=ULP, atol=0), f"{found} came of {wanted}")
 
 
@@ -128,7 +128,7 @@ def same(found: Any, wanted: Any) -> None:
 
 
 async def check_json(stand: Stand) -> None:
-    """Both forms of type names, lists and arrays."""
+    """Check JSON with both forms of type names, lists and arrays."""
     for type_name in (ARRAY, "std_msgs/msg/Float64MultiArray"):
         same((await stand.passed({"data": [1, 2.5]}, type_name)).msg["data"], [1.0, 2.5])
     values = np.random.default_rng(1).normal(size=1024)
@@ -139,7 +139,7 @@ async def check_json(stand: Stand) -> None:
 
 
 async def check_cbor(stand: Stand) -> None:
-    """Typed arrays of every element, as lists and as arrays; bytes."""
+    """Check CBOR with typed arrays of every element type, as lists and as arrays, and with bytes."""
     values = np.random.default_rng(2).normal(size=1024)
     kinds = {
         "Float64": ("f8", values),
@@ -170,7 +170,7 @@ async def check_cbor(stand: Stand) -> None:
 
 
 async def check_raw(stand: Stand) -> None:
-    """Return the serialised message, read by rosbags."""
+    """Check the serialised message with rosbags."""
     types = MessageTypes()
     values = np.random.default_rng(3).normal(size=100)
     message = await stand.passed({"data": values}, compression="cbor-raw")
@@ -184,13 +184,13 @@ async def check_raw(stand: Stand) -> None:
 
 
 async def check_png(stand: Stand) -> None:
-    """Pictures."""
+    """Check messages in pictures."""
     values = np.random.default_rng(4).normal(size=500)
     same((await stand.passed({"data": values}, compression="png")).msg["data"], values)
 
 
 async def check_fragments(stand: Stand) -> None:
-    """Cut by the server, and cut by the client."""
+    """Check fragments from the server and from the client."""
     text = "x\u00e4\U0001f600\n" * 500
     fragmentings: tuple[dict[str, Any], ...] = (
         {"fragment_size": 100},
@@ -208,7 +208,7 @@ async def check_fragments(stand: Stand) -> None:
 
 
 async def check_qos(stand: Stand) -> None:
-    """Check quality of service: a late reader gets the kept messages, and a request beyond the offer gets none."""
+    """Check quality of service: a late subscriber gets latched messages, an incompatible one none."""
     offer = Qos(reliability="best_effort", depth=5)
     same((await stand.passed({"data": [1.5]}, offer=offer)).msg["data"], [1.5])
     for wish in (
@@ -245,7 +245,7 @@ async def check_qos(stand: Stand) -> None:
 
 
 async def check_latch(stand: Stand) -> None:
-    """Check that a late reader gets the last message."""
+    """Check that a late subscriber gets the last message."""
     topic = stand.topic()
     async with stand.clients() as (subscriber, publisher):
         publication = await publisher.advertise(topic, ARRAY, latch=True)
@@ -256,7 +256,7 @@ async def check_latch(stand: Stand) -> None:
 
 
 async def check_throttle(stand: Stand) -> None:
-    """One message in half a second, to one reader of two on the same topic."""
+    """Check a throttle of one message per half second, for one of two subscribers to a topic."""
     topic = stand.topic()
     async with stand.clients() as (subscriber, publisher):
         slow = subscriber.subscribe(topic, ARRAY, throttle_rate=60_000)
@@ -275,7 +275,7 @@ async def check_throttle(stand: Stand) -> None:
 
 
 async def check_services(stand: Stand) -> None:
-    """Check services that answer, refuse and are missing."""
+    """Check calls of services that answer, refuse and do not exist."""
     type_name = "rcl_interfaces/srv/ListParameters"
 
     async def serve(args: dict[str, Any]) -> dict[str, Any]:
@@ -289,7 +289,7 @@ async def check_services(stand: Stand) -> None:
         for number in range(20):
             answer = await caller.call("/verify/list", {"prefixes": [str(number)], "depth": 1}, PATIENCE)
             expect(answer["result"]["names"] == [str(number)], f"it answered {answer}")
-        # ROS 2 keeps ten requests of a service, and loses what comes beyond at once.
+        # ROS 2 keeps ten requests of a service, and loses further ones.
         answers = await asyncio.gather(
             *(caller.call("/verify/list", {"prefixes": [str(n)], "depth": 1}, PATIENCE) for n in range(8))
         )
@@ -324,7 +324,7 @@ async def check_goal(stand: Stand) -> None:
 
 
 async def check_silence(stand: Stand) -> None:
-    """Check that the error of a wait holds the server's words about a wrong type."""
+    """Check that the error of a wait contains the server's message about a wrong type."""
     topic = stand.topic()
     async with stand.clients() as (subscriber, publisher):
         await publisher.advertise(topic, ARRAY)
@@ -340,7 +340,7 @@ async def check_silence(stand: Stand) -> None:
 
 
 async def check_nan(stand: Stand) -> None:
-    """Check that messages which the server would drop silently are refused, with the place."""
+    """Check that messages that the server would drop silently are refused, and the error names the place."""
     topic = stand.topic()
     async with stand.clients() as (_subscriber, publisher):
         publication = await publisher.advertise(topic, ARRAY)
@@ -353,7 +353,7 @@ async def check_nan(stand: Stand) -> None:
 
 
 async def check_restart(stand: Stand) -> None:
-    """Check that everything is restored after a server is killed, and the reader gets the length of the gap."""
+    """Check that everything is restored after a server is killed, and that the gap's length is reported."""
     forms: tuple[Compression, ...] = ("none", "cbor", "cbor-raw", "png")
     topics = {form: stand.topic() for form in forms}
     async with stand.clients() as (subscriber, publisher):
@@ -399,9 +399,9 @@ CHECKS: tuple[tuple[str, Callable[[Stand], Awaitable[None]]], ...] = (
 
 
 async def verify(kinds: list[str]) -> int:
-    """All checks on each server."""
+    """Run all checks on each server."""
     OUT.mkdir(parents=True, exist_ok=True)
-    logging.getLogger("bridge").setLevel(logging.CRITICAL)  # the checks say what matters
+    logging.getLogger("bridge").setLevel(logging.CRITICAL)  # the checks print everything relevant
     tally = Tally()
     for name in kinds:
         with socket() as free:
@@ -416,7 +416,7 @@ async def verify(kinds: list[str]) -> int:
                     await check(stand)
                 except (CheckError, BridgeError) as error:
                     why = f"{type(error).__name__}: {error}"
-                tally.tell(
+                tally.report(
                     f"{stand.kind.name}: {title}",
                     started,
                     why,

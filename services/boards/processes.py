@@ -16,13 +16,14 @@ from pcie_shim.board.server import StopSignal, serve_board
 from pcie_shim.endpoint import Endpoint
 from services.errors import BoardFailedError, SettingsError
 from services.settings import endpoint_in
-from services.sockets.status import BoardStatus, ProcessStatus, serve_status_in_thread
-from services.supervision.child import RESTARTS_WITHIN, how_it_ended
+from services.sockets.reporting import STUCK_S, serve_status_in_thread, shifted
+from services.sockets.status import BoardStatus, ProcessStatus
+from services.supervision.child import RESTARTS_WITHIN, describe_exit
 from services.supervision.parent import end_with_parent
-from services.supervision.private_directory import remove_stale_sockets
-from terminal.ending import PARENT_VARIABLE
 from terminal.errors import StoppedError, exit_code_of
+from terminal.log_line import PARENT_VARIABLE, name_process
 from terminal.output import say
+from terminal.private_directory import remove_stale_sockets
 from terminal.signals import check_signals
 
 
@@ -32,6 +33,7 @@ def serve_one(
     misbehave: Misbehaviour | None,
     directory: Path | None,
     *,
+    metrics: str = "",
     restarts: int = 0,
     on_ready: Callable[[], None],
 ) -> int:
@@ -65,7 +67,12 @@ def serve_one(
         listening.append(board)
         on_ready()
 
-    with serve_status_in_thread(directory, f"board{index}", status):
+    def is_alive() -> bool:
+        turned = listening[0].turned if listening else 0.0
+        return not turned or time.monotonic() - turned < STUCK_S
+
+    name = f"board{index}"
+    with serve_status_in_thread(directory, name, status, metrics=metrics, is_alive=is_alive):
         serve_board(endpoint, index=index, stop=stop, misbehave=misbehave, on_ready=ready)
     return ended_by[0] if ended_by else 0
 
@@ -100,10 +107,13 @@ def _check_free(endpoint: Endpoint) -> None:
 class BoardProcesses:
     """Boards 0 to n-1, each in a process forked from this one."""
 
-    def __init__(self, directory: Path, count: int, restarts: int, run_directory: Path | None) -> None:
+    def __init__(
+        self, directory: Path, count: int, restarts: int, run_directory: Path | None, metrics: str = ""
+    ) -> None:
         self._endpoints = [endpoint_in(directory, f"board{at}") for at in range(count)]
         self._restarts = restarts
         self._run_directory = run_directory
+        self._metrics = metrics
         self._reports = PARENT_VARIABLE not in os.environ  # a master monitors its boards itself
         self._arrivals = _Arrivals(count)
         self._started: dict[int, int] = {}
@@ -140,12 +150,14 @@ class BoardProcesses:
         code = 1
         try:
             os.environ[PARENT_VARIABLE] = str(parent)
+            name_process(f"board{at}")
             end_with_parent()
             ended_by = serve_one(
                 self._endpoints[at],
                 at,
                 None,
                 self._run_directory,
+                metrics=shifted(self._metrics, at),
                 restarts=self._starts[at] - 1,
                 on_ready=lambda: self._ready(at),
             )
@@ -180,8 +192,8 @@ class BoardProcesses:
                 if self._restarts
                 else ""
             )
-            raise BoardFailedError(f"board {at} {how_it_ended(code)}{often}")
-        say(f"board {at} {how_it_ended(code)}; restarting it")
+            raise BoardFailedError(f"board {at} {describe_exit(code)}{often}")
+        say(f"board {at} {describe_exit(code)}; restarting it")
         self._fork(at)
 
     def _end_all(self) -> None:

@@ -15,11 +15,12 @@ from services.boards.processes import BoardProcesses, serve_one
 from services.commands import flags as options
 from services.errors import SettingsError
 from services.settings import load_settings
-from services.sockets.serving import endpoint_from
+from services.sockets.reporting import check_metrics
+from services.sockets.serving import deployment_for, endpoint_from
 from services.supervision.child import RESTARTS
 from services.supervision.parent import end_with_parent, leave_private_directory
 from terminal.command_line import CommandLine
-from terminal.ending import PARENT_VARIABLE
+from terminal.log_line import PARENT_VARIABLE, name_process
 from terminal.output import say
 from terminal.signals import check_signals, stopped_error
 
@@ -29,7 +30,7 @@ _OVER_TCP: Final = "A board over TCP"
 app = CommandLine(
     help="Emulate boards of the mini-cluster. They start blank; pcie-app or the loader programs them.\n\n"
     "`board --listen unix:/tmp/b/board0.sock` runs one board; `board --boards 4 --directory /tmp/b` runs four, "
-    "each in its own process."
+    "each in its own process; `board -d build/boat --directory /tmp/b` as many as the deployment has."
 )
 
 
@@ -38,8 +39,16 @@ def board(
     listen: options.Listen = None,
     index: Annotated[int, typer.Option(min=0, help="Number of the board, for its messages.")] = 0,
     boards: Annotated[
-        int | None, typer.Option(min=1, max=64, help="Number of boards to run.", rich_help_panel=_SEVERAL)
+        int | None,
+        typer.Option(
+            min=1,
+            max=64,
+            help="Number of boards to run.",
+            show_default="that of the deployment",
+            rich_help_panel=_SEVERAL,
+        ),
     ] = None,
+    deployment: options.Deployment = None,
     directory: Annotated[
         Path | None,
         typer.Option(
@@ -66,6 +75,8 @@ def board(
         typer.Option(metavar="FILE", help="Private key of the certificate (PEM).", rich_help_panel=_OVER_TCP),
     ] = None,
     insecure: options.Insecure = False,
+    metrics: options.Metrics = None,
+    log_format: options.LogFormat = None,
     misbehave: Annotated[
         str,
         typer.Option(
@@ -76,11 +87,14 @@ def board(
 ) -> int:
     """Emulate boards of the mini-cluster."""
     end_with_parent()
-    settings = load_settings(key_file=key_file)
+    settings = load_settings(deployment=deployment, key_file=key_file, metrics=metrics, log_format=log_format)
+    check_metrics(settings.metrics, insecure=insecure)
     run_directory = settings.run_directory
+    if boards is None and listen is None and directory is not None:
+        boards = len(deployment_for(settings).boards)
     if (listen is None) == (boards is None):
         raise SettingsError(
-            "give either --listen ENDPOINT for one board, or --boards N --directory DIR for several"
+            "give either --listen ENDPOINT for one board, or --directory DIR for several, with --boards N or a deployment"
         )
     if boards is not None:
         if misbehave:
@@ -97,7 +111,8 @@ def board(
             raise SettingsError(
                 f"--directory {directory} can be entered by other users, who could replace the boards' sockets: run chmod 700 {directory}"
             )
-        BoardProcesses(directory, boards, restarts, run_directory).run()
+        BoardProcesses(directory, boards, restarts, run_directory, settings.metrics).run()
+    name_process(f"board{index}")
     from machines.kernel import warm_up
 
     warm_up()
@@ -109,7 +124,7 @@ def board(
             say(f"board {index} listens at {endpoint}")
 
     fault = Misbehaviour.parse(misbehave) if misbehave else None
-    ended_by = serve_one(endpoint, index, fault, run_directory, on_ready=on_ready)
+    ended_by = serve_one(endpoint, index, fault, run_directory, metrics=settings.metrics, on_ready=on_ready)
     if ended_by:
         raise stopped_error(ended_by)
     return 0

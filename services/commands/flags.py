@@ -6,6 +6,7 @@ from typing import Annotated, Any, Final
 import typer
 
 from services.settings import ENV_PREFIX, LONGEST_S, SHORTEST_S, Settings
+from toolchain.deployment.fields import TOPIC_BYTES_MAX, TOPIC_BYTES_MIN
 
 SERVER: Final = "rosbridge"
 BOARDS: Final = "Boards"
@@ -58,7 +59,7 @@ Ca = Annotated[
 Listen = Annotated[
     str | None,
     typer.Option(
-        help="Serve at this endpoint (a master; a board: its host) instead of standard input and output.",
+        help="Endpoint at which to wait for a master (a board: for pcie-app or a loader).",
         metavar="unix:PATH|tcp://HOST:PORT",
         rich_help_panel=SERVING,
     ),
@@ -67,6 +68,18 @@ Insecure = Annotated[
     bool,
     typer.Option(
         help="Permit an unprotected address that other machines can reach.", rich_help_panel=SERVING
+    ),
+]
+Run = Annotated[
+    str | None, typer.Option("--run", metavar="NAME", help="One of several runs of this user, by its name.")
+]
+Metrics = Annotated[
+    str | None,
+    setting(
+        "metrics",
+        "Serve metrics and health over TCP too; a master uses the next ports for its processes.",
+        otherwise="only in the run directory",
+        metavar="tcp://HOST:PORT",
     ),
 ]
 KeyFile = Annotated[
@@ -92,9 +105,20 @@ MessageBytes = Annotated[
     int | None,
     setting(
         "message_bytes",
-        "Largest message of a topic, in bytes; a larger one ends the connection.",
+        "Largest message of a topic, in bytes; a larger one ends the connection, a second one the topic.",
         min=1 << 10,
         max=1 << 28,
+        rich_help_panel=SERVER,
+    ),
+]
+TopicBytes = Annotated[
+    int | None,
+    setting(
+        "topic_bytes",
+        "Largest message of each topic that is read, in bytes; larger ones are discarded and counted.",
+        otherwise=_DEPLOYMENTS,
+        min=TOPIC_BYTES_MIN,
+        max=TOPIC_BYTES_MAX,
         rich_help_panel=SERVER,
     ),
 ]
@@ -121,19 +145,39 @@ Stop = Annotated[
         rich_help_panel=BOARDS,
     ),
 ]
+Integrity = Annotated[
+    str | None,
+    setting(
+        "integrity",
+        "Detect wrong counts: canary (known readings between frames) or twice (two banks for each frame).",
+        otherwise=_DEPLOYMENTS,
+        metavar="off|canary|twice",
+        rich_help_panel=BOARDS,
+    ),
+]
+IntegrityFrames = Annotated[
+    int | None,
+    setting(
+        "integrity_frames",
+        "Frames within which canaries find a flipped bit.",
+        otherwise=_DEPLOYMENTS,
+        min=1,
+        rich_help_panel=BOARDS,
+    ),
+]
 Boards = Annotated[
     str | None,
     setting(
         "boards",
-        "Running boards, in the order of the partitions.",
+        "Running boards, in the order of the partitions, or the folder of `board --directory`.",
         otherwise=_DEPLOYMENTS,
-        metavar="ENDPOINT,...",
+        metavar="ENDPOINT,...|unix:DIR/",
         rich_help_panel=BOARDS,
     ),
 ]
 ConnectTimeout = Annotated[float | None, seconds("connect_timeout", "To reach the rosbridge server.")]
 FirstDataTimeout = Annotated[
-    float | None, seconds("first_data_timeout", "Until the first reading; of listen, the first result.")
+    float | None, seconds("first_data_timeout", "Until the first reading (listen: the first result).")
 ]
 PeerTimeout = Annotated[float | None, seconds("peer_timeout", "To reach a local process or a board.")]
 BoardTimeout = Annotated[
@@ -144,4 +188,13 @@ LogLevel = Annotated[
     str | None,
     setting("log_level", "Log level; debug logs one line per frame.", metavar="info|warning|debug"),
 ]
-Count = Annotated[int | None, typer.Option("--count", "-n", min=1, help="Exit after this many.")]
+LogFormat = Annotated[
+    str | None,
+    setting(
+        "log_format", "Lines on standard error: text, dated text, or JSON objects.", metavar="text|dated|json"
+    ),
+]
+Count = Annotated[
+    int | None,
+    typer.Option("--count", "-n", min=1, help="Exit after this many results (subscriber: readings)."),
+]

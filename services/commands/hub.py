@@ -8,8 +8,11 @@ import typer
 from bridge.codecs.json_codec import MAX_SIZE
 from bridge.hub.access import AccessPolicy, is_loopback, read_tokens, tls_context
 from bridge.hub.limits import HubLimits
+from services.commands import flags as options
 from services.errors import SettingsError
 from services.hub_process import serve
+from services.settings import load_settings
+from services.sockets.reporting import check_metrics
 from services.supervision.parent import end_with_parent
 from terminal.command_line import CommandLine
 from terminal.one_line import shown
@@ -78,9 +81,13 @@ def hub(
             rich_help_panel=_ACCESS,
         ),
     ] = False,
+    metrics: options.Metrics = None,
+    log_format: options.LogFormat = None,
 ) -> int:
     """Serve rosbridge without ROS."""
     end_with_parent()
+    settings = load_settings(metrics=metrics, log_format=log_format)
+    check_metrics(settings.metrics, insecure=insecure)
     access = _access_policy(tls_cert, tls_key, token_file, origin or [])
     if not is_loopback(host) and not insecure and (access.tls is None or not access.tokens):
         missing = " and ".join(
@@ -101,6 +108,7 @@ def hub(
             clients=clients,
             ros_version=2 if ros_version == "2" else 1,
             announce=announce,
+            settings=settings,
         )
     )
 

@@ -11,7 +11,7 @@ from services.settings import load_settings
 from services.sockets.serving import board_endpoint
 from services.supervision.parent import end_with_parent
 from terminal.command_line import CommandLine
-from terminal.output import say
+from terminal.output import say, say_if_slow
 
 app = CommandLine(
     help="Program a board with an image written by `toolchain build`.\n\n"
@@ -31,6 +31,8 @@ def loader(
     """Program a board with an image written by `toolchain build`."""
     end_with_parent()
     settings = load_settings(peer_timeout=peer_timeout, key_file=key_file, board_ca=board_ca)
-    image_hash = program(board_endpoint(endpoint, "ENDPOINT", settings), image, timeout=settings.peer_timeout)
+    board = board_endpoint(endpoint, "ENDPOINT", settings)
+    with say_if_slow(f"waiting for the board at {board}"):
+        image_hash = program(board, image, timeout=settings.peer_timeout)
     say(f"{endpoint} holds image {image_hash[:16]} now")
     return 0

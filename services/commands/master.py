@@ -6,16 +6,19 @@ from typing import Annotated
 import orjson
 import typer
 
+from services.boards.integrity import integrity_rule
 from services.commands import flags as options
 from services.errors import SettingsError
 from services.master.run import run_master
-from services.settings import endpoint_in, load_settings
+from services.settings import Settings, endpoint_in, load_settings
 from services.sockets.control_socket import ReloadOrder, control_socket, give_order
-from services.sockets.serving import deployment_for
+from services.sockets.reporting import check_metrics
+from services.sockets.serving import board_endpoints, deployment_for
 from services.supervision.parent import end_with_parent
 from terminal.command_line import CommandLine
 from terminal.errors import ExitCode
 from terminal.one_line import one_line
+from terminal.output import say
 from terminal.signals import run_async
 
 RELOAD_TIME = 600.0
@@ -49,8 +52,11 @@ def master(
     boards: options.Boards = None,
     queue: options.Queue = None,
     stop: options.Stop = None,
+    integrity: options.Integrity = None,
+    integrity_frames: options.IntegrityFrames = None,
     ros_version: options.RosVersion = None,
     message_bytes: options.MessageBytes = None,
+    topic_bytes: options.TopicBytes = None,
     connect_timeout: options.ConnectTimeout = None,
     first_data_timeout: options.FirstDataTimeout = None,
     peer_timeout: options.PeerTimeout = None,
@@ -66,10 +72,16 @@ def master(
             "--fused",
         ),
     ] = None,
+    metrics: options.Metrics = None,
+    insecure: options.Insecure = False,
     log_level: options.LogLevel = None,
+    log_format: options.LogFormat = None,
     json: Annotated[bool, typer.Option("--json", help="Print one JSON object per result.")] = False,
     print_config: Annotated[
         bool, typer.Option("--print-config", help="Print the resulting settings and exit.")
+    ] = False,
+    check: Annotated[
+        bool, typer.Option("--check", help="Check the settings, the deployment and its images, and exit.")
     ] = False,
 ) -> int:
     """Move readings to the boards and posteriors back to the robot."""
@@ -91,8 +103,11 @@ def master(
         boards=boards,
         queue=queue,
         stop=stop,
+        integrity=integrity,
+        integrity_frames=integrity_frames,
         ros_version=ros_version,
         message_bytes=message_bytes,
+        topic_bytes=topic_bytes,
         connect_timeout=connect_timeout,
         first_data_timeout=first_data_timeout,
         peer_timeout=peer_timeout,
@@ -101,18 +116,36 @@ def master(
         key_file=key_file,
         board_ca=board_ca,
         fused=fused,
+        metrics=metrics,
         log_level=log_level,
+        log_format=log_format,
         **connected,
     )
     if print_config:
         print(orjson.dumps(settings.model_dump(mode="json"), option=orjson.OPT_INDENT_2).decode())
         return ExitCode.DONE
+    if check:
+        _check(settings)
+        return ExitCode.DONE
     if once == loop:
         raise SettingsError("choose one of --once and --loop")
     if once and count is not None:
         raise SettingsError("--count requires --loop; --once computes one frame")
+    check_metrics(settings.metrics, insecure=insecure)
     loaded = deployment_for(settings)
+    integrity_rule(settings, loaded)  # refuse an unsound rule before processes are started
     return run_async(run_master(settings, loaded, once=once, count=count, json=json))
+
+
+def _check(settings: Settings) -> None:
+    """Print that a run can start with these settings, or raise the error that would end it."""
+    loaded = deployment_for(settings, images=True)
+    if settings.boards:
+        board_endpoints(settings, loaded)
+    count = len(loaded.boards)
+    say(
+        f"{settings.deployment} is deployment {loaded.hash[:12]} for {count} {'board' if count == 1 else 'boards'}"
+    )
 
 
 @app.command("reload")
@@ -128,6 +161,7 @@ def reload_(
             metavar="DIR",
         ),
     ] = None,
+    run: options.Run = None,
 ) -> int:
     """Make a running `master --loop` switch to another deployment of the same shape, or reload its folder.
 
@@ -142,8 +176,9 @@ def reload_(
     async def order() -> int:
         from services.sockets.stack import find_run
 
-        run = directory or settings.control_directory or settings.run_directory or await find_run()
-        print(one_line(await give_order(control_socket(run), ReloadOrder(folder), timeout=RELOAD_TIME)))
+        given = None if run else directory or settings.control_directory or settings.run_directory
+        where = given or (await find_run(run)).only_run
+        print(one_line(await give_order(control_socket(where), ReloadOrder(folder), timeout=RELOAD_TIME)))
         return ExitCode.DONE
 
     return run_async(order())

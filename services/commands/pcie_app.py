@@ -10,8 +10,8 @@ from services.pipeline.pcie_app import ROLE, PcieApp
 from services.pipes.lines import require_pipe
 from services.pipes.pcie_app import compute_lines
 from services.settings import load_settings
+from services.sockets.reporting import check_metrics, serve_status_in_thread
 from services.sockets.serving import board_endpoints, deployment_for, own_endpoint
-from services.sockets.status import serve_status_in_thread
 from services.supervision.parent import end_with_parent
 from terminal.command_line import CommandLine
 
@@ -29,6 +29,8 @@ def pcie_app(
     boards: options.Boards = None,
     listen: options.Listen = None,
     stop: options.Stop = None,
+    integrity: options.Integrity = None,
+    integrity_frames: options.IntegrityFrames = None,
     peer_timeout: options.PeerTimeout = None,
     board_timeout: options.BoardTimeout = None,
     reprogram: Annotated[
@@ -41,7 +43,9 @@ def pcie_app(
     key_file: options.KeyFile = None,
     board_ca: options.BoardCa = None,
     insecure: options.Insecure = False,
+    metrics: options.Metrics = None,
     log_level: options.LogLevel = None,
+    log_format: options.LogFormat = None,
 ) -> int:
     """Drive the boards of a mini-cluster."""
     end_with_parent()
@@ -49,17 +53,24 @@ def pcie_app(
         deployment=deployment,
         boards=boards,
         stop=stop,
+        integrity=integrity,
+        integrity_frames=integrity_frames,
         peer_timeout=peer_timeout,
         board_timeout=board_timeout,
         key_file=key_file,
         board_ca=board_ca,
+        metrics=metrics,
         log_level=log_level,
+        log_format=log_format,
     )
     loaded = deployment_for(settings, images=True)
     deployed = DeployedBoards(settings, loaded, board_endpoints(settings, loaded), reprogram=reprogram)
     if listen is not None:
+        check_metrics(settings.metrics, insecure=insecure)
         pcie = PcieApp(deployed, own_endpoint(listen, insecure=insecure), settings.log_level)
-        with serve_status_in_thread(settings.run_directory, ROLE, pcie.status):
+        with serve_status_in_thread(
+            settings.run_directory, ROLE, pcie.status, metrics=settings.metrics, is_alive=pcie.is_alive
+        ):
             return pcie.serve()
     require_pipe(ROLE, "readings")
     return compute_lines(deployed, loaded.machine.rng_banks)

@@ -8,6 +8,7 @@ from services.pipeline.result_topics import ROLE
 from services.pipes.lines import require_pipe
 from services.pipes.publisher import publish_lines
 from services.settings import load_settings
+from services.sockets.reporting import check_metrics
 from services.sockets.serving import deployment_for, listening, own_endpoint
 from services.supervision.parent import end_with_parent
 from terminal.command_line import CommandLine
@@ -33,7 +34,9 @@ def publisher(
         float | None, options.seconds("seen_timeout", "Until a result must be seen on the wire.")
     ] = None,
     insecure: options.Insecure = False,
+    metrics: options.Metrics = None,
     log_level: options.LogLevel = None,
+    log_format: options.LogFormat = None,
 ) -> int:
     """Publish posteriors over rosbridge."""
     end_with_parent()
@@ -44,10 +47,13 @@ def publisher(
         ros_version=ros_version,
         connect_timeout=connect_timeout,
         seen_timeout=seen_timeout,
+        metrics=metrics,
         log_level=log_level,
+        log_format=log_format,
     )
     loaded = deployment_for(settings)
     if listen is not None:
+        check_metrics(settings.metrics, insecure=insecure)
         link = listening(own_endpoint(listen, insecure=insecure), ROLE, loaded)
         return run_async(Publisher(settings, loaded, link).run())
     require_pipe(ROLE, "results")

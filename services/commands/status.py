@@ -7,15 +7,17 @@ import typer
 
 from services.commands import flags as options
 from services.errors import SettingsError
+from services.output.frame_story import show_frame
 from services.output.status_screen import show
 from services.settings import load_settings
-from services.sockets.stack import find_run
+from services.sockets.stack import Found, find_run
 from terminal.command_line import CommandLine
 from terminal.signals import run_async
 
 app = CommandLine(
     help="Show the whole stack in one screen: processes, boards and images, last frame, rates, losses by reason.\n\n"
-    "`status` finds the only run of this user; `status --directory DIR` selects the processes with that BM_RUN_DIRECTORY.\n\n"
+    "`status` finds the only run of this user, and lists several, of which `--run NAME` selects one; "
+    "`status --directory DIR` selects the processes with that BM_RUN_DIRECTORY.\n\n"
     "Exit codes: 0 everything is ready, 6 something is not, 2 nothing was found."
 )
 
@@ -32,22 +34,37 @@ def status(
             metavar="DIR",
         ),
     ] = None,
+    run: options.Run = None,
     watch: Annotated[bool, typer.Option("--watch", "-w", help="Refresh every second until Ctrl-C.")] = False,
+    frame: Annotated[
+        int | None,
+        typer.Option(
+            "--frame",
+            min=1,
+            metavar="N",
+            help="Show one of the last 1000 frames: its stages, boards and outcome.",
+        ),
+    ] = None,
     json: Annotated[
         bool, typer.Option("--json", help="Print one JSON object; with --watch, one per line.")
     ] = False,
 ) -> int:
     """Show the whole stack in one screen."""
-    named = load_settings(run_directory=directory).run_directory
+    named = None if run is not None else load_settings(run_directory=directory).run_directory
+    if run is not None and directory is not None:
+        raise SettingsError("--run and --directory both choose a run: omit one of them")
     if named is not None and not named.is_dir():
         raise SettingsError(
             f"{named} is not a folder; name the one with the status sockets (BM_RUN_DIRECTORY of the processes)"
         )
 
-    async def run() -> int:
-        return await show(named or await find_run(), watch=watch, json=json)
+    async def show_run() -> int:
+        found = Found(named, []) if named is not None else await find_run(run)
+        if frame is not None:
+            return await show_frame(found.only_run, frame, json=json)
+        return await show(found.run, found.others, watch=watch, json=json)
 
-    return run_async(run())
+    return run_async(show_run())
 
 
 if __name__ == "__main__":

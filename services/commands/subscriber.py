@@ -10,10 +10,10 @@ from services.errors import SettingsError
 from services.pipeline.subscriber import ROLE, Subscriber
 from services.pipes.subscriber import print_addresses, print_variables
 from services.settings import load_settings
+from services.sockets.reporting import check_metrics
 from services.sockets.serving import deployment_for, listening, own_endpoint
 from services.supervision.parent import end_with_parent
 from terminal.command_line import CommandLine
-from terminal.output import say
 from terminal.signals import run_async
 from toolchain.deployment import Source
 
@@ -56,10 +56,13 @@ def subscriber(
     queue: options.Queue = None,
     ros_version: options.RosVersion = None,
     message_bytes: options.MessageBytes = None,
+    topic_bytes: options.TopicBytes = None,
     connect_timeout: options.ConnectTimeout = None,
     first_data_timeout: options.FirstDataTimeout = None,
     insecure: options.Insecure = False,
+    metrics: options.Metrics = None,
     log_level: options.LogLevel = None,
+    log_format: options.LogFormat = None,
 ) -> int:
     """Extract variables from a ROS topic over rosbridge."""
     end_with_parent()
@@ -70,9 +73,12 @@ def subscriber(
         queue=queue,
         ros_version=ros_version,
         message_bytes=message_bytes,
+        topic_bytes=topic_bytes,
         connect_timeout=connect_timeout,
         first_data_timeout=first_data_timeout,
+        metrics=metrics,
         log_level=log_level,
+        log_format=log_format,
     )
     if settings.deployment is not None and (value := topic or type_ or variables):
         flag = "--topic" if topic else "--type" if type_ else "--variables"
@@ -80,13 +86,12 @@ def subscriber(
             f"{flag} {value} cannot be combined with a deployment; {settings.deployment} has its own: omit one of them"
         )
     if listen is not None:
+        check_metrics(settings.metrics, insecure=insecure)
         loaded = deployment_for(settings)
         link = listening(own_endpoint(listen, insecure=insecure), ROLE, loaded)
         return run_async(Subscriber(settings, loaded, link).run())
     if settings.deployment is not None:
         loaded = deployment_for(settings)
-        for each in loaded.sources:
-            say(f"listening on {each.topic} at {settings.uri or each.uri}")
         return run_async(print_addresses(settings, loaded, count))
     if settings.uri is None or topic is None or type_ is None:
         raise SettingsError(
@@ -100,5 +105,4 @@ def subscriber(
         raise SettingsError(
             f"--{first['loc'][0]}: {str(first['msg']).removeprefix('Value error, ')}"
         ) from error
-    say(f"listening on {topic} at {settings.uri}")
     return run_async(print_variables(settings, source, names, count))

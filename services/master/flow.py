@@ -20,6 +20,7 @@ from services.errors import (
     RosbridgeLostError,
     VariableError,
 )
+from services.master.history import FrameHistory
 from services.master.peers import ANSWER_TIME, Awaited, Peer, Peers
 from services.pipeline.frames import WaitingFrames
 from services.pipeline.generations import InForce
@@ -104,8 +105,12 @@ class FrameFlow:
         self._last = (0, 0)
         self._losses: Counter[LossReason] = Counter()
         self._reported_causes: set[str] = set()
+        self.history = FrameHistory()
+        """The last frames."""
         self._failures: deque[float] = deque(maxlen=RESTARTS + 1)
         self.published = 0
+        self.first_reading_at: float | None = None
+        """Monotonic time of the first complete reading."""
         self.has_data = False
         """Whether a message has arrived, usable or not."""
         self.end: asyncio.Future[None] = asyncio.get_running_loop().create_future()
@@ -165,10 +170,14 @@ class FrameFlow:
         if peer is self._peers.app and self._computing is not None:
             self._losses[LossReason.WITH_APP] += 1
             if self._follows:
-                self._log.debug(LossReason.WITH_APP, frame=self._computing.number)
+                self._log.debug(
+                    LossReason.WITH_APP, frame=self._computing.number, _reason=LossReason.WITH_APP
+                )
+            self.history.lost(self._computing.number, LossReason.WITH_APP)
             self._computing = None
         if peer is self._peers.publisher and self._at_publisher:
             self._losses[LossReason.WITH_PUBLISHER] += self._at_publisher
+            self.history.lost_at_publisher(LossReason.WITH_PUBLISHER)
             self._at_publisher = 0
 
     def awaited(self, peer: Peer) -> Awaited | None:
@@ -216,15 +225,15 @@ class FrameFlow:
     def drop_next_generation(self) -> None:
         """Drop the readings for the next deployment."""
         dropped, self._next_readings = self._next_readings, None
-        self._lose(dropped)
+        self._count_lost(dropped)
 
     def adopt_next_generation(self) -> None:
         """Drop the readings for the previous deployment, and use those for the next one."""
         if self._next_readings is not None:
-            self._lose(self._readings)
+            self._count_lost(self._readings)
             self._readings, self._next_readings = self._next_readings, None
 
-    def _lose(self, readings: WaitingFrames[WaitingReading] | None) -> None:
+    def _count_lost(self, readings: WaitingFrames[WaitingReading] | None) -> None:
         if readings is not None:
             self._losses[LossReason.IN_RELOAD] += len(readings)
             self._losses[LossReason.PASSED_OVER] += readings.passed_over
@@ -236,10 +245,12 @@ class FrameFlow:
         if self._once and self._number:
             return
         self._received += 1
+        if self.first_reading_at is None:
+            self.first_reading_at = time.monotonic()
         self._losses[LossReason.PASSED_OVER] += reading.passed_over
         self._losses[LossReason.UNPAIRED] += reading.unpaired
         if self._peers.publisher.away and not self._once:
-            self._losses[LossReason.ROSBRIDGE_AWAY] += 1  # nobody could get its result
+            self._losses[LossReason.ROSBRIDGE_AWAY] += 1  # its result could not be received
             return
         waiting = WaitingReading(reading, time.monotonic_ns())
         ahead = reading.generation - self._in_force.generation
@@ -283,7 +294,9 @@ class FrameFlow:
         self._number += 1
         reading, number = waiting.reading, self._number
         bank = number % self._in_force.deployment.machine.rng_banks
-        self._computing = _Computing(number, waiting, time.monotonic_ns())
+        now = time.monotonic_ns()
+        self._computing = _Computing(number, waiting, now)
+        self.history.sent(number, self._in_force.generation, bank, reading, (waiting.arrived, now))
         app.protocol.send(Frame(number, reading.addresses, bank, reading.prior_codes))
         if self._follows:
             self._follow(number, bank, waiting)
@@ -320,20 +333,27 @@ class FrameFlow:
         )
         if not self._at_publisher:
             self._published_at = time.monotonic()
+        self.history.computed(result)
         self._at_publisher += 1  # before sending: a publisher in this process answers at once
         if publisher is None or not publisher.send(record):
             self._at_publisher -= 1
             self._losses[LossReason.WITH_PUBLISHER] += 1
+            self.history.lost(result.number, LossReason.WITH_PUBLISHER)
         self._send_next()
 
     def _take_failure(self, record: FrameFailed) -> None:
+        is_withheld = record.reason is FailureReason.WITHHELD
+        reason = LossReason.WITHHELD if is_withheld else LossReason.FAILED
         if self._computing is not None and self._computing.number == record.number:
             self._computing = None
+            self.history.lost(record.number, reason, record.sentence)
         if self._once:
             self.fail(ReportedError(record.exit_code, record.sentence))
             return
-        self._losses[LossReason.FAILED] += 1
-        if record.reason is FailureReason.FAILED:
+        self._losses[reason] += 1
+        if is_withheld:
+            self._log.warning(record.sentence, frame=record.number, _reason=reason)
+        elif record.reason is FailureReason.FAILED:
             now = time.monotonic()
             self._failures.append(now)
             recent = sum(1 for each in self._failures if now - each <= RESTARTS_WITHIN)
@@ -344,14 +364,15 @@ class FrameFlow:
                     )
                 )
                 return
-            self._log.warning(record.sentence, frame=record.number)
+            self._log.warning(record.sentence, frame=record.number, _reason=LossReason.FAILED)
         elif self._follows:
-            self._log.debug(record.sentence, frame=record.number)
+            self._log.debug(record.sentence, frame=record.number, _reason=LossReason.FAILED)
         self._send_next()
 
     def _take_outcome(self, record: Published) -> None:
         self._at_publisher = max(0, self._at_publisher - 1)
         self._published_at = time.monotonic()
+        self.history.ended(record, record.outcome)
         if record.outcome is Outcome.PUBLISHED:
             self.published += 1
             self._last = (record.number, time.monotonic_ns())

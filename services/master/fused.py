@@ -5,13 +5,16 @@ Records are passed by calls instead of over local sockets. Boards remain separat
 
 import asyncio
 import threading
+import time
 from collections.abc import Callable, Coroutine
 from concurrent.futures import Future
-from typing import Any, TypeVar, cast
+from typing import Any, Final, TypeVar, cast
 
 from pcie_shim.errors import BoardError, PcieShimError
-from services.boards.deployed import TICK, DeployedBoards
+from services.boards.canaries import PAUSE
+from services.boards.deployed import DeployedBoards
 from services.boards.frames import frame_failed, result_record
+from services.master.command_lines import METRICS_PORTS
 from services.pipeline.pcie_app import ROLE as PCIE_APP
 from services.pipeline.pcie_app import Progress
 from services.pipeline.publisher import Publisher
@@ -20,11 +23,13 @@ from services.pipeline.subscriber import ROLE as SUBSCRIBER
 from services.pipeline.subscriber import Subscriber
 from services.settings import Settings
 from services.sockets.records import AnyRecord, Frame, Notice, Prepare, Ready, Record, Switch, Trouble
+from services.sockets.reporting import serve_status, shifted
 from services.sockets.serving import Link, MakeLink, board_endpoints
-from services.sockets.status import serve_status
 from terminal.errors import exit_code_of
 from toolchain.deployment import Deployment
 
+_CANARY: Final = 0
+"""Number of a canary; frames are numbered from 1."""
 Result = TypeVar("Result")
 TakeRecord = Callable[[AnyRecord], None]
 
@@ -79,10 +84,12 @@ class FusedBoards:
 
     def __init__(self, boards: DeployedBoards, settings: Settings, link: MakeLink) -> None:
         self._boards = boards
-        self._run_directory = settings.run_directory
+        self._settings = settings
         self._progress = Progress(boards, settings.log_level)
         self._link = link(self._take)
-        self._number: int | None = None
+        self._number: int | None = None  # _CANARY: a canary instead of a frame
+        self._next_frame: Frame | None = None  # it waits for a canary
+        self._began = 0
         self._watched: int | None = None
         self._loop = asyncio.get_running_loop()
         self._looking: asyncio.Task[None] | None = None
@@ -95,20 +102,27 @@ class FusedBoards:
         Raises:
             PcieShimError: The boards cannot be opened, or a board came back with another image.
         """
-        async with self._link, serve_status(self._run_directory, PCIE_APP, self._progress.status):
+        settings, get_status = self._settings, self._progress.status
+        status = serve_status(settings.run_directory, PCIE_APP, get_status, metrics=settings.metrics)
+        async with self._link, status:
             try:
                 self._progress.ready = Ready(await _in_thread(self._boards.open))
                 self._link.keep(self._progress.ready)
                 while True:
-                    await asyncio.sleep(TICK)
+                    number = self._progress.asked
+                    await asyncio.sleep(self._boards.pause)
                     if self._number is not None:
                         if self._boards.is_late:
                             self._collect()
-                    elif self._boards.gone and self._looking is None:
+                    elif self._looking is not None or self._one_thread.locked():
+                        pass
+                    elif self._boards.gone:
                         async with self._one_thread:
                             back = await _in_thread(self._boards.recover)
                         for board in back:
                             self._link.send(Notice("info", f"board {board} is back, programmed"))
+                    elif self._boards.canaries is not None and self._progress.asked == number:
+                        self._post_canary()
             except PcieShimError as error:
                 self._link.send(Trouble(exit_code_of(error), str(error)))
                 raise
@@ -132,13 +146,53 @@ class FusedBoards:
         if isinstance(record, Prepare):
             answer = await _in_thread(lambda: boards.generations.prepare(record))
         else:
-            self._unwatch()  # its link is closed, and the next link may get the same descriptor
             async with self._one_thread:
+                while self._number is not None:  # a canary, which ends by its deadline at the latest
+                    await asyncio.sleep(PAUSE)
+                self._unwatch()  # its link is closed, and the next link may get the same descriptor
                 answer = await _in_thread(lambda: boards.switch(record))
         self._link.send(answer)
 
+    def _post_canary(self) -> None:
+        try:
+            self._boards.post_canary()
+        except BoardError as error:
+            self._canary_failed(error)
+        else:
+            self._number = _CANARY
+            self._watch()
+
+    def _canary_failed(self, error: BoardError) -> None:
+        self._unwatch()
+        self._number = None
+        self._link.send(Notice("warning", str(error)))
+        self._looking = self._loop.create_task(self._find_lost_boards(None, error))
+
+    def _take_next(self) -> None:
+        """Go on with a canary that is owed, or else with the frame that waits."""
+        if self._boards.is_canary_owed:
+            self._post_canary()
+        else:
+            self._start_next_frame()
+
+    def _start_next_frame(self) -> None:
+        if self._next_frame is not None:
+            frame, self._next_frame = self._next_frame, None
+            self._start(frame)
+
     def _post(self, record: Frame) -> None:
+        if self._number is not None or self._looking is not None:
+            self._next_frame = record
+            return
+        if self._boards.is_canary_owed:
+            self._next_frame = record
+            self._post_canary()
+            return
+        self._start(record)
+
+    def _start(self, record: Frame) -> None:
         self._progress.asked += 1
+        self._began = time.monotonic_ns()
         try:
             self._boards.post(record)
         except BoardError as error:
@@ -171,28 +225,38 @@ class FusedBoards:
         try:
             output = self._boards.collect()
         except BoardError as error:
-            self._failed(number, error)
+            if number == _CANARY:
+                self._canary_failed(error)
+            else:
+                self._failed(number, error)
             return
         if output is None:
             self._watch()
             return
         self._number = None
-        self._progress.computed(number, output)
-        self._link.send(result_record(number, output))
+        if number != _CANARY:
+            self._progress.computed(number, output)
+            self._link.send(result_record(number, output, self._began))
+        if self._number is None:  # sending may have brought the next frame
+            self._take_next()
 
     def _failed(self, number: int, error: BoardError) -> None:
         self._unwatch()
-        self._progress.failed += 1
+        self._progress.count_failure(error)
         self._number = None
-        self._looking = self._loop.create_task(self._look(number, error))
+        self._looking = self._loop.create_task(self._find_lost_boards(number, error))
 
-    async def _look(self, number: int, error: BoardError) -> None:
+    async def _find_lost_boards(self, number: int | None, error: BoardError) -> None:
+        """Find all lost boards, and then report the frame as failed, or compute the one that waits."""
         try:
             async with self._one_thread:
-                await _in_thread(lambda: self._boards.find_gone(error))
+                await _in_thread(lambda: self._boards.find_lost_boards(error))
         finally:
             self._looking = None
-        self._link.send(frame_failed(number, error))
+        if number is None:
+            self._start_next_frame()  # even if a canary is owed, so that a broken link fails a frame
+        else:
+            self._link.send(frame_failed(number, error))
 
 
 async def _in_thread(work: Callable[[], Result]) -> Result:
@@ -229,10 +293,13 @@ def fused_services(
 
         return make
 
+    def settings_of(role: str) -> Settings:
+        return settings.model_copy(update={"metrics": shifted(settings.metrics, METRICS_PORTS[role])})
+
     boards = DeployedBoards(settings, deployment, board_endpoints(settings, deployment))
     running = {
-        SUBSCRIBER: Subscriber(settings, deployment, link_of(SUBSCRIBER)).run(),
-        PUBLISHER: Publisher(settings, deployment, link_of(PUBLISHER)).run(),
-        PCIE_APP: FusedBoards(boards, settings, link_of(PCIE_APP)).run(),
+        SUBSCRIBER: Subscriber(settings_of(SUBSCRIBER), deployment, link_of(SUBSCRIBER)).run(),
+        PUBLISHER: Publisher(settings_of(PUBLISHER), deployment, link_of(PUBLISHER)).run(),
+        PCIE_APP: FusedBoards(boards, settings_of(PCIE_APP), link_of(PCIE_APP)).run(),
     }
     return {role: (ends[role], coroutine) for role, coroutine in running.items()}

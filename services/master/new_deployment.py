@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from services.errors import NotReloadedError, SettingsError, ShapeError
-from services.supervision.private_directory import COPY_PREFIX
+from terminal.private_directory import COPY_PREFIX
 from toolchain.deployment import Deployment, load_deployment
 from toolchain.deployment.same_shape import differences
 
@@ -32,8 +32,9 @@ def read_new(folder: Path, in_force: Deployment, as_used: Callable[[Deployment],
     found = differences(as_used(in_force), as_used(loaded))
     if found:
         rest = f"; {len(found) - _NAMED} more" if len(found) > _NAMED else ""
+        other = "other connections" if all(each.is_connection for each in found) else "another shape"
         raise ShapeError(
-            f"{loaded.path} has another shape: {'; '.join(map(str, found[:_NAMED]))}{rest}. "
+            f"{loaded.path} has {other}: {'; '.join(map(str, found[:_NAMED]))}{rest}. "
             "A reload can change tables, priors, targets and the reading of messages; for this, restart the run"
         )
     return loaded

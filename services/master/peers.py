@@ -41,9 +41,9 @@ from services.sockets.records import (
 from services.sockets.serving import board_endpoints, endpoint_from
 from services.sockets.status import PeerStatus
 from services.supervision.child import RESTARTS, RESTARTS_WITHIN, Child, end_all
-from services.supervision.private_directory import PrivateDirectory
 from terminal.errors import ExitCode
 from terminal.output import say
+from terminal.private_directory import PrivateDirectory
 
 if TYPE_CHECKING:
     from services.master.fused import FusedEnd  # it imports all three services
@@ -226,7 +226,7 @@ class Peers:
             self.board_endpoints = tuple(
                 str(endpoint_in(directory, f"board{at}")) for at in range(len(endpoints))
             )
-            command = boards_command(len(endpoints), directory, once=self._once)
+            command = boards_command(len(endpoints), directory, settings, once=self._once)
             self._boards = Child("the boards' process", command, directory=directory)
         for role, text in given.items():
             self._by_role[role] = Peer(role, None, None) if settings.fused else self._peer(role, text)

@@ -79,7 +79,7 @@ class Reloads:
         started = time.monotonic()
         lost_before = self._lost
         number = self._in_force.generation + 1
-        new = await asyncio.to_thread(read_new, folder, self._in_force.deployment, self._as_used)
+        new = await asyncio.to_thread(read_new, folder, self._in_force.deployment, self._without_overridden)
         kept = await self._keep_copy(new, number)
         subscriber, publisher, app = self._peers.subscriber, self._peers.publisher, self._peers.app
         limit = self._settings.peer_timeout + ANSWER_TIME
@@ -111,7 +111,7 @@ class Reloads:
         milliseconds = (time.monotonic() - started) * 1000
         return (
             f"generation {number} is in force, deployment {new.hash[:12]} of {folder}; "
-            f"{fates(in_flight, lost, lost_meanwhile)}, {milliseconds:.0f} ms"
+            f"{describe_frames(in_flight, lost, lost_meanwhile)}, {milliseconds:.0f} ms"
         )
 
     @property
@@ -196,7 +196,7 @@ class Reloads:
         self._flow.adopt_next_generation()
         self._flow.resume()
 
-    def _as_used(self, deployment: Deployment) -> Deployment:
+    def _without_overridden(self, deployment: Deployment) -> Deployment:
         """Return a deployment without the fields that flags of this run override, so that these may differ."""
         update: dict[str, Any] = {}
         if self._settings.uri:
@@ -229,7 +229,7 @@ class Reloads:
             self._peers.set_flag("--deployment", str(kept))
 
 
-def fates(in_flight: int, lost: int, lost_meanwhile: int = 0) -> str:
+def describe_frames(in_flight: int, lost: int, lost_meanwhile: int = 0) -> str:
     """Return a text about the frames in flight at the start of a reload and the readings lost during it.
 
     `lost` frames were still waiting for the boards after the drain; `lost_meanwhile` readings did not fit

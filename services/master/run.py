@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from services.errors import NoDataError
+from services.master.children import ChildrenWatch
 from services.master.flow import FrameFlow
 from services.master.peers import ROLE, Peers
 from services.master.reload import Reloads
@@ -17,10 +18,11 @@ from services.pipeline.generations import InForce
 from services.settings import Settings
 from services.sockets.control_socket import serve_control
 from services.sockets.records import LossReason, Published
-from services.sockets.status import ProcessStatus, serve_status
+from services.sockets.reporting import serve_status
+from services.sockets.status import ProcessStatus
 from terminal.errors import ExitCode
 from terminal.logs import get_logger
-from terminal.output import say
+from terminal.output import say, show_progress
 from toolchain.deployment import Deployment
 
 _PROGRESS_EVERY = 1.0
@@ -46,7 +48,6 @@ class Master:
         )
         self._reloads = Reloads(settings, self._in_force, self._peers, self._flow, self._log)
         self._tasks: list[asyncio.Task[None]] = []
-        self._started = time.monotonic()
 
     async def run(self) -> int:
         """Start missing peers, move frames until the end of the run, and stop the peers that were started.
@@ -59,12 +60,28 @@ class Master:
         try:
             peers.prepare()
             run_directory = settings.run_directory or peers.directory
-            await sockets.enter_async_context(serve_status(run_directory, ROLE, self.status))
+            more: dict[str, Any] = {}
+            history = self._flow.history
+            if run_directory is not None:
+                watch = ChildrenWatch(peers, run_directory)
+                self._begin_task(watch.run())
+                more["is_alive"] = watch.is_alive
+            report = serve_status(
+                run_directory,
+                ROLE,
+                self.status,
+                metrics=settings.metrics,
+                stages=history.latencies,
+                frame=history.story,
+                **more,
+            )
+            await sockets.enter_async_context(report)
             if not self._once:
                 control = settings.control_directory or run_directory
                 await sockets.enter_async_context(serve_control(control, self._reloads.order))
                 self._begin_task(self._reloads.keep_first())
-                if sys.stderr.isatty():
+                # results on the terminal show the progress themselves
+                if sys.stderr.isatty() and not (self._json and sys.stdout.isatty()):
                     self._begin_task(self._show_progress())
             self._begin_task(self._expect_data())
             await peers.start(self._flow)
@@ -107,7 +124,9 @@ class Master:
     def summary(self) -> str:
         """Return a sentence about the results and losses of the run."""
         losses = self._flow.losses
-        elapsed = time.monotonic() - self._started
+        # waiting for the robot does not count
+        began = self._flow.first_reading_at
+        elapsed = 0.0 if began is None else time.monotonic() - began
         text = f"{self._flow.published} results published in {elapsed:.1f} s"
         if missed := losses.pop(LossReason.SOME_TOPICS, 0):
             text += f", {missed} of them {LossReason.SOME_TOPICS}"
@@ -140,9 +159,10 @@ class Master:
             await asyncio.sleep(_PROGRESS_EVERY)
             now, published = time.monotonic(), self._flow.published
             if published != count:
-                rate = (published - count) / (now - before)
+                began = max(before, self._flow.first_reading_at or before)
+                rate = (published - count) / (now - began) if now > began else 0.0
                 of = f" of {self._count}" if self._count else ""
-                self._log.info(f"{published}{of} results, {rate:.0f} a second")
+                show_progress(f"{ROLE}: {published}{of} results, {rate:.0f} a second")
             before, count = now, published
 
 

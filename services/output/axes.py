@@ -52,7 +52,8 @@ def axes_of(posterior: Posterior, deployment: Deployment | None) -> list[Axis]:
     theirs = list(zip(posterior.labels, posterior.sizes, strict=True))
     if ours != theirs:
         raise ValueError(
-            f"the received posterior has {_grid(theirs)}, but the deployment of {deployment.directory} has {_grid(ours)}"
+            f"the received posterior has {_grid(theirs)}, but the deployment of {deployment.directory} has {_grid(ours)}; "
+            "name the deployment that publishes them"
         )
     return deployment_axes(deployment)
 

@@ -3,6 +3,7 @@
 from typing import Final
 
 from bridge.client import connect
+from bridge.discovery import announced_uri
 from posteriors.errors import BadResultError, NoResultError
 from posteriors.listening import posteriors
 from posteriors.posterior import MAX_RESULT, Posterior
@@ -44,7 +45,7 @@ async def show_frames(
     began = False
     async with (
         connect(
-            uri,
+            await announced_uri(uri),
             connect_timeout=settings.connect_timeout,
             retry=True,
             ca_file=settings.ca,

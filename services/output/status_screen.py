@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import asyncio
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import msgspec
 
 from services.errors import SettingsError
-from services.sockets.stack import StackStatus, ask_stack
-from services.sockets.status import BoardStatus, FrameCounts
+from services.sockets.stack import StackStatus, ask_stack, no_run_error
+from services.sockets.status import BoardStatus, FrameCounts, ProcessStatus
 from terminal.errors import ExitCode
 
 if TYPE_CHECKING:
@@ -44,6 +44,7 @@ def screen(stack: StackStatus) -> RenderableType:
         for process in stack.processes
         if (hub := process.hub) is not None
     ]
+    parts += [each for process in stack.processes if process.stages for each in (Text(""), _stages(process))]
     if boards := _boards_by_number(stack):
         parts += [Text(""), _boards(boards)]
     return Group(*parts)
@@ -68,7 +69,7 @@ def _processes(stack: StackStatus) -> Table:
 
     restarts = {peer.name: peer.restarts for process in stack.processes for peer in process.peers}
     table = _table("process", "ready")
-    for heading in ("pid", "up", "restarts", "received", "completed", "per s"):
+    for heading in ("pid", "up", "restarts", "CPU %", "MB", "received", "completed", "per s"):
         table.add_column(heading, justify="right", no_wrap=True)
     table.add_column("last frame", no_wrap=True)
     table.add_column("lost")
@@ -82,10 +83,23 @@ def _processes(stack: StackStatus) -> Table:
             str(process.pid),
             _duration(process.uptime_s),
             "" if known is None else str(known),
+            # the processes of the boat do not report the recent CPU time, and older ones not their memory
+            f"{process.cpu_percent:.1f}" if process.version else "",
+            f"{process.memory_bytes / 1e6:.0f}" if process.memory_bytes else "",
             *map(Text, _counts(process.frames)),
         )
     for silent in stack.silent:
         table.add_row(Text(plain(silent.name)), Text("no answer", "red"))
+    return table
+
+
+def _stages(process: ProcessStatus) -> Table:
+    """Return the latencies of the published frames, the whole first."""
+    table = _table("latency of")
+    for heading in ("p50 ms", "p99 ms", "frames"):
+        table.add_column(heading, justify="right")
+    for stage in sorted(process.stages, key=lambda each: each.stage != "frame"):
+        table.add_row(plain(stage.stage), f"{stage.p50_ms:.3f}", f"{stage.p99_ms:.3f}", str(stage.frames))
     return table
 
 
@@ -109,9 +123,10 @@ def _boards(boards: list[BoardStatus]) -> Table:
 
     table = _table("board", "state", "image", "restarts", "last cycles", "endpoint")
     for board in boards:
+        state = f"{board.state}, {board.damaged} x damaged" if board.damaged else board.state
         table.add_row(
             str(board.index),
-            Text(plain(board.state), "green" if board.state in {"programmed", "blank"} else "red"),
+            Text(plain(state), "green" if board.state in {"programmed", "blank"} else "red"),
             Text(plain(board.image[:12])),
             str(board.restarts),
             "" if board.last_cycles is None else str(board.last_cycles),
@@ -140,7 +155,8 @@ def _boards_by_number(stack: StackStatus) -> list[BoardStatus]:
                 continue
             seen, own = (known, board) if known.image else (board, known)
             restarts = max(seen.restarts, own.restarts)
-            boards[board.index] = msgspec.structs.replace(seen, restarts=restarts)
+            damaged = max(seen.damaged, own.damaged)
+            boards[board.index] = msgspec.structs.replace(seen, restarts=restarts, damaged=damaged)
     return [boards[index] for index in sorted(boards)]
 
 
@@ -169,14 +185,14 @@ def _counts(frames: FrameCounts | None) -> tuple[str, str, str, str, str]:
     )
 
 
-async def show(directory: Path, *, watch: bool, json: bool) -> int:
-    """Print the status of a run, once or every second.
+async def show(directory: Path | None, others: Sequence[Path], *, watch: bool, json: bool) -> int:
+    """Print the status of a run and of other processes, once or every second.
 
     Returns:
         0 if everything is ready, otherwise 6.
 
     Raises:
-        SettingsError: No process answers, and `watch` is false.
+        SettingsError: There is no run, or no process answers, and `watch` is false.
     """
     from rich.console import Console
     from rich.live import Live
@@ -198,10 +214,12 @@ async def show(directory: Path, *, watch: bool, json: bool) -> int:
         live.start()
     try:
         while True:
-            stack = await ask_stack(directory)
+            stack = await ask_stack(directory, others)
             if not stack.processes and not watch:
                 break
             put(stack)
+            if directory is None and not watch:
+                raise no_run_error()
             if not watch:
                 return ExitCode.DONE if stack.ready else ExitCode.CHILD
             await asyncio.sleep(_WATCH_INTERVAL)

@@ -7,6 +7,7 @@ from functools import partial
 from typing import Any
 
 from bridge.client import Ros, State, connect
+from bridge.discovery import announced_uri
 from services.settings import Settings
 from services.sockets.records import Trouble
 from services.sockets.serving import Link
@@ -30,26 +31,26 @@ async def connect_all(
 ) -> dict[str, Ros]:
     """Connect to each server once, and return the connections by URI.
 
-    The URI in the settings replaces all others. Connections are added to `by_uri` as they are created;
-    `options` are those of `connect`.
+    The URI in the settings replaces all others. Connections are added to `by_uri` as they are created, so that
+    the status names a server that is waited for; `options` are those of `connect`.
 
     Raises:
-        BridgeError: A server is unreachable, or is not a rosbridge server.
+        BridgeError: A server is unreachable, is not a rosbridge server, or is not announced.
     """
     by_uri = {} if by_uri is None else by_uri
     for uri in uris:
         if (used := settings.uri or uri) not in by_uri:
-            by_uri[used] = await stack.enter_async_context(
-                connect(
-                    used,
-                    connect_timeout=settings.connect_timeout,
-                    retry=True,
-                    ca_file=settings.ca,
-                    ros_version=settings.ros_version,
-                    on_state=None if on_state is None else partial(on_state, used),
-                    **options,
-                )
+            by_uri[used] = connect(
+                await announced_uri(used),
+                connect_timeout=settings.connect_timeout,
+                retry=True,
+                ca_file=settings.ca,
+                ros_version=settings.ros_version,
+                check_types=False,  # its own messages are right
+                on_state=None if on_state is None else partial(on_state, used),
+                **options,
             )
+            await stack.enter_async_context(by_uri[used])
     return by_uri
 
 

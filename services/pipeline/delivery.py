@@ -16,7 +16,7 @@ CHECK_INTERVAL = 10.0
 
 
 class NotReceivableError(BridgeError):
-    """Raised when nobody can receive the result of a run of one frame."""
+    """Raised if the result of a run of one frame cannot be received."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,11 +30,11 @@ class AdvertisedTopic:
 
 
 async def refusals(topics: Iterable[AdvertisedTopic], *, settled: bool) -> dict[str, str]:
-    """Return why nobody can receive a topic, by the topic's name, as far as rosapi tells.
+    """Return, by topic, why topics cannot be received, as far as rosapi tells.
 
     Args:
         topics: The topics.
-        settled: Whether the servers had the time to make them known.
+        settled: Whether the servers have had time to register them.
     """
     asked = list(topics)
     found = await asyncio.gather(*(_refusal(topic, settled=settled) for topic in asked))
@@ -49,12 +49,12 @@ async def _refusal(topic: AdvertisedTopic, *, settled: bool) -> str:
         return ""
     if known and not same_type(known, topic.type):
         return (
-            f"nobody can receive {topic.name} at {topic.uri}: it is {known[:80]} there, not {topic.type}; "
+            f"{topic.name} cannot be received at {topic.uri}: it is {known[:80]} there, not {topic.type}; "
             "end the other publisher, or build with another output topic"
         )
     if not known and settled:
         return (
-            f"nobody can receive {topic.name} at {topic.uri}: the server does not know it although it was advertised; "
-            f"does its topics_glob allow the topic, and has it {topic.type.partition('/')[0]}?"
+            f"{topic.name} cannot be received at {topic.uri}: the server does not know it although it was advertised; "
+            f"does its topics_glob allow the topic, and does it have {topic.type.partition('/')[0]}?"
         )
     return ""

@@ -11,7 +11,8 @@ import time
 from pcie_shim.endpoint import Endpoint, listen, remove_listener
 from pcie_shim.errors import BoardError, PcieShimError
 from pcie_shim.host.frame import FrameOutput
-from services.boards.deployed import TICK, DeployedBoards
+from services.boards.agreement import DisagreementError
+from services.boards.deployed import DeployedBoards
 from services.boards.frames import frame_failed, result_record
 from services.errors import LocalSocketError, OtherPeerError
 from services.sockets.local_socket import BlockingRecordSocket, check_hello, own_hello
@@ -27,6 +28,7 @@ from services.sockets.records import (
     Switch,
     Trouble,
 )
+from services.sockets.reporting import STUCK_S
 from services.sockets.serving import outdated
 from services.sockets.status import FrameCounts, ProcessStatus, reasons, seconds_since
 from terminal.errors import ExitCode, exit_code_of
@@ -49,6 +51,10 @@ class Progress:
         self.asked = 0
         self.failed = 0
         self.ready: Ready | None = None
+
+    def count_failure(self, error: BoardError) -> None:
+        """Count a frame without a result; `DeployedBoards` counts those whose computations disagree."""
+        self.failed += not isinstance(error, DisagreementError)
 
     def computed(self, number: int, output: FrameOutput) -> None:
         """Count and log a computed frame."""
@@ -78,10 +84,13 @@ class Progress:
             deployment=self._boards.generations.deployment.hash,
             generation=self._boards.generations.number,
             boards=self._boards.status(output),
+            integrity=self._boards.integrity_status(),
             frames=FrameCounts(
                 received=self.asked,
                 completed=self._computed,
-                lost=reasons({LossReason.FAILED: self.failed}),
+                lost=reasons(
+                    {LossReason.FAILED: self.failed, LossReason.WITHHELD: self._boards.disagreements}
+                ),
                 last_number=number or None,
                 last_age_s=seconds_since(tick),
             ),
@@ -99,6 +108,7 @@ class PcieApp:
         self._greeted = False
         self._progress = Progress(boards, log_level)
         self._selector = selectors.DefaultSelector()
+        self._turned = 0.0
 
     @property
     def _deployment(self) -> Deployment:
@@ -119,7 +129,9 @@ class PcieApp:
                 self._progress.ready = Ready(self._boards.open())
                 while True:
                     check_signals()
-                    self._poll(listener, TICK)
+                    self._turned = time.monotonic()
+                    if not self._poll(listener, self._boards.pause):
+                        self._run_canary()
                     self._recover_boards()
             except PcieShimError as error:
                 self._report(listener, Trouble(exit_code_of(error), str(error)))
@@ -130,12 +142,15 @@ class PcieApp:
                 self._master.close()
             remove_listener(self._endpoint, listener)
 
-    def _poll(self, listener: socket.socket, timeout: float) -> None:
-        for key, _ in self._selector.select(timeout):
+    def _poll(self, listener: socket.socket, timeout: float) -> bool:
+        """Handle what arrives within `timeout` seconds, and return whether anything did."""
+        events = self._selector.select(timeout)
+        for key, _ in events:
             if key.fileobj is listener:
                 self._accept(listener)
             else:
                 self._receive()
+        return bool(events)
 
     def _accept(self, listener: socket.socket) -> None:
         connection = BlockingRecordSocket(listener.accept()[0], self._where)
@@ -214,17 +229,35 @@ class PcieApp:
         """Return the status of this process; called from the thread of the status socket."""
         return self._progress.status()
 
+    def is_alive(self) -> bool:
+        """Return whether the boards' thread makes progress; opening the boards has its own limits."""
+        return not self._turned or time.monotonic() - self._turned < STUCK_S
+
     def _compute(self, frame: Frame) -> None:
         progress = self._progress
         progress.asked += 1
+        began = time.monotonic_ns()
         try:
             output = self._boards.run(frame)
         except BoardError as error:
-            progress.failed += 1
+            progress.count_failure(error)
             self._send(frame_failed(frame.number, error))
         else:
-            self._send(result_record(frame.number, output))
+            self._send(result_record(frame.number, output, began))
             progress.computed(frame.number, output)
+            while self._boards.is_canary_owed and self._run_canary():
+                pass
+
+    def _run_canary(self) -> bool:
+        """Run a canary if there are any, and return whether all boards gave the right counts."""
+        if self._boards.canaries is None or self._boards.gone:
+            return False
+        try:
+            self._boards.run_canary()
+        except BoardError as error:
+            self._send(Notice("warning", str(error)))
+            return False
+        return True
 
     def _recover_boards(self) -> None:
         for board in self._boards.recover():

@@ -27,6 +27,7 @@ from services.sockets.records import (
     Rosbridge,
     Switch,
 )
+from services.sockets.reporting import serve_status
 from services.sockets.serving import MakeLink
 from services.sockets.status import (
     FrameCounts,
@@ -34,7 +35,6 @@ from services.sockets.status import (
     connections,
     reasons,
     seconds_since,
-    serve_status,
     why_not_connected,
 )
 from terminal.logs import get_logger
@@ -53,7 +53,7 @@ class Publisher:
         self._generations = Generations(deployment, posterior_layout)
         self._logs_frames = settings.log_level == "debug"
         self._log = get_logger(ROLE, settings.log_level)
-        self._run_directory = settings.run_directory
+        self._settings = settings
         self._where = ""
         self._outcomes: Counter[Outcome] = Counter()
         self._last = (0, 0)
@@ -180,7 +180,9 @@ class Publisher:
 
     async def run(self) -> int:
         """Serve until a signal, or raise a BridgeError if a server is unreachable or not a rosbridge server."""
-        async with self._link, serve_status(self._run_directory, ROLE, self.status):
+        settings = self._settings
+        status = serve_status(settings.run_directory, ROLE, self.status, metrics=settings.metrics)
+        async with self._link, status:
             try:
                 async with self._topics.opened(self._state_changed) as where:
                     await self._check_delivery(settled=False)

@@ -8,7 +8,7 @@ import time
 import msgspec
 
 from bridge.client import Message, Ros, State, Subscription
-from bridge.errors import BridgeError, NoMessageError
+from bridge.errors import BridgeError, NoMessageError, TopicLeftOutError
 from bridge.names import absolute
 from services.errors import RosbridgeLostError, VariableError
 from services.pipeline.connections import connect_all, reconnect_now, report_failure
@@ -31,6 +31,7 @@ from services.sockets.records import (
     Switched,
     Unusable,
 )
+from services.sockets.reporting import serve_status
 from services.sockets.serving import MakeLink
 from services.sockets.status import (
     FrameCounts,
@@ -38,7 +39,6 @@ from services.sockets.status import (
     connections,
     reasons,
     seconds_since,
-    serve_status,
     why_not_connected,
 )
 from terminal.logs import get_logger
@@ -87,6 +87,7 @@ class Subscriber:
         self._link = link(self._take)
         self._lost: asyncio.Future[None] | None = None
         self._rosbridges: dict[str, Ros] = {}
+        self._subscriptions: list[Subscription] = []
         self._received = self._completed = self._unusable = 0
         self._passed_over = self._passed_over_sent = 0
         self._unpaired_before_reload = self._unpaired_sent = 0
@@ -155,6 +156,7 @@ class Subscriber:
                 lost=reasons(
                     {
                         LossReason.PASSED_OVER: self._passed_over,
+                        LossReason.TOO_LARGE: sum(each.discarded for each in self._subscriptions),
                         LossReason.UNUSABLE: self._unusable,
                         LossReason.UNPAIRED: self._unpaired,
                     }
@@ -189,7 +191,7 @@ class Subscriber:
         settings = self._settings
         sources = self._deployment.sources
         self._lost = asyncio.get_running_loop().create_future()
-        status = serve_status(settings.run_directory, ROLE, self.status)
+        status = serve_status(settings.run_directory, ROLE, self.status, metrics=settings.metrics)
         async with self._link, status, contextlib.AsyncExitStack() as stack:
             try:
                 uris = [source.uri for source in sources]
@@ -233,7 +235,9 @@ class Subscriber:
             queue_length=0 if self._queue_all else 1,
             queue_size=RECEIVED_QUEUE,
             compression=source.compression,
+            max_bytes=self._settings.topic_bytes or source.topic_bytes,
         )
+        self._subscriptions.append(subscription)
         timeout = self._settings.first_data_timeout
         hint = asyncio.ensure_future(self._hint(ros, source))
         first, silent = True, False
@@ -248,6 +252,12 @@ class Subscriber:
                 self._link.notice("warning", str(error))
                 silent = True
                 continue
+            except TopicLeftOutError as error:
+                if self._assembler.needs(at):
+                    raise
+                self._link.notice("warning", f"{error}; frames go on without it")
+                hint.cancel()
+                return
             if silent:
                 self._link.notice("info", f"messages of {source.topic} are back")
             first = silent = False
@@ -262,7 +272,7 @@ class Subscriber:
             self._read(at, message)
 
     async def _hint(self, ros: Ros, source: Source) -> None:
-        """Report a topic that nobody publishes, with topics of similar names, since it may be mistyped."""
+        """Report a topic without a publisher, and topics with similar names, since it may be mistyped."""
         await asyncio.sleep(_HINT_AFTER)
         if await ros.publishers(source.topic) != []:
             return  # or the server has no rosapi

@@ -58,7 +58,7 @@ class _Topic(Generic[Item]):
         near = min(self.waiting, key=lambda each: abs(each.stamp - stamp), default=None)
         return near if near is not None and abs(near.stamp - stamp) <= reach else None
 
-    def may_bring(self, stamp: int, reach: int) -> bool:
+    def may_complete(self, stamp: int, reach: int) -> bool:
         """Return whether the next message may be within `reach` of a stamp, according to the period."""
         if self.newest is None:
             return True
@@ -99,7 +99,7 @@ class Synchroniser(Generic[Item]):
         topic = self._topics[at]
         if topic.newest is not None:
             if stamp < topic.newest - self._tolerance:
-                self._begin_again()
+                self._restart()
             elif stamp > topic.newest:
                 topic.intervals.append(stamp - topic.newest)
         topic.newest, topic.heard = stamp, tick
@@ -127,7 +127,7 @@ class Synchroniser(Generic[Item]):
             self._drop(topic, len(topic.waiting))
         self.deadline = None
 
-    def _begin_again(self) -> None:
+    def _restart(self) -> None:
         """Forget the stamps of all topics, because a bag or a simulation has restarted."""
         self.forget()
         self._done = -1
@@ -163,7 +163,7 @@ class Synchroniser(Generic[Item]):
             if near is not None:
                 chosen[other] = near
                 reach = abs(near.stamp - pivot.stamp)
-            if topic.is_alive(tick, self._begun or 0) and topic.may_bring(pivot.stamp, reach):
+            if topic.is_alive(tick, self._begun or 0) and topic.may_complete(pivot.stamp, reach):
                 expected.append(other)
         # The first message of each needed topic completed the set; a nearer, later one does not prolong the
         # wait.

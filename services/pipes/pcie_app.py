@@ -7,12 +7,13 @@ import numpy as np
 
 from pcie_shim.errors import FrameInputError
 from pcie_shim.host.frame import FrameOutput
+from services.boards.canaries import DamagedBoardError
 from services.boards.deployed import DeployedBoards
 from services.errors import InputLineError
 from services.pipeline.inference import REASON_WORDS
 from services.pipes.lines import blocking_lines, decoded
 from services.sockets.records import Addresses, Frame
-from terminal.output import print_json_line, say
+from terminal.output import print_json_line, say, say_if_slow
 
 
 class LineReading(msgspec.Struct):
@@ -38,7 +39,9 @@ def compute_lines(boards: DeployedBoards, banks: int) -> int:
         InputLineError: A line is not a reading for this deployment.
         BoardError: A board failed.
     """
-    say(boards.open())
+    with say_if_slow("waiting for the boards"):
+        opened = boards.open()
+    say(opened)
     try:
         for number, line in blocking_lines():
             reading = reading_from_line(line, number)
@@ -49,9 +52,22 @@ def compute_lines(boards: DeployedBoards, banks: int) -> int:
             except FrameInputError as error:
                 raise InputLineError(f"line {number} of standard input: {error}") from error
             print_json_line(_line(number, output, reading.stamp_ns))
+            while boards.is_canary_owed:
+                _run_canary(boards)
     finally:
         boards.close()
     return 0
+
+
+def _run_canary(boards: DeployedBoards) -> None:
+    """Run a canary; a damaged board is programmed again, once, before the next line is read."""
+    try:
+        boards.run_canary()
+    except DamagedBoardError as error:
+        say(str(error))
+        boards.recover()
+        if boards.gone:
+            raise
 
 
 def _line(number: int, output: FrameOutput, stamp_ns: int | None) -> dict[str, Any]:

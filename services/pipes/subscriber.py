@@ -11,7 +11,7 @@ from services.pipeline.subscriber import RECEIVED_QUEUE
 from services.pipeline.timed_frames import TimedFrames
 from services.settings import Settings
 from services.sockets.records import Reading
-from terminal.output import print_json_line
+from terminal.output import print_json_line, say
 from toolchain.deployment import Deployment, Source
 
 
@@ -31,7 +31,10 @@ async def print_variables(settings: Settings, source: Source, names: list[str], 
         max_size=settings.message_bytes,
         ros_version=settings.ros_version,
     ) as ros:
-        subscription = ros.subscribe(source.topic, source.type, queue_size=RECEIVED_QUEUE)
+        subscription = ros.subscribe(
+            source.topic, source.type, queue_size=RECEIVED_QUEUE, max_bytes=settings.topic_bytes
+        )
+        say(f"listening on {source.topic} at {source.uri}")
         printed = 0
         while count is None or printed < count:
             message = await subscription.next(timeout=settings.first_data_timeout)
@@ -80,11 +83,17 @@ async def print_addresses(settings: Settings, deployment: Deployment, count: int
 
         async def follow(at: int, source: Source) -> None:
             subscription = by_uri[settings.uri or source.uri].subscribe(
-                source.topic, source.type, queue_size=RECEIVED_QUEUE, compression=source.compression
+                source.topic,
+                source.type,
+                queue_size=RECEIVED_QUEUE,
+                compression=source.compression,
+                max_bytes=settings.topic_bytes or source.topic_bytes,
             )
             while True:
                 frames.add(at, await subscription.next(timeout=settings.first_data_timeout))
 
+        for source in deployment.sources:
+            say(f"listening on {source.topic} at {settings.uri or source.uri}")
         tasks = [asyncio.ensure_future(follow(at, source)) for at, source in enumerate(deployment.sources)]
         try:
             ended, _ = await asyncio.wait([*tasks, finished], return_when=asyncio.FIRST_COMPLETED)

@@ -15,9 +15,9 @@ import msgspec
 from pcie_shim.endpoint import Endpoint, listen, remove_listener
 from pcie_shim.errors import PcieShimError
 from services.errors import ControlError, NotReloadedError, ReportedError
-from services.supervision.private_directory import CONTROL_SUFFIX
 from terminal.errors import ExitCode, exit_code_of
 from terminal.output import say
+from terminal.private_directory import CONTROL_SUFFIX
 
 ORDER_LIMIT = 1 << 14
 """Maximum size of an order in bytes, with room for a path of 4096 escaped characters."""

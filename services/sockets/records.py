@@ -20,8 +20,12 @@ class LossReason(StrEnum):
     """Replaced by a newer reading (`queue = latest`)."""
     UNPAIRED = "unpaired"
     """No message arrived on another topic within the tolerance."""
+    TOO_LARGE = "too large"
+    """Above the limit of its topic (`topic_bytes`)."""
     UNUSABLE = "with an unusable variable"
     FAILED = "failed on a board"
+    WITHHELD = "withheld"
+    """Its two computations disagreed (`integrity = twice`)."""
     WITH_APP = "lost with pcie-app"
     WITH_PUBLISHER = "lost with the publisher"
     IN_RELOAD = "lost in a reload"
@@ -50,6 +54,8 @@ class FailureReason(StrEnum):
     """A board failed while it computed the frame."""
     AWAY = "away"
     """A board that failed an earlier frame is not back yet."""
+    WITHHELD = "withheld"
+    """The two computations of the frame disagree, so its result is not used."""
 
 
 class Record(msgspec.Struct, array_like=True, frozen=True):
@@ -153,7 +159,8 @@ class Frame(Record, tag="frame", frozen=True):
 class FrameResult(Record, tag="result", frozen=True):
     """pcie-app to master: the results of the boards, and durations.
 
-    `boards` is a list of `pcie_shim.host.frame.BoardResult`, which only its sender and the publisher read.
+    `boards` is a list of `pcie_shim.host.frame.BoardResult`, which only its sender and the publisher read;
+    `began_tick` is the begin of the register writes.
     """
 
     number: int
@@ -162,6 +169,7 @@ class FrameResult(Record, tag="result", frozen=True):
     compute_ns: int
     reads_ns: int
     boards_compute_ns: int
+    began_tick: int = 0
 
 
 class FrameFailed(Record, tag="failed", frozen=True):
@@ -190,7 +198,8 @@ class Published(Record, tag="published", frozen=True):
 
     `seen` is whether it was seen on the wire (None if that was not checked). `best_line` has `best_probability`;
     `total_ns` is the time from the reading's receipt to the result's sending. `missed` counts the outputs, of several,
-    whose servers were away.
+    whose servers were away. `out_ns` is the duration of publishing, `boards` has the cycles and the stop
+    reason of each board.
     """
 
     number: int
@@ -201,6 +210,8 @@ class Published(Record, tag="published", frozen=True):
     cycles: int
     total_ns: int
     missed: int = 0
+    out_ns: int = 0
+    boards: list[tuple[int, int]] = []
 
 
 class Prepare(Record, tag="prepare", frozen=True):

@@ -223,13 +223,18 @@ def deployment_for(settings: Settings, *, images: bool = False) -> Deployment:
 def board_endpoints(settings: Settings, deployment: Deployment) -> list[Endpoint]:
     """Return the endpoints of the boards: those in the settings, otherwise those of the deployment.
 
+    A folder, `unix:/folder/`, stands for all boards that `board --directory` runs there.
+
     Raises:
         SettingsError: A board has no endpoint, or there are too few or too many.
     """
     texts = settings.boards or tuple(board.endpoint for board in deployment.boards)
+    if len(texts) == 1 and texts[0].startswith("unix:") and texts[0].endswith("/"):
+        texts = tuple(f"{texts[0]}board{at}.sock" for at in range(len(deployment.boards)))
     if len(texts) != len(deployment.boards):
         raise SettingsError(
-            f"--boards names {len(texts)} of the deployment's {len(deployment.boards)} boards; name each once, in the order of the partitions"
+            f"--boards (or BM_BOARDS) names {len(texts)} board(s), and {deployment.directory} has {len(deployment.boards)}; "
+            "name each once, in the order of the partitions, or a folder as unix:/folder/ with a slash at its end"
         )
     if not all(texts) and any(texts):
         raise SettingsError(

@@ -3,15 +3,19 @@
 import asyncio
 import os
 import tempfile
+from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
+from datetime import datetime, timedelta
 from pathlib import Path
+from typing import NamedTuple
 
 import msgspec
 
 from services.errors import SettingsError
 from services.sockets.status import ProcessStatus, read_process_status
-from services.supervision.private_directory import DIRECTORY_PREFIX
 from terminal.health import SUFFIX, NoHealthError
+from terminal.one_line import shown
+from terminal.private_directory import DIRECTORY_PREFIX
 
 ANSWER_TIME = 1.0
 """Seconds in which all processes must answer."""
@@ -35,8 +39,22 @@ class StackStatus(msgspec.Struct, frozen=True, kw_only=True):
     silent: list[SilentProcess]
 
 
+class Found(NamedTuple):
+    """The private directory of a run, if any, and those of processes that belong to no run, such as a hub."""
+
+    run: Path | None
+    others: list[Path]
+
+    @property
+    def only_run(self) -> Path:
+        """The run, or a SettingsError if there is none."""
+        if self.run is None:
+            raise no_run_error()
+        return self.run
+
+
 def run_directories() -> list[Path]:
-    """Return the private directories of the user's runs, alive or dead, sorted by name."""
+    """Return the private directories of this user's processes, alive or dead, sorted by name."""
     places = {Path(tempfile.gettempdir())}
     if runtime := os.environ.get("XDG_RUNTIME_DIR"):
         places.add(Path(runtime))
@@ -46,9 +64,9 @@ def run_directories() -> list[Path]:
 
 
 def _is_own_directory(path: Path) -> bool:
-    """Return whether a directory belongs to this user, even if it disappears or is inaccessible."""
+    """Return whether a directory belongs to this user, even if it disappears; a link may be of another user."""
     try:
-        return path.is_dir() and path.stat().st_uid == os.getuid()
+        return path.is_dir() and not path.is_symlink() and path.stat().st_uid == os.getuid()
     except OSError:
         return False
 
@@ -73,12 +91,17 @@ def _sort_key(name: str) -> tuple[int, int, str]:
     return len(_ORDER), int(digits) if digits.isascii() and digits.isdigit() else 1 << 30, name
 
 
-async def ask_stack(directory: Path) -> StackStatus:
-    """Return the status of the processes in a run directory, queried in parallel, within about a second."""
-    paths = _status_sockets(directory)
+async def ask_stack(directory: Path | None, others: Iterable[Path] = ()) -> StackStatus:
+    """Return the status of the processes in a run directory, queried in parallel, within about a second.
+
+    Of the `others`, only those that answer are included.
+    """
+    paths = _status_sockets(directory) if directory is not None else []
+    more = [path for other in others for path in _status_sockets(other)]
     loop = asyncio.get_running_loop()
-    with ThreadPoolExecutor(max(1, len(paths))) as pool:
-        answers = await asyncio.gather(*(loop.run_in_executor(pool, _ask, path) for path in paths))
+    with ThreadPoolExecutor(max(1, len(paths) + len(more))) as pool:
+        asked = await asyncio.gather(*(loop.run_in_executor(pool, _ask, path) for path in [*paths, *more]))
+    answers = asked[: len(paths)] + [each for each in asked[len(paths) :] if isinstance(each, ProcessStatus)]
     processes = [each for each in answers if isinstance(each, ProcessStatus)]
     silent = [each for each in answers if isinstance(each, SilentProcess)]
     answered = {each.name for each in answers}
@@ -93,7 +116,7 @@ async def ask_stack(directory: Path) -> StackStatus:
     why = [f"{each.name}: {each.why}" for each in processes if not each.ready]
     why += [f"{each.name}: {each.why}" for each in silent]
     return StackStatus(
-        directory=str(directory),
+        directory=str(directory) if directory is not None else "no run",
         ready=bool(processes) and not why,
         why=why,
         processes=processes,
@@ -101,19 +124,52 @@ async def ask_stack(directory: Path) -> StackStatus:
     )
 
 
-async def find_run() -> Path:
-    """Return the private directory of the user's only living run, or raise a SettingsError."""
+async def find_run(name: str | None = None) -> Found:
+    """Return the user's only living run, or the one with this name, and the processes without a run.
+
+    Raises:
+        SettingsError: There is no such run, or there are several, or no process at all.
+    """
     found = run_directories()
-    stacks = [await ask_stack(path) for path in found]
-    alive = [path for path, stack in zip(found, stacks, strict=True) if stack.processes]
+    stacks = dict(zip(found, await asyncio.gather(*(ask_stack(path) for path in found)), strict=True))
+    alive = {path: stack for path, stack in stacks.items() if stack.processes}
+    runs = [path for path in alive if (path / f"master{SUFFIX}").exists()]
+    others = [path for path in alive if path not in runs]
     dead = [str(path) for path in found if path not in alive]
     remark = f" (left behind by runs that were killed: {', '.join(dead)})" if dead else ""
-    if not alive:
-        raise SettingsError(
-            f"no run of this user was found{remark}; start a master, or name the folder of the status sockets with --directory"
-        )
-    if len(alive) > 1:
-        raise SettingsError(
-            f"{len(alive)} runs of this user are alive: {', '.join(map(str, alive))}; choose one with --directory{remark}"
-        )
-    return alive[0]
+    known = "; ".join(f"{run_name(path)} ({_described(alive[path])})" for path in runs)
+    if name is not None:
+        chosen = [path for path in runs if run_name(path) == name]
+        if not chosen:
+            raise SettingsError(
+                f"--run {shown(name)} is not a living run of this user: {known or 'there is none'}{remark}"
+            )
+        return Found(chosen[0], others)
+    if len(runs) > 1:
+        raise SettingsError(f"{len(runs)} runs of this user are alive: {known}; choose one with --run NAME")
+    if runs:
+        return Found(runs[0], others)
+    if others:
+        return Found(None, others)
+    raise no_run_error(remark)
+
+
+def no_run_error(remark: str = "") -> SettingsError:
+    """Return the error that there is no run."""
+    return SettingsError(
+        f"no run of this user was found{remark}; start a master, or name the folder of the status sockets with --directory"
+    )
+
+
+def run_name(directory: Path) -> str:
+    """Return the name of a run: the end of its private directory's name."""
+    return directory.name.removeprefix(DIRECTORY_PREFIX)
+
+
+def _described(stack: StackStatus) -> str:
+    """Return the start and the deployment of a run."""
+    for process in stack.processes:
+        if process.name == "master":
+            started = datetime.now().astimezone() - timedelta(seconds=process.uptime_s)
+            return f"since {started:%Y-%m-%d %H:%M:%S}, {shown(process.folder)}"
+    return "its master does not answer"

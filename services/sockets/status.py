@@ -1,31 +1,18 @@
-"""Status of a process: its records, reported on and read from its status socket (`terminal.health`).
-
-Processing of frames only updates counters; everything else happens when a status is requested.
-"""
+"""Status of a process: its records, read from its status socket (`terminal.health`)."""
 
 from __future__ import annotations
 
-import contextlib
-import os
 import time
-from collections import deque
-from collections.abc import AsyncIterator, Callable, Iterator, Mapping
-from pathlib import Path
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, TypeVar
 
 import msgspec
 
-from services.errors import SettingsError
-from services.sockets.records import VERSION
-from services.supervision.parent import leave_private_directory
-from terminal.health import foreign_socket_error, read_status, serve_health, serve_health_in_thread
+from terminal.health import foreign_socket_error, read_status
 
 if TYPE_CHECKING:
     # boards and pcie-app start without importing the bridge
     from bridge.client import Ros
-
-_SAMPLES = 6
-"""Number of samples, one per second: a rate covers the last five seconds."""
 
 
 class ConnectionStatus(msgspec.Struct, frozen=True):
@@ -57,7 +44,10 @@ class FrameCounts(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class BoardStatus(msgspec.Struct, frozen=True, kw_only=True):
-    """A board: `state` is starting, blank, programmed, or gone (as seen by pcie-app)."""
+    """A board: `state` is starting, blank, programmed, or gone (as seen by pcie-app).
+
+    `damaged` counts how often it gave wrong counts for a canary (pcie-app).
+    """
 
     index: int
     endpoint: str
@@ -66,6 +56,22 @@ class BoardStatus(msgspec.Struct, frozen=True, kw_only=True):
     restarts: int = 0
     last_cycles: int | None = None
     why: str = ""
+    damaged: int = 0
+
+
+class IntegrityStatus(msgspec.Struct, frozen=True, kw_only=True):
+    """Detection of wrong counts: `kind` is canary or twice, `frames` the setting `integrity_frames`.
+
+    `walk` is the number of canaries that select every address, `canaries` the number of right ones so far,
+    `damaged` the number of wrong ones, and `withheld` the frames whose two computations disagreed.
+    """
+
+    kind: str
+    frames: int
+    walk: int
+    canaries: int
+    damaged: int
+    withheld: int
 
 
 class PeerStatus(msgspec.Struct, frozen=True, kw_only=True):
@@ -76,6 +82,25 @@ class PeerStatus(msgspec.Struct, frozen=True, kw_only=True):
     pid: int
     restarts: int
     ready: bool
+
+
+BUCKETS_S = tuple(digit * 10.0**exponent for exponent in range(-5, 1) for digit in (1, 2, 5))[:17]
+"""Upper bounds of the buckets of a latency in seconds, from 10 us to 2 s; the last bucket has none."""
+
+
+class StageLatency(msgspec.Struct, frozen=True, kw_only=True):
+    """The latencies of a stage of frames; `frame` is the stage that stands for all others.
+
+    `p50_ms` and `p99_ms` are quantiles over the last 1000 published frames. `frames`, `sum_s` and `buckets`
+    cover all of them: a bucket has the number of frames up to its bound in `BUCKETS_S`, without those below.
+    """
+
+    stage: str
+    p50_ms: float
+    p99_ms: float
+    frames: int
+    sum_s: float
+    buckets: list[int]
 
 
 class HubStatus(msgspec.Struct, frozen=True):
@@ -89,6 +114,9 @@ class HubStatus(msgspec.Struct, frozen=True):
 class ProcessStatus(msgspec.Struct, frozen=True, kw_only=True):
     """A process. `why` gives the cause while it is not ready, and its state when it is.
 
+    `cpu_s` is its user and system time so far, `cpu_percent` that of the last seconds (100 is one core), and
+    `memory_bytes` its resident memory.
+
     `deployment` is the hash of the deployment in force, `generation` the number of changes since the start of
     the run, and `folder` the folder from which the master has read it.
     """
@@ -99,6 +127,9 @@ class ProcessStatus(msgspec.Struct, frozen=True, kw_only=True):
     pid: int = 0
     version: str = ""
     uptime_s: float = 0.0
+    cpu_s: float = 0.0
+    cpu_percent: float = 0.0
+    memory_bytes: int = 0
     deployment: str = ""
     generation: int = 0
     folder: str = ""
@@ -107,11 +138,11 @@ class ProcessStatus(msgspec.Struct, frozen=True, kw_only=True):
     boards: list[BoardStatus] = msgspec.field(default_factory=list)
     peers: list[PeerStatus] = msgspec.field(default_factory=list)
     hub: HubStatus | None = None
+    stages: list[StageLatency] = msgspec.field(default_factory=list)
+    integrity: IntegrityStatus | None = None
 
 
 Reason = TypeVar("Reason", bound=str)
-GetStatus = Callable[[], ProcessStatus]
-"""Function that returns the status of a process; identity and rate are added here."""
 
 
 def seconds_since(tick: int) -> float | None:
@@ -130,6 +161,8 @@ def why_not_connected(rosbridges: Mapping[str, Ros]) -> str:
         return "waiting for the rosbridge server"
     for uri, ros in rosbridges.items():
         if ros.state != "connected":
+            if uri in ros.last_error:
+                return f"waiting for the rosbridge server: {ros.last_error}"
             reason = f" ({ros.last_error})" if ros.last_error else ""
             return f"waiting for the rosbridge server at {uri}{reason}"
     return ""
@@ -138,67 +171,6 @@ def why_not_connected(rosbridges: Mapping[str, Ros]) -> str:
 def reasons(counts: Mapping[Reason, int]) -> dict[str, int]:
     """Return the counts that are not 0."""
     return {reason: count for reason, count in dict(counts).items() if count}
-
-
-class _Answerer:
-    """Source of the JSON object: status of the process, identity, and rate from samples."""
-
-    def __init__(self, name: str, get_status: GetStatus) -> None:
-        self._name = name
-        self._get_status = get_status
-        self._started = time.monotonic()
-        self._samples: deque[tuple[float, int]] = deque(maxlen=_SAMPLES)
-
-    def sample(self) -> None:
-        frames = self._get_status().frames
-        if frames is not None:
-            self._samples.append((time.monotonic(), frames.completed))
-
-    def answer(self) -> bytes:
-        status = self._get_status()
-        frames = status.frames
-        if frames is not None and self._samples:
-            at, count = self._samples[0]
-            elapsed = time.monotonic() - at
-            rate = (frames.completed - count) / elapsed if elapsed > 0 else 0.0
-            frames = msgspec.structs.replace(frames, rate=round(rate, 1))
-        whole = msgspec.structs.replace(
-            status,
-            name=self._name,
-            pid=os.getpid(),
-            version=VERSION,
-            uptime_s=round(time.monotonic() - self._started, 3),
-            frames=frames,
-        )
-        return msgspec.json.encode(whole)
-
-
-def _check(directory: Path | None) -> None:
-    if directory is not None and not directory.is_dir():
-        raise SettingsError(
-            f"BM_RUN_DIRECTORY: {directory} is not a folder; create it, or name an existing one"
-        )
-
-
-@contextlib.asynccontextmanager
-async def serve_status(directory: Path | None, name: str, get_status: GetStatus) -> AsyncIterator[None]:
-    """Answer in the running loop within the context; do nothing without a directory, which must exist."""
-    _check(directory)
-    answerer = _Answerer(name, get_status)
-    async with serve_health(directory, name, answerer.answer, answerer.sample):
-        yield
-
-
-@contextlib.contextmanager
-def serve_status_in_thread(directory: Path | None, name: str, get_status: GetStatus) -> Iterator[None]:
-    """Answer from a thread within the context, for a process with one blocking thread."""
-    _check(directory)
-    answerer = _Answerer(name, get_status)
-    try:
-        with serve_health_in_thread(directory, name, answerer.answer, answerer.sample):
-            yield
-    finally:
-        leave_private_directory()
 
 
 def read_process_status(path: str, timeout: float) -> ProcessStatus:

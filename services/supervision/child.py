@@ -13,9 +13,9 @@ from pathlib import Path
 
 from services.errors import ReportedError, StackError
 from services.supervision.parent import DIRECTORY_VARIABLE
-from terminal.ending import PARENT_VARIABLE
 from terminal.errors import ExitCode
-from terminal.output import say
+from terminal.log_line import PARENT_VARIABLE
+from terminal.output import relay
 
 RUN_DIRECTORY_VARIABLE = "BM_RUN_DIRECTORY"
 """Environment variable with the folder of status sockets (the setting `run_directory`)."""
@@ -35,7 +35,7 @@ def own_command(name: str) -> list[str]:
     return [str(beside)] if beside.exists() else [shutil.which(name) or name]
 
 
-def how_it_ended(code: int | None) -> str:
+def describe_exit(code: int | None) -> str:
     """Return a text for an exit code: the signal that killed the process, or the code itself."""
     if code is not None and code < 0:
         try:
@@ -126,7 +126,7 @@ class Child:
         code = self.exit_code
         if self._errors:
             return ReportedError(code if code and code > 0 else ExitCode.CHILD, self._errors[-1])
-        return ReportedError(ExitCode.CHILD, f"{self.name} {how_it_ended(code)}")
+        return ReportedError(ExitCode.CHILD, f"{self.name} {describe_exit(code)}")
 
     def may_restart(self) -> bool:
         """Count a restart; return whether the limit per minute permits it."""
@@ -177,7 +177,7 @@ class Child:
             if text.startswith("error: "):
                 self._errors.append(text.removeprefix("error: "))
             elif text:
-                say(text)
+                relay(text, self.name)
 
 
 async def end_all(children: Iterable[Child], stop_timeout: float) -> list[str]:

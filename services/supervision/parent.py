@@ -9,8 +9,8 @@ import signal
 import time
 from pathlib import Path
 
-from services.supervision.private_directory import COPY_PREFIX, has_master, remove_stale_sockets
-from terminal.ending import PARENT_VARIABLE
+from terminal.log_line import PARENT_VARIABLE
+from terminal.private_directory import COPY_PREFIX, has_master, remove_stale_sockets
 from terminal.signals import stopped_error
 
 DIRECTORY_VARIABLE = "ROSBAYES_DIRECTORY"
@@ -55,7 +55,7 @@ def leave_private_directory() -> None:
         return
     directory = Path(name)
     deadline = time.monotonic() + _DYING_TIME
-    while _is_dying(os.environ.get(PARENT_VARIABLE, "")) and time.monotonic() < deadline:
+    while _has_dying_threads(os.environ.get(PARENT_VARIABLE, "")) and time.monotonic() < deadline:
         time.sleep(0.001)
     remove_stale_sockets(directory)
     if not has_master(directory):
@@ -65,7 +65,7 @@ def leave_private_directory() -> None:
         directory.rmdir()
 
 
-def _is_dying(process: str) -> bool:
+def _has_dying_threads(process: str) -> bool:
     """Return whether a killed process still has threads, until whose end it keeps its locks and sockets."""
     try:
         zombie = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] == "Z"

@@ -78,7 +78,7 @@ def test_importing_this_imports_no_zeroconf() -> None:
 
 
 def _announced(**properties: Any) -> Any:
-    """What zeroconf makes of an announcement."""
+    """Return an announcement as read by zeroconf."""
     said: dict[str, Any] = {
         "name": f"Robot.{discovery.SERVICE_TYPE}",
         "port": 9090,

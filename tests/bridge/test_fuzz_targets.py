@@ -1,4 +1,4 @@
-"""What scripts/fuzz plays, with generated input, and with every input that ever failed (tests/bridge/findings)."""
+"""Targets of scripts/fuzz, run with generated input and every input that ever failed (findings/)."""
 
 from pathlib import Path
 

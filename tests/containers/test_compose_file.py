@@ -15,7 +15,10 @@ ROOT = Path(__file__).resolve().parents[2]
 COMPOSE = YAML(typ="safe").load(ROOT / "compose.yaml")
 SERVICES = COMPOSE["services"]
 COMMANDS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
-BOARDS = sorted(name for name in SERVICES if name.startswith("board"))
+ENDING = {"check"}
+"""Services that end before the others start."""
+WATCHED = [name for name in SERVICES if name not in ENDING | {"viewer"}]
+ALL_BUT_ENDING = [name for name in SERVICES if name not in ENDING]
 
 every_service = pytest.mark.parametrize("name", SERVICES)
 
@@ -52,13 +55,20 @@ def test_limited(name):
     assert set(service["logging"]["options"]) == {"max-size", "max-file"}
 
 
-@every_service
-def test_watched_and_ended_in_time(name):
+@pytest.mark.parametrize("name", WATCHED)
+def test_watched(name):
     service = SERVICES[name]
-    assert service["healthcheck"]["test"] == ["CMD", "python", "-m", "services.ready", name]
+    process = "board0" if name == "boards" else name
+    assert service["healthcheck"]["test"] == ["CMD", "python", "-m", "services.ready", process]
     assert {"interval", "timeout", "retries", "start_period", "start_interval"} <= set(service["healthcheck"])
-    assert service["environment"]["BM_RUN_DIRECTORY"] == "/run/rosbayes/status"
-    assert "status:/run/rosbayes/status" in service["volumes"]
+    directory = "/run/rosbayes/${COMPOSE_PROJECT_NAME}"  # `status` shows it, so two stacks can be told apart
+    assert service["environment"]["BM_RUN_DIRECTORY"] == directory
+    assert f"status:{directory}" in service["volumes"]
+
+
+@pytest.mark.parametrize("name", ALL_BUT_ENDING)
+def test_ended_in_time(name):
+    service = SERVICES[name]
     assert service["stop_grace_period"] == "5s"
     assert service["restart"] == "unless-stopped"
     assert service["init"] is True  # a process that is 1 would not hear SIGTERM before it has its handlers
@@ -68,7 +78,7 @@ def test_watched_and_ended_in_time(name):
 def test_its_command_exists_and_its_variables_are_settings(name):
     command = SERVICES[name]["command"].split()[0]
     assert command in COMMANDS
-    assert command == name or name in BOARDS
+    assert command == {"boards": "board", "viewer": "listen", "check": "master"}.get(name, name)
     known = {ENV_PREFIX + field.upper() for field in Settings.model_fields}
     assert {key for key in SERVICES[name]["environment"] if key.startswith(ENV_PREFIX)} <= known
 
@@ -76,7 +86,7 @@ def test_its_command_exists_and_its_variables_are_settings(name):
 def test_one_image():
     assert {service["image"] for service in SERVICES.values()} == {"rosbayes"}
     built = [name for name, service in SERVICES.items() if "build" in service]
-    assert built == ["master"]
+    assert built == ["check"]
     assert all(service["pull_policy"] == "never" for name, service in SERVICES.items() if name not in built)
 
 
@@ -106,13 +116,21 @@ def test_ways_out():
         assert networks_of(name) | networks_of(name, **robot, BM_BOARDS="tcp://far:7000") <= declared
 
 
-def test_only_the_four_share_the_sockets():
+@pytest.mark.parametrize(
+    ("volume", "services"),
+    [("sockets", {"master", "subscriber", "publisher", "pcie-app"}), ("boards", {"boards", "pcie-app"})],
+)
+def test_only_these_share_the_sockets(volume, services):
     sharing = {
         name
         for name, service in SERVICES.items()
-        if any("sockets:" in str(each) for each in service["volumes"])
+        if any(str(each).startswith(f"{volume}:") for each in service["volumes"])
     }
-    assert sharing == {"master", "subscriber", "publisher", "pcie-app"}
+    assert sharing == services
+    assert volume in COMPOSE["volumes"]
+
+
+def test_sockets_are_the_users_own():
     for volume in COMPOSE["volumes"].values():
         assert "uid=10001" in volume["driver_opts"]["o"]
         assert "mode=0700" in volume["driver_opts"]["o"]
@@ -143,39 +161,66 @@ def test_who_may_be_missing_is_not_required():
 
 
 def test_boards_are_those_of_the_deployment():
-    partitions = re.search(r"--partitions (\d+)", (ROOT / "Dockerfile").read_text())
-    assert len(BOARDS) == int(partitions[1])
-    default = filled(SERVICES["pcie-app"]["environment"]["BM_BOARDS"])
-    assert default == ",".join(f"tcp://{board}:7000" for board in BOARDS)
-    for index, board in enumerate(BOARDS):
-        assert SERVICES[board]["command"] == f"board --listen tcp://0.0.0.0:7000 --insecure --index {index}"
+    settings = SERVICES["boards"]["environment"]
+    command, _, directory = SERVICES["boards"]["command"].split()
+    assert command == "board"
+    assert filled(settings["BM_BOARDS"]) == f"unix:{directory}/"
+    assert SERVICES["pcie-app"]["environment"]["BM_DEPLOYMENT"] == settings["BM_DEPLOYMENT"]
+
+
+def test_a_stack_that_cannot_start_ends():
+    assert SERVICES["check"]["command"] == "master --check"
+    assert SERVICES["check"]["restart"] == "no"
+    assert SERVICES["check"]["environment"].items() <= SERVICES["master"]["environment"].items()
+
+    def awaited(name):
+        needed = SERVICES[name].get("depends_on", {})
+        return needed.keys() | {each for need in needed for each in awaited(need)}
+
+    for name in ALL_BUT_ENDING:
+        assert "check" in awaited(name)
+        if name != "hub":
+            assert "hub" in awaited(name)  # whose port may be taken
+
+
+def test_an_absent_robot_ends_nothing():
+    day = "86400"
+    for name in ("master", "subscriber", "publisher", "viewer"):
+        environment = SERVICES[name]["environment"]
+        assert filled(environment["BM_CONNECT_TIMEOUT"]) == day
+        assert filled(environment["BM_FIRST_DATA_TIMEOUT"]) == day
+    # neither of the two is healthy without a robot
+    assert {how["condition"] for how in SERVICES["master"]["depends_on"].values()} == {"service_started"}
 
 
 def test_another_deployment_is_mounted_where_it_is_looked_for():
     environment = SERVICES["master"]["environment"]
     assert filled(environment["BM_DEPLOYMENT"]) == "/deployment"
     target = next(each for each in SERVICES["pcie-app"]["volumes"] if isinstance(each, dict))
-    assert filled(environment["BM_DEPLOYMENT"], DEPLOYMENT="build/mine") == target["target"]
+    assert filled(target["target"], DEPLOYMENT="build/mine") == "/build/mine"
+    assert target in SERVICES["boards"]["volumes"]
+    assert SERVICES["pcie-app"]["working_dir"] == "/"  # so that errors name what the user typed
+    assert filled(environment["BM_DEPLOYMENT"], DEPLOYMENT="build/mine") == "build/mine"
     assert filled(target["source"], DEPLOYMENT="build/mine") == "build/mine"
     assert target["read_only"] is True
     assert target["bind"] == {"create_host_path": False}  # a wrong name is an error, no new folder of root's
-    # boards keep their image for as long as they run: another deployment must make new ones
-    assert "DEPLOYMENT" in SERVICES["board0"]["labels"]["deployment"]
 
 
 @pytest.mark.parametrize(
     ("variables", "profiles"),
     [
-        ({}, ["simulation", "boards", "viewer"]),
-        ({"ROSBRIDGE_URI": "ws://robot:9090"}, ["simulation-off", "boards", "viewer"]),
-        ({"BM_BOARDS": "tcp://far:7000"}, ["simulation", "boards-off", "viewer"]),
+        ({}, {"hub", "boat", "boards", "viewer"}),
+        ({"ROSBRIDGE_URI": "ws://robot:9090"}, {"boards", "viewer"}),
+        ({"BM_BOARDS": "tcp://far:7000"}, {"hub", "boat", "viewer"}),
+        ({"DEPLOYMENT": "build/mine"}, {"hub", "boards", "viewer"}),
+        ({"DEPLOYMENT": "build/mine", "ROSBRIDGE_URI": "ws://robot:9090"}, {"boards", "viewer"}),
     ],
 )
 def test_profiles(variables, profiles):
     line = re.search(r"^COMPOSE_PROFILES=(.*)$", (ROOT / ".env").read_text(), re.MULTILINE)
-    assert filled(line[1], **variables).split(",") == profiles
     used = {each for service in SERVICES.values() for each in service.get("profiles", [])}
-    assert used == {"simulation", "boards", "viewer"}
+    assert used == {"hub", "boat", "boards", "viewer"}
+    assert set(filled(line[1], **variables).split(",")) & used == profiles
 
 
 def has_compose():

@@ -1,4 +1,4 @@
-"""The guide's examples are programs: each is run as it stands against a hub, but for addresses and files."""
+"""The examples of the client's pages are programs: each is run as it stands against a hub, but for addresses and files."""
 
 import asyncio
 import contextlib
@@ -14,7 +14,10 @@ from typing import Any
 import pytest
 from websockets.asyncio.client import connect as plain_connect
 
-from bridge.client import connect, goals, handles, session, websocket
+from bridge.client import connect, handles, session, websocket
+from bridge.client.actions import goals
+from bridge.client.actions.actionlib_server import MAX_ID
+from bridge.client.protocol.actions import MAX_SERVED_GOALS
 from bridge.client.protocol.calls import MAX_CALLS
 from bridge.client.protocol.goals import MAX_GOALS
 from bridge.client.protocol.services import MAX_REQUESTS
@@ -23,12 +26,14 @@ from bridge.hub.access import AccessPolicy
 from tests.bridge.hub.sockets import running_hub
 from tests.certificates import issue
 
-GUIDE = Path(__file__).parents[2] / "docs/how-to/bridge.md"
+FOLDER = Path(__file__).parents[2] / "docs/how-to"
+GUIDE = "\n".join(path.read_text() for path in sorted(FOLDER.glob("bridge*.md")))
 EXAMPLES = dict(
-    re.findall(
-        r"^## ([^\n]+)\n(?:(?!^## ).)*?^```python\n(.*?)^```", GUIDE.read_text(), re.MULTILINE | re.DOTALL
-    )
+    re.findall(r"^###? ([^\n]+)\n(?:(?!^##).)*?^```python\n(.*?)^```", GUIDE, re.MULTILINE | re.DOTALL)
 )
+STARTS = re.findall(r"(?:^    |with\s`)hub(?: --ros-version (\d))?(?:`|$)", GUIDE, re.MULTILINE)
+"""ROS versions of the hubs that the pages start for their examples."""
+(ROS_VERSION,) = {int(number) for number in STARTS}
 TOKEN = "guide-test-token-0123456789"
 PATIENCE = 60.0
 
@@ -36,14 +41,14 @@ Company = Callable[[str], Awaitable[None]]
 
 
 async def run(example: str, uri: str, company: Company | None = None, **environment: str) -> str:
-    """What an example prints while ``company`` plays the robot."""
+    """Return the output of an example while `company` acts as the robot."""
     process = await asyncio.create_subprocess_exec(
         sys.executable,
         "-c",
         example.replace("ws://127.0.0.1:9090", uri),
         stdout=asyncio.subprocess.PIPE,
         stderr=asyncio.subprocess.PIPE,
-        cwd=GUIDE.parents[1],
+        cwd=FOLDER.parent,
         env={**os.environ, **environment},
     )
     robot = asyncio.create_task(company(uri)) if company is not None else None
@@ -91,32 +96,51 @@ async def works_on_goals(uri: str) -> None:
 
 poses = publishes("/pose", "geometry_msgs/PointStamped", {"point": {"x": 0.8}}, {"point": {"x": 0.9}})
 
+#: What is printed for a message that does not fit its type.
+MISSPELT = "".join(
+    line.removeprefix("    ") + "\n" for line in GUIDE.splitlines() if line.startswith("    a message of ")
+)
 #: By heading: who plays the robot, and what is printed.
 PLAYED: dict[str, tuple[Company | None, str]] = {
-    "Subscribe": (poses, "/pose {'x': 0.9}"),
+    "Subscribe": (poses, "/pose {'x': 0.9,"),
     "Publish": (None, ""),
+    "A misspelt field": (None, MISSPELT),
     "Long arrays": (None, "0.5 float64"),
+    "Large messages": (None, "{'data': 'short'} discarded: 1\na message of /notes cannot be published"),
     "Serialised messages": (None, "laser [0.5 1.5]"),
     "Services": (None, "{'sum': 3}\nservice /add at ws://"),
+    "Serve an action": (None, "SUCCEEDED {'sequence': [0, 1, 1, 2, 3, 5]}"),
+    "Actions of ROS 1": (None, "so far: {'sequence': [7]}\nSUCCEEDED {'sequence': [49]}"),
+    "Serve an action on a thread": (None, "SUCCEEDED {'sequence': [0, 1, 1, 2, 3, 5]}"),
+    "Parameters, topics and nodes": (None, "15 1.0\nparameter /camera:gain at ws://"),
+    "Threads": (None, "{'data': 'from a thread'}"),
+    "Transforms between frames": (None, "[2. 1. 0.] [1.5 1.  0. ] (4, 4)\nframe gripper is not known"),
+    "Topics and services": (None, "{'result': 42}"),
     "Find a variable in messages": (
         None,
         "D1 (True, 7)\ny (True, 2.5)\npose.position.x (True, 1.5)\nranges[1] (True, 0.5)\ndata[2] (True, 3)\n",
     ),
-    "Several robots": (poses, "two {'x': 0.9}"),
+    "Several robots": (poses, "two {'x': 0.9,"),
     "Quality of service (ROS 2)": (None, "{'data': 'here be dragons'}"),
 }
-ELSEWHERE = {"Actions (ROS 2)", "TLS, tokens, proxies"}
+ELSEWHERE = {"Actions", "TLS, tokens, proxies"}
 
 
 @pytest.mark.parametrize("heading", PLAYED)
 async def test_an_example_runs(heading):
     company, printed = PLAYED[heading]
-    async with running_hub(ros_version=2) as port:
+    async with running_hub(ros_version=ROS_VERSION) as port:
         assert printed in await run(EXAMPLES[heading], f"ws://127.0.0.1:{port}", company)
 
 
+async def test_the_example_without_asyncio_reads_with_a_callback_and_with_an_iterator():
+    async with running_hub(ros_version=ROS_VERSION) as port:
+        out = await run(EXAMPLES["Topics and services"], f"ws://127.0.0.1:{port}")
+    assert {"heard hello", "read hello"} <= set(out.splitlines())
+
+
 async def test_what_is_published_is_heard():
-    async with running_hub(ros_version=2) as port, connect(f"ws://127.0.0.1:{port}") as ros:
+    async with running_hub(ros_version=ROS_VERSION) as port, connect(f"ws://127.0.0.1:{port}") as ros:
         poses = ros.subscribe("/pose", "geometry_msgs/PointStamped")
         await ros.call("/rosapi/get_time", timeout=PATIENCE)
         await run(EXAMPLES["Publish"], ros.uri)
@@ -126,17 +150,17 @@ async def test_what_is_published_is_heard():
 
 @pytest.mark.parametrize("served", [True, False])
 async def test_the_goal_of_the_guide(served):
-    async with running_hub(ros_version=2) as port:
+    async with running_hub(ros_version=ROS_VERSION) as port:
         uri = f"ws://127.0.0.1:{port}"
         if not served:
-            assert "no result: action /fibonacci" in await run(EXAMPLES["Actions (ROS 2)"], uri)
+            assert "no result: action /fibonacci" in await run(EXAMPLES["Actions"], uri)
             return
         async with connect(uri) as ros:
             worker = asyncio.create_task(works_on_goals(uri))
             async with asyncio.timeout(PATIENCE):
                 while "/fibonacci" not in (await ros.call("/rosapi/action_servers"))["action_servers"]:
                     await asyncio.sleep(0.05)
-            out = await run(EXAMPLES["Actions (ROS 2)"], uri)
+            out = await run(EXAMPLES["Actions"], uri)
             worker.cancel()
         assert "so far: {'sequence': [0, 1]}" in out
         assert "SUCCEEDED {'sequence': [0, 1, 1]}" in out
@@ -155,7 +179,7 @@ async def test_the_door_of_the_guide(tmp_path):
 
 def test_no_example_is_left_out():
     assert set(EXAMPLES) == set(PLAYED) | ELSEWHERE
-    assert len(EXAMPLES) == GUIDE.read_text().count("```python")
+    assert len(EXAMPLES) == GUIDE.count("```python")
 
 
 @pytest.mark.parametrize(
@@ -171,6 +195,8 @@ def test_no_example_is_left_out():
         ("waiting for the next fragment", f"{fragments.MAX_AGE:g} s"),
         ("calls that wait for answers", str(MAX_CALLS)),
         ("active goals", str(MAX_GOALS)),
+        ("goals that this client executes", str(MAX_SERVED_GOALS)),
+        ("the id of a goal of ROS 1", f"{MAX_ID} characters"),
         ("feedback that waits in a goal", str(goals.FEEDBACK_QUEUE_SIZE)),
         ("concurrent requests to services of this client", str(MAX_REQUESTS)),
         ("the closing handshake", f"{websocket.CLOSE_TIMEOUT:g} s"),
@@ -178,5 +204,5 @@ def test_no_example_is_left_out():
     ],
 )
 def test_the_table_of_limits_is_true(row, size):
-    (found,) = re.findall(rf"^\| {row}[^|]*\| ([^|]+) \|", GUIDE.read_text(), re.MULTILINE)
+    (found,) = re.findall(rf"^\| {row}[^|]*\| ([^|]+) \|", GUIDE, re.MULTILINE)
     assert found == size

@@ -1,4 +1,4 @@
-"""docs/how-to/operating.md: alarms are those of the sources, and units are ones that systemd takes."""
+"""The pages about operation: alarms are those of the sources, and units are ones that systemd takes."""
 
 import ast
 import re
@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-PAGE = (ROOT / "docs/how-to/operating.md").read_text()
+FOLDER = ROOT / "docs/how-to"
+PAGE = "".join((FOLDER / name).read_text() for name in ("containers.md", "hosts.md", "operating.md"))
 PACKAGES = ("services", "terminal", "posteriors", "bridge", "pcie_shim")
 
 

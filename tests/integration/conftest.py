@@ -210,11 +210,14 @@ class Stage:
         """All processes but the named have ended, and no socket or private directory is left."""
 
         def left() -> list[str]:
-            directories = [str(path) for path in self.where.glob("rosbayes-*/*")]
+            files = [
+                path for path in self.where.glob("rosbayes-*/*") if path.name.split(".")[0] not in except_for
+            ]
+            directories = [str(path) for path in files]
             return sorted(set(self.processes()) - set(except_for)) + directories
 
         await until(lambda: not left(), lambda: f"left: {left()}")
-        assert not list(self.where.glob("rosbayes-*"))
+        assert not [path for path in self.where.glob("rosbayes-*") if not list(path.iterdir())]
 
     def end_all(self) -> None:
         for all_ in self.processes().values():
@@ -362,7 +365,7 @@ async def until_subscribed(uri: str, topic: str) -> None:
 
 
 async def status_of(runs: Path, name: str) -> dict:
-    """What a process of a run says of itself."""
+    """Return the status of a process of a run."""
     reader, writer = await asyncio.open_unix_connection(runs / f"{name}.status.sock")
     try:
         return json.loads(await reader.read())

@@ -61,7 +61,7 @@ type = "std_msgs/UInt8MultiArray"
 variables = {{ cell = "data[2]" }}
 """
 ADDRESSES = [4, 4, 4, 4, 4]
-"""What a robot in place 2 reads, in the order of the columns."""
+"""Readings of a robot in place 2, in the order of the columns."""
 
 
 class Robots:

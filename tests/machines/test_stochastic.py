@@ -1,4 +1,4 @@
-"""What streams of random bits promise (thesis 2.1.1): the mean is the product, the spread is equation 2.1.
+"""Statistics of streams of random bits (thesis 2.1.1): the mean is the product, the spread is equation 2.1.
 
 Seeds are fixed, so that nothing here is left to chance: a test that passes, passes always.
 """
@@ -81,5 +81,5 @@ def test_counts_spread_as_equation_2_1_says(parameters, banks):
     p = exact(machine)
     limit = np.sqrt(p * (1 - p) / cycles)
     assert (np.abs(rates.mean(axis=0) - p) < 4 * limit / np.sqrt(banks)).all()
-    # What so many draws spread is known to 1 in sqrt(2 banks).
+    # The spread of so many draws is known to 1 in sqrt(2 banks).
     assert rates.std(axis=0) == pytest.approx(limit, rel=3.5 / np.sqrt(2 * banks))

@@ -69,8 +69,9 @@ def test_a_taken_port_and_a_missing_folder_are_said(folder: Path) -> None:
     port = server.getsockname()[1]
     with server, pytest.raises(EndpointError):
         listen(Endpoint(host="127.0.0.1", port=port))
-    with pytest.raises(EndpointError):
+    with pytest.raises(EndpointError) as caught:
         listen(Endpoint(path=str(folder / "no" / "a.sock")))
+    assert f"{folder / 'no'} " in str(caught.value)
 
 
 def test_nothing_listening_is_said_in_time(folder: Path) -> None:

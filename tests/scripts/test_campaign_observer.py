@@ -4,9 +4,16 @@ import copy
 
 import pytest
 
-from scripts.campaigning.accounts import Counters, Excuses, judge
-from scripts.campaigning.expected import BANKS, LINES, BoardOutcome, Outcome, UnusableError, addresses_of
-from scripts.campaigning.observer import OLDEST, Flaw, Observer
+from scripts.campaigning.judging.accounts import Counters, Excuses, judge
+from scripts.campaigning.judging.expected import (
+    BANKS,
+    LINES,
+    BoardOutcome,
+    Outcome,
+    UnusableError,
+    addresses_of,
+)
+from scripts.campaigning.judging.observer import OLDEST, Flaw, Observer
 
 NAMES = ("campaign1", "campaign2")
 
@@ -94,6 +101,8 @@ class Recording:
                 observer.fault(now)
             elif kind == "calm":
                 observer.calm(now)
+            elif kind == "flip":
+                observer.flip(what)
             elif kind == "reload":
                 observer.reloaded(what, NAMES[what % 2])
             else:
@@ -394,3 +403,24 @@ def test_addresses_are_those_of_the_deployment(values, addresses):
 def test_a_word_is_not_a_reading():
     with pytest.raises(UnusableError):
         addresses_of({"near": "three", "far": 1})
+
+
+@pytest.mark.parametrize(
+    ("wrong", "calm_before", "flaws"),
+    [
+        ((), None, set()),
+        ((2, 3, 4), None, set()),
+        ((2, 5), None, {Flaw.WRONG}),
+        ((2, 4), 4, {Flaw.WRONG}),
+    ],
+    ids=["hidden", "within the frames", "a frame later", "after it was found"],
+)
+def test_wrong_results_are_accepted_only_within_the_stated_frames_of_a_flip(wrong, calm_before, flaws):
+    run = Recording()
+    for index in wrong:
+        data = run.message("result", index)["data"]
+        data[0], data[1] = data[1], data[0]
+    if calm_before is not None:
+        run.events.insert(3 * calm_before, ("calm", None, calm_before * 0.1))
+    run.events.insert(0, ("flip", 3, 0.0))
+    assert run.play() == flaws

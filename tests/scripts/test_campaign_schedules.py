@@ -9,6 +9,8 @@ from scripts.campaigning.faults import ENDS, MOST_ENDS, Fault, Kind, Schedule, e
 from scripts.campaigning.shrinking import shrink
 from scripts.campaigning.stack import Topology
 
+CONTAINERS = Topology.CONTAINERS
+
 
 @pytest.mark.parametrize("topology", Topology)
 def test_a_seed_gives_the_same_steps_within_what_a_master_forgives(topology):
@@ -21,9 +23,21 @@ def test_a_seed_gives_the_same_steps_within_what_a_master_forgives(topology):
 
 @pytest.mark.parametrize("kind", Kind)
 def test_only_faults_of_a_kind_are_drawn(kind):
-    steps = Schedule(random.Random(1), Topology.APART, [kind]).steps(10)
+    topology = Topology.CONTAINERS if kind is Kind.CONTAINERS else Topology.APART
+    steps = Schedule(random.Random(1), topology, [kind]).steps(10)
     assert steps
     assert kind in {fault.kind for step in steps for fault in step}
+
+
+def test_containers_have_only_faults_that_an_engine_can_inject():
+    steps = [
+        step for seed in range(30) for step in Schedule(random.Random(seed), CONTAINERS, list(Kind)).steps(10)
+    ]
+    faults = {fault for step in steps for fault in step}
+    assert {fault.kind for fault in faults} == {Kind.SIGNALS, Kind.ROSBRIDGE, Kind.INPUT, Kind.CONTAINERS}
+    targets = {fault.target for fault in faults} - {"rosbridge", "readings"}
+    assert targets == {"hub", "boards", "subscriber", "publisher", "pcie-app", "master"}
+    assert {fault.target for fault in faults if fault.what == "cut-off"} == {"subscriber", "publisher"}
 
 
 @pytest.mark.parametrize(
@@ -38,6 +52,9 @@ def test_only_faults_of_a_kind_are_drawn(kind):
         (Fault("rosbridge", "gone", "rosbridge", 1.0), True, True),
         (Fault("links", "corrupt", "board1", 1.0, 1), False, False),
         (Fault("input", "burst", "readings", 0.0, 10_000), False, False),
+        (Fault("containers", "cut-off", "subscriber", 1.0), True, False),
+        (Fault("containers", "restart", "publisher"), False, True),
+        (Fault("containers", "full", "boards", 1.0), False, False),
     ],
     ids=str,
 )

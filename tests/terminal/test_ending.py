@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from terminal.errors import ExitCode
+from terminal.ending import outcome
+from terminal.errors import ExitCode, StoppedError
 
 PROGRAM = """
 import os, signal, threading, time
@@ -70,6 +71,25 @@ def test_a_signal_ends_a_command_wherever_it_is(place):
     code, lines = end_of(place)
     assert code == ExitCode.TERMINATED
     assert lines == ["asked to end (SIGTERM)"]
+
+
+@pytest.mark.parametrize("ending", ["return", "raise OSError"])
+def test_a_signal_that_arrives_when_a_command_has_ended(monkeypatch, ending):
+    """It interrupts the call that would have it ignored."""
+    calls = []
+
+    def interrupted():
+        calls.append(ending)
+        if len(calls) == 1:
+            raise StoppedError(ExitCode.INTERRUPTED, "interrupted (Ctrl-C)")
+
+    def command():
+        if ending != "return":
+            raise OSError
+
+    monkeypatch.setattr("terminal.ending.ignore_signals", interrupted)
+    assert outcome(command) == ExitCode.INTERRUPTED
+    assert len(calls) == 2
 
 
 def test_a_dropped_signal_counts_at_the_end_of_a_command():

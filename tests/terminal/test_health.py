@@ -1,6 +1,6 @@
 """The status socket: one JSON object per connection, for its user alone, whatever asks and whatever answers.
 
-is_ready, read_status ──▶ NAME.status.sock ◀── serve_health (a loop), serve_health_in_thread (a blocking process)
+is_ready, read_status ──▶ NAME.status.sock ◀── serve_health (in a loop, or in_thread of a blocking process)
 """
 
 import asyncio
@@ -20,10 +20,10 @@ from terminal.health import (
     ANSWER_LIMIT,
     NoHealthError,
     Silence,
+    in_thread,
     is_ready,
     read_status,
     serve_health,
-    serve_health_in_thread,
     status_socket,
 )
 
@@ -35,7 +35,6 @@ class Server:
 
     def __init__(self, kind):
         self.kind = kind
-        self.samples = 0
 
     @contextlib.contextmanager
     def serving(self, directory, status, name="board0"):
@@ -43,14 +42,14 @@ class Server:
             return json.dumps(status).encode()
 
         if self.kind == "thread":
-            with serve_health_in_thread(directory, name, answer, self.sample):
+            with in_thread(lambda: serve_health(directory, name, answer)):
                 yield
             return
         loop = asyncio.new_event_loop()
         begun, over = threading.Event(), asyncio.Event()
 
         async def serve():
-            async with serve_health(directory, name, answer, self.sample):
+            async with serve_health(directory, name, answer):
                 begun.set()
                 await over.wait()
 
@@ -63,9 +62,6 @@ class Server:
             loop.call_soon_threadsafe(over.set)
             thread.join(PATIENCE)
             loop.close()
-
-    def sample(self):
-        self.samples += 1
 
 
 @pytest.fixture(params=["thread", "loop"])
@@ -87,7 +83,6 @@ def test_every_connection_gets_one_object(server, tmp_path):
         assert is_ready(path, PATIENCE) == (True, "programmed")
         assert json.loads(read_status(path, PATIENCE)) == status()
         assert stat.S_IMODE(Path(path).stat().st_mode) == 0o600
-        assert server.samples
     assert not list(tmp_path.iterdir())
 
 

@@ -1,4 +1,4 @@
-"""Whatever stands in a sentence, on a terminal it is one line and no order to it."""
+"""Any text in a sentence is printed as one line without control characters."""
 
 import asyncio
 import json

@@ -130,7 +130,7 @@ def test_questions_that_cannot_be_built(network, arguments, named):
 
 
 @pytest.mark.parametrize(
-    ("option", "value"), [("--uri", "robot:9090"), ("--topic", "a b"), ("--type", "x"), ("--output", "/a b")]
+    ("option", "value"), [("--uri", "robot9090"), ("--topic", "a b"), ("--type", "x"), ("--output", "/a b")]
 )
 def test_a_wrong_target_is_refused_before_the_model_is_read(case, option, value):
     (case / "model.py").write_text("raise SystemExit('the model was read')")

@@ -66,7 +66,7 @@ class DeploymentEdits:
 
 def edited(deployment: Deployment, edits: DeploymentEdits) -> Deployment:
     """Return the deployment with the edits and its new hash, or raise a BuildError for a wrong edit."""
-    target = _given(uri=edits.uri, topic=edits.topic, type=edits.type)
+    target = _defined(uri=edits.uri, topic=edits.topic, type=edits.type)
     if target and len(deployment.sources) > 1:
         raise BuildError(
             f"--{next(iter(target))}: this deployment has {len(deployment.sources)} sources; edit [[source]] in "
@@ -74,21 +74,21 @@ def edited(deployment: Deployment, edits: DeploymentEdits) -> Deployment:
         )
     first_source, *sources = deployment.sources
     first_output, *outputs = deployment.outputs
-    machine = _given(target_count=edits.target_count, max_cycles=edits.max_cycles, stop=edits.stop)
+    machine = _defined(target_count=edits.target_count, max_cycles=edits.max_cycles, stop=edits.stop)
     try:
         changed = deployment.replace(
             sources=(first_source.replace(**target), *sources),
-            outputs=(first_output.replace(**_given(topic=edits.output)), *outputs),
+            outputs=(first_output.replace(**_defined(topic=edits.output)), *outputs),
             variables=_with_paths(_in_order(deployment.variables, edits.order), dict(edits.paths)),
             machine=deployment.machine.replace(**machine),
-            **_given(queue=edits.queue, tolerance_s=edits.tolerance_s),
+            **_defined(queue=edits.queue, tolerance_s=edits.tolerance_s),
         )
     except ValidationError as reason:
         raise refused_option(reason) from None
     return with_hash(changed)
 
 
-def _given(**values: object) -> dict[str, object]:
+def _defined(**values: object) -> dict[str, object]:
     return {key: value for key, value in values.items() if value is not None}
 
 
@@ -251,6 +251,8 @@ def _with_places(new: Deployment, old: Deployment) -> Deployment:
         outputs=old.outputs,
         queue=old.queue,
         tolerance_s=old.tolerance_s,
+        integrity=old.integrity,
+        integrity_frames=old.integrity_frames,
         prior=old.prior,
         variables=tuple(
             variable.replace(source=before[variable.name].source, path=before[variable.name].path)

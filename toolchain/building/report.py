@@ -23,12 +23,18 @@ def build_report(
         f"Machine: BM1, codes of {machine.prob_bits} bits (scale = {machine.scale}), counters of "
         f"{machine.counter_bits} bits, stops at a count of {machine.target_count} or after {machine.max_cycles} "
         f"cycles, stop = {machine.stop}; {machine.rng} with {machine.rng_banks} banks, rng_reset = "
-        f"{machine.rng_reset}, {machine.steps_per_clock} steps a clock."
+        f"{machine.rng_reset}, {machine.steps_per_clock} steps per clock."
     )
     machine_sentence += many_sentence(machine)
     paragraphs = [
         f"Model {model.name}: {model.lines} lines ({grid}), {count}"
-        + (f" in the columns' order {names}." if len(model.known) > 1 else f", {names}." if names else "."),
+        + (
+            f", in the order of the columns: {names}."
+            if len(model.known) > 1
+            else f", {names}."
+            if names
+            else "."
+        ),
         *_state_paragraph(model),
         *_prior_paragraph(model, deployment),
         machine_sentence,

@@ -7,7 +7,15 @@ from typing import Final, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from toolchain.deployment import Source, Variable, WrittenPrior
-from toolchain.deployment.fields import MessagePath, MessageType, Name, Sequence, Topic, WebSocketUri
+from toolchain.deployment.fields import (
+    MessagePath,
+    MessageType,
+    Name,
+    Sequence,
+    Topic,
+    TopicBytes,
+    WebSocketUri,
+)
 from toolchain.errors import BuildError, ToolchainError
 from toolchain.files.toml_file import TomlFile, nearest_name
 
@@ -26,6 +34,7 @@ class SourceTable(BaseModel):
     type: MessageType
     """The type of its messages."""
     compression: Literal["none", "cbor"] = "none"
+    topic_bytes: TopicBytes | None = None
     """The requested encoding: `cbor` pays off for messages with long arrays."""
     variables: dict[Name, MessagePath] | None = None
     """The path of each variable in the message, by its name; None for all variables of no other source."""
@@ -59,6 +68,7 @@ class SourcesFile:
                 topic=table.topic,
                 type=table.type,
                 compression=table.compression,
+                topic_bytes=table.topic_bytes,
             )
             for table in self.tables
         )

@@ -20,7 +20,9 @@ def build(
     uri: Annotated[
         str,
         typer.Option(
-            help="rosbridge server of the readings.", metavar="ws://HOST:PORT", rich_help_panel=MESSAGES
+            help="rosbridge server of the readings.",
+            metavar="ws://HOST:PORT|robot:NAME",
+            rich_help_panel=MESSAGES,
         ),
     ] = "",
     topic: Annotated[

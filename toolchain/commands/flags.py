@@ -15,7 +15,7 @@ from toolchain.building.options import OnMissing
 from toolchain.deployment import Scale, Stop
 
 MODEL: Final = "The model"
-NETWORK: Final = "A network: what is asked"
+NETWORK: Final = "The question to a network"
 BOARDS: Final = "Boards"
 TABLES: Final = "Tables of codes"
 STOPPING: Final = "Counters and stopping"

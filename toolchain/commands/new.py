@@ -48,7 +48,7 @@ def _next_steps(folder: Path) -> str:
 
     toolchain build {where} -o {built} --uri ws://127.0.0.1:9090 --topic /{folder.name}/readings --type std_msgs/Float64MultiArray
 
-To run it, in a second and a third terminal a rosbridge server and what stands for the robot:
+To run it, start a rosbridge server in a second terminal, and the simulated robot in a third:
 
     hub
     python {shlex.quote(str(folder / "robot.py"))}

@@ -19,6 +19,7 @@ app = CommandLine(no_args_is_help=True)
 Directory: TypeAlias = Annotated[
     Path, typer.Argument(help="Folder of the deployment, written by `toolchain build`.", metavar="DIR")
 ]
+Verbose: TypeAlias = Annotated[bool, typer.Option("--verbose", "-v", help="List unchanged files too.")]
 
 
 @app.callback()
@@ -36,6 +37,7 @@ def memories(
             metavar="MODEL",
         ),
     ] = None,
+    verbose: Verbose = False,
 ) -> None:
     """Write the parameters and memory files again; with --model also the images, with new numbers.
 
@@ -51,14 +53,14 @@ def memories(
         read = read_model(model, flags)
         before = _lines(directory)
         changes = regenerate_memories(directory, read, build_date=build_date(model_file(model)))
-        _print_changes(changes, before, _lines(directory))
+        _print_changes(changes, before, _lines(directory), verbose=verbose)
     elif flags.settings or flags.question:
         raise BuildError(f"{'--set' if flags.settings else flags.question[0]} is for a model: add --model")
     else:
-        _print_changes(regenerate_memories(directory))
+        _print_changes(regenerate_memories(directory), verbose=verbose)
 
 
-def project(directory: Directory) -> None:
+def project(directory: Directory, verbose: Verbose = False) -> None:
     """Write the Quartus project again.
 
     For example `toolchain regenerate project build/boat`.
@@ -66,7 +68,7 @@ def project(directory: Directory) -> None:
     from toolchain.building.regenerate import regenerate_project
 
     changes = regenerate_project(directory)
-    _print_changes(changes)
+    _print_changes(changes, verbose=verbose)
     if not changes:
         typer.echo("rng = ideal exists only in emulation, so there is no project", err=True)
 
@@ -74,7 +76,8 @@ def project(directory: Directory) -> None:
 def deployment(
     directory: Directory,
     uri: Annotated[
-        str | None, typer.Option(help="rosbridge server of the readings.", metavar="ws://HOST:PORT")
+        str | None,
+        typer.Option(help="rosbridge server of the readings.", metavar="ws://HOST:PORT|robot:NAME"),
     ] = None,
     topic: Annotated[str | None, typer.Option(help="Topic of the readings.", metavar="TOPIC")] = None,
     message_type: Annotated[
@@ -103,6 +106,7 @@ def deployment(
     tolerance: Annotated[
         float | None, typer.Option(help="Seconds within which readings from several topics belong together.")
     ] = None,
+    verbose: Verbose = False,
 ) -> None:
     """Write deployment.toml with other topics, or variables in another order; manual edits are kept.
 
@@ -127,7 +131,7 @@ def deployment(
     )
     before = _lines(directory)
     changes = regenerate_deployment(directory, edits)
-    _print_changes(changes, before, _lines(directory))
+    _print_changes(changes, before, _lines(directory), verbose=verbose)
 
 
 def _lines(directory: Path) -> list[str]:
@@ -136,13 +140,21 @@ def _lines(directory: Path) -> list[str]:
     return file.read_text(encoding="utf-8", errors="replace").splitlines() if file.is_file() else []
 
 
-def _print_changes(changes: "Changes", before: Sequence[str] = (), after: Sequence[str] = ()) -> None:
+def _print_changes(
+    changes: "Changes", before: Sequence[str] = (), after: Sequence[str] = (), *, verbose: bool
+) -> None:
+    unchanged = [name for name, change in changes if change == "unchanged"]
     for name, change in changes:
+        if change == "unchanged" and not verbose:
+            continue
         typer.echo(f"{change:9}  {name}")
         if name == FILE_NAME:
             for line in difflib.unified_diff(before, after, lineterm="", n=0):
                 if not line.startswith(("---", "+++", "@@")):
                     typer.echo(f"           {line}")
+    if unchanged and not verbose:
+        files = "1 file" if len(unchanged) == 1 else f"{len(unchanged)} files"
+        typer.echo(f"unchanged  {files} (--verbose lists them)")
 
 
 add_commands(app, memories, project, deployment)

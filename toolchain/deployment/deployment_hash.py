@@ -1,6 +1,6 @@
 """The hash that protects a deployment against edits.
 
-It covers everything that follows from the model, but not URIs and endpoints: a deployment remains valid for
+It covers everything that follows from the model, but not URIs, endpoints and the like: a deployment remains valid for
 another robot, but not after an edit that contradicts its tables.
 """
 
@@ -11,12 +11,14 @@ from toolchain.deployment.deployment import Deployment, DeploymentFile
 
 
 def deployment_hash(deployment: DeploymentFile) -> str:
-    """Return the SHA-256 (hexadecimal) of a deployment without its URIs, endpoints and compression."""
+    """Return the SHA-256 (hexadecimal) of a deployment without its URIs, endpoints, compression, `topic_bytes` and integrity."""
     content = deployment.model_dump(
         mode="json",
         exclude={
             "hash": True,
-            "sources": {"__all__": {"uri", "compression"}},
+            "integrity": True,
+            "integrity_frames": True,
+            "sources": {"__all__": {"uri", "compression", "topic_bytes"}},
             "boards": {"__all__": {"endpoint"}},
             "outputs": {"__all__": {"uri"}},
         },

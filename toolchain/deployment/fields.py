@@ -16,14 +16,22 @@ _TOPIC = re.compile(r"/?[A-Za-z]\w*(?:/\w+)*")
 MESSAGE_PATH = re.compile(r"[A-Za-z_][A-Za-z0-9_]*(?:\.[A-Za-z_][A-Za-z0-9_]*|\[[0-9]{1,9}\])*")
 
 
+ROBOT: Final = "robot:"
+"""Prefix of a URI that names a robot, which the services look up when they start."""
+
+
 def websocket_uri(uri: str) -> str:
-    """Return a WebSocket URI, or raise a ValueError."""
+    """Return a WebSocket URI or `robot:NAME`, or raise a ValueError."""
+    if uri.startswith(ROBOT) and uri.removeprefix(ROBOT).strip() and uri.isprintable():
+        return uri
     try:
         is_whole = bool(urlsplit(uri).hostname) and urlsplit(uri).port != 0
     except ValueError:  # a port beyond 65535, half an IPv6 address
         is_whole = False
     if not is_whole or not re.fullmatch(r"wss?://[^\s/?#]+\S*", uri):
-        raise ValueError(f"{uri!r} is not a WebSocket URI; expected one like 'ws://robot:9090'")
+        raise ValueError(
+            f"{uri!r} is not a WebSocket URI; expected one like 'ws://robot:9090' (or {ROBOT}NAME)"
+        )
     return uri
 
 
@@ -71,6 +79,9 @@ Name = Annotated[str, Field(min_length=1, max_length=NAME_MAX), AfterValidator(_
 """One printable line, because names also come from network files."""
 Sha256 = Annotated[str, _matching(_SHA256, "a SHA-256 hash; expected 64 hexadecimal digits")]
 Step = Annotated[float, AfterValidator(_not_zero)]
+TOPIC_BYTES_MIN, TOPIC_BYTES_MAX = 1 << 10, 1 << 28
+"""Smallest and largest limit of the size of a topic's messages, in bytes."""
+TopicBytes = Annotated[int, Field(ge=TOPIC_BYTES_MIN, le=TOPIC_BYTES_MAX)]
 
 Item = TypeVar("Item")
 # TOML arrays and strings become tuples and enums; their contents stay strict.

@@ -45,7 +45,7 @@ def load_deployment(directory: Path, *, images: bool = True, edited: bool = Fals
     if computed != file.hash and not edited:
         raise DamagedDeploymentError(
             f"{path} is not as it was built: its hash is {computed[:16]}, "
-            f"but it names {file.hash[:16] or 'none'}; only URIs, endpoints and compression may be edited: "
+            f"but it names {file.hash[:16] or 'none'}; only URIs, endpoints, compression, topic_bytes and integrity may be edited: "
             "build it again with 'toolchain build', or keep the edit with 'toolchain regenerate deployment'"
         )
     deployment = Deployment(**dict(file), directory=directory)

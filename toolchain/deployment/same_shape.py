@@ -19,7 +19,9 @@ if TYPE_CHECKING:
     from pydantic import BaseModel
 
 
-_DEPLOYMENT_FREE: Final = {"name", "hash", "tolerance_s", "prior", "directory"}
+_DEPLOYMENT_FREE: Final = {
+    *("name", "hash", "tolerance_s", "prior", "directory", "integrity", "integrity_frames"),
+}
 _VARIABLE_FREE: Final = {
     *("source", "path", "offset", "step", "period", "values", "on_range", "on_missing", "states"),
 }
@@ -39,6 +41,11 @@ class Difference:
     """Its value in the deployment in force."""
     after: str
     """Its value in the new deployment."""
+
+    @property
+    def is_connection(self) -> bool:
+        """Whether it is about servers, topics and boards' addresses, not about the machine."""
+        return self.field.startswith(("[[source]]", "[[output]]")) or self.field.endswith(" endpoint")
 
     def __str__(self) -> str:
         return f"{self.field} is {self.before} in the run and {self.after} in the new one"

@@ -26,6 +26,7 @@ from toolchain.deployment.fields import (
     States,
     Step,
     Topic,
+    TopicBytes,
     Unit,
     WebSocketUri,
     states_fit,
@@ -51,6 +52,16 @@ class Queue(StrEnum):
     """Only the newest waits; passed-over readings are counted."""
     ALL = "all"
     """All wait, in order."""
+
+
+class Integrity(StrEnum):
+    """The detection of silently wrong counts."""
+
+    OFF = "off"
+    CANARY = "canary"
+    """Known readings walk through all addresses of all tables between the frames."""
+    TWICE = "twice"
+    """Every frame is computed with two banks, whose counts must agree."""
 
 
 class Scale(StrEnum):
@@ -83,6 +94,7 @@ class Source(Section):
     topic: Topic
     type: MessageType
     compression: Literal["none", "cbor"] = Field(default="none", exclude_if=lambda way: way == "none")
+    topic_bytes: TopicBytes | None = Field(default=None, exclude_if=lambda size: size is None)
 
 
 class Variable(Section):

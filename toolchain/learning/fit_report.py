@@ -163,7 +163,7 @@ def _empty_cells(options: FitOptions) -> str:
     if options.method is FitMethod.NORMALS:
         return "the formula of the mean with the numbers below"
     looks = "the model's own table" if options.prior == "model" else "a uniform table"
-    return f"the prior alone: {looks}, worth {options.pseudo_count:g} readings a cell"
+    return f"the prior alone: {looks}, worth {options.pseudo_count:g} readings per cell"
 
 
 def _table(fit: Fit, supports: Sequence[Support], lines: int) -> str:
@@ -190,8 +190,8 @@ def _table(fit: Fit, supports: Sequence[Support], lines: int) -> str:
 
 def _how_to_load(output: Path) -> str:
     return (
-        f"A model() with a parameter for it takes it with --set {shlex.quote(f'fit={output}')}; any other one with "
-        f"toolchain.learning.fitted.with_fit(model, Path({str(output.resolve())!r}))."
+        "To use it, return toolchain.learning.fitted.with_fit(model, fit) from model(), where fit is a parameter "
+        f"of type Path | None, and build with --set {shlex.quote(f'fit={output}')}."
     )
 
 

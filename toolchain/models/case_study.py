@@ -35,10 +35,14 @@ def load_model(case: Path, settings: Mapping[str, str]) -> Model:
     """
     path = model_path(case)
     if not path.is_file():
-        what = f"has no {FILE_NAME}" if Path(case).is_dir() else "is not a folder"
+        what = "does not exist"
+        if Path(case).is_dir():
+            what = f"has no {FILE_NAME}"
+        elif Path(case).exists():
+            what = "is not a model"
         raise ModelError(
-            f"{case} {what}; expected a case study's folder with a {FILE_NAME} that defines model(), or a network's "
-            "file: .bif, .xmlbif, .uai or .net"
+            f"{case} {what}; expected a folder with a {FILE_NAME} that defines model(), or a network file (.bif, "
+            ".xmlbif, .uai or .net)"
         )
     with _importing_from(path.parent.resolve()):
         function = _model_function(path)

@@ -104,7 +104,7 @@ def compare_files(directory: Path, files: OutputFiles) -> list[tuple[str, Change
         if not path.is_file():
             changes[name] = Change.NEW
         else:
-            changes[name] = Change.UNCHANGED if _says_the_same(path, pieces()) else Change.CHANGED
+            changes[name] = Change.UNCHANGED if _has_same_lines(path, pieces()) else Change.CHANGED
     for name in _existing(directory, files.own):
         if name not in files.contents:
             changes[name] = Change.REMOVED
@@ -146,7 +146,7 @@ def _remove(path: Path) -> None:
         raise BuildError(f"{path} cannot be written: {reason.strerror or reason}") from None
 
 
-def _says_the_same(path: Path, pieces: Iterable[bytes]) -> bool:
+def _has_same_lines(path: Path, pieces: Iterable[bytes]) -> bool:
     """Compare a file with its expected content line by line, ignoring comments and empty lines."""
     expected = (line for piece in pieces for line in piece.splitlines())
     try:

@@ -6,6 +6,7 @@ Nothing is collected without a connection.
 
 from typing import Any
 
+from bridge.client.protocol.actions import Actions
 from bridge.client.protocol.calls import Calls
 from bridge.client.protocol.events import Event, StatusReceived, Unusable
 from bridge.client.protocol.goals import Goals
@@ -31,6 +32,7 @@ class ClientCore:
         calls: The pending service calls.
         goals: The active goals.
         services: The services of this client.
+        actions: The actions of this client.
     """
 
     def __init__(
@@ -49,6 +51,7 @@ class ClientCore:
         self.calls = Calls(wire)
         self.goals = Goals(wire)
         self.services = Services(wire)
+        self.actions = Actions(wire)
         self._fragments = Reassembler(max_size=max_size)
 
     @property
@@ -62,6 +65,7 @@ class ClientCore:
         self.wire.clear()
         self.publications.restore()
         self.services.restore()
+        self.actions.restore()
         self.subscriptions.restore()
 
     def lost(self) -> None:
@@ -70,6 +74,7 @@ class ClientCore:
         self.wire.clear()
         self.calls.lost()
         self.services.lost()
+        self.actions.lost()
         self.goals.lost()
         self._fragments.clear()
 
@@ -150,6 +155,8 @@ class ClientCore:
                 )
             case "action_feedback" | "action_result":
                 return self.goals.receive(operation, data)
+            case "send_action_goal" | "cancel_action_goal":
+                return self.actions.receive(operation, data)
             case str():
                 return Unusable(f"a message with an unknown op arrived: {excerpt(data)}")
             case _:

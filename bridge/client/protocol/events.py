@@ -14,6 +14,17 @@ class MessageReceived(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
+class MessageDiscarded:
+    """A message above its topic's limit: its size, the limit, and how many there were so far."""
+
+    topic: str
+    size: int
+    limit: int
+    count: int
+    subscriptions: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
 class CallAnswered:
     """A service answered: its values, or the text of its refusal."""
 
@@ -74,8 +85,35 @@ class GoalEnded:
     ok: bool
     status: GoalStatus
     values: Any
+    text: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class GoalRequested:
+    """A goal for an action of this client."""
+
+    action: str
+    goal: str
+    values: dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class CancelRequested:
+    """The sender of a goal wants it cancelled."""
+
+    action: str
+    goal: str
 
 
 Event = (
-    MessageReceived | CallAnswered | ServiceRequested | StatusReceived | GoalFeedback | GoalEnded | Unusable
+    MessageReceived
+    | MessageDiscarded
+    | CallAnswered
+    | ServiceRequested
+    | StatusReceived
+    | GoalFeedback
+    | GoalEnded
+    | GoalRequested
+    | CancelRequested
+    | Unusable
 )

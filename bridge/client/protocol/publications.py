@@ -6,8 +6,9 @@ from typing import Any
 
 from bridge.client.protocol.wire import Wire
 from bridge.codecs.json_codec import encode
+from bridge.codecs.message_check import Definitions, MessageCheck
 from bridge.errors import EncodeError, TypeConflictError
-from bridge.names import absolute, check_name, same_type, split_type
+from bridge.names import absolute, check_name, ros1_type, same_type, split_type
 from bridge.qos import Qos
 
 
@@ -23,6 +24,7 @@ class _Advertised:
     wire_id: str
     prefix: bytes  # start of its messages on the wire, which end with a brace
     holders: set[int] = field(default_factory=set)
+    check: MessageCheck | None = None
     latched: bytes | None = None  # the last message, repeated after a reconnection
 
 
@@ -31,6 +33,7 @@ class Publications:
 
     def __init__(self, wire: Wire) -> None:
         self._wire = wire
+        self._definitions: dict[str, Definitions] = {}
         self._advertised: dict[str, _Advertised] = {}
         self._advertisements: dict[int, _Advertised] = {}
 
@@ -38,7 +41,7 @@ class Publications:
         """Advertise everything on a new connection, and repeat the last message of latched topics."""
         for advertised in self._advertised.values():
             self._send_advertise(advertised)
-            if advertised.latched is not None:
+            if advertised.latched is not None and len(advertised.latched) <= self._wire.sendable:
                 self._wire.write_bytes(advertised.latched)
 
     def advertise(
@@ -62,6 +65,7 @@ class Publications:
             self._advertised[key] = advertised = _Advertised(
                 topic, type_name, latch, queue_size, qos, wire_id, prefix
             )
+            self._set_check(advertised)
             self._send_advertise(advertised)
         elif not same_type(advertised.type, type_name) or advertised.latch != latch or advertised.qos != qos:
             raise TypeConflictError(
@@ -84,19 +88,37 @@ class Publications:
             **qos,
         )
 
+    def is_known(self, type_name: str) -> bool:
+        """Return whether `define` was called for a type."""
+        return ros1_type(type_name) in self._definitions
+
+    def define(self, type_name: str, definitions: Definitions) -> None:
+        """Check messages of a type from now on, if its definition is among these."""
+        self._definitions[ros1_type(type_name)] = definitions
+        for advertised in self._advertised.values():
+            if same_type(advertised.type, type_name):
+                self._set_check(advertised)
+
+    def _set_check(self, advertised: _Advertised) -> None:
+        name = ros1_type(advertised.type)
+        definitions = self._definitions.get(name, {})
+        advertised.check = MessageCheck(name, definitions) if name in definitions else None
+
     def publish(self, advertisement: int, msg: Mapping[str, Any]) -> bytes:
         """Return the bytes of a message of an advertised topic, which bypass the outbox."""
         advertised = self._advertisements[advertisement]
-        prefix = advertised.prefix
+        prefix, check = advertised.prefix, advertised.check
         try:
+            if check is not None and (tuple(msg) != check.trusted_keys or next(check.is_due)):
+                check(msg)
             body = encode(
                 msg,
                 nonfinite="refuse",
-                max_size=self._wire.max_size - len(prefix) - 1,
+                max_size=self._wire.sendable - len(prefix) - 1,
                 max_depth=self._wire.max_depth - 1,
             )
         except EncodeError as error:
-            raise EncodeError(f"a message of {advertised.topic} cannot be published: {error}") from None
+            raise type(error)(f"a message of {advertised.topic} cannot be published: {error}") from None
         data = b"%b%b}" % (prefix, body)
         if advertised.latch:
             advertised.latched = data

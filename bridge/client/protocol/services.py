@@ -58,6 +58,10 @@ class Services:
     def answer(self, ticket: int, values: Mapping[str, Any] | str, *, ok: bool = True) -> None:
         """Answer a request with fields, or with `ok=False` a reason as text, unless its connection was lost.
 
+        The reference server drops an answer whose `values` are not an object, and the caller waits for ever
+        (rosbridge_library/capabilities/service_response.py, `service_response_msg_fields`), so the text is in a
+        field of its own, which it ignores and the hub passes on.
+
         Raises:
             EncodeError: The values cannot be encoded as JSON; the request is still pending.
         """
@@ -66,7 +70,8 @@ class Services:
             return
         service, wire_id = request
         identity = {} if wire_id is None else {"id": wire_id}
-        self._wire.write(op="service_response", service=service, values=values, result=ok, **identity)
+        answer = {"values": values} if ok else {"values": {}, "reason": values}
+        self._wire.write(op="service_response", service=service, result=ok, **answer, **identity)
         del self._requests[ticket]
 
     def receive(self, operation: dict[str, Any], data: bytes | str) -> ServiceRequested | Unusable | None:

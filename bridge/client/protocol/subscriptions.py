@@ -8,7 +8,8 @@ from typing import Any, Final, NamedTuple
 
 import orjson
 
-from bridge.client.protocol.events import MessageReceived, Unusable
+from bridge.client.protocol.events import MessageDiscarded, MessageReceived, Unusable
+from bridge.client.protocol.probation import Probation
 from bridge.client.protocol.subscription_options import Delivery
 from bridge.client.protocol.wire import RosVersion, Wire
 from bridge.codecs.arrays import with_arrays, with_lists
@@ -41,6 +42,7 @@ class _Subscribed:
     type: str | None
     delivery: Delivery
     wire_id: str
+    max_size: int
     wanted: dict[int, _Wanted] = field(default_factory=dict)
     throttle_rate: int = 0
     queue_length: int = 0
@@ -51,6 +53,7 @@ class _Subscribed:
     as_json: bool = False
     """Whether JSON is asked for instead of CBOR."""
     envelopes_tried: int = 0
+    discarded: int = 0
 
     def combine(self) -> bool:
         """Combine the options to the fastest rate and the longest queue; return whether these changed."""
@@ -60,6 +63,11 @@ class _Subscribed:
         self.all_numbers = tuple(self.wanted)
         self.has_throttled = any(w.throttle_rate > self.throttle_rate for w in self.wanted.values())
         return before != (self.throttle_rate, self.queue_length)
+
+    def discard(self, topic: str, size: int) -> MessageDiscarded:
+        """Count a message above the limit."""
+        self.discarded += 1
+        return MessageDiscarded(topic, size, self.max_size, self.discarded, self.all_numbers)
 
     def receivers(self, now: float) -> tuple[int, ...]:
         """Return the numbers of the subscriptions that receive a message at `now`."""
@@ -84,7 +92,7 @@ class _Known(NamedTuple):
     subscribed: _Subscribed
 
 
-_UNKNOWN: Final = _Known(b"\xff", 0, "", _Subscribed("", None, Delivery(), ""))
+_UNKNOWN: Final = _Known(b"\xff", 0, "", _Subscribed("", None, Delivery(), "", 0))
 """Placeholder before the first envelope is known, with which no message begins."""
 
 
@@ -96,6 +104,7 @@ class Subscriptions:
         binary: Whether any topic is subscribed as CBOR.
         numpy: Whether any topic is subscribed with NumPy arrays.
         envelopes: The known envelopes of messages.
+        probation: The topics that are not subscribed now, because a message was too large.
     """
 
     def __init__(self, wire: Wire) -> None:
@@ -103,6 +112,7 @@ class Subscriptions:
         self.binary = False
         self.numpy = False
         self.envelopes: dict[bytes, _Known] = {}
+        self.probation = Probation()
         self._known = _UNKNOWN  # the last of these
         self._wire = wire
         self._subscribed: dict[str, _Subscribed] = {}
@@ -144,7 +154,8 @@ class Subscriptions:
         new = subscribed is None or (subscribed.type is None and type_name is not None)
         delivery = delivery or Delivery()
         if subscribed is None:
-            subscribed = _Subscribed(topic, type_name, delivery, f"subscribe:{topic}:{number}")
+            max_size = min(delivery.max_bytes or self._wire.max_size, self._wire.max_size)
+            subscribed = _Subscribed(topic, type_name, delivery, f"subscribe:{topic}:{number}", max_size)
             self._subscribed[key] = subscribed
             self._note_deliveries()
         elif type_name and subscribed.type and not same_type(subscribed.type, type_name):
@@ -164,7 +175,31 @@ class Subscriptions:
             self._send_subscribe(subscribed)
         return number
 
+    def blame(self, named: str | None, *, only_topics: bool) -> tuple[int, ...]:
+        """Handle a message that was too large for the connection (see `Probation.blame`).
+
+        Returns:
+            Numbers of the subscriptions to the topic that is left out from now on.
+        """
+        subscribed = [key for key in self._subscribed if not self.probation.holds(key)]
+        culprit = self.probation.blame(subscribed, named and absolute(named), only_topics=only_topics)
+        return () if culprit is None else self._subscribed[culprit].all_numbers
+
+    def release(self) -> bool:
+        """Subscribe to the next suspect of such a message; return whether there was one."""
+        topic = self.probation.release()
+        if topic is None:
+            return False
+        self._send_subscribe(self._subscribed[topic])
+        return True
+
+    def has_left_out(self, topic: str) -> bool:
+        """Return whether a topic is left out, because its messages are too large for the connection."""
+        return self.probation.has_left_out(absolute(topic))
+
     def _send_subscribe(self, subscribed: _Subscribed) -> None:
+        if self.probation.holds(absolute(subscribed.topic)):
+            return
         operation: dict[str, Any] = {"op": "subscribe", "id": subscribed.wire_id, "topic": subscribed.topic}
         if subscribed.type is not None:
             operation["type"] = self._wire.type_name(subscribed.type)
@@ -194,6 +229,7 @@ class Subscriptions:
                 self._send_subscribe(subscribed)
         else:
             del self._subscribed[absolute(subscribed.topic)]
+            self.probation.forget(absolute(subscribed.topic))
             self._note_deliveries()
             self._send_unsubscribe(subscribed)
 
@@ -212,7 +248,11 @@ class Subscriptions:
 
     def silent(self) -> list[str]:
         """Return the topics with a type that have had no message on this connection."""
-        return [s.topic for s in self._subscribed.values() if s.type is not None and not s.has_messages]
+        return [
+            s.topic
+            for key, s in self._subscribed.items()
+            if s.type is not None and not s.has_messages and not self.probation.holds(key)
+        ]
 
     def renew(self, topic: str) -> bool:
         """Renew the subscription of a topic that is silent although published; return whether it gives up CBOR.
@@ -232,7 +272,7 @@ class Subscriptions:
         self._send_subscribe(subscribed)
         return gives_up_cbor
 
-    def receive_known(self, data: bytes) -> MessageReceived | None:
+    def receive_known(self, data: bytes) -> MessageReceived | MessageDiscarded | None:
         """Handle a message with a known envelope; return None if `receive` has to handle it."""
         known = self._known
         if not data.startswith(known.envelope):
@@ -241,7 +281,10 @@ class Subscriptions:
                 return None
             self._known = known = found
         subscribed = known.subscribed
-        if data[-1] != BRACE or len(data) > self._wire.max_size or subscribed.has_throttled:
+        if len(data) > subscribed.max_size:
+            is_usable = len(data) <= self._wire.max_size
+            return subscribed.discard(known.topic, len(data)) if is_usable else None
+        if data[-1] != BRACE or subscribed.has_throttled:
             return None
         message = data[known.size : -1]
         try:
@@ -272,7 +315,7 @@ class Subscriptions:
 
     def receive(
         self, operation: dict[str, Any], now: float, data: bytes | str, *, from_cbor: bool = False
-    ) -> MessageReceived | Unusable | None:
+    ) -> MessageReceived | MessageDiscarded | Unusable | None:
         """Handle a publish, decoded from `data` (from CBOR with arrays according to `numpy`).
 
         None if it is not subscribed, or throttled.
@@ -286,6 +329,7 @@ class Subscriptions:
             return None
         if not subscribed.has_messages:
             subscribed.has_messages = True
+            self.probation.hear(absolute(topic))
             self.seen_version = self.seen_version or ros_version_of_message(msg)
         if (
             type(data) is bytes
@@ -294,6 +338,8 @@ class Subscriptions:
             and subscribed.envelopes_tried < _ENVELOPES
         ):
             self._learn_envelope(data, topic, subscribed)
+        if len(data) > subscribed.max_size:
+            return subscribed.discard(topic, len(data))
         receivers = subscribed.receivers(now)
         if not receivers:
             return None

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from itertools import count
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 from bridge.client.protocol.subscription_options import check_fragment_size
 from bridge.codecs.fragments import split
@@ -10,6 +10,9 @@ from bridge.codecs.json_codec import encode
 from bridge.names import Kind, ros1_type, ros2_type
 
 RosVersion = Literal[1, 2]
+
+SMALLEST_LIMIT: Final = 2048
+"""Smallest limit of a server that is believed, so that subscriptions and advertisements can always be sent."""
 
 
 class Wire:
@@ -21,6 +24,7 @@ class Wire:
         ros_version: ROS version of the server, None while unknown.
         fragment_size: Maximum number of characters in a message before `pieces` splits it; None for no limit.
         max_size: Maximum size of a message in bytes.
+        sendable: Maximum size of an outbound message, which the server may limit further.
         max_depth: Maximum nesting of a message.
         number: Function that returns a new number at each call.
     """
@@ -32,7 +36,7 @@ class Wire:
         self.connected = False
         self.ros_version: RosVersion | None = ros_version
         self.fragment_size = fragment_size
-        self.max_size = max_size
+        self.max_size = self.sendable = max_size
         self.max_depth = max_depth
         self._outbox: list[bytes] = []
         self.number: Callable[[], int] = count(1).__next__
@@ -44,8 +48,13 @@ class Wire:
     def write(self, **operation: Any) -> None:
         """Write an operation."""
         self.write_bytes(
-            encode(operation, nonfinite="refuse", max_size=self.max_size, max_depth=self.max_depth)
+            encode(operation, nonfinite="refuse", max_size=self.sendable, max_depth=self.max_depth)
         )
+
+    def limit(self, size: int) -> None:
+        """Refuse messages of more bytes from now on, unless they are sent in fragments."""
+        if self.fragment_size is None:
+            self.sendable = min(self.sendable, max(size, SMALLEST_LIMIT))
 
     def write_bytes(self, data: bytes) -> None:
         """Write an encoded message."""

@@ -7,16 +7,22 @@ without it CBOR packs only floats, and the other two are refused.
 Every conversion checks the type, range and number of values before it allocates memory for them.
 """
 
+import contextlib
+import time
 from base64 import b64decode
 from collections.abc import Callable
+from functools import cache
 from math import inf, nan
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 from bridge.errors import BridgeError
+from bridge.hub.delivery.filling import FieldTypes, Filler, Types
+from bridge.hub.delivery.interfaces import PARTS, message_texts, part_name
 from bridge.hub.errors import DefinitionsPendingError, RefusedError
 from bridge.names import ros1_type, ros2_type
 
 if TYPE_CHECKING:
+    from rosbags.typesys import Stores
     from rosbags.typesys.store import Typestore
 
 RosVersion = Literal[1, 2]
@@ -25,6 +31,8 @@ _NUMBERS: Final = {
     "int8": "i1",
     "uint8": "u1",
     "octet": "u1",
+    "byte": "u1",
+    "char": "u1",
     "int16": "i2",
     "uint16": "u2",
     "int32": "i4",
@@ -46,13 +54,14 @@ _RANGES: Final = {"f4": (-_FLOAT32, _FLOAT32), "f8": (-inf, inf)} | {
 _DEFAULTS: Final[dict[str, Any]] = {"bool": False, "string": "", "wstring": ""} | {
     name: 0.0 if elements[0] == "f" else 0 for name, elements in _NUMBERS.items()
 }
-_BYTES: Final = frozenset({"uint8", "octet"})
+_BYTES: Final = frozenset({"uint8", "octet", "char"})
 _TIMES: Final = {"builtin_interfaces/msg/Time": "time", "builtin_interfaces/msg/Duration": "duration"}
 _ROS1_TIME: Final = {"sec": "secs", "nanosec": "nsecs"}
 """Fields of a time in ROS 1, by their names in rosbags, which are ROS 2's."""
 _BYTES_A_VALUE: Final = 16
 """Bytes of the size limit per value of a serialised message; `{}` in an array can stand for dozens of values.
 """
+_DUMMY: Final = "structure_needs_at_least_one_member"
 _MISSING: Final = (
     "the hub has no message definitions: install rosbags (pip install rosbags) and start the hub again"
 )
@@ -63,8 +72,8 @@ _Convert = Callable[[Any], Any]
 class Definitions:
     """The known message types of one ROS version."""
 
-    def __init__(self, ros_version: RosVersion = 1) -> None:
-        """Start without definitions."""
+    def __init__(self, ros_version: RosVersion = 1, wall_clock: Callable[[], int] = time.time_ns) -> None:
+        """Start without definitions; `wall_clock` returns nanoseconds since 1970, for absent stamps."""
         self.ros_version: RosVersion = ros_version
         self.load_in_background: Callable[[], None] | None = None
         """Starts a thread for `load`; without it, loading blocks the operation that needs definitions."""
@@ -73,17 +82,24 @@ class Definitions:
         self._store: Typestore | None = None
         self._missing = False
         self._typed: dict[str, _Convert] = {}
+        self._types = Types(self._field_types, _DEFAULTS, _TIMES, ros_version, wall_clock)
+        self._fillers: dict[str, Filler | None] = {}
         self._texts: dict[str, str] = {}
 
     def load(self) -> None:
         """Import rosbags and its types, which takes tenths of a second."""
         try:
-            from rosbags.typesys import Stores, get_typestore
+            from rosbags.typesys import Stores
         except ImportError:
             self._missing = True
         else:
-            self._store = get_typestore(Stores.ROS2_JAZZY if self.ros_version == 2 else Stores.ROS1_NOETIC)
+            self._store = _store(Stores.ROS2_JAZZY if self.ros_version == 2 else Stores.ROS1_NOETIC)
         self.pending = False
+
+    def preload(self) -> None:
+        """Load the definitions in the background, before an operation needs them."""
+        with contextlib.suppress(DefinitionsPendingError):
+            self.require()
 
     def require(self) -> None:
         """Load the definitions for an operation that needs them.
@@ -104,6 +120,35 @@ class Definitions:
     def name(self, type_name: str) -> str:
         """Return a message type's name as this ROS version writes it."""
         return ros2_type(type_name) if self.ros_version == 2 else ros1_type(type_name)
+
+    def filler(self, type_name: str) -> Filler | None:
+        """Return what fills the absent fields of a message type, or None if the type is unknown.
+
+        Raises:
+            DefinitionsPendingError: The definitions are being loaded.
+        """
+        self.require()
+        if type_name not in self._fillers:
+            try:
+                _store, known = self._known(type_name)
+            except BridgeError:
+                return None
+            self._fillers[type_name] = Filler(self._types, known)
+        return self._fillers[type_name]
+
+    def fillers(self, type_name: str, kind: Literal["srv", "action"]) -> dict[str, Filler]:
+        """Return what fills the parts of a service or an action, such as `Request`; unknown parts are left out.
+
+        Raises:
+            DefinitionsPendingError: The definitions are being loaded.
+        """
+        fillers = {part: self.filler(part_name(type_name, part, self.ros_version)) for part in PARTS[kind]}
+        return {part: filler for part, filler in fillers.items() if filler is not None}
+
+    def _field_types(self, name: str) -> FieldTypes:
+        store, known = self._known(name)
+        fields = _fields(store, known)
+        return {self._field(name, field): _element(kind, content) for field, (kind, content) in fields}
 
     def typed(self, type_name: str, message: dict[str, Any]) -> dict[str, Any] | None:
         """Convert a message's arrays of numbers to typed arrays, for CBOR.
@@ -149,7 +194,7 @@ class Definitions:
             name = waiting.pop(0)
             if name in found:
                 continue
-            constants, fields = store.fielddefs[name]
+            constants, fields = store.fielddefs[name][0], _fields(store, name)
             elements = [_element(kind, content) for _, (kind, content) in fields]
             nested = [element in store.fielddefs for element, _ in elements]
             found[name] = {
@@ -173,7 +218,7 @@ class Definitions:
     def _shown(self, name: str) -> str:
         if self.ros_version == 1:
             return _TIMES.get(name) or ros1_type(name)
-        return name
+        return name.replace("/msg/", "/srv/") if name.endswith(("_Request", "_Response")) else name
 
     def _field(self, type_name: str, field: str) -> str:
         return _ROS1_TIME[field] if self.ros_version == 1 and type_name in _TIMES else field
@@ -183,9 +228,37 @@ class Definitions:
         if self._store is None:
             raise RefusedError(_MISSING)
         known = ros2_type(type_name)
-        if known not in self._store.fielddefs:
+        if not _define(self._store, known, self.ros_version):
             raise RefusedError(f"the hub does not know the fields of {type_name}")
         return self._store, known
+
+
+@cache
+def _store(name: "Stores") -> "Typestore":
+    """Return the types of a ROS version, one store for all hubs of a process."""
+    from rosbags.typesys import get_typestore
+
+    return get_typestore(name)
+
+
+def _define(store: "Typestore", name: str, ros_version: RosVersion) -> bool:
+    """Return whether a type is known, after adding its definition and those of its parts if rosbags lacks them."""
+    if name in store.fielddefs:
+        return True
+    text = message_texts(ros_version).get(name)
+    if text is None:
+        return False
+    from rosbags.typesys import get_types_from_msg
+
+    types = get_types_from_msg(text, name)
+    for field in types[name][1]:
+        element, _length = _element(*field[1])
+        if element not in _DEFAULTS:
+            _define(store, element, ros_version)
+    if ros_version == 1:
+        types = {name: (types[name][0], [entry for entry in types[name][1] if entry[0] != _DUMMY])}
+    store.register(types)
+    return True
 
 
 class _Builder:
@@ -243,6 +316,11 @@ class _Builder:
         self._values += max(values, 1)
         if self._values > self._max_values:
             raise ValueError(f"it has more than {self._max_values} values")
+
+
+def _fields(store: "Typestore", name: str) -> list[Any]:
+    """Return the fields of a type, without the one that ROS 2 adds to an empty message."""
+    return [entry for entry in store.fielddefs[name][1] if entry[0] != _DUMMY]
 
 
 def _element(kind: Any, content: Any) -> tuple[str, int]:

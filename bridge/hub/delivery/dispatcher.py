@@ -56,14 +56,16 @@ class Dispatcher:
         """Queue a message that must not be dropped, in the encoding that was requested."""
         self.work += len(payload) >> 6
         if png:
-            wrapped = as_png(payload)
-            # No answer may be lost, so one that is too large as a picture, which is rare, is sent as plain
-            # JSON.
-            payload = wrapped if len(wrapped) <= self._limits.message_bytes else payload
+            payload = self.as_png(payload)
         client.outbox.put(payload, fragment_size)
         if client.outbox.overflowed:
             client.close_reason = f"it leaves {self._limits.client_bytes} bytes of answers unread"
         self.mark_ready(client)
+
+    def as_png(self, payload: bytes) -> bytes:
+        """Return an operation as a picture, or unchanged if that is too large, which is rare: no answer may be lost."""
+        wrapped = as_png(payload)
+        return wrapped if len(wrapped) <= self._limits.message_bytes else payload
 
     def offer(self, client: Client, lane: Lane, payload: bytes, now: float) -> None:
         """Queue a message that newer messages of its lane may replace."""

@@ -8,11 +8,12 @@ import orjson
 
 from bridge.client.protocol.events import GoalStatus
 from bridge.errors import BridgeError
+from bridge.hub.delivery.definitions import Definitions
 from bridge.hub.delivery.dispatcher import Dispatcher
 from bridge.hub.delivery.outbox import Lane
 from bridge.hub.errors import RefusedError
-from bridge.hub.graph import Client, Graph
-from bridge.hub.handlers.requests import Caller, Offers
+from bridge.hub.graph import Client, Graph, Offer
+from bridge.hub.handlers.requests import Caller, Offers, filled
 from bridge.hub.limits import HubLimits
 from bridge.hub.operations import Operation, flag, optional_text, text
 from bridge.names import absolute, ros2_type, same_type
@@ -28,7 +29,7 @@ class _Goal:
 
     key: str
     caller: Caller
-    action: str
+    action: Offer
     server: Client
     wants_feedback: bool
     feedback: Lane = field(default_factory=Lane)
@@ -37,11 +38,14 @@ class _Goal:
 class Actions:
     """The actions of one hub, and the goals that have not ended."""
 
-    def __init__(self, graph: Graph, limits: HubLimits, dispatcher: Dispatcher) -> None:
+    def __init__(
+        self, graph: Graph, limits: HubLimits, dispatcher: Dispatcher, definitions: Definitions
+    ) -> None:
         """Start without actions."""
         self._graph = graph
         self._limits = limits
         self._dispatcher = dispatcher
+        self._definitions = definitions
         self._offers = Offers(
             graph.actions, lambda client: client.actions, limits.services_per_client, "action"
         )
@@ -55,11 +59,12 @@ class Actions:
             self._send_cancel(self._take(key))
         for key in list(client.tasks):
             goal = self._take(key)
-            self._fail(goal.caller, f"{goal.action} went away during the goal")
+            self._fail(goal.caller, f"{goal.action.name} went away during the goal")
 
     def advertise(self, client: Client, operation: Operation, _now: float) -> None:
         """Perform `advertise_action`."""
-        self._offers.add(client, operation, ros2_type(text(operation, "type"), "action"))
+        type_name = ros2_type(text(operation, "type"), "action")
+        self._offers.add(client, operation, type_name, self._definitions.fillers(type_name, "action"))
 
     def unadvertise(self, client: Client, operation: Operation, _now: float) -> None:
         """Perform `unadvertise_action`; goals that it executes may still be ended."""
@@ -95,13 +100,13 @@ class Actions:
             "id": key,
             "action": action.name,
             "action_type": action.type,
-            "args": {} if args is None else args,
+            "args": filled(action.fillers.get("Goal"), args, self._limits.message_bytes),
             "feedback": wants_feedback,
         }
         payload = self._dispatcher.checked(orjson.dumps(request), f"the goal for {name}")
         lane = Lane(self._limits.queue_length)
         lane.fragment_size = caller.fragment_size
-        self.goals[key] = _Goal(key, caller, action.name, server, wants_feedback, lane)
+        self.goals[key] = _Goal(key, caller, action, server, wants_feedback, lane)
         client.goals[caller.id] = key
         server.tasks.add(key)
         self._dispatcher.send(server, payload)
@@ -112,7 +117,7 @@ class Actions:
         goal_id = operation.get("id")
         key = client.goals.get(goal_id) if isinstance(goal_id, str | int | None) else None
         goal = self.goals[key] if key is not None else None
-        if goal is None or goal.action != absolute(name):
+        if goal is None or goal.action.name != absolute(name):
             raise RefusedError(f"this client does not have a goal {str(goal_id)[:80]!r} of {name}")
         self._send_cancel(goal)
 
@@ -122,7 +127,7 @@ class Actions:
         if name == service or name not in self._graph.actions:
             return None
         for key in client.goals.values():
-            if self.goals[key].action == name:
+            if self.goals[key].action.name == name:
                 self._send_cancel(self.goals[key])
         return {"return_code": 0, "goals_canceling": []}
 
@@ -131,11 +136,14 @@ class Actions:
         goal = self._goal_of(client, operation)
         values = operation.get("values", {})
         if not isinstance(values, dict):
-            raise RefusedError(f"the feedback of {goal.action} must be a JSON object")
+            raise RefusedError(f"the feedback of {goal.action.name} must be a JSON object")
         if not goal.wants_feedback:
             return
+        values = filled(goal.action.fillers.get("Feedback"), values, self._limits.message_bytes)
         payload = goal.caller.operation("action_feedback", "action", values=values)
-        self._dispatcher.checked(payload, f"the feedback of {goal.action}")
+        self._dispatcher.checked(payload, f"the feedback of {goal.action.name}")
+        if goal.caller.png:
+            payload = self._dispatcher.as_png(payload)
         self._dispatcher.offer(goal.caller.client, goal.feedback, payload, now)
 
     def end_goal(self, client: Client, operation: Operation, _now: float) -> None:
@@ -146,15 +154,16 @@ class Actions:
         if isinstance(status, bool) or not isinstance(status, int) or status not in set(GoalStatus):
             status = GoalStatus.SUCCEEDED if result is True else GoalStatus.ABORTED
         if result is not True:
-            reason = f"{goal.action} did not reach the goal" if values is None else values
+            reason = f"{goal.action.name} did not reach the goal" if values is None else values
             self._fail(
                 goal.caller, reason if isinstance(reason, str) else orjson.dumps(reason).decode(), status
             )
         elif not isinstance(values, dict | None):
-            self._fail(goal.caller, f"{goal.action} ended with values that are not a JSON object")
+            self._fail(goal.caller, f"{goal.action.name} ended with values that are not a JSON object")
         else:
-            payload = goal.caller.operation(*_RESULT, values=values or {}, status=status, result=True)
             try:
+                values = filled(goal.action.fillers.get("Result"), values, self._limits.message_bytes)
+                payload = goal.caller.operation(*_RESULT, values=values, status=status, result=True)
                 goal.caller.answer(self._dispatcher, payload)
             except RefusedError as error:
                 self._fail(goal.caller, str(error))
@@ -172,7 +181,7 @@ class Actions:
         return goal
 
     def _send_cancel(self, goal: _Goal) -> None:
-        cancel = {"op": "cancel_action_goal", "id": goal.key, "action": goal.action}
+        cancel = {"op": "cancel_action_goal", "id": goal.key, "action": goal.action.name}
         self._dispatcher.send(goal.server, orjson.dumps(cancel))
 
     def _fail(self, caller: Caller, reason: str, status: int = GoalStatus.ABORTED) -> None:

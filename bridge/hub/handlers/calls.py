@@ -10,10 +10,12 @@ from typing import Any, Final
 import orjson
 
 from bridge.errors import BridgeError
+from bridge.hub.delivery.definitions import Definitions
 from bridge.hub.delivery.dispatcher import Dispatcher
+from bridge.hub.delivery.filling import Filler
 from bridge.hub.errors import RefusedError
 from bridge.hub.graph import Client, Graph
-from bridge.hub.handlers.requests import Caller, Offers
+from bridge.hub.handlers.requests import Caller, Offers, filled
 from bridge.hub.handlers.rosapi import PREFIX, Rosapi
 from bridge.hub.limits import HubLimits
 from bridge.hub.operations import Operation, number, text
@@ -31,6 +33,8 @@ class _Call:
     caller: Caller
     server: Client
     deadline: float
+    filler: Filler | None
+    """Fills absent fields of the answer."""
 
 
 class Calls:
@@ -41,6 +45,7 @@ class Calls:
         graph: Graph,
         limits: HubLimits,
         dispatcher: Dispatcher,
+        definitions: Definitions,
         rosapi: Rosapi,
         answer_here: Callable[[Client, str], dict[str, Any] | None],
     ) -> None:
@@ -48,6 +53,7 @@ class Calls:
         self._graph = graph
         self._limits = limits
         self._dispatcher = dispatcher
+        self._definitions = definitions
         self._rosapi = rosapi
         self._answer_here = answer_here
         self._offers = Offers(
@@ -84,7 +90,8 @@ class Calls:
         name, type_name = text(operation, "service"), text(operation, "type")
         if absolute(name).startswith(PREFIX):
             raise RefusedError(f"{name} belongs to the hub")
-        self._offers.add(client, operation, self._rosapi.service_type_name(type_name))
+        type_name = self._rosapi.service_type_name(type_name)
+        self._offers.add(client, operation, type_name, self._definitions.fillers(type_name, "srv"))
 
     def unadvertise(self, client: Client, operation: Operation, _now: float) -> None:
         """Perform `unadvertise_service`."""
@@ -100,10 +107,10 @@ class Calls:
 
     def _start(self, caller: Caller, operation: Operation, now: float) -> None:
         name, args = caller.name, operation.get("args")
-        key, args = absolute(name), {} if args is None else args
+        key = absolute(name)
         if self._rosapi.offers(key):
             self._dispatcher.work += (len(self._graph.topics) + len(self._graph.services)) >> 3
-            self._answer(caller, self._rosapi.call(key, args))
+            self._answer(caller, self._rosapi.call(key, {} if args is None else args))
             return
         service = self._graph.services.get(key)
         if service is None:
@@ -119,9 +126,10 @@ class Calls:
             raise RefusedError(f"{name} already has {len(server.requests)} calls to answer")
         deadline = now + min(number(operation, "timeout") or inf, self._limits.call_timeout)
         request_id = f"service_request:{key}:{next(self._numbers)}"
+        args = filled(service.fillers.get("Request"), args, self._limits.message_bytes)
         payload = orjson.dumps({"op": "call_service", "id": request_id, "service": key, "args": args})
         self._dispatcher.checked(payload, f"the request for {name}")
-        self.pending[request_id] = _Call(caller, server, deadline)
+        self.pending[request_id] = _Call(caller, server, deadline, service.fillers.get("Response"))
         self._schedule(deadline, request_id)
         client.calls.add(request_id)
         server.requests.add(request_id)
@@ -139,14 +147,19 @@ class Calls:
         key = operation.get("id")
         if not isinstance(key, str) or key not in client.requests:
             raise RefusedError(f"no client waits for the answer {str(key)[:80]!r}")
-        caller = self._take(key).caller
+        call = self._take(key)
+        caller = call.caller
         values, result = operation.get("values", {}), operation.get("result", True)
+        reason = operation.get("reason")
+        if result is False and isinstance(reason, str):  # of this project's client
+            self._fail(caller, reason)
+            return
         # In ROS 1 the reference server forwards an answer whatever its result; roslibpy's tests rely on this.
         if isinstance(values, dict) and (
             result is True or (self._rosapi.ros_version == 1 and "values" in operation)
         ):
             try:
-                self._answer(caller, values)
+                self._answer(caller, filled(call.filler, values, self._limits.message_bytes))
             except RefusedError as error:
                 self._fail(caller, str(error))
         elif result is True:

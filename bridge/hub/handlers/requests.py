@@ -1,14 +1,15 @@
 """Servers and callers, common to services and actions."""
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Self
+from typing import Any, Self
 
 import orjson
 
 from bridge.hub.delivery.dispatcher import Dispatcher, fragment_size_of
 from bridge.hub.delivery.encodings import Compression, compression_of
+from bridge.hub.delivery.filling import Filler
 from bridge.hub.errors import RefusedError
 from bridge.hub.graph import Client, Offer
 from bridge.hub.operations import Operation, OperationId, checked_name, is_logged, number, operation_id, text
@@ -49,6 +50,22 @@ class Caller:
         dispatcher.send(self.client, payload, fragment_size=self.fragment_size, png=self.png)
 
 
+def filled(filler: Filler | None, values: Any, room: int) -> Any:
+    """Return arguments or results with the defaults of absent fields, and named fields instead of a list.
+
+    Raises:
+        RefusedError: They would grow by more than `room` bytes.
+    """
+    if values is None:
+        values = {}
+    if filler is not None:
+        if isinstance(values, list):
+            values = filler.named(values)
+        if isinstance(values, dict):
+            filler.fill(values, None, room)
+    return values
+
+
 class Offers:
     """Services or actions by name; the last client to offer a name serves it."""
 
@@ -61,7 +78,9 @@ class Offers:
         self._limit = limit
         self._kind = kind
 
-    def add(self, client: Client, operation: Operation, type_name: str) -> None:
+    def add(
+        self, client: Client, operation: Operation, type_name: str, fillers: Mapping[str, Filler]
+    ) -> None:
         """Add an offer, or take it over from another client."""
         name = checked_name(text(operation, self._kind))
         key, names = absolute(name), self._names_of(client)
@@ -73,7 +92,7 @@ class Offers:
             if is_logged(client.takeovers):
                 log.warning("%s took %s over from %s", client.node, key, before.client.node)
             self._names_of(before.client).discard(key)
-        self._offers[key] = Offer(key, type_name, client)
+        self._offers[key] = Offer(key, type_name, client, fillers)
         names.add(key)
 
     def remove(self, client: Client, operation: Operation) -> None:

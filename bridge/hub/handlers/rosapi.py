@@ -17,6 +17,7 @@ import orjson
 from bridge.codecs.json_codec import is_deeper
 from bridge.errors import NameFormError
 from bridge.hub.delivery.definitions import Definitions
+from bridge.hub.delivery.interfaces import part_name
 from bridge.hub.errors import RefusedError
 from bridge.hub.graph import Graph
 from bridge.hub.limits import HubLimits
@@ -30,6 +31,9 @@ ROSOUT: Final = "/rosout"
 """The topic of ROS's log, which carries the hub's refusals."""
 _ACTIONLIB: Final = ("goal", "cancel", "status", "feedback", "result")
 """Topics that a server of ROS 1's actionlib publishes or subscribes to under its name."""
+
+_ROS2_FIELDS: Final = {"default": "default_value"}
+"""Fields that have another name in ROS 2."""
 
 Values = dict[str, Any]
 Answer = Callable[..., Values]
@@ -71,6 +75,8 @@ class Rosapi:
             "search_param": ("SearchParam", ("name",), self._search_param),
             "publishers": ("Publishers", ("topic",), self._publishers),
             "service_host": ("ServiceHost", ("service",), self._service_host),
+            "service_request_details": ("ServiceRequestDetails", ("type",), self._service_request_details),
+            "service_response_details": ("ServiceResponseDetails", ("type",), self._service_response_details),
             "service_node": ("ServiceNode", ("service",), self._service_node),
             "service_providers": ("ServiceProviders", ("service",), self._service_providers),
             "service_type": ("ServiceType", ("service",), self._service_type),
@@ -105,7 +111,7 @@ class Rosapi:
             raise RefusedError(
                 f"{service}: args must be an object with the fields {', '.join(names) or '(none)'}"
             )
-        given = [args.get(name, "") for name in names]
+        given = [args.get(name, args.get(_ROS2_FIELDS.get(name), "")) for name in names]
         for name, value in zip(names, given, strict=True):
             if not isinstance(value, str):
                 raise RefusedError(f"{service}: field {name} must be a string")
@@ -163,6 +169,12 @@ class Rosapi:
 
     def _message_details(self, type_name: str) -> Values:
         return {"typedefs": self._definitions.details(type_name)}
+
+    def _service_request_details(self, type_name: str) -> Values:
+        return self._message_details(part_name(type_name, "Request", self.ros_version))
+
+    def _service_response_details(self, type_name: str) -> Values:
+        return self._message_details(part_name(type_name, "Response", self.ros_version))
 
     def _subscribers(self, name: str) -> Values:
         topic = self._graph.topics.get(absolute(name))

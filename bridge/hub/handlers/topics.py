@@ -126,7 +126,10 @@ class Topics:
             _learn_envelope(advertisement, name, raw)
         topic = advertisement.topic
         if topic.subscriptions or topic.latching:
-            self.distribute(topic, parsed, _cut_out(operation, raw), now)
+            data = _cut_out(operation, raw)
+            filler = advertisement.filler
+            filled = filler.fill(parsed, data, self._limits.message_bytes) if filler else None
+            self.distribute(topic, parsed, filled or data, now)
 
     def publish_again(self, client: Client, data: bytes, now: float) -> bool:
         """Perform a `publish` with a known envelope: only its message is parsed, and forwarded as received.
@@ -160,7 +163,15 @@ class Topics:
         if type(parsed) is not dict or is_deeper(message, self._limits.depth - 1):
             return False
         if topic.subscriptions or topic.latching:
-            self.distribute(topic, parsed, message, now, envelope, data)
+            try:
+                filler = advertisement.filler
+                filled = filler.fill(parsed, message, self._limits.message_bytes) if filler else None
+                if filled is None:
+                    self.distribute(topic, parsed, message, now, envelope, data)
+                else:
+                    self.distribute(topic, parsed, filled, now)
+            except RefusedError:
+                return False
         return True
 
     def distribute(
@@ -198,7 +209,7 @@ class Topics:
             if subscription.compression is _PLAIN:
                 if subscription.prefix != prefix:
                     prefix = subscription.prefix
-                    payload = b"%b%b}" % (prefix, data)
+                    payload = prefix + data + b"}"
                 self._dispatcher.offer(subscription.client, subscription.lane, payload, now)
             else:
                 message = message or self._message(topic, data, parsed)
@@ -314,9 +325,11 @@ class Topics:
         is_new = advertisement is None or own_id not in advertisement.ids
         if is_new and client.open_advertisements >= self._limits.advertisements_per_client:
             raise RefusedError(f"this client already has {client.open_advertisements} advertisements")
+        self._definitions.require()
         topic = self._join(name, type_name, type_needed=True)
         if advertisement is None:
-            advertisement = topic.advertisements[client] = Advertisement(client, topic)
+            filler = self._definitions.filler(topic.type)
+            advertisement = topic.advertisements[client] = Advertisement(client, topic, filler)
             client.advertisements[topic.name] = advertisement
         client.open_advertisements += is_new
         advertisement.ids.add(own_id)

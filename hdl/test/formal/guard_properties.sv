@@ -34,7 +34,7 @@ module guard_properties (
         assert ((ready & ~halt[2:0]) != 0 && halt[255:3] == 0);
       end
     end
-    // reading disturbs nobody
+    // reads do not change anything
     if (!write) assert (!ring);
   end
 endmodule

@@ -1,4 +1,4 @@
-"""This project's client under measurement: commands of scripts/bench bridge on standard input, answers on standard output."""
+"""This project's client under measurement, with commands of scripts/bench bridge on standard input."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ ACK_EVERY = 50
 
 
 def message_of(count: int) -> dict[str, Any]:
-    """Numbers as sensors have them, all digits used; as an array where they are many."""
+    """Return a message of numbers such as sensors measure, as an array if there are many."""
     values = (np.arange(count) + 1) / 7.0
     return {"data": values if count > 16 else values.tolist()}
 
 
 async def publish(ros: Ros, topic: str, values: int, count: int) -> dict[str, Any]:
-    """Publish as fast as it goes; the last message says so."""
+    """Publish as fast as possible; the last message is marked."""
     publisher = await ros.advertise(topic, TYPE)
     message = message_of(values)
     for _ in range(count):
@@ -36,14 +36,14 @@ async def publish(ros: Ros, topic: str, values: int, count: int) -> dict[str, An
 
 
 async def receive(ros: Ros, topic: str, count: int, compression: Any) -> dict[str, Any]:
-    """Hear so many messages; every now and then say how many there were."""
+    """Receive `count` messages, and print their number from time to time."""
     acks = await ros.advertise(topic + "/heard", TYPE)
     arrays: Any = "numpy" if compression == "cbor" else "list"
     listener = ros.subscribe(
         topic, TYPE, queue_length=1000, queue_size=1000, compression=compression, arrays=arrays
     )
     await ros.call("/rosapi/get_time")
-    tell("ready")
+    print_answer("ready")
     total, seen = 0.0, 0
     async with asyncio.timeout(PATIENCE):
         async for message in listener:
@@ -57,7 +57,7 @@ async def receive(ros: Ros, topic: str, count: int, compression: Any) -> dict[st
 
 
 async def round_trip(ros: Ros, topic: str, values: int, count: int, compression: Any) -> dict[str, Any]:
-    """Publish a message and hear it again, one after the other; microseconds of each."""
+    """Publish and receive one message after the other, and print the microseconds of each."""
     publisher = await ros.advertise(topic, TYPE)
     arrays: Any = "numpy" if compression == "cbor" else "list"
     listener = ros.subscribe(topic, TYPE, compression=compression, arrays=arrays)
@@ -73,13 +73,13 @@ async def round_trip(ros: Ros, topic: str, values: int, count: int, compression:
     return {"us": times}
 
 
-def tell(answer: object) -> None:
-    """One line of JSON."""
+def print_answer(answer: object) -> None:
+    """Print one line of JSON."""
     print(json.dumps(answer), flush=True)
 
 
 async def main() -> None:
-    """Do what each line says until there is none."""
+    """Execute the command in each line until end of file."""
     do: dict[str, Callable[..., Awaitable[dict[str, Any]]]] = {
         "publish": publish,
         "receive": receive,
@@ -88,11 +88,11 @@ async def main() -> None:
     lines = asyncio.StreamReader()
     await asyncio.get_running_loop().connect_read_pipe(lambda: asyncio.StreamReaderProtocol(lines), sys.stdin)
     async with connect(sys.argv[1]) as ros:
-        tell("connected")
+        print_answer("connected")
         while line := await lines.readline():
             command, cpu = json.loads(line), time.process_time()
             answer = await do[command.pop("do")](ros, **command)
-            tell(answer | {"cpu_s": time.process_time() - cpu})
+            print_answer(answer | {"cpu_s": time.process_time() - cpu})
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ const [modulePath, url] = process.argv.slice(2);
 const { Ros, Topic } = await import(pathToFileURL(modulePath));
 const messageType = "std_msgs/Float64MultiArray";
 const ACK_EVERY = 50;
-const tell = (answer) => process.stdout.write(`${JSON.stringify(answer)}\n`);
+const print_answer = (answer) => process.stdout.write(`${JSON.stringify(answer)}\n`);
 const valuesOf = (count) => Array.from({ length: count }, (_, at) => (at + 1) / 7);
 
 const ros = new Ros({ url });
@@ -42,7 +42,7 @@ const commands = {
       }),
     );
     await settled();
-    tell("ready");
+    print_answer("ready");
     await all;
     return { sum };
   },
@@ -68,12 +68,12 @@ const commands = {
   },
 };
 
-tell("connected");
+print_answer("connected");
 for await (const line of createInterface({ input: process.stdin })) {
   const command = JSON.parse(line);
   const before = process.cpuUsage();
   const answer = await commands[command.do](command);
   const { user, system } = process.cpuUsage(before);
-  tell({ ...answer, cpu_s: (user + system) / 1e6 });
+  print_answer({ ...answer, cpu_s: (user + system) / 1e6 });
 }
 process.exit(0);

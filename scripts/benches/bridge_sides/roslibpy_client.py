@@ -1,6 +1,7 @@
-"""roslibpy as a client under measurement: commands of scripts/bench bridge on standard input, answers on standard output.
+"""roslibpy as a client under measurement, with commands of scripts/bench bridge on standard input.
 
-Runs in roslibpy's own environment, so it imports nothing of this project. Transport: ROSLIBPY_TRANSPORT.
+It runs in roslibpy's own environment, so it does not import this project. ROSLIBPY_TRANSPORT selects the
+transport.
 """
 
 from __future__ import annotations
@@ -21,12 +22,12 @@ ACK_EVERY = 50
 
 
 def values_of(count: int) -> list[float]:
-    """Numbers as sensors have them, all digits used."""
+    """Return numbers such as sensors measure, with all digits significant."""
     return [(at + 1) / 7.0 for at in range(count)]
 
 
 def publish(ros: roslibpy.Ros, topic: str, values: int, count: int) -> dict[str, Any]:
-    """Publish as fast as it goes; the last message says so."""
+    """Publish as fast as possible; the last message is marked."""
     publisher = roslibpy.Topic(ros, topic, TYPE)
     message = roslibpy.Message({"data": values_of(values)})
     for _ in range(count):
@@ -36,7 +37,7 @@ def publish(ros: roslibpy.Ros, topic: str, values: int, count: int) -> dict[str,
 
 
 def receive(ros: roslibpy.Ros, topic: str, count: int, compression: str) -> dict[str, Any]:
-    """Hear so many messages; every now and then say how many there were."""
+    """Receive `count` messages, and print their number from time to time."""
     heard, acks = threading.Event(), roslibpy.Topic(ros, topic + "/heard", TYPE)
     seen = [0, 0.0]
 
@@ -50,14 +51,14 @@ def receive(ros: roslibpy.Ros, topic: str, count: int, compression: str) -> dict
 
     roslibpy.Topic(ros, topic, TYPE, queue_length=1000, compression=compression).subscribe(on_message)
     ros.get_time()
-    tell("ready")
+    print_answer("ready")
     if not heard.wait(PATIENCE):
         raise TimeoutError(f"{seen[0]} of {count} messages came")
     return {"sum": seen[1]}
 
 
 def round_trip(ros: roslibpy.Ros, topic: str, values: int, count: int, compression: str) -> dict[str, Any]:
-    """Publish a message and hear it again, one after the other; microseconds of each."""
+    """Publish and receive one message after the other, and print the microseconds of each."""
     back: queue.SimpleQueue[Any] = queue.SimpleQueue()
     publisher = roslibpy.Topic(ros, topic, TYPE)
     listener = roslibpy.Topic(ros, topic, TYPE, compression=compression)
@@ -75,17 +76,17 @@ def round_trip(ros: roslibpy.Ros, topic: str, values: int, count: int, compressi
     return {"us": times}
 
 
-def tell(answer: object) -> None:
-    """One line of JSON."""
+def print_answer(answer: object) -> None:
+    """Print one line of JSON."""
     print(json.dumps(answer), flush=True)
 
 
 def main() -> None:
-    """Do what each line says until there is none."""
+    """Execute the command in each line until end of file."""
     host, port = sys.argv[1].removeprefix("ws://").split(":")
     ros = roslibpy.Ros(host, int(port))
     ros.run(PATIENCE)
-    tell("connected")
+    print_answer("connected")
     do: dict[str, Callable[..., dict[str, Any]]] = {
         "publish": publish,
         "receive": receive,
@@ -94,7 +95,7 @@ def main() -> None:
     for line in sys.stdin:
         command, cpu = json.loads(line), time.process_time()
         answer = do[command.pop("do")](ros, **command)
-        tell(answer | {"cpu_s": time.process_time() - cpu})
+        print_answer(answer | {"cpu_s": time.process_time() - cpu})
     ros.terminate()
 
 

@@ -1,12 +1,13 @@
-"""A double of the reference server's design, for scripts/bench bridge: Tornado, threads, json, a message class per type.
+"""A server of the reference server's design, for scripts/bench bridge: Tornado, threads, message classes.
 
-It is not rosbridge_suite, which needs ROS, but does the same work on a message, for one type:
-Tornado reads it; a queue takes it to a thread of its connection, which parses it and fills a message object, every
-field checked against its type; the message is serialised and goes through a socket, as between ROS nodes; the
-subscription's thread reads it, makes a message object, takes the values out of it again and writes them as JSON;
-Tornado's loop, which alone may touch the connections, is handed the text. All else is left out, in the double's favour.
+It is not rosbridge_suite, which needs ROS, but does the same work for a message of one type: Tornado reads
+it; a queue passes it to the connection's thread, which parses it and fills a message object, checking every
+field against its type; the message is serialised and sent through a socket, as between ROS nodes; the
+subscription's thread reads it, creates a message object, extracts the values and writes them as JSON; the
+text is passed to Tornado's loop, which alone may use the connections. Everything else is omitted, in this
+server's favour.
 
-Prints its URI. Runs in an environment with Tornado, so it imports nothing of this project.
+It prints its URI. It runs in an environment with Tornado, so it does not import this project.
 """
 
 from __future__ import annotations
@@ -63,14 +64,14 @@ PYTHON_TYPES = {"string": (str,), "uint32": (int,), "float64": (int, float)}
 
 
 def filled(message: Message, values: dict[str, Any]) -> Message:
-    """Fill a message with what came as JSON; a value that does not fit its type is an error."""
+    """Return a message filled from JSON, or raise an error for a value that does not fit its type."""
     for name, value in values.items():
         setattr(message, name, fitting(message.fields[name], value))
     return message
 
 
 def fitting(kind: str, value: Any) -> Any:
-    """Return a value of a field's type."""
+    """Return a value converted to a field's type."""
     if kind.endswith("[]"):
         return [fitting(kind[:-2], item) for item in value]
     if kind in TYPES:
@@ -119,7 +120,7 @@ class Connection(tornado.websocket.WebSocketHandler):  # type: ignore[misc]  # t
         threading.Thread(target=self.work, daemon=True).start()
 
     def on_message(self, message: str | bytes) -> None:
-        """Leave it to the thread."""
+        """Queue the message for the thread."""
         self.incoming.put(message)
 
     def on_close(self) -> None:
@@ -127,16 +128,16 @@ class Connection(tornado.websocket.WebSocketHandler):  # type: ignore[misc]  # t
         self.incoming.put(None)
 
     def check_origin(self, _origin: str) -> bool:
-        """Let everybody in."""
+        """Accept every origin."""
         return True
 
     def work(self) -> None:
-        """Do what each message asks for."""
+        """Perform the operation in each message."""
         while (message := self.incoming.get()) is not None:
             self.perform(json.loads(message))
 
     def perform(self, operation: dict[str, Any]) -> None:
-        """Know the operations that are measured with, and answer calls."""
+        """Perform one of the operations used in measurements."""
         if operation["op"] == "publish":
             data = serialised(filled(Float64MultiArray(), operation["msg"]))
             with lock:
@@ -152,24 +153,24 @@ class Connection(tornado.websocket.WebSocketHandler):  # type: ignore[misc]  # t
             self.send({"op": "service_response", "id": operation.get("id"), "values": {}, "result": True})
 
     def listen(self, source: socket.socket, topic: str) -> None:
-        """Pass on what comes on a topic."""
+        """Forward the messages of a topic."""
         reader = source.makefile("rb")
         while size := reader.read(4):
             message = deserialised(reader.read(struct.unpack("<I", size)[0]))
             self.send({"op": "publish", "topic": topic, "msg": taken_out(message)})
 
     def send(self, operation: dict[str, Any]) -> None:
-        """Write it here, have the loop send it."""
+        """Encode an operation in this thread, and have the loop send it."""
         self.loop.add_callback(self.hand_out, json.dumps(operation))
 
     def hand_out(self, text: str) -> None:
-        """Send, in the loop's thread."""
+        """Send from the loop's thread."""
         if self.ws_connection is not None:
             self.write_message(text)
 
 
 async def main() -> None:
-    """Serve at any free port of loopback."""
+    """Serve on a free port of loopback."""
     sockets = tornado.netutil.bind_sockets(0, "127.0.0.1")
     server = tornado.httpserver.HTTPServer(tornado.web.Application([(r"/.*", Connection)]))
     server.add_sockets(sockets)

@@ -1,6 +1,7 @@
 """A clock that can be stepped, for processes that have this folder in PYTHONPATH.
 
-libfaketime cannot do it: with a monotonic clock of its own, waits change too, and without, Python's sleep fails.
+libfaketime is not suitable: if it also changes the monotonic clock, waits change too; otherwise Python's
+sleep fails.
 """
 
 import os

@@ -1,4 +1,4 @@
-"""The campaign's model: a place on a line of 16, seen by two small sensors.
+"""The campaign's model: a position among 16 cells, measured by two small sensors.
 
 Readings are addresses already (whole numbers from 0), so that the observer needs no code of the stack to know them.
 """
@@ -12,7 +12,7 @@ VALUES = {"near": 7, "far": 5}
 
 
 def model(slope: float = 1.0) -> Model:
-    """Return the model; `slope` tells the tables of two deployments of the same shape apart."""
+    """Return the model; `slope` makes the tables of two deployments of the same shape differ."""
     place = interval("x", 0.0, 16.0, cells=CELLS)
     x = np.arange(CELLS)
     known = []

@@ -232,9 +232,8 @@ def test_a_request_and_its_answer(identity, args, values, ok):
     assert isinstance(request, ServiceRequested)
     assert (request.service, request.args) == ("/s", args.get("args", {}))
     core.services.answer(request.ticket, values, ok=ok)
-    assert sent(core) == [
-        {"op": "service_response", "service": "/s", "values": values, "result": ok, **identity}
-    ]
+    answer = {"values": values} if ok else {"values": {}, "reason": values}
+    assert sent(core) == [{"op": "service_response", "service": "/s", "result": ok, **answer, **identity}]
     core.services.answer(request.ticket, values)
     assert sent(core) == [], "only once"
 
@@ -351,7 +350,7 @@ TOPICS = ["/a", "a", "/b", "c"]
 
 
 class PaperServer:
-    """What a server would know from the wire, kept as simply as can be."""
+    """The state of a server, as known from the wire, in the simplest form."""
 
     def __init__(self) -> None:
         self.advertised: dict[str, dict[str, Any]] = {}
@@ -379,7 +378,7 @@ class PaperServer:
 
 
 class Wishes(RuleBasedStateMachine):
-    """What this client wants and what the server knows must always agree while there is a connection."""
+    """Check that the client's requests and the server's state always agree while connected."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""Who may come in: tokens, TLS, and what is said to who may not."""
+"""Access to the hub: tokens, TLS, and answers to refused clients."""
 
 import ssl
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What the beacons see of the boat."""
+"""Distances and bearings of the boat from the beacons."""
 
 import math
 

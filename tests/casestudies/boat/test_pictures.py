@@ -73,7 +73,7 @@ class TestPositions:
 
     @pytest.mark.parametrize("x", [-45, 35])
     def test_the_label_covers_no_axis(self, tmp_path, x):
-        """What stands beside the map is the same, wherever the boat is."""
+        """The labels next to the map do not depend on the boat's position."""
         draw_positions(tmp_path / "middle.png", [instance(1, 0, 10)])
         draw_positions(tmp_path / "edge.png", [instance(1, x, 10)])
         water = np.bincount(pixels_of(tmp_path / "middle.png", (0.918, 0.949, 0.973))[:, 1])

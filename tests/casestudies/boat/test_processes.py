@@ -72,7 +72,7 @@ def where_the_boat_is(fake):
 
 
 async def say_result(fake, number):
-    """What the publisher says of one frame."""
+    """Return the publisher's message about one frame."""
     await fake.publish("/bm/frame", frame_message({"sec": number, "nanosec": 0}, number, published=True))
     await fake.publish("/BMresults", posterior_message(certain(500)))
 

@@ -41,7 +41,9 @@ def codes(robot):
 
 
 def sight(random, x, y, *, outlier=None):
-    """What a robot at (x, y) sees with the model's noise; one range may be wild, every third landmark hidden."""
+    """Return readings of a robot at (x, y) with noise; one range may be an outlier, some landmarks are
+    hidden.
+    """
     readings = []
     for place, landmark in enumerate(LANDMARKS):
         if place == random.integers(0, 6):

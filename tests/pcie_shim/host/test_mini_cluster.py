@@ -7,6 +7,7 @@ import dataclasses
 import re
 import select
 import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -34,6 +35,7 @@ from pcie_shim.errors import (
     ImageMismatchError,
     PcieShimError,
 )
+from pcie_shim.host.driven_board import DrivenBoard
 from pcie_shim.host.frame import FrameInput, FrameOutput
 from pcie_shim.host.frame_encoder import BoardWords
 from pcie_shim.host.loader import program
@@ -114,14 +116,17 @@ def test_a_frame_in_pieces_is_the_same_frame(cluster: MiniCluster) -> None:
 
 
 def test_an_output_says_how_each_board_ended_and_where_the_time_went(cluster: MiniCluster) -> None:
+    began = time.perf_counter_ns()
     output = cluster.run(frame(None, None, target_count=255, max_cycles=2**17))
+    elapsed = time.perf_counter_ns() - began
     kept = outcome(output)
     ends = {board.cycles for board in output.boards if board.reason is StopReason.SLICE}
     stopped = [board.cycles for board in output.boards if board.reason is StopReason.OVERFLOW]
     assert ends == {512 << output.slices - 1}
     assert 0 < max(stopped) <= min(ends)
-    assert output.register_writes_ns > 0
-    assert output.reads_ns > 0
+    spent = output.register_writes_ns, output.compute_ns, output.reads_ns
+    assert min(spent) > 0
+    assert sum(spent) < elapsed
     assert 0 < output.boards_compute_ns < output.compute_ns + output.register_writes_ns
     cluster.run(frame(3, 4))  # the results are the caller's own
     assert outcome(output) == kept
@@ -160,15 +165,36 @@ def boards(start_board: StartBoard) -> list[BoardProcess]:
     return [start_board(index=index) for index in range(2)]
 
 
-def test_written_priors_are_split_over_the_boards(boards: list[BoardProcess]) -> None:
+def written_addresses(cluster: MiniCluster, monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Return a list to which the addresses of all writes of the first board will be added."""
+    written: list[int] = []
+    link = cluster._boards[0].link
+    good = link.post
+
+    def post(writes: list[tuple[int, bytes]]) -> None:
+        written.extend(address for address, _ in writes)
+        good(writes)
+
+    monkeypatch.setattr(link, "post", post)
+    return written
+
+
+def test_written_priors_are_split_over_the_boards(
+    boards: list[BoardProcess], monkeypatch: pytest.MonkeyPatch
+) -> None:
     parts = images(20, (3, 2), prior_mode=PriorMode.WRITTEN, zeros=0)
     random = np.random.default_rng(1)
     with MiniCluster.open(endpoints_of(boards), parts) as cluster:
+        written = written_addresses(cluster, monkeypatch)
         first = random.integers(1, 256, 5).astype(np.uint16)
         second = random.integers(1, 256, 5).astype(np.uint16)
+        known = None
         for codes in (None, first, first, second, None, first):
+            written.clear()
             given_frame = frame(prior_codes=codes)
             assert outcome(cluster.run(given_frame)) == expected(parts, given_frame)
+            assert (rm.PRIOR_CODES in written) is (codes is not known or codes is None)
+            known = codes
         first[:] = second  # changed in place, after it was written
         assert outcome(cluster.run(given_frame)) == expected(parts, given_frame)
         for codes in (first[:4], np.full(5, 256, np.uint16)):
@@ -180,16 +206,8 @@ def test_what_did_not_change_is_not_written(
     boards: list[BoardProcess], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     parts = images(30, (3, 2), prior_bits=2)
-    written: list[int] = []
     with MiniCluster.open(endpoints_of(boards), parts) as cluster:
-        link = cluster._boards[0].link
-        good = link.post
-
-        def post(writes: list[tuple[int, bytes]]) -> None:
-            written.extend(address for address, _ in writes)
-            good(writes)
-
-        monkeypatch.setattr(link, "post", post)
+        written = written_addresses(cluster, monkeypatch)
         for changed, first in (
             ({}, rm.TARGET_COUNT),
             ({}, rm.RUN_UNTIL),
@@ -322,10 +340,13 @@ def test_a_misbehaving_board_fails_the_frame_and_comes_back(
     parts = images(70, (3, 2, 2))
     with MiniCluster.open(endpoints_of(boards), parts, timeout=20, slack=SLACK) as cluster:
         assert outcome(cluster.run(frame(**OWN))) == expected(parts, frame(**OWN))
+        link = cluster._boards[0].link
         with pytest.raises(error) as caught:
             cluster.run(frame(**OWN))
         assert (caught.value.board, caught.value.exit_code) == (1, 5)
         assert [cluster.is_open(at) for at in (0, 1)] == [True, False]
+        if error is BoardSilentError:  # meanwhile the others have finished, so their links stay
+            assert cluster._boards[0].link is link
         with pytest.raises(BoardGoneError):
             cluster.run(frame(**OWN))
         cluster.reopen(1, timeout=240)
@@ -372,8 +393,10 @@ def test_a_killed_board_is_gone_and_its_successor_is_programmed(boards: list[Boa
         boards[0].kill()
         with pytest.raises(BoardGoneError):
             cluster.run(frame())
+        began = time.monotonic()
         with pytest.raises(BoardUnreachableError):
             cluster.reopen(0, timeout=0.05)
+        assert time.monotonic() - began < 120
         with pytest.raises(BoardGoneError):
             cluster.run(frame())
         successor = BoardProcess(boards[0].endpoint)
@@ -467,6 +490,24 @@ def test_doorbell_numbers_go_round(start_board: StartBoard, monkeypatch: pytest.
         for number in (0xFFFFFFFE, 0xFFFFFFFF, 1, 2):
             assert outcome(cluster.run(frame(stop="own"))) == expected(parts, frame(stop="own"))
             assert cluster._boards[0].number == number
+
+
+def test_an_interrupted_opening_leaves_boards_that_can_be_opened(
+    boards: list[BoardProcess], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    open_board = DrivenBoard.open
+
+    def interrupted(board: DrivenBoard, *limits: float) -> None:
+        open_board(board, *limits)
+        raise KeyboardInterrupt
+
+    parts = images(10, (3, 2))
+    with monkeypatch.context() as patch:
+        patch.setattr(DrivenBoard, "open", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            MiniCluster.open(endpoints_of(boards), parts)
+    with MiniCluster.open(endpoints_of(boards), parts) as cluster:
+        assert outcome(cluster.run(frame())) == expected(parts, frame())
 
 
 def test_a_closed_cluster_runs_nothing(boards: list[BoardProcess]) -> None:

@@ -1,11 +1,17 @@
-"""The commands that listen for others on the network: what they refuse."""
+"""The commands that listen for others: the networks that they refuse, and the boards of a deployment."""
+
+import shutil
 
 import pytest
 
 from services.commands.board import app as board
+from services.commands.master import app as master
 from services.commands.pcie_app import app as pcie_app
 from services.commands.publisher import app as publisher
 from services.commands.subscriber import app as subscriber
+from services.errors import SettingsError
+from services.settings import Settings
+from services.sockets.serving import board_endpoints
 from tests.command_runner import invoke
 
 EVERYWHERE = "tcp://0.0.0.0:7000"
@@ -45,3 +51,40 @@ def test_a_service_serves_no_master_on_the_network(service, boat):
     ended = invoke(service, arguments)
     assert ended.exit_code == 2
     assert "--insecure" in ended.stderr
+
+
+def test_as_many_boards_as_the_deployment_has(boat, tmp_path, monkeypatch):
+    class Counted:
+        def __init__(self, directory, count, *_):
+            assert directory == tmp_path / "boards"
+            counted.append(count)
+
+        def run(self):
+            raise SettingsError("counted")
+
+    counted = []
+    monkeypatch.setattr("services.commands.board.BoardProcesses", Counted)
+    ended = invoke(board, ["-d", boat.directory, "--directory", tmp_path / "boards"])
+    assert (ended.exit_code, counted) == (2, [len(boat.boards)])
+    monkeypatch.setenv("BM_DEPLOYMENT", str(boat.directory))
+    invoke(board, ["--boards", "2", "--directory", tmp_path / "boards"])
+    assert counted.pop() == 2, "a number that is given counts"
+
+
+def test_a_folder_stands_for_all_boards_in_it(boat):
+    endpoints = board_endpoints(Settings(boards=("unix:/run/boards/",)), boat)
+    assert [each.path for each in endpoints] == [f"/run/boards/board{at}.sock" for at in range(4)]
+    with pytest.raises(SettingsError):
+        board_endpoints(Settings(boards=("unix:/run/boards",)), boat)
+
+
+def test_a_master_checks_before_it_starts_anything(built, tmp_path):
+    folder = tmp_path / "deployment"
+    shutil.copytree(built, folder)
+    assert invoke(master, ["--check", "-d", folder]).exit_code == 0
+    assert invoke(master, ["--check", "-d", folder, "--boards", "unix:/run/boards/"]).exit_code == 0
+    assert invoke(master, ["--check", "-d", folder, "--boards", "tcp://far:7000"]).exit_code == 2
+    (folder / "boards" / "board0.bm").write_bytes(b"")
+    damaged = invoke(master, ["--check", "-d", folder])
+    assert damaged.exit_code == 2
+    assert str(folder) in damaged.stderr

@@ -92,9 +92,12 @@ async def test_frames_wait_for_a_publisher_that_does_not_answer(run):
         computed(run)
     assert len(run.app.frames) == MOST_AT_PUBLISHER
     assert run.flow.awaited(run.peers.publisher) is not None
+    assert run.flow.awaited(run.peers.subscriber) is None
     assert run.flow.busy_with
     published(run, 1)
     assert len(run.app.frames) == MOST_AT_PUBLISHER + 1
+    run.flow.lost(run.peers.subscriber)
+    assert run.lost == {}
     run.flow.lost(run.peers.publisher)
     assert run.lost == {LossReason.WITH_PUBLISHER: MOST_AT_PUBLISHER - 1}
     run.flow.lost(run.peers.app)
@@ -208,7 +211,8 @@ async def test_only_a_board_that_fails_again_and_again_ends_the_run(run, reason)
     run.read(RESTARTS + 2)
     for _ in range(RESTARTS):
         failed(run, reason)
-    assert run.lost == {LossReason.FAILED: RESTARTS}
+    counted = LossReason.WITHHELD if reason is FailureReason.WITHHELD else LossReason.FAILED
+    assert run.lost == {counted: RESTARTS}
     assert run.error is None
     failed(run, reason)
     assert isinstance(run.error, BoardFailedError) is (reason is FailureReason.FAILED)
@@ -252,7 +256,20 @@ async def test_a_record_of_another_service_is_reported(run):
 
 async def test_a_frame_is_followed_by_its_number(boat):
     run = Run(boat, log_level="debug")
-    run.read(stamp_ns=17)
+    run.read(stamp_ns=17, received_tick=1000, sent_tick=3500)
     (notice,) = run.subscriber.records
     assert isinstance(notice, Notice)
     assert notice.sentence.startswith("frame=1 complete stamp_ns=17 ")
+    assert notice.sentence.endswith(" taken_us=2")
+
+
+async def test_the_time_before_the_first_reading_does_not_count(run, monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    assert "in 0.0 s" in run.master.summary()
+    now[0] = 400.0
+    run.read()
+    now[0] = 402.0
+    computed(run)
+    published(run, 1)
+    assert "1 results published in 2.0 s" in run.master.summary()

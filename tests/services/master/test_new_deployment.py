@@ -16,8 +16,8 @@ from services.pipeline.generations import Generations
 from services.settings import Settings
 from services.sockets.records import Hello, NotReloaded, Prepare, Prepared, Switch, Switched
 from services.supervision.parent import DIRECTORY_VARIABLE
-from services.supervision.private_directory import PrivateDirectory
 from terminal.errors import ExitCode, StoppedError
+from terminal.private_directory import PrivateDirectory
 from toolchain.building.regenerate import DeploymentEdits, regenerate_deployment
 from toolchain.deployment import load_deployment
 
@@ -48,6 +48,7 @@ def test_a_deployment_of_another_shape_is_refused_by_the_fields_name(folder, loa
     with pytest.raises(ShapeError) as refused:
         read_new(folder, loaded, same)
     assert "[[source]] 0 uri is " in str(refused.value)
+    assert "shape" not in str(refused.value)  # the machine is the same
 
     def as_used(deployment):
         sources = tuple(each.model_copy(update={"uri": "ws://flag:1"}) for each in deployment.sources)

@@ -3,12 +3,13 @@
 import asyncio
 import sys
 import time
+from contextlib import nullcontext, suppress
 from types import SimpleNamespace
-from unittest.mock import Mock
+from unittest.mock import AsyncMock, Mock
 
 import pytest
 
-from services.errors import ChildDiedError, OtherPeerError, ReportedError
+from services.errors import ChildDiedError, NotReloadedError, OtherPeerError, ReportedError, SettingsError
 from services.master.peers import Awaited, Peer, Peers
 from services.pipeline.generations import InForce
 from services.settings import Settings
@@ -101,6 +102,51 @@ async def test_a_peer_that_does_not_answer_in_time_is_cut_off(peers, events, own
     await asyncio.wait_for(watching, 50)
 
 
+@pytest.mark.parametrize(
+    ("role", "own_boards", "greet", "ready"),
+    [("pcie-app", False, 0.2, 10.8), ("subscriber", True, 0.2, 70.8), ("pcie-app", True, 60.2, 70.8)],
+)
+async def test_boards_that_compile_give_services_more_time(peers, events, role, own_boards, greet, ready):
+    peer = Peer(role, endpoint_from("unix:/x", ""), None)
+    peer.since = 7.0
+    peers._boards = Process() if own_boards else None
+    events.pending = Awaited("answer frame 3", 1.0, 0.2)
+    for limit in (greet, ready):
+        awaited = peers._awaited(peer)
+        assert (awaited.since, awaited.limit) == (7.0, pytest.approx(limit))
+        peer.greeted, peer.ready = True, peer.greeted
+    assert peers._awaited(peer) is events.pending
+
+
+ROLES = ("subscriber", "publisher", "pcie-app")
+
+
+@pytest.mark.parametrize("given", [(), ("publisher",), ("pcie-app",), ROLES])
+def test_peers_that_are_not_given_are_started(boat, tmp_path, given):
+    settings = Settings(**{role.replace("-", "_"): f"unix:/tmp/{role}.sock" for role in given})
+    peers = Peers(settings, InForce(boat, tmp_path), get_logger("test"), once=True)
+    peers.prepare()
+    try:
+        assert [peer.role for peer in peers] == list(ROLES)
+        assert tuple(peer.role for peer in peers if peer.child is None) == given
+        assert (peers.directory is None) is (given == ROLES)
+        assert (peers._boards is None) is ("pcie-app" in given)
+        assert len(peers.board_endpoints) == (0 if "pcie-app" in given else len(boat.boards))
+    finally:
+        if peers._private is not None:
+            peers._private.remove()
+
+
+@pytest.mark.parametrize("given", [{}, {"publisher": "unix:/tmp/publisher.sock"}])
+def test_a_fused_master_has_all_services_inside(boat, tmp_path, given):
+    settings = Settings(fused=True, boards=("unix:/tmp/board.sock",) * 4, **given)
+    peers = Peers(settings, InForce(boat, tmp_path), get_logger("test"), once=True)
+    with pytest.raises(SettingsError) if given else nullcontext():
+        peers.prepare()
+    peers._private.remove()
+    assert [(peer.endpoint, peer.child) for peer in peers] == ([] if given else [(None, None)] * 3)
+
+
 @pytest.fixture
 def connected(peers):
     """A service of the master's own that has just connected."""
@@ -164,3 +210,77 @@ async def test_trouble_and_an_error_in_taking_a_record_end_the_run(peers, events
     events.received = Mock(side_effect=BrokenPipeError)
     peers._take(connected, Begin(once=False))
     assert isinstance(events.error, BrokenPipeError)
+
+
+async def test_only_the_end_of_the_present_connection_counts(peers, connected):
+    connected.protocol = object()
+    peers._closed(connected, object(), None)
+    assert not connected.closed.is_set()
+    peers._closed(connected, connected.protocol, reason := OSError())
+    assert connected.closed.is_set()
+    assert connected.reason is reason
+
+
+async def test_flags_are_for_the_masters_own_processes(peers, connected):
+    peers._by_role["subscriber"] = Peer("subscriber", endpoint_from("unix:/x", ""), None)
+    connected.child = Mock()
+    peers.set_flag("--deployment", "/there")
+    connected.child.set_flag.assert_called_once_with("--deployment", "/there")
+
+
+async def test_a_peer_that_is_gone_is_reported_once(peers, connected, boat):
+    connected.child, peers._once, peers._log = None, False, Mock()
+    for _ in range(2):
+        for _ in range(2):
+            await peers._bring_back(connected)
+        peers._take(connected, own_hello("publisher", boat.hash))
+        connected.greeted = False
+    assert peers._log.warning.call_count == 2  # once each time
+
+
+@pytest.mark.parametrize(("own", "limit"), [(True, 60.0), (False, 0.2)])
+async def test_a_lost_peer_answers_no_reload_and_is_brought_back(peers, connected, own, limit):
+    if not own:
+        connected.child = None
+    peers._connect, peers._watch = AsyncMock(), AsyncMock()
+    peers._bring_back = AsyncMock(side_effect=[None, ChildDiedError("it died")])
+    connected.answer = asyncio.get_running_loop().create_future()
+    connected.protocol, connected.ready, connected.outdated, connected.away = object(), True, True, True
+    with pytest.raises(ChildDiedError):
+        await peers._keep(connected)
+    assert isinstance(connected.answer.exception(), NotReloadedError)
+    assert (connected.protocol, connected.ready, connected.outdated, connected.away) == (
+        None,
+        False,
+        False,
+        False,
+    )
+    assert [each.args for each in peers._connect.await_args_list] == [(connected, limit), (connected, 60.0)]
+
+
+async def test_services_inside_get_a_grace_period_to_end(boat, tmp_path):
+    async def stubborn():
+        while True:
+            with suppress(asyncio.CancelledError):
+                await stopped.wait()
+                return
+
+    stopped = asyncio.Event()
+    settings = Settings(stop_timeout=0.1)
+    peers = Peers(settings, InForce(boat, tmp_path), get_logger("test"), once=True)
+    task = asyncio.ensure_future(stubborn())
+    peers._inside.append(task)
+    await asyncio.sleep(0)
+    await asyncio.wait_for(peers.leave(), 60)
+    assert not task.done()
+    stopped.set()
+    await task
+
+
+async def test_the_status_of_a_peer_that_is_not_a_child(peers, connected):
+    connected.child = None
+    (status,) = peers.status()
+    assert (status.name, status.pid, status.restarts, status.ready) == ("publisher", 0, 0, False)
+    connected.child, connected.ready = Mock(pid=7, restarts=2), True
+    (status,) = peers.status()
+    assert (status.pid, status.restarts, status.ready) == (7, 2, True)

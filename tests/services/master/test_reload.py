@@ -1,16 +1,27 @@
 """Reloads: what is asked of whom, what becomes of readings meanwhile, and the way back."""
 
 import asyncio
+from pathlib import Path
+from unittest.mock import AsyncMock, Mock, call
 
 import msgspec
 import pytest
 
-from services.errors import NotReloadedError, SettingsError
+from services.errors import NotReloadedError, ReportedError, SettingsError
 from services.master import reload
-from services.master.reload import fates
+from services.master.reload import describe_frames
 from services.pipeline.frames import QUEUE_ALL_DEPTH
 from services.sockets.control_socket import ReloadOrder
-from services.sockets.records import FrameResult, LossReason, Outcome, Prepare, Published, Switch
+from services.sockets.records import (
+    FrameResult,
+    LossReason,
+    NotReloaded,
+    Outcome,
+    Prepare,
+    Published,
+    Switch,
+)
+from tests.services.master.conftest import Run
 
 MEANWHILE = "; 3 readings that came meanwhile found no place to wait and were lost"
 
@@ -27,7 +38,7 @@ MEANWHILE = "; 3 readings that came meanwhile found no place to wait and were lo
     ],
 )
 def test_lost_frames_are_not_counted_as_finished(counts, text):
-    assert fates(*counts) == text
+    assert describe_frames(*counts) == text
 
 
 @pytest.fixture
@@ -75,13 +86,13 @@ async def test_readings_that_still_wait_after_the_drain_are_lost(begun, order, m
     monkeypatch.setattr(reload, "_DRAIN_TIME", 0.1)
     begun.flow.hold()
     begun.read(3)
-    assert f"; {fates(3, 3)}, " in await begun.reloads.order(order)
+    assert f"; {describe_frames(3, 3)}, " in await begun.reloads.order(order)
     assert begun.lost == {LossReason.IN_RELOAD: 3}
 
 
 async def test_boards_get_no_frame_while_they_are_programmed(begun, order):
     begun.app.before_switch = begun.read
-    assert f"; {fates(0, 1)}, " in await begun.reloads.order(order)
+    assert f"; {describe_frames(0, 1)}, " in await begun.reloads.order(order)
     assert begun.app.frames == []
 
 
@@ -137,3 +148,84 @@ async def test_a_reload_ends_with_its_run(begun, order):
     assert kinds(begun.subscriber) == [Prepare, Switch]
     assert kinds(begun.publisher) == [Prepare]
     assert begun.lost == {LossReason.IN_RELOAD: 1}
+
+
+async def test_programming_takes_its_time_for_each_board(boat, order, monkeypatch):
+    limits, wait_for = [], asyncio.wait_for
+
+    def limited(awaitable, limit):
+        limits.append(limit)
+        return wait_for(awaitable, limit)
+
+    monkeypatch.setattr(asyncio, "wait_for", limited)
+    run = Run(boat, queue="all", peer_timeout=40)
+    run.peers.begun.set()
+    await run.reloads.order(order)
+    # all prepare; then the subscriber, pcie-app with its four boards, and the publisher switch
+    assert limits == [100, 100, 100, 100, 260, 100]
+
+
+async def test_fields_that_flags_override_may_differ(boat):
+    boards = tuple(each.model_copy(update={"endpoint": "unix:/tmp/x.sock"}) for each in boat.boards)
+    given = boat.model_copy(update={"boards": boards})
+    run = Run(boat)
+    assert run.reloads._without_overridden(given) == given
+    run = Run(boat, uri="ws://elsewhere:9090", queue="all")
+    run.peers.board_endpoints = ("unix:/tmp/own.sock",)
+    same = run.reloads._without_overridden(given)
+    assert {each.uri for each in (*same.sources, *same.outputs)} == {"ws://elsewhere:9090"}
+    assert (same.queue, len(same.sources), len(same.outputs)) == ("all", len(boat.sources), len(boat.outputs))
+    assert same.boards == tuple(each.model_copy(update={"endpoint": ""}) for each in boards)
+
+
+@pytest.mark.parametrize("generation", [0, 1])
+async def test_children_read_a_copy_of_the_first_deployment(begun, tmp_path, generation):
+    begun.reloads._keep_copy = AsyncMock(return_value=tmp_path)
+    begun.peers.set_flag = Mock()
+    begun.flow._in_force.generation = generation
+    await begun.reloads.keep_first()
+    assert begun.peers.set_flag.mock_calls == ([] if generation else [call("--deployment", str(tmp_path))])
+    begun.reloads._keep_copy.side_effect = OSError("the disk is full")
+    begun.reloads._log = Mock()
+    await begun.reloads.keep_first()
+    assert begun.reloads._log.warning.call_count == 1
+
+
+@pytest.mark.parametrize("child", [None, Mock()])
+async def test_only_children_need_a_copy(begun, boat, tmp_path, child):
+    begun.peers._private = Mock(path=tmp_path)
+    begun.peers.app.child = child
+    kept = await begun.reloads._keep_copy(boat, 1)
+    assert (kept.parent == tmp_path) is (child is not None)
+    assert (kept == boat.directory) is (child is None)
+
+
+async def test_children_prepare_a_copy_and_the_user_hears_of_the_original(begun, order):
+    begun.reloads._keep_copy = AsyncMock(return_value=Path("/kept"))
+    begun.peers.subscriber.child = Mock()
+    answer = NotReloaded(1, 4, "/kept/boards is empty")
+    begun.app.send = lambda record: begun.peers.app.answered(answer) or True
+    with pytest.raises(ReportedError) as caught:
+        await begun.reloads.order(order)
+    assert caught.value.exit_code == 4
+    assert f"{order.folder}/boards" in str(caught.value)
+    folders = [each.records[0].folder for each in (begun.subscriber, begun.publisher)]
+    assert folders == ["/kept", order.folder]
+
+
+@pytest.mark.parametrize("asked", [Prepare, Switch])
+async def test_a_service_that_does_not_answer_is_ended(boat, order, monkeypatch, asked):
+    monkeypatch.setattr(reload, "ANSWER_TIME", 0.0)
+    monkeypatch.setattr(reload, "_PROGRAM_TIME", 0.0)
+    run = Run(boat, queue="all", peer_timeout=0.2)
+    run.peers.begun.set()
+    run.app.send, send = (
+        (lambda record: True if isinstance(record, asked) else send(record)),
+        run.app.send,
+    )
+    with pytest.raises(NotReloadedError) as caught:
+        await asyncio.wait_for(run.reloads.order(order), 60)
+    assert "pcie-app at this process" in str(caught.value)
+    assert ("switch" in str(caught.value)) is (asked is Switch)
+    assert run.peers.app.closed.is_set()
+    assert run.peers.app.answer is None

@@ -1,5 +1,6 @@
 """Connections to a deployment's servers: certificates from the settings, and servers that start later."""
 
+import asyncio
 import contextlib
 
 import pytest
@@ -8,8 +9,11 @@ from bridge.errors import AccessRefusedError, UnreachableError
 from bridge.hub.access import AccessPolicy, tls_context
 from services.pipeline.connections import connect_all
 from services.settings import Settings
+from services.sockets.status import why_not_connected
 from tests.bridge.hub.sockets import running_hub
 from tests.certificates import issue
+
+PATIENCE = 60
 
 
 async def test_a_certificate_that_only_the_settings_know(tmp_path):
@@ -22,3 +26,29 @@ async def test_a_certificate_that_only_the_settings_know(tmp_path):
         async with contextlib.AsyncExitStack() as stack:
             with pytest.raises((AccessRefusedError, UnreachableError)):
                 await connect_all(stack, Settings(connect_timeout=0.5), uris)
+
+
+async def test_a_robot_of_the_deployment_is_looked_up(monkeypatch):
+    async with running_hub() as port:
+
+        async def resolve(name):
+            assert name == "Robot 7"
+            return f"ws://127.0.0.1:{port}"
+
+        monkeypatch.setattr("bridge.discovery.resolve", resolve)
+        async with contextlib.AsyncExitStack() as stack:
+            by_uri = await connect_all(stack, Settings(), ["robot:Robot 7"])
+            assert by_uri["robot:Robot 7"].state == "connected"
+
+
+async def test_a_server_that_is_waited_for_is_named(unused_tcp_port):
+    uri, by_uri = f"ws://127.0.0.1:{unused_tcp_port}", {}
+    async with contextlib.AsyncExitStack() as stack:
+        connecting = asyncio.create_task(connect_all(stack, Settings(connect_timeout=60), [uri], by_uri))
+        async with asyncio.timeout(PATIENCE):
+            while not (by_uri and by_uri[uri].last_error):
+                await asyncio.sleep(0.01)
+        assert uri in why_not_connected(by_uri)
+        async with running_hub(port=unused_tcp_port):
+            await connecting
+            assert not why_not_connected(by_uri)

@@ -1,5 +1,8 @@
 """Frames: which messages make one, from one topic and from several."""
 
+import struct
+from contextlib import nullcontext
+
 import pytest
 
 from services.errors import OverflowedQueueError, VariableError
@@ -11,6 +14,7 @@ from services.pipeline.frames import (
     WaitingFrames,
 )
 from toolchain.deployment import Board, Deployment, Dimension, MachineSection, Source, Variable
+from toolchain.deployment.sections import WrittenPrior
 
 HASH = "0" * 64
 
@@ -85,6 +89,19 @@ def test_a_reading_without_a_topic_that_was_due_says_so():
     assert dict(frames.absent) == {"/t1": 1}
 
 
+@pytest.mark.parametrize("needed", [True, False])
+def test_a_prior_may_have_a_topic_of_its_own(needed):
+    prior = WrittenPrior(source=1, path="belief", on_missing="error" if needed else "model")
+    frames = FrameAssembler(deployment(variable("D1"), sources=2).model_copy(update={"prior": prior}))
+    assert (frames.needs(0), frames.needs(1)) == (True, needed)
+    assert frames.take(0, stamped(0, D1=1), 1, 1) == []
+    (reading,) = frames.take(1, stamped(0, belief=[1, 2, 2, 0]), 2, 2)
+    assert reading.addresses == [1]
+    assert reading.prior_codes == struct.pack("<4H", 128, 255, 255, 0)
+    with pytest.raises(VariableError) if needed else nullcontext():
+        frames.take(1, stamped(100), 3, 3)
+
+
 def far_apart(ms, count=UNPAIRED_WARNING, **second):
     frames = two_topics()
     for at in range(count):
@@ -97,6 +114,7 @@ def test_stamps_that_never_meet_are_reported():
     assert far_apart(2000, UNPAIRED_WARNING - 1).stamp_gap() is None
     frames = far_apart(2000)
     assert frames.stamp_gap() == StampGap("/t1", "/t0", 2.0, 0.05, ())
+    assert far_apart(-2000).stamp_gap() == StampGap("/t0", "/t1", 2.0, 0.05, ())
     assert far_apart(0, header={}).stamp_gap().without_header == ("/t1",)
     assert frames.take(1, stamped(10 * UNPAIRED_WARNING - 10, D2=1), 1, 1) != []
     assert frames.stamp_gap() is None

@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 from contextlib import asynccontextmanager
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -101,9 +102,11 @@ async def test_the_master_learns_that_no_server_is_there_and_that_one_is_back(bo
         running = asyncio.create_task(publisher.run())
         while not any(isinstance(each, Ready) for each in link.sent):
             await asyncio.sleep(0.01)
+        assert (publisher.status().ready, publisher.status().why) == (True, publisher._where)
         ros = publisher._topics.rosbridges[fake.uri]
         ros._session._delay = 600.0  # unless the master says that one is back
         await gone(publisher._topics, fake)
+        assert not publisher.status().ready
         await fake.come_back()
         assert [each.connected for each in link.sent if isinstance(each, Rosbridge)] == [False]
         link.take(Rosbridge(connected=True))  # the subscriber has reached it
@@ -113,6 +116,14 @@ async def test_the_master_learns_that_no_server_is_there_and_that_one_is_back(bo
         running.cancel()
         with contextlib.suppress(asyncio.CancelledError):
             await running
+
+
+@pytest.mark.parametrize(("level", "logged"), [("debug", 1), ("info", 0)])
+def test_each_result_is_logged_for_debugging(boat, link, level, logged):
+    publisher = Publisher(Settings(log_level=level), boat, link.make)
+    publisher._log = Mock()
+    publisher._report(Published(7, Outcome.PUBLISHED, None, 0, 1.0, 9, 9))
+    assert [each.kwargs["frame"] for each in publisher._log.debug.mock_calls] == [7] * logged
 
 
 async def test_results_go_on_where_a_server_is(boat):
@@ -175,7 +186,7 @@ async def running_publisher(boat, link, uri):
 async def outcome_of(link):
     while not (found := [each for each in link.sent if isinstance(each, Published)]):
         await asyncio.sleep(0.01)
-    return found[-1].outcome
+    return found[-1].outcome, found[-1].missed
 
 
 @pytest.mark.parametrize("other", ["std_msgs/msg/String", ""])
@@ -192,13 +203,24 @@ async def test_results_that_nobody_can_receive_are_lost(boat, link, monkeypatch,
         while not any(isinstance(each, Notice) for each in link.sent):
             await asyncio.sleep(0.01)
         link.take(result(boat, 1))
-        assert await outcome_of(link) is Outcome.REFUSED
+        assert await outcome_of(link) == (Outcome.REFUSED, 0)
         fake.types.pop("/BMresults", None)
         fake.know("/BMresults", "std_msgs/msg/Float64MultiArray")
         link.sent.clear()
         await asyncio.sleep(0.3)
         link.take(result(boat, 2))
-        assert await outcome_of(link) is Outcome.PUBLISHED
+        assert await outcome_of(link) == (Outcome.PUBLISHED, 0)
+        running.cancel()
+
+
+async def test_reports_that_nobody_can_receive_cost_no_results(boat, link):
+    async with FakeRosbridge(rosapi=True) as fake:
+        fake.know("/bm/frame", "std_msgs/msg/Empty")
+        _, running = await running_publisher(boat, link, fake.uri)
+        (notice,) = [each for each in link.sent if isinstance(each, Notice)]
+        assert notice.sentence.startswith("/bm/frame ")
+        link.take(result(boat, 1))
+        assert await outcome_of(link) == (Outcome.PUBLISHED, 0)
         running.cancel()
 
 

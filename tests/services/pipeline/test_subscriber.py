@@ -2,10 +2,13 @@
 
 import asyncio
 import contextlib
+import time
+from unittest.mock import Mock, call
 
 import pytest
 
 from bridge.client import Message
+from services.errors import RosbridgeLostError
 from services.pipeline.subscriber import Subscriber
 from services.settings import Settings
 from services.sockets.records import Begin, LossReason, Notice, Reading, Ready, Rosbridge, Unusable
@@ -25,6 +28,8 @@ def test_passed_over_readings_are_reported_once_and_counted_in_all(boat, link):
         link.backlog = 0
         subscriber._read(0, Message("/boat/sensors", dict(READING), 1, 2))
     assert [reading.passed_over for reading in link.sent] == [2, 3, 0]
+    assert {reading.generation for reading in link.sent} == {0}
+    assert 0 < link.sent[0].sent_tick <= link.sent[-1].sent_tick <= time.monotonic_ns()
     frames = subscriber.status().frames
     assert (frames.completed, frames.lost) == (3, {LossReason.PASSED_OVER: 5})
 
@@ -47,6 +52,14 @@ def test_an_unusable_message_is_reported_by_its_cause(boat, link):
     assert isinstance(first, Unusable)
     assert first.cause == second.cause
     assert subscriber.status().frames.lost == {LossReason.UNUSABLE: 2}
+
+
+@pytest.mark.parametrize(("level", "logged"), [("debug", 1), ("info", 0)])
+def test_the_number_of_a_reading_is_logged_for_debugging(boat, link, level, logged):
+    subscriber = Subscriber(Settings(log_level=level), boat, link.make)
+    subscriber._log = Mock()
+    link.take(Notice("debug", "frame=1 complete"))
+    assert subscriber._log.debug.mock_calls == [call("frame=1 complete")] * logged
 
 
 @pytest.mark.parametrize(("existing", "hinted"), [("/boat/sensors2", True), ("/elsewhere", False)])
@@ -85,6 +98,74 @@ async def test_a_large_message_is_taken_up_to_the_limit_of_the_settings(boat, li
         while not any(isinstance(each, Reading | Rosbridge) for each in link.sent):
             await asyncio.sleep(0.01)
         assert sum(isinstance(each, Reading) for each in link.sent) == completed
+        running.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await running
+
+
+async def test_a_message_above_the_limit_of_its_topic_is_counted(boat, link):
+    async with FakeRosbridge() as fake:
+        subscriber = Subscriber(Settings(uri=fake.uri, topic_bytes=1 << 16), boat, link.make)
+        running = asyncio.create_task(subscriber.run())
+        while not any(isinstance(each, Ready) for each in link.sent):
+            await asyncio.sleep(0.01)
+        link.take(Begin(once=False))
+        await fake.wait_for_op("subscribe", topic="/boat/sensors")
+        await fake.publish("/boat/sensors", READING | {"image": "x" * (1 << 17)})
+        await fake.publish("/boat/sensors", READING)
+        async with asyncio.timeout(60):
+            while not any(isinstance(each, Reading) for each in link.sent):
+                await asyncio.sleep(0.01)
+        assert subscriber.status().frames.lost == {LossReason.TOO_LARGE: 1}
+        running.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await running
+
+
+def test_the_status_says_since_when_there_are_no_readings(boat, link, monkeypatch):
+    monkeypatch.setattr("services.pipeline.subscriber.why_not_connected", lambda _: "")
+    now = [1_000_000_000_000]
+    monkeypatch.setattr("time.monotonic_ns", lambda: now[0])
+    subscriber = Subscriber(Settings(ready_timeout=5), boat, link.make)
+    assert subscriber.status().ready  # no run needs readings yet
+    link.take(Begin(once=False))
+    status = subscriber.status()
+    assert (status.ready, status.frames.last_age_s) == (False, None)
+    assert "/boat/sensors" in status.why
+    subscriber._read(0, Message("/boat/sensors", dict(READING), 1, now[0]))
+    now[0] += 5_000_000_000
+    assert subscriber.status().ready
+    now[0] += 1_000_000_000
+    status = subscriber.status()
+    assert (status.ready, status.frames.last_age_s) == (False, 6.0)
+    assert "6 s" in status.why
+
+
+@pytest.mark.parametrize("once", [True, False])
+async def test_only_a_single_reading_needs_a_server_that_stays(boat, link, tmp_path, monkeypatch, once):
+    serving = Mock(return_value=contextlib.nullcontext())
+    monkeypatch.setattr("services.pipeline.subscriber.serve_status", serving)
+    async with FakeRosbridge() as fake:
+        subscriber = Subscriber(Settings(uri=fake.uri, run_directory=tmp_path), boat, link.make)
+        running = asyncio.create_task(subscriber.run())
+        while not any(isinstance(each, Ready) for each in link.sent):
+            await asyncio.sleep(0.01)
+        link.take(Begin(once=once))
+        await fake.wait_for_op("subscribe", topic="/boat/sensors")
+        assert serving.call_args.args == (tmp_path, "subscriber", subscriber.status)
+        await fake.vanish()
+        if once:
+            with pytest.raises(RosbridgeLostError):
+                await asyncio.wait_for(running, 60)
+            return
+        await fake.come_back()
+        async with asyncio.timeout(60):
+            while Rosbridge(connected=True) not in link.sent:
+                link.take(Rosbridge(connected=True))  # the publisher has reached it
+                await asyncio.sleep(0.01)
+        assert [each.connected for each in link.sent if isinstance(each, Rosbridge)] == [False, True]
+        assert [each.level for each in link.sent if isinstance(each, Notice)] == ["warning", "info"]
+        assert not running.done()
         running.cancel()
         with contextlib.suppress(asyncio.CancelledError):
             await running

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.pipeline.synchroniser import DEPTH, Synchroniser
+from services.pipeline.synchroniser import ALIVE_PERIODS, DEPTH, Synchroniser
 
 MS = 1_000_000
 TOLERANCE = 50 * MS
@@ -56,6 +56,31 @@ def test_a_topic_that_is_silent_for_long_is_not_waited_for():
     assert synchroniser.absent == []
 
 
+@pytest.mark.parametrize("repeated", [[], [(1, 100, 101)]], ids=["once", "a message came twice"])
+def test_a_topic_whose_next_message_is_far_is_not_waited_for(repeated):
+    arrivals = [(at, t, t) for t in range(0, 300, 100) for at in range(2)] + repeated
+    _, synchroniser = sets_of([True, False], arrivals)
+    synchroniser.add(0, 210 * MS, 210 * MS, 210)
+    assert synchroniser.take_set(210 * MS) == {0: 210}
+
+
+def test_a_second_message_of_an_instant_waits_for_no_partner():
+    synchroniser = sets_of([True, False], [(0, 0, 0), (1, 0, 1)])[1]
+    synchroniser.add(0, 0, 2 * MS, "again")
+    assert synchroniser.take_set(2 * MS) == {0: "again"}
+
+
+@pytest.mark.parametrize(
+    ("silence", "waits"), [(ALIVE_PERIODS * 100, True), (ALIVE_PERIODS * 100 + 1, False)]
+)
+def test_a_topic_is_alive_for_some_periods(silence, waits):
+    arrivals = [(at, t, t) for t in range(0, 300, 100) for at in range(2)]
+    _, synchroniser = sets_of([True, False], arrivals)
+    tick = (200 + silence) * MS
+    synchroniser.add(0, tick, tick, "late")
+    assert (synchroniser.take_set(tick) is None) is waits
+
+
 def test_a_slow_topic_delays_nothing_between_its_messages():
     """A topic of 1 Hz beside one of 100 Hz belongs to the nearest of its sets only."""
     fast = [(0, t, t) for t in range(0, 3000, 10)]
@@ -73,6 +98,8 @@ def test_a_late_message_of_an_optional_topic_makes_no_set_of_its_own():
     )
     assert sets[-2:] == [{0: 300}, {0: 400, 1: 400}]
     assert synchroniser.unpaired == 1
+    again, synchroniser = sets_of([False] * 2, [(0, 0, 0), (1, 0, 1), (1, 0, 2)])
+    assert (again, synchroniser.unpaired) == ([{0: 0, 1: 0}], 1)
 
 
 def test_stamps_pair_up_to_the_tolerance():
@@ -90,10 +117,10 @@ def test_stamps_that_begin_again_are_a_new_beginning():
 
 
 def test_an_endless_topic_without_partner_stays_bounded():
-    sets, synchroniser = sets_of([True] * 2, [(0, t, t) for t in range(DEPTH + 10)])
-    assert (sets, synchroniser.unpaired) == ([], 10)
+    sets, synchroniser = sets_of([True] * 2, [(0, t, t) for t in range(DEPTH + 11)])
+    assert (sets, synchroniser.unpaired) == ([], 11)
     synchroniser.forget()
-    assert synchroniser.unpaired == DEPTH + 10
+    assert synchroniser.unpaired == DEPTH + 11
 
 
 @st.composite
@@ -130,7 +157,8 @@ def test_any_order_gives_the_sets_of_a_plain_offline_pairing(case):
     ]
     sets, synchroniser = sets_of(needed, arrivals)
     assert sets == wanted
-    assert synchroniser.unpaired <= len(arrivals) - sum(map(len, sets))
+    synchroniser.forget()
+    assert synchroniser.unpaired == len(arrivals) - sum(map(len, sets))
 
 
 def nearest_pairs(stamps, tolerance):
@@ -156,7 +184,9 @@ def test_needed_topics_of_any_rates_pair_as_they_would_offline(periods, data):
     phases = [data.draw(st.integers(0, period)) for period in periods]
     stamps = [range(1000 + phase, 4000, period) for phase, period in zip(phases, periods, strict=True)]
     arrivals = [(at, stamp, stamp) for at, each in enumerate(stamps) for stamp in each]
-    sets, _ = sets_of([True] * 2, arrivals)
+    sets, synchroniser = sets_of([True] * 2, arrivals)
+    synchroniser.forget()
+    assert synchroniser.unpaired == len(arrivals) - sum(map(len, sets))
     pairs = [(each[0], each[1]) for each in sets]
     wanted = nearest_pairs(stamps, 50)
     # the last ones have no later messages that show they are the nearest

@@ -15,6 +15,7 @@ from rich.console import Console
 from services.errors import SettingsError
 from services.output.status_screen import screen
 from services.sockets import stack as status
+from services.sockets.reporting import serve_status
 from services.sockets.status import (
     BoardStatus,
     ConnectionStatus,
@@ -22,7 +23,6 @@ from services.sockets.status import (
     HubStatus,
     PeerStatus,
     ProcessStatus,
-    serve_status,
 )
 
 
@@ -160,10 +160,29 @@ async def test_the_only_live_run_is_found(places):
     with pytest.raises(SettingsError, match=str(dead)):
         await status.find_run()
     async with served(one, master=process()):
-        assert await status.find_run() == one
+        assert await status.find_run() == (one, [])
         async with served(two, master=process()):
             with pytest.raises(SettingsError, match="2 runs"):
                 await status.find_run()
+            assert await status.find_run("two") == (two, [])
+            with pytest.raises(SettingsError, match="three"):
+                await status.find_run("three")
+
+
+async def test_processes_without_a_run_are_shown_with_it_and_alone(places):
+    run, hub, boat = (make_run(places, name) for name in ("run", "hub", "boat"))
+    listener(boat, "boat").close()
+    async with served(hub, hub=process(hub=HubStatus(3, 5, 7))):
+        alone = await status.find_run()
+        assert alone == (None, [hub])
+        with pytest.raises(SettingsError):
+            _ = alone.only_run
+        async with served(run, master=process()):
+            found = await status.find_run()
+            assert found == (run, [hub])
+            stack = await status.ask_stack(*found)
+            assert [each.name for each in stack.processes] == ["hub", "master"]
+            assert (stack.ready, stack.silent, stack.directory) == (True, [], str(run))
 
 
 async def test_watching_prints_a_line_every_second_until_it_is_ended(places):
@@ -195,4 +214,10 @@ def test_a_run_that_ends_while_runs_are_looked_for_is_none(places, monkeypatch):
         return seen
 
     monkeypatch.setattr(Path, "is_dir", and_then_it_goes)
+    assert status.run_directories() == [run]
+
+
+def test_a_link_to_a_run_is_not_another_run(places):
+    run = make_run(places, "aaaaaaaa")
+    run.with_name(run.name.replace("aaaaaaaa", "bbbbbbbb")).symlink_to(run)
     assert status.run_directories() == [run]

@@ -1,4 +1,4 @@
-"""What a process adds to its status: who it is, and how fast frames are lately."""
+"""The parts of a status that every process adds: its identity, and the current frame rate."""
 
 import os
 import socket
@@ -8,18 +8,18 @@ import msgspec
 import pytest
 
 from services.errors import SettingsError
-from services.sockets import status
+from services.sockets import reporting
 from services.sockets.records import VERSION
+from services.sockets.reporting import Report, serve_status, serve_status_in_thread
 from services.sockets.status import (
     FrameCounts,
     ProcessStatus,
     read_process_status,
     seconds_since,
-    serve_status,
-    serve_status_in_thread,
 )
-from services.supervision.private_directory import remove_stale_sockets
-from terminal.health import NoHealthError, Silence, serve_health_in_thread, status_socket
+from services.supervision.service_manager import ServiceManager
+from terminal.health import NoHealthError, Silence, in_thread, serve_health, status_socket
+from terminal.private_directory import remove_stale_sockets
 
 PATIENCE = 60.0
 
@@ -44,7 +44,7 @@ def test_a_process_says_who_it_is(tmp_path):
 
 def test_a_status_of_another_version_is_refused(tmp_path):
     with (
-        serve_health_in_thread(tmp_path, "hub", lambda: b'{"ready":true,"why":3}', lambda: None),
+        in_thread(lambda: serve_health(tmp_path, "hub", lambda: b'{"ready":true,"why":3}')),
         pytest.raises(NoHealthError) as silent,
     ):
         read_process_status(status_socket(tmp_path, "hub"), PATIENCE)
@@ -64,21 +64,44 @@ def test_stale_sockets_are_removed_and_live_ones_stay(tmp_path):
     (tmp_path / "board0.sock").touch()
     with serve_status_in_thread(tmp_path, "board0", get_status):
         remove_stale_sockets(tmp_path)
-        assert sorted(path.name for path in tmp_path.iterdir()) == ["board0.sock", "board0.status.sock"]
+        assert sorted(path.name for path in tmp_path.iterdir()) == [
+            "board0.http.sock",
+            "board0.sock",
+            "board0.status.sock",
+        ]
 
 
 def test_a_rate_is_of_the_last_seconds(monkeypatch):
     now = [100.0]
-    monkeypatch.setattr(status.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(reporting.time, "monotonic", lambda: now[0])
     done = [0]
-    answerer = status._Answerer("pcie-app", lambda: ProcessStatus(ready=True, why="", frames=counts(done[0])))
+    report = Report("pcie-app", lambda: ProcessStatus(ready=True, why="", frames=counts(done[0])))
     for seconds, a_second in ((20, 30), (6, 5)):  # it is slower now, and the past does not count any more
         for _ in range(seconds):
-            answerer.sample()
+            report.sample(ServiceManager())
             now[0] += 1
             done[0] += a_second
-    found = msgspec.json.decode(answerer.answer(), type=ProcessStatus)
+    found = msgspec.json.decode(report.answer(), type=ProcessStatus)
     assert (found.frames.rate, found.uptime_s) == (5, 26)
+
+
+def test_a_rate_does_not_count_the_time_before_the_first_result(monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr(reporting.time, "monotonic", lambda: now[0])
+    done = [0]
+    report = Report("pcie-app", lambda: ProcessStatus(ready=True, why="", frames=counts(done[0])))
+    for a_second in (0, 0, 0, 10, 10):
+        report.sample(ServiceManager())
+        now[0] += 1
+        done[0] += a_second
+    assert report.status().frames.rate == 10
+
+
+def test_a_process_says_what_it_uses(tmp_path):
+    with serve_status_in_thread(tmp_path, "pcie-app", get_status):
+        found = read_process_status(status_socket(tmp_path, "pcie-app"), PATIENCE)
+    assert found.cpu_s > 0
+    assert 10e6 < found.memory_bytes < 10e9
 
 
 def test_the_age_of_nothing_is_none():

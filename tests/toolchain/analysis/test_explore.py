@@ -183,7 +183,8 @@ def test_the_command(case):
     rows = result.stdout.splitlines()
     assert len(rows) == 5
     assert any(row.startswith("* address") for row in rows)
-    # What a kept point takes is estimated again: the estimator may have been calibrated since.
+    # The resources of a stored point are estimated again, because the estimator may have been calibrated
+    # since.
     path = case.parent / "r.jsonl"
     kept = Results(path).points.values()
     path.unlink()

@@ -53,7 +53,7 @@ def test_a_controller_of_logic_takes_8000_to_30000_elements():
 
 
 def test_registers_are_counted_exactly():
-    # What yosys finds in these (scripts/verify resources has more).
+    # Yosys's results for these (scripts/verify resources has more).
     cell, threshold = SensorMode.CELL, SensorMode.THRESHOLD
     for lines, sensors, registers, others in (
         (8, 3, 1309, {}),

@@ -113,7 +113,7 @@ def test_the_interface_grows_with_the_model_and_says_so(tmp_path):
         {"max_cycles": 0},
         {"counter_bits": 0},
         {"rng_banks": 0},
-        {"uri": "robot:9090"},
+        {"uri": "turtle:9090"},
         {"topic": ""},
         {"type": "Float64"},
         {"output": "/a b"},

@@ -234,7 +234,7 @@ def test_regenerated_memories_are_the_same(case, mode, replicas):
     assert contents(out) == before
 
 
-# What is said beforehand
+# Estimates and errors before a build
 
 
 @pytest.mark.parametrize(

@@ -47,7 +47,7 @@ def build(tmp_path, built_model, **options):
 
 
 def on_boards(deployment, addresses, codes=None):
-    """What the boards of a deployment compute together, normalised as the host does it."""
+    """Return the joint result of a deployment's boards, normalised as by the host."""
     sensors, row = deployment.machine_addresses(addresses)
     boards = [read_image(deployment.image_path(at)).machine for at in range(len(deployment.boards))]
     machine = joined(boards)

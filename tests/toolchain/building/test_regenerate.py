@@ -36,7 +36,7 @@ def built(case):
 
 
 def regenerate(part, built, *arguments, code=0):
-    result = toolchain("regenerate", part, built, *arguments)
+    result = toolchain("regenerate", part, built, "--verbose", *arguments)
     assert result.exit_code == code, result.output
     return result
 
@@ -45,6 +45,15 @@ def changes(result):
     return {
         line.split()[1]: line.split()[0] for line in result.stdout.splitlines() if not line.startswith(" ")
     }
+
+
+def test_unchanged_files_are_counted(built):
+    listed = changes(regenerate("memories", built))
+    assert set(listed.values()) == {"unchanged"}
+    result = toolchain("regenerate", "memories", built)
+    assert result.exit_code == 0
+    assert result.stdout.split()[:3] == ["unchanged", str(len(listed)), "files"]
+    assert result.stdout.count("\n") == 1
 
 
 def test_memories_from_the_images(built):

@@ -1,4 +1,4 @@
-"""What `toolchain check` says of readings and lines holds on the machine, and every mistake has its finding."""
+"""Findings of `toolchain check` about readings and lines hold on the machine, and every mistake is found."""
 
 import itertools
 import json
@@ -44,7 +44,7 @@ def only(findings, check):
     return finding
 
 
-# What is said of readings and lines, on the machine
+# Findings about readings and lines, on the machine
 
 
 @st.composite

@@ -13,7 +13,7 @@ from toolchain.checks.rng_relations import relations
 
 
 def numbers(kind, seeds, cycles, steps):
-    """What every column shows in each cycle, from the generators themselves: uint64[cycles, columns]."""
+    """Return the generators' numbers for every column in each cycle: uint64[cycles, columns]."""
     lfsr, states, shown = LFSR(kind), np.asarray(seeds, dtype=np.uint64), []
     for _ in range(cycles):
         shown.append(states)

@@ -1,4 +1,4 @@
-"""What `toolchain check` says of topics whose messages have to be paired."""
+"""Findings of `toolchain check` about topics whose messages must be paired."""
 
 import pytest
 

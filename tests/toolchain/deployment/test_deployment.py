@@ -129,12 +129,12 @@ def test_uris_and_endpoints_may_be_edited(folder):
     before = load_deployment(folder, images=False)
     edit(folder, "ws://a:9090", "wss://robot.local:443/bridge")
     edit(folder, 'endpoint = ""', 'endpoint = "tcp://board0:7000"')
-    edit(folder, 'uri = ""', 'uri = "ws://elsewhere:9090"')
+    edit(folder, 'uri = ""', 'uri = "robot:Robot 7"')
     after = load_deployment(folder, images=False)
     assert after.hash == before.hash
     assert after.sources[0].uri == "wss://robot.local:443/bridge"
     assert after.boards[0].endpoint == "tcp://board0:7000"
-    assert after.output_uri(after.outputs[0]) == "ws://elsewhere:9090"
+    assert after.output_uri(after.outputs[0]) == "robot:Robot 7"
 
 
 @pytest.mark.parametrize(
@@ -185,6 +185,7 @@ def test_another_format_is_reported_before_anything_else(folder, new):
         ("values = 360", "values = 512", 26, ("variable", 1)),
         ("ws://a:9090", "http://a:9090", 10, ("source", 0, "uri")),
         ("ws://a:9090", "ws://a:90900", 10, ("source", 0, "uri")),
+        ("ws://a:9090", "robot: ", 10, ("source", 0, "uri")),
         ("ws://a:9090", "ws://[::1", 10, ("source", 0, "uri")),
         ("max_cycles = 131072", f"max_cycles = {2**63}", 65, ("machine", "max_cycles")),
         ("boat_msgs/Sensors", "Sensors", 12, ("source", 0, "type")),

@@ -307,7 +307,7 @@ def test_the_command_fits_normals_and_a_model_loads_them(corridor):
     assert surprises[1] < surprises[0]
     fitted = load_model(corridor / "corridor", {"fit": str(out)})
     assert fitted.known[0].normal.sigma.max() < 0.25
-    assert f"--set fit={out}; " in result.stdout
+    assert f"--set fit={out}." in result.stdout
 
 
 def test_the_command_counts(corridor):
@@ -315,7 +315,7 @@ def test_the_command_counts(corridor):
     result = done(
         fit(corridor, "-o", out, "--reading", "door=door", "--method", "counts", "--pseudo-count", "3")
     )
-    assert "worth 3 readings a cell" in result.stdout
+    assert "worth 3 readings per cell" in result.stdout
     fitted = load_model(corridor / "corridor", {"fit": str(out)})
     assert fitted.known[2].table[1, :50].mean() == pytest.approx(0.8, abs=0.05)
 

@@ -124,7 +124,7 @@ def test_what_the_file_itself_refuses_is_said_in_its_own_words(case):
 def test_no_folder_and_no_model(tmp_path):
     with pytest.raises(ModelError, match=r"has no model\.py"):
         load_model(tmp_path, {})
-    with pytest.raises(ModelError, match="is not a folder"):
+    with pytest.raises(ModelError, match="does not exist"):
         load_model(tmp_path / "nowhere", {})
 
 

@@ -14,6 +14,9 @@ from rosbags.typesys import Stores, get_typestore
 
 from bridge.codecs import cbor_codec, png
 from bridge.codecs.fragments import Reassembler
+from bridge.hub.delivery.definitions import Definitions
+from bridge.hub.delivery.encodings import Compression, Message
+from bridge.hub.errors import RefusedError
 from bridge.hub.handlers import topics
 from tests.bridge.hub.broker_harness import WALL_CLOCK, Harness, publisher_and_subscriber
 
@@ -39,12 +42,11 @@ def test_cbor_has_bytes_and_typed_arrays_of_the_types_elements() -> None:
     msg = cbor_codec.decode(payload, arrays="numpy")["msg"]
     np.testing.assert_array_equal(msg["ranges"], np.array([1.5, 2, math.nan], "f4"), strict=True)
     np.testing.assert_array_equal(msg["intensities"], np.array([], "f4"), strict=True)
-    assert (msg["angle_min"], msg["header"]) == (-1.5, {"frame_id": "é"})
+    assert (msg["angle_min"], msg["header"]["frame_id"]) == (-1.5, "é")
     publisher, subscriber = publisher_and_subscriber("sensor_msgs/PointCloud2", compression="cbor")
-    cloud = {"fields": [{"name": "x", "offset": 0}], "width": 3}
     for data in ("AAH/", [0, 1, 255]):
-        publisher.publish("/t", {"data": data, **cloud})
-    assert subscriber.messages() == [{"data": b"\x00\x01\xff", **cloud}] * 2
+        publisher.publish("/t", {"data": data, "width": 3})
+    assert [(cloud["data"], cloud["width"]) for cloud in subscriber.messages()] == [(b"\x00\x01\xff", 3)] * 2
 
 
 @pytest.mark.parametrize(
@@ -134,6 +136,21 @@ def test_a_png_that_is_larger_than_may_be_is_refused() -> None:
     assert subscriber.client.refused == 1
 
 
+@pytest.mark.parametrize("compression", list(Compression))
+def test_the_limit_of_a_message_is_exact(compression: Compression) -> None:
+    definitions = Definitions()
+    message = {"data": "x" * 100}
+
+    def payload(max_size: int) -> bytes:
+        data = json.dumps(message).encode()
+        return Message(data, message, "std_msgs/String", 0, definitions, max_size).payload(compression, "/t")
+
+    size = len(payload(10_000))
+    assert len(payload(size)) == size
+    with pytest.raises(RefusedError):
+        payload(size - 1)
+
+
 # --- fragments
 
 
@@ -205,7 +222,7 @@ def test_of_several_wishes_the_last_form_and_the_least_size_count() -> None:
 
 
 def test_a_dropped_message_is_not_encoded(monkeypatch: pytest.MonkeyPatch) -> None:
-    publisher, subscriber = publisher_and_subscriber(ARRAY, compression="cbor", throttle_rate=1000)
+    publisher, subscriber = publisher_and_subscriber("a/B", compression="cbor", throttle_rate=1000)
     publisher.publish("/t", {"data": [1.5]})
     monkeypatch.setattr(topics.Message, "payload", None)
     publisher.publish("/t", {"data": [2.5]})

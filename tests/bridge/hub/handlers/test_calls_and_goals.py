@@ -348,3 +348,70 @@ def test_actions_are_described_also_those_of_actionlibs_topics(action: Work) -> 
     assert action.client.rosapi("action_servers") == {"action_servers": ["/work"]}
     action.client.subscribe("/dock/goal", type="a/B")
     assert set(action.client.rosapi("action_servers")["action_servers"]) == {"/dock", "/work"}
+
+
+# --- absent fields
+
+
+@pytest.mark.parametrize("ros_version", [1, 2])
+@pytest.mark.parametrize(
+    ("args", "received"),
+    [
+        ({"b": 2}, {"a": 0, "b": 2}),
+        (None, {"a": 0, "b": 0}),
+        ([], {"a": 0, "b": 0}),
+        ([1], {"a": 1, "b": 0}),
+        ([1, 2, 3], {"a": 1, "b": 2}),
+        ("text", "text"),
+    ],
+)
+def test_arguments_and_values_of_a_known_service_are_whole(
+    ros_version: Any, args: Any, received: Any
+) -> None:
+    hub = Harness(ros_version=ros_version)
+    server, client = hub.connect(), hub.connect()
+    server.send(op="advertise_service", service="/add", type="rospy_tutorials/AddTwoInts")
+    client.send(op="call_service", service="/add", args=args)
+    (request,) = server.read()
+    assert request["args"] == received
+    server.send(op="service_response", id=request["id"], service="/add", values={}, result=True)
+    assert client.read() == [
+        {"op": "service_response", "service": "/add", "values": {"sum": 0}, "result": True}
+    ]
+
+
+@pytest.mark.parametrize("ros_version", [1, 2])
+def test_parts_of_a_known_action_are_whole(ros_version: Any) -> None:
+    hub = Harness(ros_version=ros_version)
+    server, client = hub.connect(), hub.connect()
+    server.send(op="advertise_action", action="/look", type="tf2_msgs/LookupTransform")
+    client.send(op="send_action_goal", action="/look", args={"timeout": {"sec": 1, "secs": 1}}, feedback=True)
+    (goal,) = server.read()
+    assert goal["args"]["timeout"]["nanosec" if ros_version == 2 else "nsecs"] == 0
+    assert goal["args"]["advanced"] is False
+    server.send(op="action_feedback", id=goal["id"], action="/look", values={})
+    assert client.read()[0]["values"] == {}
+    server.send(
+        op="action_result", id=goal["id"], action="/look", values={"error": {"error": 1}}, result=True
+    )
+    values = client.read()[0]["values"]
+    assert values["error"] == {"error": 1, "error_string": ""}
+    assert values["transform"]["transform"]["rotation"]["w"] == float(ros_version == 2)
+
+
+def test_values_that_outgrow_the_limit_are_refused() -> None:
+    hub = Harness(message_bytes=300)
+    server, client = hub.connect(), hub.connect()
+    server.send(op="advertise_service", service="/map", type="nav_msgs/GetPlan")
+    client.send(op="call_service", service="/map")
+    assert client.read()[0]["result"] is False
+    server.send(op="advertise_service", service="/add", type="rospy_tutorials/AddTwoInts")
+    client.send(op="call_service", service="/add", id=1)
+    assert server.read()[0]["args"] == {"a": 0, "b": 0}
+
+
+@pytest.mark.parametrize("ros_version", [1, 2])
+def test_the_reason_of_this_projects_client_is_passed_on(ros_version: Any) -> None:
+    work = Work("service", ros_version=ros_version)
+    answer = work.ended(values={}, result=False, reason="no room")
+    assert (answer["values"], answer["result"]) == ("no room", False)

@@ -1,7 +1,9 @@
 import json
+from typing import Any
 
 import pytest
 
+from bridge.hub.handlers.rosapi import _ROS2_FIELDS, PREFIX
 from tests.bridge.hub.broker_harness import WALL_CLOCK, Harness, Peer
 
 
@@ -94,16 +96,62 @@ def test_every_service_that_is_listed_can_be_called(peer: Peer) -> None:
     )
     for service in services:
         answer = peer.ask(service)
-        needs_more = service in {"/rosapi/set_param", "/rosapi/message_details"}  # a name, a type
+        needs_more = service == "/rosapi/set_param" or service.endswith("_details")  # a name, a type
+        needs_more = needs_more and service != "/rosapi/node_details"
         assert answer["result"] is not needs_more, answer
 
 
 @pytest.mark.parametrize(
     ("service", "type_name"),
-    [("message_details", "boat_msgs/Sensors"), ("service_request_details", "std_srvs/Empty")],
+    [("message_details", "boat_msgs/Sensors"), ("service_request_details", "boat_srvs/Row")],
 )
 def test_unknown_definitions_are_refused(peer: Peer, service: str, type_name: str) -> None:
     assert peer.ask(f"/rosapi/{service}", {"type": type_name})["result"] is False
+
+
+@pytest.mark.parametrize(
+    ("ros_version", "type_name", "request_type"),
+    [
+        (1, "std_srvs/SetBool", "std_srvs/SetBoolRequest"),
+        (2, "std_srvs/srv/SetBool", "std_srvs/srv/SetBool_Request"),
+    ],
+)
+def test_details_of_services(ros_version: Any, type_name: str, request_type: str) -> None:
+    peer = Harness(ros_version=ros_version).connect()
+    (request,) = peer.rosapi("service_request_details", type=type_name)["typedefs"]
+    assert (request["type"], request["fieldnames"], request["fieldtypes"]) == (
+        request_type,
+        ["data"],
+        ["bool"],
+    )
+    (response,) = peer.rosapi("service_response_details", type=type_name)["typedefs"]
+    assert response["fieldnames"] == ["success", "message"]
+    (empty,) = peer.rosapi("service_request_details", type="std_srvs/Empty")["typedefs"]
+    assert empty["fieldnames"] == []
+
+
+@pytest.mark.parametrize("ros_version", [1, 2])
+def test_services_of_rosapi_are_defined(ros_version: Any) -> None:
+    peer = Harness(ros_version=ros_version).connect()
+    for service in peer.rosapi("services")["services"]:
+        type_name = peer.rosapi("service_type", service=service)["type"]
+        (request,) = peer.rosapi("service_request_details", type=type_name)["typedefs"]
+        names = [
+            _ROS2_FIELDS.get(name, name) if ros_version == 2 else name for name in _arguments(peer, service)
+        ]
+        assert request["fieldnames"] == names
+        peer.rosapi("service_response_details", type=type_name)
+
+
+def _arguments(peer: Peer, service: str) -> tuple[str, ...]:
+    _type, names, _answer = peer.hub.broker._calls._rosapi._services[service.removeprefix(PREFIX)]
+    return names
+
+
+def test_a_default_of_a_parameter_under_both_of_its_names() -> None:
+    peer = Harness(ros_version=2).connect()
+    for name in ("default", "default_value"):
+        assert peer.rosapi("get_param", name="/p", **{name: "7"})["value"] == "7"
 
 
 @pytest.mark.parametrize("args", ["text", 7, {"topic": 7}, {"topic": None}, [["/chatter"]], True])

@@ -1,0 +1,240 @@
+"""Checks of outbound messages against the definition of their type: names of fields, and shapes of arrays.
+
+A message is checked completely if its structure differs from that of the last checked one. The structure consists
+of the keys of the objects outside arrays, and of the Python types and lengths of arrays in their fields. After
+`CLOSELY` messages, only the outermost keys of each message are compared, and the whole structure of every
+`SAMPLE`-th, because comparing nested objects would take a tenth of the time of publishing them. Values of scalars are
+left to the server.
+"""
+
+import difflib
+from collections.abc import Mapping
+from itertools import cycle
+from typing import Any, Final, NamedTuple
+
+from bridge.errors import MessageTypeError, NameFormError
+from bridge.names import ros1_type, ros2_type
+
+SCALAR: Final = -1
+"""Length of a field that is not an array; 0 is an array of any length."""
+CLOSELY: Final = 64
+"""Number of messages of the same structure after which only the outermost keys are compared."""
+SAMPLE: Final = 16
+"""Then the whole structure of one in so many is compared."""
+_MAX_TYPES: Final = 1000
+_MAX_FIELDS: Final = 1000
+_BYTES: Final = frozenset({"uint8", "int8", "octet", "byte", "char"})
+_PRIMITIVES: Final = _BYTES | {
+    *("bool", "boolean", "int16", "uint16", "int32", "uint32", "int64", "uint64"),
+    *("float32", "float64", "float", "double", "string", "wstring"),
+}
+_TIMES: Final = frozenset({"time", "duration", "builtin_interfaces/Time", "builtin_interfaces/Duration"})
+
+
+class FieldType(NamedTuple):
+    """Type of a field: that of its elements in the form of ROS 1, and its length (`SCALAR`, 0, or fixed)."""
+
+    element: str
+    length: int
+
+    def __str__(self) -> str:
+        brackets = "" if self.length == SCALAR else f"[{self.length or ''}]"
+        return self.element + brackets
+
+
+_TIME_FIELDS: Final = {name: FieldType("int32", SCALAR) for name in ("secs", "nsecs", "sec", "nanosec")}
+"""A time in the spelling of either ROS version, which servers accept."""
+
+Definitions = dict[str, dict[str, FieldType]]
+"""The fields of types, by the types' names in the form of ROS 1."""
+
+
+def definitions_from_rosapi(answer: Any) -> Definitions:
+    """Read the answer of rosapi's `message_details`; types that cannot be read are left out."""
+    typedefs = answer.get("typedefs") if isinstance(answer, dict) else None
+    found: Definitions = {}
+    for each in typedefs[:_MAX_TYPES] if isinstance(typedefs, list) else []:
+        match each:
+            case {
+                "type": str(name),
+                "fieldnames": [*names],
+                "fieldtypes": [*types],
+                "fieldarraylen": [*lengths],
+            } if len(names) == len(types) == len(lengths) <= _MAX_FIELDS:
+                if (
+                    all(isinstance(text, str) for text in (*names, *types))
+                    and all(type(length) is int for length in lengths)
+                    and not any(text.startswith("_") for text in names)  # slots of Python, not fields
+                ):
+                    found[_key(name)] = {
+                        field: FieldType(_key(element), length)
+                        for field, element, length in zip(names, types, lengths, strict=True)
+                    }
+    return found
+
+
+def bundled_definitions(type_name: str, ros_version: int) -> Definitions:
+    """Return the definitions of a standard type and of its parts from rosbags; empty for another type, or without rosbags."""
+    try:
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError:
+        return {}
+    store = get_typestore(Stores.ROS2_JAZZY if ros_version == 2 else Stores.ROS1_NOETIC)
+    found: Definitions = {}
+    waiting = [ros2_type(type_name)]
+    while waiting:
+        name = waiting.pop()
+        if name in store.fielddefs and _key(name) not in found:
+            fields = {field: _field_type(*kind) for field, kind in store.fielddefs[name][1]}
+            found[_key(name)] = {field: FieldType(_key(kind[0]), kind[1]) for field, kind in fields.items()}
+            waiting += [element for element, _ in fields.values()]
+    return found
+
+
+def _field_type(kind: Any, content: Any) -> tuple[str, int]:
+    match kind.name:
+        case "BASE":
+            return str(content[0]), SCALAR
+        case "NAME":
+            return str(content), SCALAR
+        case array:
+            inner, length = content
+            return _field_type(*inner)[0], length if array == "ARRAY" else 0
+
+
+def _key(type_name: str) -> str:
+    try:
+        return ros1_type(type_name)
+    except NameFormError:
+        return type_name  # a primitive
+
+
+class _Shape(NamedTuple):
+    """Structure of a checked message: its keys, its objects, and types and lengths of its arrays."""
+
+    keys: tuple[str, ...]
+    objects: tuple[tuple[str, "_Shape"], ...]
+    arrays: tuple[tuple[str, type, int], ...]  # the length is checked if it is not 0
+
+
+_NO_SHAPE: Final = _Shape(("",), (), ())
+
+
+class MessageCheck:
+    """The check of messages of one type, which remembers the last structure.
+
+    A caller may skip it for a message with `trusted_keys`, unless the next item of `is_due` is true.
+    """
+
+    def __init__(self, type_name: str, definitions: Definitions) -> None:
+        """Prepare the check of a type that is among the definitions; its name has the form of ROS 1."""
+        self._type = type_name
+        self._definitions = definitions
+        self._last = _NO_SHAPE
+        self._count = 0
+        self.trusted_keys = _NO_SHAPE.keys
+        self.is_due = cycle((True, *(False,) * (SAMPLE - 1)))
+
+    def __call__(self, msg: Mapping[str, Any]) -> None:
+        """Check a message.
+
+        Raises:
+            MessageTypeError: It has a field that the type does not have, or an array of another shape.
+        """
+        if not _has_shape(msg, self._last):
+            self._last = self._shape(self._type, msg, "")
+            self._count = 0
+        self._count += 1
+        self.trusted_keys = self._last.keys if self._count >= CLOSELY else _NO_SHAPE.keys
+
+    def _shape(self, type_name: str, msg: Any, place: str) -> _Shape:
+        """Check an object completely, and return its structure."""
+        if not isinstance(msg, Mapping):
+            raise MessageTypeError(f"{place[:-1] or 'it'} is {_shown(msg)}, expected an object ({type_name})")
+        fields = _TIME_FIELDS if type_name in _TIMES else self._definitions.get(type_name)
+        if fields is None:
+            return _Shape(tuple(msg), (), ())
+        objects, arrays = [], []
+        for name, value in msg.items():
+            field = fields.get(name)
+            if field is None:
+                raise _unknown_field(type_name, fields, name, place)
+            if value is None:
+                continue
+            if field.length != SCALAR:
+                self._check_array(type_name, field, value, f"{place}{name}")
+                arrays.append((name, type(value), 0 if isinstance(value, str) else field.length))
+            elif self._is_object(field.element):
+                objects.append((name, self._shape(field.element, value, f"{place}{name}.")))
+            elif field.element in _PRIMITIVES and _is_nested(value):
+                raise _misshapen(type_name, f"{place}{name}", field, value)
+        return _Shape(tuple(msg), tuple(objects), tuple(arrays))
+
+    def _is_object(self, element: str) -> bool:
+        return element in _TIMES or element in self._definitions
+
+    def _check_array(self, type_name: str, field: FieldType, value: Any, place: str) -> None:
+        if isinstance(value, str | bytes | bytearray):
+            good = field.element in _BYTES or field.element not in _PRIMITIVES
+            length = field.length if isinstance(value, str) else len(value)
+        else:
+            flat = getattr(value, "ndim", 1) == 1 and not isinstance(value, Mapping) and _is_nested(value)
+            good = flat and (
+                field.element not in _PRIMITIVES
+                or hasattr(value, "ndim")
+                or not any(_is_nested(item) for item in value)
+            )
+            length = len(value) if good else 0
+        if not good or (field.length and length != field.length):
+            raise _misshapen(type_name, place, field, value)
+        if self._is_object(field.element):
+            for index, item in enumerate(value):
+                self._shape(field.element, item, f"{place}[{index}].")
+
+
+def _has_shape(msg: Mapping[str, Any], shape: _Shape) -> bool:
+    keys, objects, arrays = shape
+    if tuple(msg) != keys:
+        return False
+    for name, kind, length in arrays:
+        value = msg[name]
+        if type(value) is not kind or (length and len(msg[name]) != length):
+            return False
+    for name, inner in objects:
+        value = msg[name]
+        if type(value) is not dict or not _has_shape(value, inner):
+            return False
+    return True
+
+
+def _is_nested(value: Any) -> bool:
+    """Return whether a value is an object or an array."""
+    return isinstance(value, list | tuple | Mapping) or bool(getattr(value, "ndim", 0))
+
+
+def _unknown_field(
+    type_name: str, fields: Mapping[str, FieldType], name: Any, place: str
+) -> MessageTypeError:
+    near = difflib.get_close_matches(str(name), fields, 1, 0.5)
+    hint = (
+        f"did you mean {place}{near[0]} ({fields[near[0]]})?"
+        if near
+        else f"expected {', '.join(fields) or 'none'}"
+    )
+    return MessageTypeError(f"{type_name} has no field {place}{name}; {hint}")
+
+
+def _misshapen(type_name: str, place: str, field: FieldType, value: Any) -> MessageTypeError:
+    return MessageTypeError(f"field {place} of {type_name} is {_shown(value)}, expected {field}")
+
+
+def _shown(value: Any) -> str:
+    """Return the shape of a value for a sentence."""
+    shape: tuple[int, ...] = getattr(value, "shape", ())
+    if shape:
+        return f"an array of shape {'x'.join(map(str, shape))}"
+    if isinstance(value, Mapping):
+        return "an object"
+    if isinstance(value, list | tuple):
+        return f"an array of {len(value)}{' arrays or objects' if any(map(_is_nested, value)) else ''}"
+    return f"{len(value)} bytes" if isinstance(value, bytes | bytearray) else f"a {type(value).__name__}"

@@ -1,0 +1,106 @@
+"""Correct results of the campaign's readings, from the reference kernel and the deployment's images."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from machines.bm1 import BM1Machine, Start, StopReason
+from machines.reference import ReferenceBM1
+from pcie_shim.programming_file import read_image
+from scripts.campaigning.model.model import VALUES
+
+LINES = 16
+BOARDS = 2
+BANKS = 4
+TARGET, MAX_CYCLES = 127, 1 << 17
+FIRST_SLICE = 256
+"""End of the first slice of a frame; each further slice ends at twice the cycle of the one before."""
+BUILD_OPTIONS = ("--partitions", "2", "--counter-bits", "7", "--rng-banks", "4")
+WORDS = {StopReason.OVERFLOW: "overflow", StopReason.SLICE: "slice", StopReason.MAX_CYCLES: "max cycles"}
+
+Addresses = tuple[int | None, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class BoardOutcome:
+    """A board's part of a frame."""
+
+    cycles: int
+    total: int
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """A frame's correct result: the posterior of all lines, and each board's part."""
+
+    posterior: tuple[float, ...]
+    boards: tuple[BoardOutcome, ...]
+
+
+class UnusableError(Exception):
+    """A reading from which no frame can be made."""
+
+
+def addresses_of(values: dict[str, object]) -> Addresses:
+    """Return the addresses of a reading's values, in the order of the columns.
+
+    Raises:
+        UnusableError: A value is not a number.
+    """
+    addresses: list[int | None] = []
+    for name, count in VALUES.items():
+        value = values.get(name)
+        if value is not None and not isinstance(value, int | float):
+            raise UnusableError(name)
+        if value is None or value != value:  # noqa: PLR0124 - NaN; math.isnan fails on integers beyond a double
+            addresses.append(None)
+        else:
+            addresses.append(math.floor(min(max(value, 0), count - 1) + 0.5))
+    return tuple(addresses)
+
+
+class Expected:
+    """The correct results of one deployment, computed once for each set of addresses and each bank."""
+
+    def __init__(self, folder: Path) -> None:
+        """Read the images of the deployment's boards."""
+        images = [read_image(folder / "boards" / f"board{at}.bm") for at in range(BOARDS)]
+        self.hash = "".join(image.image_hash[:8] for image in images)
+        self._machines: list[BM1Machine] = [image.machine for image in images]
+        self.outcome = cache(self._outcome)
+
+    def _outcome(self, addresses: Addresses, bank: int) -> Outcome:
+        boards = [ReferenceBM1(machine) for machine in self._machines]
+        for machine, board in zip(self._machines, boards, strict=True):
+            tops = [(1 << bits) - 1 for bits in machine.parameters.sensor_bits]
+            inputs = tuple(top if own is None else own for own, top in zip(addresses, tops, strict=True))
+            board.start(
+                Start(
+                    addresses=inputs,
+                    target_count=TARGET,
+                    max_cycles=MAX_CYCLES,
+                    bank=bank,
+                    run_until=FIRST_SLICE,
+                )
+            )
+        end = FIRST_SLICE
+        while not any(board.reason is StopReason.OVERFLOW for board in boards):
+            running = [board for board in boards if board.reason is StopReason.SLICE]
+            if not running:
+                break
+            end *= 2
+            for board in running:
+                board.resume(0 if end >= MAX_CYCLES else end)
+        weights = np.concatenate([board.counts / board.cycles for board in boards])
+        return Outcome(
+            posterior=tuple((weights / weights.sum()).tolist()),
+            boards=tuple(
+                BoardOutcome(board.cycles, int(board.counts.sum()), WORDS[board.reason]) for board in boards
+            ),
+        )

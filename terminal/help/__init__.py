@@ -1,0 +1,1 @@
+"""Help: the page of `--help`, and sentences for usage errors."""

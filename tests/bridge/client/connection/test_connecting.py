@@ -1,0 +1,295 @@
+"""The first connection: what is at the URI, and what is said when it is no rosbridge server."""
+
+import asyncio
+import contextlib
+import re
+import socket
+import time
+from collections.abc import AsyncIterator, Callable
+from typing import Any
+
+import pytest
+
+from bridge.client import State, connect
+from bridge.client.websocket import WebSocket
+from bridge.errors import (
+    AccessRefusedError,
+    BridgeError,
+    DisconnectedError,
+    NotRosbridgeError,
+    OptionError,
+    UnreachableError,
+    UriError,
+)
+from tests.fake_rosbridge import FakeRosbridge
+
+
+@contextlib.asynccontextmanager
+async def tcp_service(
+    serve: Callable[[asyncio.StreamReader, asyncio.StreamWriter], Any],
+) -> AsyncIterator[str]:
+    """A service on a port of this machine that is not a WebSocket server: its URI, as if it were one."""
+    server = await asyncio.start_server(serve, "127.0.0.1", 0)
+    try:
+        yield f"ws://127.0.0.1:{server.sockets[0].getsockname()[1]}"
+    finally:
+        server.close()
+
+
+async def fails(uri: str, error: type[BridgeError], **options: Any) -> str:
+    """Connecting fails as expected, in time; what it said, with the URI in it."""
+    begun = time.monotonic()
+    with pytest.raises(error) as caught:
+        async with connect(uri, **options):
+            pytest.fail("it connected")
+    assert time.monotonic() - begun < options.get("connect_timeout", 10) + 20
+    assert caught.value.exit_code == (2 if error in {UriError, AccessRefusedError} else 3)
+    assert uri in str(caught.value)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+async def test_it_connects_and_closes(fake):
+    ros = connect(fake.uri)
+    assert ros.state is State.CONNECTING
+    async with ros:
+        assert ros.state is State.CONNECTED
+        assert ros.uri == fake.uri
+    assert ros.state is State.CLOSED
+    with pytest.raises(DisconnectedError, match=r"connect\(\)"):
+        await ros.__aenter__()
+    await ros.close()
+
+
+@pytest.mark.parametrize(
+    "uri",
+    [
+        "127.0.0.1:9090",
+        "http://robot:9090",
+        "ws://",
+        "ws://:9090",
+        "",
+        "robot",
+        "ws://robot:port",
+        "ws://robot:70000",
+        "ws://[::1",
+        "tcp://robot:9090",
+        "ws://" + "a" * 100 + ".local",
+    ],
+)
+async def test_a_uri_that_is_none(uri):
+    assert repr(uri) in await fails(uri, UriError)
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [
+        ("ros_version", "3"),
+        ("connect_timeout", 0),
+        ("max_size", 0),
+        ("ping_interval", -1),
+        ("ping_timeout", 0),
+    ],
+)
+def test_an_option_that_is_none(option, value):
+    with pytest.raises(OptionError, match=option) as caught:
+        connect("ws://127.0.0.1:9090", **{option: value})
+    assert caught.value.exit_code == 2
+
+
+async def test_nothing_is_there(unused_tcp_port):
+    assert "connection refused" in await fails(f"ws://127.0.0.1:{unused_tcp_port}", UnreachableError)
+    assert "host name" in await fails("ws://nowhere.invalid:9090", UnreachableError)
+
+
+async def test_a_first_connection_is_tried_until_its_time_is_over(unused_tcp_port):
+    uri, states = f"ws://127.0.0.1:{unused_tcp_port}", []
+    began = time.monotonic()
+    with pytest.raises(UnreachableError):
+        async with connect(uri, retry=True, connect_timeout=0.6):
+            pass
+    assert time.monotonic() - began > 0.3
+    ros = connect(uri, retry=True, connect_timeout=120, on_state=lambda state, _reason: states.append(state))
+    opening = asyncio.create_task(ros.__aenter__())
+    while not states:
+        await asyncio.sleep(0.01)
+    async with FakeRosbridge(port=unused_tcp_port):
+        await opening
+        await ros.__aexit__(None, None, None)
+    assert states == [State.CONNECTING, State.CONNECTED, State.CLOSED]
+
+
+async def test_a_host_that_takes_nothing():
+    with socket.socket() as full:
+        full.bind(("127.0.0.1", 0))
+        full.listen(0)
+        # The kernel does not answer connections beyond its queue, like a host that does not exist.
+        fillers = [socket.socket() for _ in range(4)]
+        for filler in fillers:
+            filler.setblocking(False)
+            filler.connect_ex(full.getsockname())
+        uri = f"ws://127.0.0.1:{full.getsockname()[1]}"
+        assert "did not answer within 0.3 s" in await fails(uri, UnreachableError, connect_timeout=0.3)
+        for filler in fillers:
+            filler.close()
+
+
+async def test_a_host_that_is_switched_on_later_is_not_missed(monkeypatch):
+    """An attempt at a host that answers nothing must not use up the whole time for the first connection."""
+    monkeypatch.setattr("bridge.client.session.ATTEMPT_TIMEOUT", 0.2)
+    with socket.socket() as silent:
+        silent.bind(("127.0.0.1", 0))
+        silent.listen()
+        port = silent.getsockname()[1]
+        states = []
+        ros = connect(
+            f"ws://127.0.0.1:{port}",
+            retry=True,
+            connect_timeout=3600,
+            on_state=lambda state, _reason: states.append(state),
+        )
+        opening = asyncio.create_task(ros.__aenter__())
+        async with asyncio.timeout(60):
+            while State.CONNECTING not in states:
+                await asyncio.sleep(0.01)
+    async with FakeRosbridge(port=port), asyncio.timeout(60):
+        await opening
+        await ros.__aexit__(None, None, None)
+
+
+async def test_a_service_that_greets_before_it_is_asked(monkeypatch):
+    handshake = WebSocket.handshake
+
+    async def late_handshake(self: WebSocket, *headers: Any) -> None:
+        await asyncio.sleep(0.1)
+        await handshake(self, *headers)
+
+    monkeypatch.setattr(WebSocket, "handshake", late_handshake)
+    async with tcp_service(lambda _reader, writer: writer.write(b"220 mail ready\r\n")) as uri:
+        assert "220 mail ready" in await fails(uri, NotRosbridgeError)
+
+
+SWITCHING = b"HTTP/1.1 101 Switching Protocols\r\n"
+STREAM = b"HTTP/1.1 200 OK\r\nContent-Type: multipart/x-mixed-replace\r\n\r\n"
+
+
+@pytest.mark.parametrize(
+    ("answers", "stays", "error", "seen"),
+    [
+        ([], False, UnreachableError, r"without an answer|reset"),
+        ([b""], True, UnreachableError, " within 2 s"),
+        ([b"SSH-2.0-OpenSSH_9.2\r\n"], False, NotRosbridgeError, "SSH-2.0-Op"),
+        ([b"220 mail ready\r\n", b""], True, NotRosbridgeError, "220 mail r"),
+        ([b"\x15\x03\x01\x00\x02\x02\x16\r\n", b""], True, NotRosbridgeError, r"x15.*x03"),
+        ([b"x" * 9000], False, NotRosbridgeError, "x" * 10),
+        ([STREAM, b"frame"], True, NotRosbridgeError, "HTTP/1.1 200 OK"),
+        (
+            [b"HTTP/1.1 200 OK\r\nContent-Length: 2\r\n\r\nhi"],
+            False,
+            NotRosbridgeError,
+            r"a web server \(HTTP 200 OK\)",
+        ),
+        (
+            [b"HTTP/1.1 302 Found\r\nLocation: http://robot/x\r\nContent-Length: 0\r\n\r\n"],
+            False,
+            NotRosbridgeError,
+            "HTTP 302 Found, to http://robot/x",
+        ),
+        ([SWITCHING, b"\r\n"], False, NotRosbridgeError, "not answer as a WebSocket server"),
+        (
+            [SWITCHING, b"Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Accept: x\r\n\r\n"],
+            False,
+            NotRosbridgeError,
+            "not answer as a WebSocket server",
+        ),
+    ],
+)
+async def test_a_service_that_is_something_else(answers, stays, error, seen):
+    asked: list[bytes] = []
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Give the answers, the last one again and again if it ``stays``, and hang up otherwise."""
+        with contextlib.suppress(ConnectionError, asyncio.IncompleteReadError):
+            asked.append(await reader.readuntil(b"\r\n\r\n"))
+            for answer in answers:
+                writer.write(answer)
+            while stays:
+                await asyncio.sleep(0.01)
+                writer.write(answers[-1])
+                await writer.drain()
+        writer.close()
+
+    async with tcp_service(serve) as uri:
+        assert re.search(seen, await fails(uri, error, connect_timeout=2))
+    assert b"Upgrade: websocket" in asked[0]
+    assert b"Extensions" not in asked[0], "it asks for no compression"
+
+
+@pytest.mark.parametrize(
+    ("status", "error"),
+    [
+        (401, AccessRefusedError),
+        (403, AccessRefusedError),
+        (404, NotRosbridgeError),
+        (503, UnreachableError),
+    ],
+)
+async def test_a_server_that_refuses(status, error):
+    async with FakeRosbridge(refuses=status) as fake:
+        assert f"HTTP {status}" in await fails(fake.uri, error)
+
+
+async def test_tls_towards_a_server_without():
+    async with FakeRosbridge() as fake:
+        said = await fails(fake.uri.replace("ws:", "wss:"), BridgeError)
+    assert "TLS" in said or "reset" in said
+
+
+async def test_cancelling_an_attempt_leaves_nothing_behind():
+    gone = asyncio.Event()
+
+    async def answer(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        with contextlib.suppress(ConnectionError):
+            await reader.read(-1)
+        gone.set()
+        writer.close()
+
+    async with tcp_service(answer) as uri:
+        ros = connect(uri)
+        attempt = asyncio.create_task(ros.__aenter__())
+        await asyncio.sleep(0.1)
+        attempt.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await attempt
+        assert ros.state is State.CLOSED
+        await asyncio.wait_for(gone.wait(), 30)
+
+
+@pytest.mark.parametrize("fake", [{"silent": True}], indirect=True)
+async def test_a_client_that_is_cancelled_at_its_farewell_is_closed(fake, ros):
+    """Else it would go on for good: heard by nobody, and connecting again whenever it is lost."""
+    publication = await ros.advertise("/a", "std_msgs/String")
+    await publication.publish({"data": "x"})
+    closing = asyncio.create_task(ros.close())
+    await fake.wait_for_op("call_service", service="/rosapi/get_time")
+    closing.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await closing
+    assert ros.state is State.CLOSED
+
+
+async def test_a_service_may_close_its_client(fake, ros):
+    finished = asyncio.Event()
+
+    async def handler(_args: dict[str, Any]) -> dict[str, Any]:
+        await ros.close()
+        finished.set()
+        return {}
+
+    await ros.advertise_service("/bye", "std_srvs/Empty", handler)
+    async with connect(fake.uri) as other:
+        await fake.wait_for_op("advertise_service")
+        with contextlib.suppress(BridgeError):
+            await other.call("/bye", timeout=1)
+        await asyncio.wait_for(finished.wait(), 30)
+    assert ros.state is State.CLOSED

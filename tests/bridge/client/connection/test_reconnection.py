@@ -1,0 +1,307 @@
+"""A lost connection comes back by itself, with everything that was wanted."""
+
+import asyncio
+import re
+import socket
+import time
+from typing import Any
+
+import pytest
+
+from bridge.client import Ros, State, connect
+from bridge.client.session import FIRST_DELAY, MAX_DELAY
+from bridge.errors import DisconnectedError, NoMessageError, StateTimeoutError
+from tests.fake_rosbridge import FakeRosbridge
+
+
+@pytest.fixture
+def delays(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """The waits before attempts to reconnect, which take no time."""
+    waits: list[float] = []
+    sleep = asyncio.sleep
+
+    async def no_sleep(delay: float, *_result: Any) -> None:
+        if delay > 0:
+            waits.append(delay)
+        await sleep(0.001 if delay > 0 else 0)
+
+    monkeypatch.setattr("bridge.client.session.asyncio.sleep", no_sleep)
+    return waits
+
+
+async def gone_and_back(fake: FakeRosbridge, ros: Ros) -> None:
+    await fake.vanish()
+    await ros.wait_for_state(State.RECONNECTING, 30)
+    fake.received.clear()
+    await fake.come_back()
+    await ros.wait_for_state(State.CONNECTED, 30)
+
+
+async def test_everything_is_restored(fake):
+    states: list[tuple[State, str]] = []
+
+    def on_state(state: State, reason: str) -> None:
+        states.append((state, reason))
+        raise RuntimeError("a callback that fails breaks nothing")
+
+    async def handler(args: dict[str, Any]) -> dict[str, Any]:
+        return args
+
+    async with connect(fake.uri, on_state=on_state, check_types=False) as ros:
+        subscription = ros.subscribe("/in", "p/T", throttle_rate=20, queue_length=3)
+        publication = await ros.advertise("/out", "p/T", latch=True, queue_size=7)
+        await ros.advertise_service("/echo", "p/Echo", handler)
+        closed = ros.subscribe("/closed", "p/T")
+        await closed.close()
+        await publication.publish({"n": 1})
+        await fake.wait_for_op("publish")
+        before = [received.op for received in fake.received]
+        assert (before[0]["throttle_rate"], before[0]["queue_length"]) == (20, 3)
+        assert (before[1]["latch"], before[1]["queue_size"]) == (True, 7)
+
+        reading = asyncio.create_task(anext(subscription))
+        await gone_and_back(fake, ros)
+        assert ros.reconnections == 1
+        await fake.wait_for_op("subscribe", topic="/in")
+        after = [received.op for received in fake.received]
+        assert after == [before[1], before[-1], before[2], before[0]]
+        # In both directions, on the same handles.
+        await fake.publish("/in", {"n": 2})
+        assert (await asyncio.wait_for(reading, 30)).msg == {"n": 2}
+        await publication.publish({"n": 3})
+        await fake.wait_for_op("publish", msg={"n": 3})
+        async with connect(fake.uri) as other:
+            assert await other.call("/echo", {"n": 4}) == {"n": 4}
+    expected = [State.CONNECTED, State.RECONNECTING, State.CONNECTED, State.CLOSED]
+    assert [state for state, _reason in states] == expected
+    assert states[1][1]
+    assert ros.last_error
+
+
+async def test_nothing_is_published_into_the_void(fake, ros):
+    publication = await ros.advertise("/a", "p/T")
+    await fake.vanish()
+    await ros.wait_for_state(State.RECONNECTING, 30)
+    with pytest.raises(DisconnectedError, match=fake.uri):
+        await publication.publish({"n": 1})
+    with pytest.raises(DisconnectedError):
+        await ros.call("/s")
+    # Requests in the meantime are sent later.
+    later = ros.subscribe("/later", "p/T")
+    new = await ros.advertise("/new", "p/T")
+    await publication.close()
+    await fake.come_back()
+    await ros.wait_for_state(State.CONNECTED, 30)
+    await fake.wait_for_op("subscribe", topic="/later")
+    assert fake.ops("publish") == []
+    await fake.publish("/later", {"n": 2})
+    assert (await later.next(30)).msg == {"n": 2}
+    await new.publish({"n": 3})
+    await fake.wait_for_op("publish", topic="/new")
+
+
+async def test_the_waits_double_up_to_two_seconds(delays):
+    assert (FIRST_DELAY, MAX_DELAY) == (0.1, 2.0)
+    async with FakeRosbridge() as fake, connect(fake.uri) as ros:
+        await fake.vanish()
+        while len(delays) < 12:
+            await asyncio.get_running_loop().run_in_executor(None, time.sleep, 0.01)
+        for number, delay in enumerate(delays):
+            longest = min(0.1 * 2**number, MAX_DELAY)
+            assert 0.8 * longest <= delay <= longest
+        assert "refused" in ros.last_error
+
+
+@pytest.mark.parametrize(("steady", "longest"), [(600.0, 2.0), (0.0, 0.1)])
+async def test_only_a_steady_connection_resets_the_back_off(fake, ros, delays, monkeypatch, steady, longest):
+    monkeypatch.setattr("bridge.client.session.STEADY", steady)
+    for number in range(6):
+        await fake.cut()
+        await fake.wait_for_connections(number + 2)
+        await ros.wait_for_state(State.CONNECTED, 30)
+    assert 0.8 * longest <= max(delays) <= longest
+
+
+@pytest.mark.parametrize("trouble", ["refuses", "something else listens"])
+async def test_it_comes_back_whatever_was_there_meanwhile(fake, ros, trouble):
+    if trouble == "refuses":
+        fake.refuses = 503
+        await fake.cut()
+        await asyncio.wait_for(_until(lambda: "HTTP 503" in ros.last_error), 120)
+        fake.refuses = None
+    else:
+        await fake.vanish()
+        greeter = await asyncio.start_server(lambda _r, w: w.write(b"220 mail\r\n"), "127.0.0.1", fake.port)
+        await asyncio.wait_for(_until(lambda: "220 mail" in ros.last_error), 120)
+        greeter.close()
+        await fake.come_back()
+    await ros.wait_for_state(State.CONNECTED, 30)
+
+
+@pytest.mark.parametrize(
+    ("frame", "said"),
+    [
+        (b"\x88\x02\x03\xe9", 1001),
+        (b"\x88\x02\x03\xf1", 1009),
+        (b"\xff\xff not a frame", "protocol"),
+    ],
+)
+async def test_a_server_that_ends_the_connection_and_does_not_hang_up(fake, ros, monkeypatch, frame, said):
+    monkeypatch.setattr("bridge.client.websocket.CLOSE_TIMEOUT", 0.2)
+    fake.freeze()
+    (client,) = fake._clients
+    client.connection.transport.write(frame)
+    await ros.wait_for_state(State.RECONNECTING, 30)
+    assert str(said) in ros.last_error
+    await ros.wait_for_state(State.CONNECTED, 30)
+
+
+@pytest.mark.parametrize("ros", [{"ping_interval": 0.4, "ping_timeout": 0.3}], indirect=True)
+async def test_a_silent_peer_is_noticed(fake, ros):
+    subscription = ros.subscribe("/a", "p/T")
+    await fake.wait_for_op("subscribe")
+    fake.freeze()
+    await ros.wait_for_state(State.RECONNECTING, 30)
+    assert "server for 0." in ros.last_error
+    await ros.wait_for_state(State.CONNECTED, 30)
+    await fake.wait_for_op("subscribe", count=2)
+    await fake.publish("/a", {})
+    assert (await subscription.next(30)).blind_seconds >= 0.7, "it counts from the last sign of life"
+
+
+@pytest.mark.parametrize("fake", [{"silent": True}], indirect=True)
+@pytest.mark.parametrize("ros", [{"ping_interval": 0.05, "ping_timeout": 1.0}], indirect=True)
+async def test_a_quiet_server_that_answers_pings_is_kept(fake, ros):
+    await asyncio.sleep(2)
+    assert (ros.state, ros.reconnections, fake.connections) == (State.CONNECTED, 0, 1)
+
+
+@pytest.mark.parametrize("ros", [{"ping_interval": 0.1, "ping_timeout": 1.0}], indirect=True)
+async def test_a_sleep_of_this_process_is_not_the_servers_silence(fake, ros):
+    fake.freeze()
+    while ros._session._connected()._pinged_at is None:
+        await asyncio.sleep(0)
+    fake.thaw()
+    time.sleep(2.5)  # noqa: ASYNC251  # the whole process stands still while the answer is on its way
+    await asyncio.sleep(0.3)
+    assert (ros.state, ros.reconnections, fake.connections) == (State.CONNECTED, 0, 1)
+
+
+@pytest.mark.parametrize("ros", [{"max_size": 1000}], indirect=True)
+async def test_a_message_that_is_too_large_ends_the_connection_and_says_so(fake, ros):
+    subscription = ros.subscribe("/a", "p/T", queue_size=5)
+    await fake.wait_for_op("subscribe")
+    waiting = asyncio.create_task(subscription.next(timeout=1))
+    await asyncio.sleep(0)
+    await fake.publish("/a", {"n": "x" * 2000})
+    await ros.wait_for_state(State.RECONNECTING, 30)
+    reason = "the server sent a message of more than 1000 bytes (max_size allows larger ones)"
+    assert ros.last_error == reason
+    with pytest.raises(NoMessageError, match=re.escape(f"the connection was lost: {reason}")):
+        await waiting
+    await fake.wait_for_op("subscribe", count=2)
+    await fake.publish("/a", {"n": 1})
+    assert (await subscription.next(30)).msg == {"n": 1}
+
+
+async def test_waiting_for_a_state_is_bounded_and_closing_ends_it_and_the_reconnecting(fake, ros):
+    subscription = ros.subscribe("/a", "p/T")
+    await ros.wait_for_state(State.CONNECTED, 1)
+    await fake.vanish()
+    await ros.wait_for_state(State.RECONNECTING, 30)
+    with pytest.raises(StateTimeoutError) as caught:
+        await ros.wait_for_state(State.CONNECTED, 0.05)
+    assert str(caught.value).startswith(
+        f"the connection to {fake.uri} was not connected within 0.05 s, it is reconnecting ("
+    )
+    assert caught.value.exit_code == 3
+    waiting = asyncio.create_task(ros.wait_for_state(State.CONNECTED, 30))
+    await asyncio.sleep(0)
+    await ros.close()
+    for late in (waiting, ros.wait_for_state(State.CONNECTED, 30)):
+        with pytest.raises(DisconnectedError, match="closed"):
+            await late
+    assert not [task for task in asyncio.all_tasks() if "Session." in repr(task.get_coro())]
+    await fake.come_back()
+    await asyncio.sleep(0.4)
+    assert (ros.state, fake.connections) == (State.CLOSED, 1)
+    assert [message async for message in subscription] == []
+
+
+async def test_closing_from_the_callback(fake):
+    closing: list[asyncio.Task[None]] = []
+
+    def on_state(state: State, _reason: str) -> None:
+        if state is State.RECONNECTING:
+            closing.append(asyncio.get_running_loop().create_task(ros.close()))
+
+    ros = connect(fake.uri, on_state=on_state)
+    async with ros:
+        await fake.cut()
+        await ros.wait_for_state(State.CLOSED, 30)
+    await asyncio.gather(*closing)
+
+
+async def test_a_peer_that_does_not_say_goodbye_is_not_waited_for(fake, ros, monkeypatch):
+    monkeypatch.setattr("bridge.client.websocket.CLOSE_TIMEOUT", 0.2)
+    fake.freeze()
+    await asyncio.wait_for(ros.close(), 30)
+
+
+async def test_nothing_is_left_open():
+    async with FakeRosbridge() as fake:
+        for _ in range(3):
+            async with connect(fake.uri) as ros:
+                ros.subscribe("/a", "p/T")
+                await fake.cut()
+        await asyncio.sleep(0.05)
+        assert not fake._clients
+        assert len(asyncio.all_tasks()) <= 2, "this one, and the fake's accepting one"
+    with socket.socket() as again:
+        again.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        again.bind(("127.0.0.1", fake.port))
+
+
+async def test_the_first_message_after_losses_says_how_long_it_was_dark(fake, ros):
+    subscription = ros.subscribe("/a", "p/T")
+    await fake.wait_for_op("subscribe")
+    await fake.publish("/a", {})
+    assert (await subscription.next(30)).blind_seconds == 0
+    begun = time.monotonic()
+    for _ in range(2):
+        await fake.vanish()
+        await asyncio.sleep(0.3)
+        between = ros.subscribe("/c", "p/T")
+        await fake.come_back()
+        await ros.wait_for_state(State.CONNECTED, 30)
+    late = ros.subscribe("/b", "p/T")
+    await fake.wait_for_op("subscribe", topic="/b")
+    for topic in ("/a", "/a", "/b"):
+        await fake.publish(topic, {})
+    first, second = await subscription.next(30), await subscription.next(30)
+    assert 0.6 <= first.blind_seconds <= time.monotonic() - begun
+    assert subscription.blind_seconds == first.blind_seconds >= between.blind_seconds + 0.6
+    assert second.blind_seconds == (await late.next(30)).blind_seconds == late.blind_seconds == 0
+    await subscription.close()
+    await gone_and_back(fake, ros)
+    assert subscription.blind_seconds == first.blind_seconds
+
+
+@pytest.mark.parametrize("queue_size", [1, 2, 5])
+async def test_darkness_is_told_even_if_its_message_is_dropped(fake, ros, queue_size):
+    subscription = ros.subscribe("/a", "p/T", queue_size=queue_size)
+    await gone_and_back(fake, ros)
+    await fake.wait_for_op("subscribe")
+    for n in range(20):
+        await fake.publish("/a", {"n": n})
+    await asyncio.wait_for(_until(lambda: subscription.lost == 20 - queue_size), 120)
+    messages = [await subscription.next(30) for _ in range(queue_size)]
+    assert [message.msg["n"] for message in messages] == list(range(20 - queue_size, 20))
+    dark = [message.blind_seconds for message in messages]
+    assert dark == [subscription.blind_seconds] + [0.0] * (queue_size - 1)
+    assert dark[0] > 0
+
+
+async def _until(condition: Any) -> None:
+    while not condition():
+        await asyncio.sleep(0.01)

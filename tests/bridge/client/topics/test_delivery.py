@@ -1,0 +1,206 @@
+"""How messages come: CBOR, serialised bytes, pictures, fragments, arrays, qualities of service; without a network.
+
+ClientCore ──data_to_send──▶ the test (plays the server)
+    ▲                          │
+    └──────────receive─────────┘
+"""
+
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bridge.client.protocol import ClientCore, Delivery
+from bridge.client.protocol.events import GoalEnded, GoalFeedback, GoalStatus, MessageReceived, Unusable
+from bridge.client.protocol.goals import MAX_GOALS
+from bridge.codecs import cbor_codec
+from bridge.codecs.fragments import split
+from bridge.errors import OptionError, SlowPeerError
+from bridge.qos import Qos
+from tests.bridge.client.cores import connected, sent, tell
+
+CBOR = Delivery(compression="cbor")
+ARRAYS = Delivery(compression="cbor", arrays="numpy")
+RAW = Delivery(compression="cbor-raw")
+
+
+def publish(msg: Any, topic: str = "/a") -> dict[str, Any]:
+    return {"op": "publish", "topic": topic, "msg": msg}
+
+
+def in_cbor(msg: Any, topic: str = "/a") -> bytes:
+    return cbor_codec.encode(publish(msg, topic))
+
+
+def in_json(msg: Any, topic: str = "/a") -> bytes:
+    return json.dumps(publish(msg, topic)).encode()
+
+
+# Requests
+
+
+def test_everything_that_can_be_asked_is_asked_again_after_a_loss():
+    core = connected()
+    delivery = Delivery(compression="cbor", fragment_size=1000, qos=Qos(depth=3))
+    core.subscriptions.subscribe("/a", "p/T", delivery=delivery)
+    core.publications.advertise("/b", "p/T", qos=Qos(durability="transient_local"))
+    before = sent(core)
+    core.lost()
+    core.restore()
+    advertise, subscribe = sent(core)
+    assert before == [subscribe, advertise]
+    assert (subscribe["compression"], subscribe["fragment_size"]) == ("cbor", 1000)
+    assert (subscribe["qos"], advertise["qos"]) == ({"depth": 3}, {"durability": "transient_local"})
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"compression": "zip"},
+        {"arrays": "array"},
+        {"fragment_size": 0},
+        {"fragment_size": 1.5},
+        {"fragment_size": True},
+        {"compression": "cbor-raw", "arrays": "numpy"},
+    ],
+)
+def test_what_cannot_be_asked(wrong):
+    with pytest.raises(OptionError, match="|".join(wrong)):
+        Delivery(**wrong)
+    if "fragment_size" in wrong:
+        with pytest.raises(OptionError, match="fragment_size"):
+            ClientCore(**wrong)
+
+
+# Deliveries
+
+
+def test_topics_of_one_client_that_want_it_differently():
+    core = connected()
+    core.subscriptions.subscribe("/arrays", "p/T", delivery=ARRAYS)
+    core.subscriptions.subscribe("/lists", "p/T", delivery=CBOR)
+    core.subscriptions.subscribe("/raw", "p/T", delivery=RAW)
+    core.subscriptions.subscribe("/json", "p/T")
+    msg = {"data": np.array([1.5]), "bytes": b"\x01"}
+
+    def came(data: bytes) -> Any:
+        event = core.receive(data, 0.0)
+        assert isinstance(event, MessageReceived)
+        return event.msg
+
+    assert isinstance(came(in_cbor(msg, "/arrays"))["data"], np.ndarray)
+    assert came(in_cbor(msg, "/lists")) == {"data": [1.5], "bytes": b"\x01"}
+    assert came(in_cbor({"secs": 1, "nsecs": 2, "bytes": b"\x01"}, "/raw"))["bytes"] == b"\x01"
+    assert came(in_json({"data": [1.5]}, "/json")) == {"data": [1.5]}
+
+
+def test_cbor_that_nobody_asked_for_is_not_read():
+    core = connected()
+    number = core.subscriptions.subscribe("/a", "p/T")
+    assert isinstance(core.receive(in_cbor({}), 0.0), Unusable)
+    core.subscriptions.unsubscribe(number)
+    number = core.subscriptions.subscribe("/a", "p/T", delivery=CBOR)
+    assert isinstance(core.receive(in_cbor({}), 0.0), MessageReceived)
+    core.subscriptions.unsubscribe(number)
+    assert isinstance(core.receive(in_cbor({}), 0.0), Unusable)
+
+
+def test_fragments_of_a_lost_connection_do_not_count():
+    core = connected()
+    core.subscriptions.subscribe("/a", "p/T", delivery=Delivery(fragment_size=10))
+    first, *others = split(in_json({"text": "x" * 50}), 10, 0)
+    for lost in (False, True):
+        assert core.receive(first, 0.0) is None
+        if lost:
+            core.lost()
+            core.restore()
+        *rest, last = [core.receive(piece, 0.0) for piece in others]
+        assert rest == [None] * len(rest)
+        assert (last is None) == lost
+
+
+def test_large_messages_leave_in_fragments():
+    core, other = connected(fragment_size=60), connected()
+    number = core.publications.advertise("/a", "p/T")
+    other.subscriptions.subscribe("/a", "p/T")
+    room = 60 - len(core.publications.publish(number, {"d": ""}))
+    ids = []
+    for size in (room, room + 1, 100):
+        split_up = list(core.wire.pieces(core.publications.publish(number, {"d": "x" * size})))
+        assert (len(split_up) == 1) == (size == room)
+        *rest, last = [other.receive(piece, 0.0) for piece in split_up]
+        assert rest == [None] * len(rest)
+        assert last.msg == {"d": "x" * size}
+        ids.append(json.loads(split_up[0]).get("id"))
+    assert ids[0] is None
+    assert len(set(ids)) == 3, "each message has an id of its own"
+
+
+# Goals of actions
+
+
+def goal_of(core: ClientCore, **options: Any) -> str:
+    return core.goals.send("/fly", "boat_msgs/Fly", {"to": [1, 2]}, feedback=True, **options)
+
+
+def test_a_goal_its_feedback_and_its_end():
+    core = connected()
+    goal = goal_of(core)
+    assert sent(core) == [
+        {
+            "op": "send_action_goal",
+            "id": goal,
+            "action": "/fly",
+            "action_type": "boat_msgs/action/Fly",
+            "args": {"to": [1, 2]},
+            "feedback": True,
+        }
+    ]
+    assert tell(core, op="action_feedback", id=goal, action="/fly", values={"n": 1}) == GoalFeedback(
+        goal, {"n": 1}
+    )
+    core.goals.cancel(goal)
+    assert sent(core) == [{"op": "cancel_action_goal", "id": goal, "action": "/fly"}]
+    ended = tell(core, op="action_result", id=goal, action="/fly", values={"at": 2}, status=5, result=True)
+    assert ended == GoalEnded(goal, ok=True, status=GoalStatus.CANCELED, values={"at": 2})
+    assert tell(core, op="action_feedback", id=goal, values={}) is None
+    assert tell(core, op="action_result", id=goal, values={}) is None
+    core.goals.cancel(goal)
+    assert sent(core) == []
+
+
+@pytest.mark.parametrize(
+    ("answer", "ended"),
+    [
+        ({"values": {}, "status": 4, "result": True}, (True, GoalStatus.SUCCEEDED, {})),
+        ({"values": {"a": 1}}, (True, GoalStatus.SUCCEEDED, {"a": 1})),
+        ({}, (True, GoalStatus.SUCCEEDED, {})),
+        ({"status": 77, "result": True}, (True, GoalStatus.UNKNOWN, {})),
+        ({"status": "4", "result": True}, (True, GoalStatus.UNKNOWN, {})),
+        ({"status": [4], "result": True}, (True, GoalStatus.UNKNOWN, {})),
+        ({"values": "no", "status": 0, "result": False}, (False, GoalStatus.UNKNOWN, "no")),
+        ({"values": {"why": 1}, "result": False}, (False, GoalStatus.UNKNOWN, '{"why":1}')),
+    ],
+)
+def test_how_a_goal_may_end(answer, ended):
+    core = connected()
+    goal = goal_of(core)
+    ok, status, values = ended
+    assert tell(core, op="action_result", id=goal, **answer) == GoalEnded(
+        goal, ok=ok, status=status, values=values
+    )
+
+
+def test_goals_are_bounded_and_forgotten_with_the_connection():
+    core = connected()
+    goals = [goal_of(core) for _ in range(MAX_GOALS)]
+    with pytest.raises(SlowPeerError):
+        goal_of(core)
+    core.goals.forget(goals[0])
+    goal_of(core)
+    core.lost()
+    core.restore()
+    assert tell(core, op="action_result", id=goals[1], values={}) is None
+    assert isinstance(tell(core, op="action_result", values={}), Unusable)
+    assert isinstance(tell(core, op="action_feedback", id=5, values={}), Unusable)

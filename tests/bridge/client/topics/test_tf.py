@@ -1,0 +1,43 @@
+"""Transforms from `/tf` and `/tf_static`, through the hub."""
+
+import asyncio
+
+import numpy as np
+import pytest
+
+from bridge.client import connect
+from bridge.client.blocking import connect as connect_blocking
+from bridge.errors import FrameUnknownError
+from tests.bridge.hub.sockets import running_hub
+from tests.bridge.test_transforms import SECOND, message, turned
+
+PATIENCE = 30.0
+
+
+async def test_the_blocking_form():
+    def program(uri: str) -> None:
+        with connect_blocking(uri) as ros, ros.transforms() as transforms:
+            static = ros.advertise("/tf_static", "tf2_msgs/TFMessage", latch=True)
+            static.publish(message("base", "laser", turned(0.5, 0, SECOND)))
+            assert np.allclose(transforms.lookup("base", "laser", timeout=PATIENCE).translation, [0.5, 0, 0])
+            with pytest.raises(FrameUnknownError):
+                transforms.lookup("base", "arm", timeout=0.05)
+
+    async with running_hub(ros_version=2) as port:
+        await asyncio.wait_for(asyncio.to_thread(program, f"ws://127.0.0.1:{port}"), PATIENCE)
+
+
+@pytest.mark.parametrize("version", [1, 2])
+async def test_a_lookup_waits_for_both_topics(version):
+    async with running_hub(ros_version=version) as port, connect(f"ws://127.0.0.1:{port}") as ros:
+        static = await ros.advertise("/tf_static", "tf2_msgs/TFMessage", latch=True)
+        await static.publish(message("base", "laser", turned(0.5, 0, SECOND)))
+        async with ros.transforms() as transforms:
+            with pytest.raises(FrameUnknownError):
+                await transforms.lookup("map", "laser", timeout=0.05)
+            waiting = asyncio.create_task(transforms.lookup("map", "laser", 3 * SECOND, PATIENCE))
+            moving = await ros.advertise("/tf", "tf2_msgs/TFMessage")
+            for second in (2, 4):
+                await moving.publish(message("map", "base", turned(second, 0, second * SECOND)))
+            assert np.allclose((await waiting).apply([0, 0, 0]), [3.5, 0, 0])
+        await transforms.close()

@@ -1,0 +1,183 @@
+"""Absent fields of messages, which every subscriber sees with their defaults."""
+
+import json
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bridge.codecs import cbor_codec, png
+from bridge.hub.delivery.definitions import Definitions
+from tests.bridge.hub.broker_harness import WALL_CLOCK, Harness, Peer, publisher_and_subscriber
+
+_SECONDS, _NANOSECONDS = divmod(WALL_CLOCK, 10**9)
+_NOW = {1: {"secs": _SECONDS, "nsecs": _NANOSECONDS}, 2: {"sec": _SECONDS, "nanosec": _NANOSECONDS}}
+_ZERO = {1: {"secs": 0, "nsecs": 0}, 2: {"sec": 0, "nanosec": 0}}
+_IDENTITY = {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}
+
+
+def _send(publisher: Peer, *payloads: bytes) -> None:
+    """Send operations as a connection does, which recognises repeated envelopes."""
+    assert publisher.hub.broker.receive_turn(publisher.client, list(payloads), 0.0) == len(payloads)
+
+
+@pytest.mark.parametrize("ros_version", [1, 2])
+@pytest.mark.parametrize("prefix", ["", '"id":"x",'])  # with an envelope that is learned, and without
+def test_the_cancelling_of_a_goal_has_a_stamp(ros_version: Any, prefix: str) -> None:
+    publisher, subscriber = publisher_and_subscriber("actionlib_msgs/GoalID", ros_version)
+    texts = ('{"id": "g"}', "{}", "{ }", '{"id": "g"} ')
+    _send(publisher, *(f'{{{prefix}"op":"publish","topic":"/t","msg":{text}}}'.encode() for text in texts))
+    zero = _ZERO[ros_version]
+    assert subscriber.messages() == [{"id": id_, "stamp": zero} for id_ in ("g", "", "", "g")]
+
+
+def test_a_complete_message_is_forwarded_as_it_was_received() -> None:
+    publisher, subscriber = publisher_and_subscriber("std_msgs/Header")
+    payload = b'{"op":"publish","topic":"/t","msg":{"frame_id":"" , "seq":1e0,"stamp":{"nsecs":0,"secs":0},"more":1}}'
+    _send(publisher, payload, payload)
+    assert subscriber.payloads()[1] == payload
+
+
+@pytest.mark.parametrize("ros_version", [1, 2])
+@pytest.mark.parametrize("header", [None, {}, {"frame_id": "map"}])
+def test_an_absent_stamp_of_a_header_is_the_time_of_receipt(ros_version: Any, header: Any) -> None:
+    publisher, subscriber = publisher_and_subscriber("geometry_msgs/PointStamped", ros_version)
+    message = {"point": {"x": 1, "y": 2, "z": 3}} | ({} if header is None else {"header": header})
+    publisher.publish("/t", message)
+    (received,) = subscriber.messages()
+    assert received["point"] == message["point"]
+    assert received["header"]["stamp"] == _NOW[ros_version]
+    assert received["header"]["frame_id"] == ("map" if header else "")
+    assert ("seq" in received["header"]) is (ros_version == 1)
+
+
+def test_a_stamp_of_zero_stays() -> None:
+    publisher, subscriber = publisher_and_subscriber("std_msgs/Header")
+    publisher.publish("/t", {"stamp": {"secs": 0, "nsecs": 0}})
+    assert subscriber.messages()[0]["stamp"] == {"secs": 0, "nsecs": 0}
+
+
+@pytest.mark.parametrize("ros_version", [1, 2])
+def test_times_of_the_other_version_are_translated(ros_version: Any) -> None:
+    publisher, subscriber = publisher_and_subscriber("std_msgs/Header", ros_version)
+    publisher.publish("/t", {"stamp": _NOW[3 - ros_version] | {"more": 1}})
+    assert subscriber.messages()[0]["stamp"] == _NOW[1] | _NOW[2] | {"more": 1}
+
+
+def test_parts_and_elements_of_arrays_are_filled() -> None:
+    publisher, subscriber = publisher_and_subscriber("tf2_msgs/TFMessage", 2)
+    publisher.publish(
+        "/t", {"transforms": [{"transform": {"rotation": {"x": 0.5}}}, {"child_frame_id": "b"}, None]}
+    )
+    (received,) = subscriber.messages()
+    first, second, third = received["transforms"]
+    assert first["transform"]["rotation"] == {"x": 0.5, "y": 0.0, "z": 0.0, "w": 1.0}
+    assert second["transform"] == {"translation": {"x": 0.0, "y": 0.0, "z": 0.0}, "rotation": _IDENTITY}
+    assert second["header"] == {"stamp": _NOW[2], "frame_id": ""}
+    assert third is None
+
+
+@pytest.mark.parametrize(
+    ("type_name", "field", "default"),
+    [
+        ("geometry_msgs/PoseWithCovariance", "covariance", [0.0] * 36),
+        ("sensor_msgs/Image", "data", ""),
+        ("std_msgs/ByteMultiArray", "data", []),
+        ("std_msgs/Bool", "data", False),
+        ("diagnostic_msgs/DiagnosticStatus", "level", 0),
+        ("actionlib/TestActionResult", "result", {"result": 0}),
+        ("move_base_msgs/MoveBaseActionGoal", "goal_id", {"stamp": _ZERO[1], "id": ""}),
+        ("tf2_msgs/TFMessage", "transforms", []),
+        ("tf2_msgs/LookupTransformActionFeedback", "feedback", {}),
+        ("tf/tfMessage", "transforms", []),
+    ],
+)
+def test_defaults_of_fields(type_name: str, field: str, default: object) -> None:
+    publisher, subscriber = publisher_and_subscriber(type_name)
+    publisher.publish("/t", {})
+    assert subscriber.messages()[0][field] == default
+
+
+@pytest.mark.parametrize(
+    "message", [{"layout": None}, {"layout": 3}, {"layout": {"dim": "x"}}, {"layout": [1]}]
+)
+def test_values_of_wrong_types_stay(message: dict[str, Any]) -> None:
+    publisher, subscriber = publisher_and_subscriber("std_msgs/Int32MultiArray")
+    publisher.publish("/t", message)
+    (received,) = subscriber.messages()
+    assert received["data"] == []
+    if message["layout"] != {"dim": "x"}:
+        assert received["layout"] == message["layout"]
+
+
+def test_all_encodings_have_the_whole_message() -> None:
+    hub = Harness()
+    publisher = hub.connect()
+    publisher.advertise("/t", "std_msgs/Float64MultiArray")
+    peers = {name: hub.connect() for name in ("none", "png", "cbor", "cbor-raw")}
+    for name, peer in peers.items():
+        peer.subscribe("/t", compression=name)
+    publisher.publish("/t", {"data": [1.5]})
+    whole = {"data": [1.5], "layout": {"dim": [], "data_offset": 0}}
+    for name in ("none", "cbor"):
+        assert peers[name].messages() == [whole]
+    (picture,) = peers["png"].read()
+    assert json.loads(png.decode(picture["data"]))["msg"] == whole
+    (payload,) = peers["cbor-raw"].payloads()
+    assert cbor_codec.decode(payload)["msg"]["bytes"] == b"\0" * 8 + b"\x01\0\0\0" + b"\0" * 6 + b"\xf8\x3f"
+
+
+def test_messages_of_unknown_types_stay() -> None:
+    publisher, subscriber = publisher_and_subscriber("boat_msgs/Sensors")
+    publisher.publish("/t", {})
+    assert subscriber.messages() == [{}]
+
+
+def test_a_latched_message_is_filled() -> None:
+    hub = Harness()
+    publisher, late = hub.connect(), hub.connect()
+    publisher.advertise("/t", "std_msgs/String", latch=True)
+    publisher.publish("/t", {})
+    late.subscribe("/t")
+    assert late.messages() == [{"data": ""}]
+
+
+@pytest.mark.parametrize(
+    "text", [b'{"markers":[%b{}]}' % (b"{}," * 50_000), b'{"x":"%b"}' % (b"x" * ((1 << 20) - 50))]
+)
+def test_a_message_may_not_outgrow_the_limit(text: bytes) -> None:
+    publisher, subscriber = publisher_and_subscriber("visualization_msgs/MarkerArray")
+    envelope = b'{"op":"publish","topic":"/t","msg":'
+    _send(publisher, b"%b{}}" % envelope, b"%b%b}" % (envelope, text))
+    assert subscriber.messages() == [{"markers": []}]
+    assert publisher.client.refused == 1
+    publisher.publish("/t", {"markers": [{}]})
+    assert json.loads(subscriber.payloads()[0])["msg"]["markers"][0]["pose"]["orientation"]["w"] == 0.0
+
+
+@given(
+    st.lists(
+        st.dictionaries(
+            st.sampled_from(["header", "name", "position", "velocity", "effort", "more"]),
+            st.sampled_from([{}, {"frame_id": "a"}, [], [1.5], None]),
+        ),
+        min_size=1,
+        max_size=8,
+    )
+)
+def test_messages_are_filled_alike_whatever_was_absent_before(messages: list[dict[str, Any]]) -> None:
+    definitions = Definitions(1, lambda: WALL_CLOCK)
+    used = definitions.filler("sensor_msgs/JointState")
+    assert used is not None
+    for given_message in messages:
+        data = json.dumps(given_message).encode()
+        message, other = json.loads(data), json.loads(data)
+        fresh = Definitions(1, lambda: WALL_CLOCK).filler("sensor_msgs/JointState")
+        assert fresh is not None
+        filled, expected = used.fill(message, data, 10_000), fresh.fill(other, data, 10_000)
+        assert message == other
+        assert (filled is None) == (expected is None)
+        assert json.loads(filled or data) == message
+        kept = [field for field in given_message if field != "header"]
+        assert [message[field] for field in kept] == [given_message[field] for field in kept]

@@ -1,0 +1,126 @@
+"""The hub and rosbridge_suite's ROSBRIDGE_PROTOCOL.md, operation by operation, in raw messages.
+
+Where the hub differs, docs/reference/rosbridge-differences.md says so.
+"""
+
+import json
+from typing import Any
+
+import pytest
+
+from bridge.codecs import png
+from tests.bridge.hub.broker_harness import Harness, Peer
+
+WORK = {"action": "/work", "action_type": "a/action/Work"}
+
+
+@pytest.fixture
+def strict(hub: Harness) -> Peer:
+    """A client that gets status messages."""
+    peer = hub.connect()
+    peer.send(op="set_level", level="error")
+    return peer
+
+
+@pytest.mark.parametrize(
+    "raw",
+    [
+        b"{}",
+        b'{"op":"png","data":"iVBORw0KGgo="}',  # only servers send it
+        b'{"op":"status","level":"error","msg":"x"}',
+        b'{"op":"set_status_level","level":"error"}',  # the name in the list of 2.; in 3.2.1 it is set_level
+        b'{"op":"set_level","level":"loud"}',
+        b'{"op":"auth","mac":"","client":"","dest":"","rand":"","t":0,"level":"","end":0}',
+        b'{"op":"publish","topic":"/nowhere","msg":{}}',
+        b'{"op":"unadvertise","topic":"/nowhere"}',
+        b'{"op":"unsubscribe","topic":"/nowhere"}',
+        b'{"op":"unadvertise_service","service":"/nowhere"}',
+        b'{"op":"unadvertise_action","action":"/nowhere"}',
+        b'{"op":"cancel_action_goal","id":"x","action":"/nowhere"}',
+        b'{"op":"advertise","topic":"/t"}',
+        b'{"op":"advertise","topic":"/rosout","type":"std_msgs/String"}',
+        b'{"op":"advertise","topic":"/t","type":"a/B"}{"op":"advertise","topic":"/u","type":"a/B"}',
+    ],
+)
+def test_a_refused_operation_causes_one_status_message(strict: Peer, raw: bytes) -> None:
+    strict.send_raw(raw)
+    (status,) = strict.read()
+    assert (status["op"], status["level"]) == ("status", "error")
+    assert strict.hub.broker.graph.topics == {}
+
+
+@pytest.mark.parametrize("level", ["info", "warning", "error"])
+def test_every_level_includes_errors_and_nothing_else(hub: Harness, level: str) -> None:
+    peer = hub.connect()
+    peer.send(op="set_level", level=level, id="i")
+    peer.send(op="advertise", topic="/t", type="std_msgs/String")
+    peer.send(op="publish", topic="/t", msg={})  # a subset of its type
+    assert peer.read() == []
+    peer.send(op="fly", id="f")
+    assert peer.read()[0]["id"] == "f"
+
+
+def test_extra_fields_are_ignored(hub: Harness) -> None:
+    publisher, subscriber = hub.connect(), hub.connect()
+    publisher.send(op="advertise", topic="/t", type="a/B", queue_size=1, message_intervall=5, png="png")
+    subscriber.send(op="subscribe", topic="/t", type="a/B", message_intervall=5, png="png")
+    publisher.publish("/t", {"a": 1})
+    assert subscriber.messages() == [{"a": 1}]
+
+
+def test_an_id_after_the_name_is_not_split_off(hub: Harness) -> None:
+    assert hub.connect().ask("/rosapi/topics#33")["result"] is False
+
+
+def _goal(hub: Harness, **options: Any) -> tuple[Peer, Peer, list[Any]]:
+    server, client = hub.connect(), hub.connect()
+    server.send(op="advertise_action", action="/work", type=WORK["action_type"])
+    client.send(op="send_action_goal", **WORK | options)
+    return server, client, server.read()
+
+
+def test_one_goal_at_a_time_may_have_no_id(hub: Harness) -> None:
+    server, client, (goal,) = _goal(hub)
+    client.send(op="send_action_goal", **WORK)
+    (refusal,) = client.read()
+    assert (refusal["result"], "id" in refusal) == (False, False)
+    client.send(op="cancel_action_goal", action="/work")
+    assert server.read() == [{"op": "cancel_action_goal", "id": goal["id"], "action": "/work"}]
+    server.send(op="action_result", id=goal["id"], action="/work", values={}, status=5, result=True)
+    assert client.read() == [
+        {"op": "action_result", "action": "/work", "values": {}, "status": 5, "result": True}
+    ]
+
+
+def test_the_type_of_a_goal_may_be_left_out(hub: Harness) -> None:
+    _server, _client, goals = _goal(hub, action_type=None)
+    assert [goal["action_type"] for goal in goals] == [WORK["action_type"]]
+
+
+def test_feedback_and_result_as_png(hub: Harness) -> None:
+    server, client, (goal,) = _goal(hub, compression="png", feedback=True, id="g")
+    server.send(op="action_feedback", id=goal["id"], action="/work", values={"a": 1})
+    server.send(op="action_result", id=goal["id"], action="/work", values={"b": 1}, status=4, result=True)
+    operations = [json.loads(png.decode(operation["data"])) for operation in client.read()]
+    assert [operation["values"] for operation in operations] == [{"a": 1}, {"b": 1}]
+
+
+def test_an_answer_needs_only_its_id(hub: Harness) -> None:
+    server, client = hub.connect(), hub.connect()
+    server.send(op="advertise_service", service="/s", type="a/S")
+    client.send(op="call_service", service="/s", id=7)
+    (request,) = server.read()
+    server.send(op="service_response", id=request["id"])
+    assert client.read() == [
+        {"op": "service_response", "service": "/s", "values": {}, "result": True, "id": 7}
+    ]
+
+
+@pytest.mark.parametrize("lengths", [(3, 10), (10, 3)])
+def test_the_smallest_queue_length_counts(hub: Harness, publisher: Peer, lengths: tuple[int, int]) -> None:
+    slow = hub.connect()
+    for index, length in enumerate(lengths):
+        slow.subscribe("/t", id=index, queue_length=length)
+    for index in range(20):
+        publisher.publish("/t", {"i": index})
+    assert len(slow.messages()) == 3

@@ -1,0 +1,28 @@
+"""Every line of a run on standard error is one JSON object, those of its children too."""
+
+import json
+import os
+import signal
+
+from tests.integration.conftest import Robot, until
+
+
+async def test_every_line_of_a_run_is_an_object(stage, boat):
+    _, uri = await stage.hub()
+    async with Robot(uri) as robot:
+        await robot.keep_publishing()
+        command = ("master", "--loop", "-d", str(boat), "--uri", uri)
+        master = stage.start(*command, "--log-format", "json", "--log-level", "debug")
+        await robot.have(3)
+        (publisher,) = stage.processes()["publisher"]
+        os.kill(publisher.pid, signal.SIGKILL)
+        await until(lambda: "restarting it" in master.err)
+        await robot.have(len(robot.results) + 3)
+        master.send(signal.SIGTERM)
+        assert await master.end() == 143
+    found = [json.loads(line) for line in master.err.splitlines()]
+    assert all({"time", "level", "process", "message"} <= each.keys() for each in found)
+    processes = {each["process"] for each in found}
+    assert {"master", "subscriber", "pcie-app", "publisher"} <= processes
+    assert {each["process"] for each in found if each.get("frame") == 2} >= {"master", "pcie-app"}
+    assert "warning" in {each["level"] for each in found}

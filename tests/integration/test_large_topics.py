@@ -1,0 +1,99 @@
+"""A camera whose pictures are too large, beside a topic that frames need: results go on.
+
+/range (Range, needed), /camera (Image, 640 x 480, may be missing)  ->  hub  ->  subscriber, master  ->  hub
+"""
+
+import asyncio
+import contextlib
+import signal
+import time
+
+import numpy as np
+import pytest
+
+from bridge.client import connect
+from bridge.stamps import header
+from posteriors.listening import posteriors
+from tests.integration.conftest import PATIENCE, toolchain
+
+MODEL = """
+import numpy as np
+from toolchain.models.model import Known, Model, dimension
+
+def known(name, **more):
+    likely = np.full((256, 4), 0.2 / 255)
+    likely[2 * np.arange(4), np.arange(4)] = 0.8  # reading number 2 s in place s
+    return Known(name=name, table=likely, **more)
+
+def model():
+    return Model(name="corridor", searched=(dimension("s", size=4),), known=(
+        known("near"), known("red", on_missing="missing")))
+"""
+SOURCES = """
+[[source]]
+uri = "{uri}"
+topic = "/range"
+type = "sensor_msgs/Range"
+variables = {{ near = "range" }}
+
+[[source]]
+uri = "{uri}"
+topic = "/camera"
+type = "sensor_msgs/Image"
+variables = {{ red = "data[0]" }}
+{more}
+"""
+PICTURE = np.zeros((480, 640, 3), np.uint8).tobytes()
+
+
+@contextlib.asynccontextmanager
+async def robot(uri):
+    async def play() -> None:
+        async with connect(uri, ros_version="2", max_size=4_000_000) as ros:
+            near = await ros.advertise("/range", "sensor_msgs/Range")
+            camera = await ros.advertise("/camera", "sensor_msgs/Image")
+            while True:
+                now = header(time.time_ns(), "robot", 2)
+                image = {"header": now, "height": 480, "width": 640, "encoding": "rgb8", "step": 1920}
+                await near.publish({"header": now, "range": 4.0})
+                await camera.publish(image | {"data": PICTURE})
+                await asyncio.sleep(0.1)
+
+    task = asyncio.create_task(play())
+    try:
+        yield
+    finally:
+        task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await task
+
+
+@pytest.mark.parametrize(
+    ("key", "flags", "environment", "said"),
+    [
+        ("topic_bytes = 100000", (), {}, ""),
+        ("", ("--topic-bytes", "100000"), {}, ""),
+        ("topic_bytes = 3000000", (), {"BM_TOPIC_BYTES": "100000"}, ""),
+        ("", ("--message-bytes", "1000000"), {}, r"warning: .*/camera is left out"),
+    ],
+)
+async def test_results_go_on_beside_a_camera_with_large_pictures(stage, key, flags, environment, said):
+    hub = stage.start("hub", "--port", "0", "--message-bytes", "4000000")
+    uri = (await hub.says(r"ws://\S+"))[0]
+    case = stage.where / "corridor"
+    case.mkdir()
+    (case / "model.py").write_text(MODEL)
+    sources = stage.where / "sources.toml"
+    sources.write_text(SOURCES.format(uri=uri, more=key))
+    toolchain("build", case, "-o", stage.where / "out", "--sources", sources)
+    async with robot(uri), connect(uri) as ros, posteriors(ros) as heard:
+        command = ("master", "--loop", "-d", str(stage.where / "out"), *flags)
+        master = stage.start(*command, environment=environment | {"BM_RUN_DIRECTORY": str(stage.runs)})
+        if said:
+            await master.says(said)
+        for _ in range(20):
+            assert (await heard.next(PATIENCE)).best() == {"s": 2}
+        if not said:
+            await stage.status("subscriber", lambda status: status["frames"]["lost"].get("too large"))
+        master.send(signal.SIGINT)
+        assert await master.end() == 130

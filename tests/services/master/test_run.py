@@ -1,0 +1,146 @@
+"""A run: its status, its summary, what it prints, and its end without data."""
+
+import asyncio
+import json
+from contextlib import nullcontext
+from unittest.mock import AsyncMock, Mock
+
+import msgspec
+import pytest
+
+from services.errors import NoDataError
+from services.sockets.records import FrameResult, LossReason, Outcome, Published
+from tests.services.master.conftest import Run
+
+
+def publish(run, number=1, seen=None):
+    run.take(run.app, FrameResult(number, msgspec.Raw(b""), 0, 0, 0, 0))
+    run.take(run.publisher, Published(number, Outcome.PUBLISHED, seen, 9, 0.5, 7, 3_000_000))
+
+
+async def test_the_status_says_why_there_are_no_results(boat, monkeypatch):
+    now = [1_000_000_000_000]
+    monkeypatch.setattr("time.monotonic_ns", lambda: now[0])
+    run = Run(boat, ready_timeout=5)
+    for peer in (run.peers.app, run.peers.publisher):
+        peer.ready = False
+    status = run.master.status()
+    assert not status.ready
+    assert "publisher and pcie-app" in status.why
+    for peer in (run.peers.app, run.peers.publisher):
+        peer.ready = True
+    run.read()
+    status = run.master.status()
+    assert not status.ready
+    assert "pcie-app" not in status.why
+    publish(run)
+    flowing = run.master.status()
+    now[0] += 5_000_000_000
+    assert run.master.status().ready
+    assert flowing.ready
+    now[0] += 1_000_000_000
+    late = run.master.status()
+    assert not late.ready
+    assert "6 s" in late.why
+    assert late.why != flowing.why != ""
+    assert (late.deployment, late.generation) == (boat.hash, 0)
+    assert [peer.name for peer in late.peers] == ["subscriber", "publisher", "pcie-app"]
+
+
+async def test_results_and_those_that_nobody_saw_are_shown(boat, capsys):
+    run = Run(boat, json=True)
+    run.read(2)
+    publish(run)
+    out, err = capsys.readouterr()
+    shown = json.loads(out)
+    assert (shown["frame"], shown["cycles"], shown["ms"], err) == (1, 7, 3.0, "")
+    publish(run, 2, seen=False)
+    out, err = capsys.readouterr()
+    assert (len(out.splitlines()), len(err.splitlines())) == (1, 1)
+
+
+@pytest.mark.parametrize(("once", "lines"), [(True, 1), (False, 0)])
+async def test_a_single_result_is_printed_as_a_sentence(boat, capsys, once, lines):
+    run = Run(boat, once=once)
+    run.read()
+    publish(run)
+    out, err = capsys.readouterr()
+    assert (len(out.splitlines()), err) == (lines, "")
+    assert run.flow.end.done() is once
+
+
+async def test_the_summary_names_losses_only(run):
+    publish_ = "0 results published in 0.0 s"
+    assert run.master.summary() == publish_
+    run.flow._losses[LossReason.FAILED] = 2
+    assert run.master.summary() == f"{publish_}; not published: 2 {LossReason.FAILED}"
+
+
+@pytest.mark.parametrize("has_data", [True, False])
+async def test_a_run_without_data_ends(boat, monkeypatch, has_data):
+    monkeypatch.setattr("services.master.run._GRACE_PERIOD", 0.05)
+    run = Run(boat, first_data_timeout=0.05)
+    expecting = asyncio.ensure_future(run.master._expect_data())
+    await asyncio.sleep(0.2)
+    assert not expecting.done()  # the time begins with the run
+    run.peers.begun.set()
+    if has_data:
+        run.read()
+    await asyncio.wait_for(expecting, 60)
+    assert isinstance(run.error, NoDataError) is not has_data
+
+
+@pytest.mark.parametrize(("count", "of"), [(9, " of 9"), (None, "")])
+async def test_progress_tells_the_rate_since_the_last_time(boat, monkeypatch, count, of):
+    now, shown = [100.0], []
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    monkeypatch.setattr("services.master.run.show_progress", shown.append)
+    run = Run(boat, queue="all", count=count)
+
+    def publish_some(numbers):
+        for number in numbers:
+            publish(run, number)
+
+    seconds = iter(
+        [lambda: run.read(7), lambda: publish_some(range(1, 5)), int, lambda: publish_some([5, 6])]
+    )
+
+    async def sleep(_seconds):
+        now[0] += 2.0
+        next(seconds)()
+
+    monkeypatch.setattr(asyncio, "sleep", sleep)
+    with pytest.raises(RuntimeError):  # there are no more seconds
+        await run.master._show_progress()
+    assert shown == [f"master: 4{of} results, 2 a second", f"master: 6{of} results, 1 a second"]
+
+
+@pytest.mark.parametrize("once", [True, False])
+async def test_a_run_is_open_to_questions_until_its_end(boat, tmp_path, monkeypatch, capsys, once):
+    status, control = Mock(return_value=nullcontext()), Mock(return_value=nullcontext())
+    monkeypatch.setattr("services.master.run.serve_status", status)
+    monkeypatch.setattr("services.master.run.serve_control", control)
+    monkeypatch.setattr("services.master.run.get_logger", log := Mock())
+    run = Run(boat, once=once, run_directory=tmp_path, metrics="tcp://127.0.0.1:9999", log_level="debug")
+    peers, history = run.peers, run.flow.history
+    peers.prepare, peers.start, peers.leave, peers.end = Mock(), AsyncMock(), AsyncMock(), AsyncMock()
+    running = asyncio.ensure_future(run.master.run())
+    await asyncio.sleep(0.01)
+    assert not running.done()
+    assert status.call_args.args == (tmp_path, "master", run.master.status)
+    given = status.call_args.kwargs
+    assert (given["metrics"], given["stages"], given["frame"]) == (
+        run.master._settings.metrics,
+        history.latencies,
+        history.story,
+    )
+    assert control.call_args_list == ([] if once else [((tmp_path, run.reloads.order),)])
+    run.flow.end.set_result(None)
+    assert await running == 0
+    assert (peers.start.await_args.args, peers.leave.await_count, peers.end.await_count) == (
+        (run.flow,),
+        1,
+        1,
+    )
+    assert len(capsys.readouterr().err.splitlines()) == (not once)
+    assert log.call_args.args == ("master", "debug")

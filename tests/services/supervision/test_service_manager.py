@@ -1,0 +1,98 @@
+"""Messages to systemd over a real datagram socket: readiness, state, and signs of life only of a process that lives."""
+
+import asyncio
+import contextlib
+import os
+import socket
+
+import pytest
+
+from services.sockets.reporting import serve_status
+from services.sockets.status import ProcessStatus
+from services.supervision.service_manager import ServiceManager
+
+PATIENCE = 60.0
+
+
+@pytest.fixture(params=["path", "abstract"])
+def manager(request, tmp_path, monkeypatch):
+    """The receiving socket of a service manager, which expects a sign of life every 60 s."""
+    name = str(tmp_path / "notify") if request.param == "path" else f"@rosbayes-test-{os.getpid()}"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as receiver:
+        receiver.bind(name.replace("@", "\0", 1))
+        receiver.settimeout(PATIENCE)
+        monkeypatch.setenv("NOTIFY_SOCKET", name)
+        monkeypatch.setenv("WATCHDOG_USEC", "60000000")
+        monkeypatch.setenv("WATCHDOG_PID", str(os.getpid()))
+        yield receiver
+
+
+def said(receiver):
+    """The assignments of the datagrams so far."""
+    receiver.setblocking(False)
+    found = []
+    with contextlib.suppress(BlockingIOError):
+        while True:
+            found += receiver.recv(1 << 16).decode().split("\n")
+    return found
+
+
+def test_ready_is_said_once_and_a_state_when_it_changes(manager):
+    service = ServiceManager()
+    assert {"NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID"}.isdisjoint(os.environ)  # not for children
+    service.report("waiting", ready=False, alive=True)
+    service.report("waiting", ready=False, alive=True)
+    assert said(manager) == ["STATUS=waiting", "WATCHDOG=1", "WATCHDOG=1"]
+    service.report("results\nREADY=0", ready=True, alive=True)
+    service.report("results\nREADY=0", ready=True, alive=False)
+    assert said(manager) == ["READY=1", r"STATUS=results\nREADY=0", "WATCHDOG=1"]
+    service.stopping()
+    assert said(manager) == ["STOPPING=1"]
+
+
+def test_what_a_full_queue_refused_is_said_again(manager):
+    service = ServiceManager()
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as other, contextlib.suppress(BlockingIOError):
+        other.setblocking(False)
+        while True:
+            other.sendto(b"FDSTORE=1", manager.getsockname())
+    service.report("fine", ready=True, alive=True)
+    assert "READY=1" not in said(manager)
+    service.report("fine", ready=True, alive=True)
+    assert said(manager) == ["READY=1", "STATUS=fine", "WATCHDOG=1"]
+
+
+@pytest.mark.parametrize("value", ["\u00b2", "-1", "1e6", "9" * 5000])
+def test_an_odd_interval_of_the_watchdog_is_none(manager, monkeypatch, value):
+    monkeypatch.setenv("WATCHDOG_USEC", value)
+    ServiceManager().report("fine", ready=True, alive=True)
+    assert said(manager) == ["READY=1", "STATUS=fine"]
+
+
+def test_a_watchdog_of_another_process_is_not_ours(manager, monkeypatch):
+    monkeypatch.setenv("WATCHDOG_PID", str(os.getppid()))
+    ServiceManager().report("", ready=False, alive=True)
+    assert said(manager) == []
+
+
+def test_without_a_service_manager_nothing_is_sent(monkeypatch):
+    for value in (None, "", "/nonexistent/socket"):
+        monkeypatch.delenv("NOTIFY_SOCKET", raising=False) if value is None else monkeypatch.setenv(
+            "NOTIFY_SOCKET", value
+        )
+        ServiceManager().report("fine", ready=True, alive=True)
+
+
+async def test_a_process_reports_and_one_that_is_stuck_gives_no_sign_of_life(manager):
+    alive = [True]
+    status = ProcessStatus(ready=True, why="fine")
+    async with serve_status(None, "hub", lambda: status, is_alive=lambda: alive[0]):
+        while not (found := said(manager)):
+            await asyncio.sleep(0.05)
+        assert found == ["READY=1", "STATUS=fine", "WATCHDOG=1"]
+        alive[0] = False
+        await asyncio.sleep(1.5)
+        said(manager)
+        await asyncio.sleep(1.5)
+        assert said(manager) == []
+    assert said(manager) == ["STOPPING=1"]
