@@ -13,6 +13,7 @@ from bridge.errors import EncodeError, ParamError, ServiceError
 from tests.bridge.hub.sockets import running_hub
 
 PATIENCE = 30.0
+DOCK = "/dock"
 
 
 @pytest.fixture(params=[1, 2])
@@ -70,16 +71,16 @@ async def test_topics_services_and_nodes(ros):
 
     ros.subscribe("/in", "std_msgs/String")
     await ros.advertise("/out", "std_msgs/String")
-    await ros.advertise_service("/work", "std_srvs/SetBool", serve)
+    await ros.advertise_service(DOCK, "std_srvs/SetBool", serve)
     (node,) = await ros.subscribers("/in")
     assert await ros.publishers("/out") == [node]
-    assert await ros.node_details(node) == NodeDetails(["/in"], ["/out"], ["/work"])
+    assert await ros.node_details(node) == NodeDetails(["/in"], ["/out"], [DOCK])
     assert await ros.node_details("/nobody") == NodeDetails([], [], [])
     assert set(await ros.topics_for_type("std_msgs/msg/String")) == {"/in", "/out"}
-    assert await ros.service_type("/work") == (
+    assert await ros.service_type(DOCK) == (
         "std_srvs/srv/SetBool" if ros.ros_version == 2 else "std_srvs/SetBool"
     )
-    assert await ros.service_node("/work") == node
+    assert await ros.service_node(DOCK) == node
     assert await ros.service_providers("std_srvs/SetBool") == [node]
     assert (await ros.message_details("nav_msgs/msg/Odometry"))["geometry_msgs/PoseWithCovariance"][
         "covariance"

@@ -9,11 +9,12 @@ from tests.bridge.hub.broker_harness import Harness, Peer
 
 ASKS = {"service": "call_service", "action": "send_action_goal"}
 ENDS = {"service": "service_response", "action": "action_result"}
-TYPES = {"service": "a/Work", "action": "a/action/Work"}
+TYPES = {"service": "a/Dock", "action": "a/action/Dock"}
+DOCK = "/dock"
 
 
-class Work:
-    """A hub with a client that offers /work, a service or an action, and one that asks for it."""
+class Docking:
+    """A hub with a client that offers /dock, a service or an action, and one that asks for it."""
 
     def __init__(self, kind: str, *, ros_version: Any = 2, **limits: Any) -> None:
         self.kind = kind
@@ -29,13 +30,13 @@ class Work:
     def pending(self) -> dict[str, Any]:
         return self.hub.broker._calls.pending if self.kind == "service" else self.hub.broker._actions.goals
 
-    def offer(self, peer: Peer, name: str = "/work") -> None:
+    def offer(self, peer: Peer, name: str = DOCK) -> None:
         peer.send(op=f"advertise_{self.kind}", type=TYPES[self.kind], **{self.kind: name})
 
     def withdraw(self, peer: Peer) -> None:
-        peer.send(op=f"unadvertise_{self.kind}", **{self.kind: "work"})
+        peer.send(op=f"unadvertise_{self.kind}", **{self.kind: "dock"})
 
-    def ask(self, identity: Any = "x", peer: Peer | None = None, name: str = "/work", **more: Any) -> None:
+    def ask(self, identity: Any = "x", peer: Peer | None = None, name: str = DOCK, **more: Any) -> None:
         (peer or self.client).send(op=ASKS[self.kind], id=identity, **{self.kind: name}, **more)
 
     def asked(self, identity: Any = "x", **more: Any) -> str:
@@ -60,13 +61,13 @@ class Work:
 
 
 @pytest.fixture(params=["service", "action"])
-def work(request: pytest.FixtureRequest) -> Work:
-    return Work(request.param)
+def docking(request: pytest.FixtureRequest) -> Docking:
+    return Docking(request.param)
 
 
 @pytest.fixture
-def action() -> Work:
-    return Work("action")
+def action() -> Docking:
+    return Docking("action")
 
 
 BOTH = pytest.mark.parametrize("kind", ["service", "action"])
@@ -76,40 +77,41 @@ BOTH = pytest.mark.parametrize("kind", ["service", "action"])
 
 
 @pytest.mark.parametrize("args", [{"a": [1, {"b": None}]}, {}, [1, 2]])
-@pytest.mark.parametrize(("name", "identity"), [("work", {}), ("/work", {"id": 7}), ("/work", {"id": "x"})])
+@pytest.mark.parametrize(("name", "identity"), [("dock", {}), (DOCK, {"id": 7}), (DOCK, {"id": "x"})])
 def test_an_answer_has_the_id_and_the_name_that_were_used(
-    work: Work, args: object, name: str, identity: dict[str, Any]
+    docking: Docking, args: object, name: str, identity: dict[str, Any]
 ) -> None:
-    called = {work.kind: name} | identity
-    work.client.send(op=ASKS[work.kind], args=args, **called)
-    (request,) = work.server.read()
-    assert (request["op"], request[work.kind], request["args"]) == (ASKS[work.kind], "/work", args)
-    assert work.client.read() == []
-    work.end(request["id"], values={"sum": 3}, result=True)
-    status = {"status": GoalStatus.SUCCEEDED} if work.kind == "action" else {}
-    assert work.answer() == {"op": ENDS[work.kind], "values": {"sum": 3}, "result": True, **called, **status}
-    assert not work.pending
+    called = {docking.kind: name} | identity
+    docking.client.send(op=ASKS[docking.kind], args=args, **called)
+    (request,) = docking.server.read()
+    assert (request["op"], request[docking.kind], request["args"]) == (ASKS[docking.kind], DOCK, args)
+    assert docking.client.read() == []
+    docking.end(request["id"], values={"sum": 3}, result=True)
+    status = {"status": GoalStatus.SUCCEEDED} if docking.kind == "action" else {}
+    answer = {"op": ENDS[docking.kind], "values": {"sum": 3}, "result": True}
+    assert docking.answer() == answer | called | status
+    assert not docking.pending
 
 
-def test_answers_may_come_in_any_order_and_go_to_whoever_asked(work: Work) -> None:
-    other = work.hub.connect()
-    keys = {peer: work.asked("same", peer=peer) for peer in (work.client, other)}
-    for peer in (other, work.client):
-        work.end(keys[peer], values={"n": keys[peer]}, result=True)
-    assert [work.answer(peer)["values"]["n"] for peer in keys] == list(keys.values())
+def test_answers_may_come_in_any_order_and_go_to_whoever_asked(docking: Docking) -> None:
+    other = docking.hub.connect()
+    keys = {peer: docking.asked("same", peer=peer) for peer in (docking.client, other)}
+    for peer in (other, docking.client):
+        docking.end(keys[peer], values={"n": keys[peer]}, result=True)
+    assert [docking.answer(peer)["values"]["n"] for peer in keys] == list(keys.values())
 
 
 @pytest.mark.parametrize(
     ("values", "reason"), [("no such thing", "no such thing"), ({"error": 5}, '{"error":5}')]
 )
-def test_a_refusal_is_a_string(work: Work, values: object, reason: str) -> None:
-    answer = work.ended(values=values, result=False)
+def test_a_refusal_is_a_string(docking: Docking, values: object, reason: str) -> None:
+    answer = docking.ended(values=values, result=False)
     assert (answer["result"], answer["values"]) == (False, reason)
 
 
 @pytest.mark.parametrize("values", ["text", 3, [1]])
-def test_values_that_are_not_an_object_are_a_failure(work: Work, values: object) -> None:
-    assert work.ended(values=values, result=True)["result"] is False
+def test_values_that_are_not_an_object_are_a_failure(docking: Docking, values: object) -> None:
+    assert docking.ended(values=values, result=True)["result"] is False
 
 
 @pytest.mark.parametrize(
@@ -123,115 +125,115 @@ def test_values_that_are_not_an_object_are_a_failure(work: Work, values: object)
     ],
 )
 def test_an_impossible_wish_is_answered(kind: str, wish: dict[str, Any]) -> None:
-    work = Work(kind)
-    work.ask(**wish)
-    assert work.server.read() == []
-    answer = work.answer()
-    assert (answer["id"], answer["result"], answer[kind]) == ("x", False, wish.get("name", "/work"))
+    docking = Docking(kind)
+    docking.ask(**wish)
+    assert docking.server.read() == []
+    answer = docking.answer()
+    assert (answer["id"], answer["result"], answer[kind]) == ("x", False, wish.get("name", DOCK))
     assert isinstance(answer["values"], str)
     assert answer.get("status") == (GoalStatus.ABORTED if kind == "action" else None)
 
 
-def test_a_server_that_leaves_fails_what_it_works_on_and_leaves_nothing(work: Work) -> None:
-    work.ask()
-    work.ask(peer=work.server)  # a client can ask itself
-    work.server.disconnect()
-    assert work.answer()["result"] is False
-    assert not work.pending
-    assert not work.offered
-    work.ask()
-    assert work.answer()["result"] is False
+def test_a_server_that_leaves_fails_what_it_works_on_and_leaves_nothing(docking: Docking) -> None:
+    docking.ask()
+    docking.ask(peer=docking.server)  # a client can ask itself
+    docking.server.disconnect()
+    assert docking.answer()["result"] is False
+    assert not docking.pending
+    assert not docking.offered
+    docking.ask()
+    assert docking.answer()["result"] is False
 
 
-def test_a_client_that_leaves_is_not_answered_and_its_goals_are_cancelled(work: Work) -> None:
-    key = work.asked()
-    work.client.disconnect()
-    cancelled = [{"op": "cancel_action_goal", "id": key, "action": "/work"}]
-    assert work.server.read() == (cancelled if work.kind == "action" else [])
-    work.end(key, values={}, result=True)
-    assert work.server.client.refused == 1
-    work.hub.advance(1000)
+def test_a_client_that_leaves_is_not_answered_and_its_goals_are_cancelled(docking: Docking) -> None:
+    key = docking.asked()
+    docking.client.disconnect()
+    cancelled = [{"op": "cancel_action_goal", "id": key, "action": DOCK}]
+    assert docking.server.read() == (cancelled if docking.kind == "action" else [])
+    docking.end(key, values={}, result=True)
+    assert docking.server.client.refused == 1
+    docking.hub.advance(1000)
 
 
-def test_only_the_server_can_answer_and_only_once(work: Work) -> None:
-    key = work.asked()
-    for peer, number in ((work.hub.connect(), 666), (work.server, 1), (work.server, 2)):
-        work.end(key, peer, values={"n": number}, result=True)
-    assert work.answer()["values"] == {"n": 1}
+def test_only_the_server_can_answer_and_only_once(docking: Docking) -> None:
+    key = docking.asked()
+    for peer, number in ((docking.hub.connect(), 666), (docking.server, 1), (docking.server, 2)):
+        docking.end(key, peer, values={"n": number}, result=True)
+    assert docking.answer()["values"] == {"n": 1}
 
 
-def test_the_newest_offer_counts_and_its_owner_alone_withdraws_it(work: Work) -> None:
-    new = work.hub.connect()
-    key = work.asked("old")
-    work.offer(new)
-    work.ask("new")
-    assert work.server.read() == []
+def test_the_newest_offer_counts_and_its_owner_alone_withdraws_it(docking: Docking) -> None:
+    new = docking.hub.connect()
+    key = docking.asked("old")
+    docking.offer(new)
+    docking.ask("new")
+    assert docking.server.read() == []
     (request,) = new.read()
-    work.withdraw(work.server)
-    assert list(work.offered) == ["/work"]
-    work.withdraw(new)
-    assert not work.offered
-    assert (work.server.client.refused, new.client.refused) == (1, 0)
-    for peer, each in ((work.server, key), (new, request["id"])):  # what was begun may still be ended
-        work.end(each, peer, values={}, result=True)
-    assert [answer["id"] for answer in work.client.read()] == ["old", "new"]
+    docking.withdraw(docking.server)
+    assert list(docking.offered) == [DOCK]
+    docking.withdraw(new)
+    assert not docking.offered
+    assert (docking.server.client.refused, new.client.refused) == (1, 0)
+    for peer, each in ((docking.server, key), (new, request["id"])):  # what was begun may still be ended
+        docking.end(each, peer, values={}, result=True)
+    assert [answer["id"] for answer in docking.client.read()] == ["old", "new"]
 
 
 @BOTH
 def test_what_a_client_waits_for_and_what_a_server_works_on_are_counted(kind: str) -> None:
-    work = Work(kind, calls_per_client=3, goals_per_client=3)
-    second, other = work.hub.connect(), work.hub.connect()
-    work.offer(second, "/second")
-    for number, name in enumerate(["/work", "/second", "/work", "/second"]):  # no server has too many
-        work.ask(number, name=name)
-    assert (work.answer()["id"], len(work.pending)) == (3, 3)
-    keys = [request["id"] for request in work.server.read()]
+    docking = Docking(kind, calls_per_client=3, goals_per_client=3)
+    second, other = docking.hub.connect(), docking.hub.connect()
+    docking.offer(second, "/second")
+    for number, name in enumerate([DOCK, "/second", DOCK, "/second"]):  # no server has too many
+        docking.ask(number, name=name)
+    assert (docking.answer()["id"], len(docking.pending)) == (3, 3)
+    keys = [request["id"] for request in docking.server.read()]
     for number in range(2):
-        work.ask(number, peer=other)
-    assert (work.answer(other)["id"], len(work.pending)) == (1, 4)
-    work.end(keys[0], values={}, result=True)
-    work.ask(2, peer=other)
-    assert len(work.server.read()) == 2
+        docking.ask(number, peer=other)
+    assert (docking.answer(other)["id"], len(docking.pending)) == (1, 4)
+    docking.end(keys[0], values={}, result=True)
+    docking.ask(2, peer=other)
+    assert len(docking.server.read()) == 2
 
 
 @BOTH
 def test_offers_are_counted_and_can_be_repeated(kind: str) -> None:
-    work = Work(kind, services_per_client=2)
-    for name in ("/1", "/2", "/3", "/work"):
-        work.offer(work.server, name)
-    assert (list(work.offered), work.server.client.refused) == (["/work", "/1"], 2)
+    docking = Docking(kind, services_per_client=2)
+    for name in ("/1", "/2", "/3", DOCK):
+        docking.offer(docking.server, name)
+    assert (list(docking.offered), docking.server.client.refused) == ([DOCK, "/1"], 2)
 
 
 @BOTH
 def test_what_is_too_large_fails_and_its_failure_fits(kind: str) -> None:
-    work = Work(kind, message_bytes=400)
+    docking = Docking(kind, message_bytes=400)
     for answer in ({"values": {"a": "x" * 250}, "result": True}, {"values": "x" * 300, "result": False}):
-        work.end(work.asked("g" * 250), **answer)
-        failed = work.answer()
+        docking.end(docking.asked("g" * 250), **answer)
+        failed = docking.answer()
         assert (failed["id"], failed["result"]) == ("g" * 250, False)
         assert len(failed["values"]) <= 50
-    work.ask(name="/" + "x" * 200)
-    assert work.answer()["result"] is False
+    docking.ask(name="/" + "x" * 200)
+    assert docking.answer()["result"] is False
     growing = b",".join([b"1e15"] * 50)
-    work.client.send_raw(
-        b'{"op":"%b","%b":"/work","args":[%b]}' % (ASKS[kind].encode(), kind.encode(), growing)
+    docking.client.send_raw(
+        b'{"op":"%b","%b":"/dock","args":[%b]}' % (ASKS[kind].encode(), kind.encode(), growing)
     )
-    assert work.server.read() == []
-    assert work.answer()["result"] is False
+    assert docking.server.read() == []
+    assert docking.answer()["result"] is False
 
 
 # --- calls
 
 
 def test_as_in_ros_1_an_answer_is_passed_on_whatever_its_result() -> None:
-    service = Work("service", ros_version=1)
+    service = Docking("service", ros_version=1)
     answer = service.ended(values={"sum": 3}, result=False)
     assert (answer["values"], answer["result"]) == ({"sum": 3}, True)
     assert service.ended(result=False)["result"] is False
 
 
 def test_a_call_without_an_answer_fails_in_time() -> None:
-    service = Work("service", call_timeout=10)
+    service = Docking("service", call_timeout=10)
     for identifier, timeout in (("long", 0), ("short", 2.5), ("longer", 1000)):
         service.ask(identifier, timeout=timeout)
     requests = service.server.read()
@@ -248,7 +250,7 @@ def test_a_call_without_an_answer_fails_in_time() -> None:
 
 
 def test_deadlines_of_answered_calls_do_not_accumulate() -> None:
-    service = Work("service")
+    service = Docking("service")
     slow = service.asked("slow")
     for _ in range(1000):
         service.ended(values={})
@@ -272,21 +274,21 @@ def test_a_client_that_reads_no_answers_must_be_closed() -> None:
 
 
 @pytest.mark.parametrize("wanted", [True, False])
-def test_feedback_is_sent_only_if_requested(action: Work, wanted: bool) -> None:
+def test_feedback_is_sent_only_if_requested(action: Docking, wanted: bool) -> None:
     key = action.asked(feedback=wanted, action_type=TYPES["action"])
-    action.server.send(op="action_feedback", id=key, action="/work", values={"part": 1})
-    feedback = {"op": "action_feedback", "action": "/work", "values": {"part": 1}, "id": "x"}
+    action.server.send(op="action_feedback", id=key, action=DOCK, values={"part": 1})
+    feedback = {"op": "action_feedback", "action": DOCK, "values": {"part": 1}, "id": "x"}
     assert action.client.read() == [feedback] * wanted
 
 
-def test_goals_are_cancelled_by_their_server_one_or_all(action: Work) -> None:
+def test_goals_are_cancelled_by_their_server_one_or_all(action: Docking) -> None:
     keys = [action.asked(number) for number in range(3)]
-    action.client.send(op="cancel_action_goal", id=0, action="work")
-    assert action.server.read() == [{"op": "cancel_action_goal", "id": keys[0], "action": "/work"}]
+    action.client.send(op="cancel_action_goal", id=0, action="dock")
+    assert action.server.read() == [{"op": "cancel_action_goal", "id": keys[0], "action": DOCK}]
     action.end(keys[0], values={}, status=GoalStatus.CANCELED, result=True)
     result = action.answer()
     assert (result["id"], result["status"], result["result"]) == (0, GoalStatus.CANCELED, True)
-    assert action.client.ask("/work/_action/cancel_goal")["result"] is True
+    assert action.client.ask("/dock/_action/cancel_goal")["result"] is True
     assert [(each["op"], each["id"]) for each in action.server.read()] == [
         ("cancel_action_goal", key) for key in keys[1:]
     ]
@@ -302,28 +304,30 @@ def test_goals_are_cancelled_by_their_server_one_or_all(action: Work) -> None:
         ({"result": "yes", "values": "?", "status": True}, GoalStatus.ABORTED),
     ],
 )
-def test_a_failed_goal_has_a_status_and_a_reason(action: Work, answer: dict[str, Any], status: int) -> None:
+def test_a_failed_goal_has_a_status_and_a_reason(
+    action: Docking, answer: dict[str, Any], status: int
+) -> None:
     result = action.ended(**answer)
     assert (result["result"], result["status"]) == (False, status)
-    assert answer.get("values", "/work") in result["values"]
+    assert answer.get("values", DOCK) in result["values"]
 
 
-def test_fields_left_out_of_a_result_have_defaults(action: Work) -> None:
+def test_fields_left_out_of_a_result_have_defaults(action: Docking) -> None:
     result = {"values": {}, "status": GoalStatus.SUCCEEDED, "result": True}
-    assert action.ended() == {"op": "action_result", "action": "/work", "id": "x", **result}
+    assert action.ended() == {"op": "action_result", "action": DOCK, "id": "x", **result}
 
 
-def test_nobody_tells_or_cancels_the_goals_of_others(action: Work) -> None:
+def test_nobody_tells_or_cancels_the_goals_of_others(action: Docking) -> None:
     stranger = action.hub.connect()
     key = action.asked()
-    stranger.send(op="action_feedback", id=key, action="/work", values={})
-    stranger.send(op="cancel_action_goal", id="x", action="/work")
+    stranger.send(op="action_feedback", id=key, action=DOCK, values={})
+    stranger.send(op="cancel_action_goal", id="x", action=DOCK)
     action.client.send(op="cancel_action_goal", id="x", action="/other")
     assert (stranger.client.refused, action.client.client.refused) == (2, 1)
     assert action.client.read() == action.server.read() == []
 
 
-def test_a_client_has_one_goal_of_an_id(action: Work) -> None:
+def test_a_client_has_one_goal_of_an_id(action: Docking) -> None:
     action.ask()
     action.ask()
     assert action.answer()["result"] is False
@@ -331,7 +335,7 @@ def test_a_client_has_one_goal_of_an_id(action: Work) -> None:
 
 
 def test_a_slow_client_loses_feedback_but_not_the_result() -> None:
-    action = Work("action", queue_length=3)
+    action = Docking("action", queue_length=3)
     key = action.asked(feedback=True)
     for index in range(100):
         action.server.send(op="action_feedback", id=key, values={"i": index})
@@ -341,13 +345,13 @@ def test_a_slow_client_loses_feedback_but_not_the_result() -> None:
     assert result["op"] == "action_result"
 
 
-def test_actions_are_described_also_those_of_actionlibs_topics(action: Work) -> None:
-    assert action.client.rosapi("action_type", action="work") == {"type": TYPES["action"]}
+def test_actions_are_described_also_those_of_actionlibs_topics(action: Docking) -> None:
+    assert action.client.rosapi("action_type", action="dock") == {"type": TYPES["action"]}
     for part in ("cancel", "status", "feedback", "result"):
-        action.client.advertise(f"/dock/{part}")
-    assert action.client.rosapi("action_servers") == {"action_servers": ["/work"]}
-    action.client.subscribe("/dock/goal", type="a/B")
-    assert set(action.client.rosapi("action_servers")["action_servers"]) == {"/dock", "/work"}
+        action.client.advertise(f"/undock/{part}")
+    assert action.client.rosapi("action_servers") == {"action_servers": [DOCK]}
+    action.client.subscribe("/undock/goal", type="a/B")
+    assert set(action.client.rosapi("action_servers")["action_servers"]) == {"/undock", DOCK}
 
 
 # --- absent fields
@@ -412,6 +416,6 @@ def test_values_that_outgrow_the_limit_are_refused() -> None:
 
 @pytest.mark.parametrize("ros_version", [1, 2])
 def test_the_reason_of_this_projects_client_is_passed_on(ros_version: Any) -> None:
-    work = Work("service", ros_version=ros_version)
-    answer = work.ended(values={}, result=False, reason="no room")
+    docking = Docking("service", ros_version=ros_version)
+    answer = docking.ended(values={}, result=False, reason="no room")
     assert (answer["values"], answer["result"]) == ("no room", False)

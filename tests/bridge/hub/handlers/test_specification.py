@@ -11,7 +11,8 @@ import pytest
 from bridge.codecs import png
 from tests.bridge.hub.broker_harness import Harness, Peer
 
-WORK = {"action": "/work", "action_type": "a/action/Work"}
+DOCK = "/dock"
+DOCK_TYPE = "a/action/Dock"
 
 
 @pytest.fixture
@@ -74,33 +75,33 @@ def test_an_id_after_the_name_is_not_split_off(hub: Harness) -> None:
 
 def _goal(hub: Harness, **options: Any) -> tuple[Peer, Peer, list[Any]]:
     server, client = hub.connect(), hub.connect()
-    server.send(op="advertise_action", action="/work", type=WORK["action_type"])
-    client.send(op="send_action_goal", **WORK | options)
+    server.send(op="advertise_action", action=DOCK, type=DOCK_TYPE)
+    client.send(op="send_action_goal", **{"action": DOCK, "action_type": DOCK_TYPE} | options)
     return server, client, server.read()
 
 
 def test_one_goal_at_a_time_may_have_no_id(hub: Harness) -> None:
     server, client, (goal,) = _goal(hub)
-    client.send(op="send_action_goal", **WORK)
+    client.send(op="send_action_goal", action=DOCK, action_type=DOCK_TYPE)
     (refusal,) = client.read()
     assert (refusal["result"], "id" in refusal) == (False, False)
-    client.send(op="cancel_action_goal", action="/work")
-    assert server.read() == [{"op": "cancel_action_goal", "id": goal["id"], "action": "/work"}]
-    server.send(op="action_result", id=goal["id"], action="/work", values={}, status=5, result=True)
+    client.send(op="cancel_action_goal", action=DOCK)
+    assert server.read() == [{"op": "cancel_action_goal", "id": goal["id"], "action": DOCK}]
+    server.send(op="action_result", id=goal["id"], action=DOCK, values={}, status=5, result=True)
     assert client.read() == [
-        {"op": "action_result", "action": "/work", "values": {}, "status": 5, "result": True}
+        {"op": "action_result", "action": DOCK, "values": {}, "status": 5, "result": True}
     ]
 
 
 def test_the_type_of_a_goal_may_be_left_out(hub: Harness) -> None:
     _server, _client, goals = _goal(hub, action_type=None)
-    assert [goal["action_type"] for goal in goals] == [WORK["action_type"]]
+    assert [goal["action_type"] for goal in goals] == [DOCK_TYPE]
 
 
 def test_feedback_and_result_as_png(hub: Harness) -> None:
     server, client, (goal,) = _goal(hub, compression="png", feedback=True, id="g")
-    server.send(op="action_feedback", id=goal["id"], action="/work", values={"a": 1})
-    server.send(op="action_result", id=goal["id"], action="/work", values={"b": 1}, status=4, result=True)
+    server.send(op="action_feedback", id=goal["id"], action=DOCK, values={"a": 1})
+    server.send(op="action_result", id=goal["id"], action=DOCK, values={"b": 1}, status=4, result=True)
     operations = [json.loads(png.decode(operation["data"])) for operation in client.read()]
     assert [operation["values"] for operation in operations] == [{"a": 1}, {"b": 1}]
 
