@@ -69,7 +69,7 @@ class Robot:
 
 
 async def discover(
-    timeout: float = 2.0,  # noqa: ASYNC109  # all of it is used, and no error
+    timeout: float = 2.0,
     *,
     interfaces: Sequence[str] | None = None,
 ) -> list[Robot]:
@@ -116,7 +116,7 @@ async def discover(
 
 async def resolve(
     name: str,
-    timeout: float = 5.0,  # noqa: ASYNC109  # part of the error
+    timeout: float = 5.0,
     *,
     interfaces: Sequence[str] | None = None,
 ) -> str:

@@ -201,8 +201,7 @@ def _are_plain_addresses(parameters: BM1Parameters, given: object) -> bool:
     """Return whether these are one integer per column, all in range: a fast path for most frames."""
     if type(given) is not tuple or parameters.input_shape != (len(given),):
         return False
-    # a generator expression would slow every frame
-    for address, bits in zip(given, parameters.sensor_bits, strict=True):  # noqa: SIM110
+    for address, bits in zip(given, parameters.sensor_bits, strict=True):  # noqa: SIM110 - all() of a generator would slow every frame
         if type(address) is not int or not 0 <= address < 1 << bits:
             return False
     return True

@@ -108,7 +108,7 @@ class Posteriors:
                 return frame
             self.without_posterior += 1
 
-    async def next(self, timeout: float | None) -> Posterior:  # noqa: ASYNC109  # the limit is part of the error
+    async def next(self, timeout: float | None) -> Posterior:
         """Wait for one posterior.
 
         Args:
@@ -122,7 +122,7 @@ class Posteriors:
         """
         return await self._within(timeout, self.__anext__)
 
-    async def next_frame(self, timeout: float | None) -> FrameOutcome:  # noqa: ASYNC109  # as above
+    async def next_frame(self, timeout: float | None) -> FrameOutcome:
         """Wait for one frame: return its posterior, or its `FrameReport` with the reason if it has none.
 
         Raises:
@@ -132,7 +132,7 @@ class Posteriors:
 
     async def _within(
         self,
-        timeout: float | None,  # noqa: ASYNC109  # as above
+        timeout: float | None,
         wait: Callable[[], Coroutine[Any, Any, Result]],
     ) -> Result:
         try:

@@ -15,7 +15,7 @@ from typer.main import get_command
 from terminal.ending import outcome
 from terminal.errors import ReaderGoneError
 from terminal.help.help_page import WIDTH, write_help
-from terminal.help.usage import RefusedValueError, metavar
+from terminal.help.usage import Parameter, RefusedValueError, metavar
 from terminal.logs import escape_last_resort
 from terminal.output import open_standard_streams
 from terminal.signals import raise_on_signals
@@ -61,26 +61,21 @@ class CommandLine(typer.Typer):
         sys.exit(outcome(partial(get_command(self).main, arguments, standalone_mode=False)))
 
 
-class _WithEnd:
-    """Behaviour of commands and groups: our own page of `--help`, and our own exit codes."""
-
-    def format_help(self, ctx: Any, formatter: Any) -> None:
-        write_help(self, ctx, formatter)
-
-    def invoke(self, ctx: Any) -> Any:
-        try:
-            return super().invoke(ctx)  # type: ignore[misc]  # of typer's class
-        except BrokenPipeError as error:  # typer would exit with 1
-            raise ReaderGoneError from error
-
-
-class _Command(_WithEnd, TyperCommand):
+class _Command(TyperCommand):
     """A command that names the values of its flags in `--help`, and refuses blank and non-finite values."""
 
     def __init__(self, *args: Any, **settings: Any) -> None:
         super().__init__(*args, **settings)
         for parameter in self.params:
-            parameter.metavar = metavar(parameter)  # type: ignore[arg-type]  # typer's own classes
+            if isinstance(parameter, Parameter):
+                parameter.metavar = metavar(parameter)
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        write_help(self, ctx, formatter)
+
+    def invoke(self, ctx: Any) -> Any:
+        with _noticing_closed_pipe():
+            return super().invoke(ctx)
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         with _naming(ctx):
@@ -95,8 +90,15 @@ class _Later(_Command):
     """A place-holder with the name and purpose of a subcommand; its callback returns the subcommand."""
 
 
-class _Group(_WithEnd, TyperGroup):
+class _Group(TyperGroup):
     """A group of commands."""
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        write_help(self, ctx, formatter)
+
+    def invoke(self, ctx: Any) -> Any:
+        with _noticing_closed_pipe():
+            return super().invoke(ctx)
 
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
         name, command, rest = super().resolve_command(ctx, args)
@@ -107,6 +109,15 @@ class _Group(_WithEnd, TyperGroup):
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         with _naming(ctx):
             return super().parse_args(ctx, args)
+
+
+@contextmanager
+def _noticing_closed_pipe() -> Iterator[None]:
+    """Raise a ReaderGoneError for a closed pipe, for which typer would exit with 1."""
+    try:
+        yield
+    except BrokenPipeError as error:
+        raise ReaderGoneError from error
 
 
 @contextmanager

@@ -52,7 +52,7 @@ class NoHealthError(Exception):
 
 def status_socket(directory: str | os.PathLike[str], name: str) -> str:
     """Return the path of a process's status socket."""
-    return os.path.join(directory, name + SUFFIX)  # noqa: PTH118 - pathlib takes as long to import as all the rest
+    return os.path.join(directory, name + SUFFIX)
 
 
 # --- asking ----------------------------------------------------------------------------------------
@@ -105,7 +105,7 @@ def is_ready(path: str, timeout: float) -> tuple[bool, str]:
 
 def resources() -> dict[str, float]:
     """Return the user and system time and the resident memory of this process."""
-    with open("/proc/self/statm", encoding="ascii") as statm:  # noqa: PTH123 - see above
+    with open("/proc/self/statm", encoding="ascii") as statm:
         pages = int(statm.read().split()[1])
     return {"cpu_s": round(time.process_time(), 3), "memory_bytes": pages * os.sysconf("SC_PAGESIZE")}
 
@@ -118,7 +118,7 @@ def _listen(path: str) -> socket.socket:
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         probe.setblocking(False)  # a full backlog means that a process is listening
         if probe.connect_ex(path) == errno.ECONNREFUSED:
-            os.unlink(path)  # noqa: PTH108 - see above
+            os.unlink(path)
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
         # Linux creates the file with the mode of the socket, so another user can never connect
@@ -135,7 +135,7 @@ def _listen(path: str) -> socket.socket:
 def _listening(directory: str | os.PathLike[str] | None, name: str) -> Iterator[socket.socket | None]:
     """Listen within the context; yield None without a directory, or after a warning without a socket."""
     listener = None
-    path = "" if directory is None else status_socket(os.path.abspath(directory), name)  # noqa: PTH100 - see above
+    path = "" if directory is None else status_socket(os.path.abspath(directory), name)
     if path:
         try:
             listener = _listen(path)
@@ -150,7 +150,7 @@ def _listening(directory: str | os.PathLike[str] | None, name: str) -> Iterator[
         if listener is not None:
             listener.close()
             with contextlib.suppress(OSError):
-                os.unlink(path)  # noqa: PTH108 - see above
+                os.unlink(path)
 
 
 @contextlib.asynccontextmanager

@@ -24,7 +24,11 @@ _WARNING: Final = re.compile(r"(?:[\w-]+: )?warning: ")
 _FORMATTED: Final = re.compile(r'\{"time": "\d|\d{4}-\d\d-\d\dT[\d:.]+[+-]\d\d:\d\d ')
 _IS_CHILD: Final = PARENT_VARIABLE in os.environ
 
-_own_name: str = ""
+
+class _OwnName:
+    """Name of this process if it is not that of its command."""
+
+    value = ""
 
 
 class LogFormat(StrEnum):
@@ -48,14 +52,13 @@ def use_log_format(value: str) -> None:
 
 def name_process(name: str) -> None:
     """Set the name of this process in its JSON lines, which is otherwise that of its command."""
-    global _own_name  # noqa: PLW0603 - a process has one name
-    _own_name = name
+    _OwnName.value = name
 
 
 def process_name() -> str:
     """Return the name of this process: that of its command."""
-    if _own_name:
-        return _own_name
+    if _OwnName.value:
+        return _OwnName.value
     name = Path(sys.argv[0]).stem
     return sys.argv[1] if name in {"rosbayes", "__main__"} and len(sys.argv) > 1 else name
 

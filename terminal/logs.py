@@ -1,7 +1,6 @@
 """Logging to standard error, in one line format for every process."""
 
 import logging
-import sys
 from typing import Any
 
 import structlog
@@ -9,13 +8,22 @@ from structlog.typing import FilteringBoundLogger
 
 from terminal.log_line import LogFormat, json_line, log_format, logged, now
 from terminal.one_line import lines_of, one_line
-from terminal.output import SurvivingStream
+from terminal.output import write_line
+
+
+class _StandardError:
+    """Destination of structlog: a method for each level, which prints the line."""
+
+    def info(self, line: str) -> None:
+        write_line(line)
+
+    debug = warning = error = critical = info
 
 
 class _OneLine(logging.Formatter):
     """Formatter with one line per record: a library may quote untrusted text. Tracebacks keep their lines."""
 
-    def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802 - the name in logging
+    def formatMessage(self, record: logging.LogRecord) -> str:
         return one_line(super().formatMessage(record))
 
     def format(self, record: logging.LogRecord) -> str:
@@ -27,7 +35,7 @@ class _OneLine(logging.Formatter):
             fields["traceback"] = super().formatException(record.exc_info)
         return json_line(record.levelname.lower(), record.getMessage(), **fields)
 
-    def formatException(self, ei: Any) -> str:  # noqa: N802 - the name in logging
+    def formatException(self, ei: Any) -> str:
         return lines_of(super().formatException(ei))
 
 
@@ -63,7 +71,7 @@ def _configure(level: str) -> None:
             _line,
         ],
         wrapper_class=structlog.make_filtering_bound_logger(logging.getLevelNamesMapping()[level.upper()]),
-        logger_factory=structlog.PrintLoggerFactory(file=SurvivingStream(sys.stderr)),  # type: ignore[arg-type]  # only write and flush are used
+        logger_factory=_StandardError,
         cache_logger_on_first_use=True,
     )
 

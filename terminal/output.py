@@ -52,7 +52,7 @@ class SurvivingStream:
 
 def say(text: str) -> None:
     """Print one line for the user on standard error, even if that has been closed."""
-    _write(said(one_line(text)))
+    write_line(said(one_line(text)))
 
 
 def show_progress(text: str) -> None:
@@ -83,15 +83,16 @@ def say_if_slow(text: str, *, after_s: float = 2.0) -> Iterator[None]:
 
 def say_lines(text: str) -> None:
     """Print a text of several lines, such as a traceback, on standard error."""
-    _write(said(text))
+    write_line(said(text))
 
 
 def relay(line: str, process: str) -> None:
     """Print a line that a child has printed on standard error."""
-    _write(relayed(line, process))
+    write_line(relayed(line, process))
 
 
-def _write(text: str) -> None:
+def write_line(text: str) -> None:
+    """Print a text that is in the format in force on standard error."""
     stream = SurvivingStream(sys.stderr)
     stream.write(text + "\n")
     stream.flush()

@@ -448,7 +448,7 @@ class BlockingRos(_Blocking[Ros]):
     service_node = _blocking(Ros.service_node)
     service_providers = _blocking(Ros.service_providers)
 
-    def advertise(self, topic: str, type: str, *args: Any, **options: Any) -> BlockingPublication:  # noqa: A002
+    def advertise(self, topic: str, type: str, *args: Any, **options: Any) -> BlockingPublication:
         """Advertise a topic (see `Ros.advertise`)."""
         return BlockingPublication(
             self._thread, self._wait(self._async.advertise(topic, type, *args, **options))
@@ -457,7 +457,7 @@ class BlockingRos(_Blocking[Ros]):
     def subscribe(
         self,
         topic: str,
-        type: str | None = None,  # noqa: A002
+        type: str | None = None,
         callback: Callable[[Message], object] | None = None,
         *,
         timeout: float = WAIT_TIMEOUT,
@@ -489,7 +489,7 @@ class BlockingRos(_Blocking[Ros]):
     def advertise_service(
         self,
         service: str,
-        type: str,  # noqa: A002
+        type: str,
         handler: BlockingHandler,
         *,
         handler_timeout: float = 30.0,
@@ -504,7 +504,7 @@ class BlockingRos(_Blocking[Ros]):
     def advertise_action(
         self,
         action: str,
-        type: str,  # noqa: A002
+        type: str,
         handler: BlockingGoalHandler,
     ) -> BlockingAction:
         """Serve an action (see `Ros.advertise_action`) with a function, called on a thread per goal.
@@ -527,7 +527,7 @@ class BlockingRos(_Blocking[Ros]):
     def send_goal(
         self,
         action: str,
-        type: str,  # noqa: A002
+        type: str,
         goal: Mapping[str, Any] | None = None,
         *,
         timeout: float = WAIT_TIMEOUT,

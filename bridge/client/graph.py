@@ -63,7 +63,7 @@ class Params:
     def __init__(self, session: Session) -> None:
         self._session = session
 
-    async def get(self, name: str, default: Any = _REQUIRED, *, timeout: float = 5.0) -> Any:  # noqa: ASYNC109  # part of the error
+    async def get(self, name: str, default: Any = _REQUIRED, *, timeout: float = 5.0) -> Any:
         """Return the value of a parameter, or `default` if it does not exist.
 
         Raises:
@@ -84,20 +84,20 @@ class Params:
             return default
         raise ParamError(self._sentence(name, answer, "it does not exist"))
 
-    async def set(self, name: str, value: Any, *, timeout: float = 5.0) -> None:  # noqa: ASYNC109  # as above
+    async def set(self, name: str, value: Any, *, timeout: float = 5.0) -> None:
         """Set a parameter; errors as for `get`, and `ParamError` if the server refuses."""
         text = encode({"": value}, nonfinite="refuse")[4:-1].decode()
         self._require(name, await self._ask("set_param", timeout, name=name, value=text))
 
-    async def has(self, name: str, *, timeout: float = 5.0) -> bool:  # noqa: ASYNC109  # as above
+    async def has(self, name: str, *, timeout: float = 5.0) -> bool:
         """Return whether a parameter exists; errors as for `get`."""
         return (await self._ask("has_param", timeout, name=name)).get("exists") is True
 
-    async def delete(self, name: str, *, timeout: float = 5.0) -> None:  # noqa: ASYNC109  # as above
+    async def delete(self, name: str, *, timeout: float = 5.0) -> None:
         """Delete a parameter; errors as for `set`."""
         self._require(name, await self._ask("delete_param", timeout, name=name))
 
-    async def names(self, *, timeout: float = 5.0) -> list[str]:  # noqa: ASYNC109  # as above
+    async def names(self, *, timeout: float = 5.0) -> list[str]:
         """Return the names of all parameters; errors as for `get`."""
         names = (await self._ask("get_param_names", timeout)).get("names")
         return [name for name in names if isinstance(name, str)] if isinstance(names, list) else []

@@ -221,7 +221,7 @@ class Subscription(Handle):
         elif self._deadline != inf:
             self._set_alarm(now)
 
-    async def next(self, timeout: float) -> Message:  # noqa: ASYNC109  # the limit is part of the error
+    async def next(self, timeout: float) -> Message:
         """Wait for one message, at most `timeout` seconds.
 
         Raises:
@@ -319,7 +319,7 @@ class Publication(Handle):
         )
         self._register()
 
-    async def publish(self, msg: Mapping[str, Any], *, timeout: float = 5.0) -> None:  # noqa: ASYNC109  # as above
+    async def publish(self, msg: Mapping[str, Any], *, timeout: float = 5.0) -> None:
         """Send one message, whose values may be NumPy arrays, and return when the socket has accepted it.
 
         It is sent at once if the server keeps up; otherwise it waits for its turn, at most `timeout` seconds.
@@ -353,7 +353,7 @@ class Publication(Handle):
         """Whether a message would have to wait for a slow server or for a connection."""
         return not self._session.is_open or self._session.must_wait()
 
-    async def ready(self, timeout: float = 5.0) -> None:  # noqa: ASYNC109  # as above
+    async def ready(self, timeout: float = 5.0) -> None:
         """Wait until the server has accepted all previous messages; errors as for `publish`."""
         if self._session.must_wait():
             await self._session.wait_turn(f"a message of {self.topic}", timeout)

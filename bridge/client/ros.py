@@ -139,7 +139,7 @@ class Ros:
         """Latest status messages of the server, newest last. Most servers send none."""
         return tuple(self._session.statuses)
 
-    async def wait_for_state(self, state: State, timeout: float) -> None:  # noqa: ASYNC109  # part of the error
+    async def wait_for_state(self, state: State, timeout: float) -> None:
         """Wait until the connection is in a state.
 
         Raises:
@@ -153,7 +153,7 @@ class Ros:
     async def advertise(
         self,
         topic: str,
-        type: str,  # noqa: A002  # ROS's word
+        type: str,
         latch: bool = False,
         queue_size: int = PUBLISH_QUEUE_SIZE,
         *,
@@ -191,7 +191,7 @@ class Ros:
     def subscribe(
         self,
         topic: str,
-        type: str | None = None,  # noqa: A002  # ROS's word
+        type: str | None = None,
         *,
         throttle_rate: int = 0,
         queue_length: int = 0,
@@ -254,7 +254,7 @@ class Ros:
         self,
         service: str,
         args: Mapping[str, Any] | None = None,
-        timeout: float = 5.0,  # noqa: ASYNC109  # part of the error
+        timeout: float = 5.0,
     ) -> Any:
         """Call a service.
 
@@ -278,7 +278,7 @@ class Ros:
     async def advertise_service(
         self,
         service: str,
-        type: str,  # noqa: A002  # ROS's word
+        type: str,
         handler: Handler,
         *,
         handler_timeout: float = 30.0,
@@ -305,11 +305,11 @@ class Ros:
     async def send_goal(
         self,
         action: str,
-        type: str,  # noqa: A002  # ROS's word
+        type: str,
         goal: Mapping[str, Any] | None = None,
         *,
         feedback: bool = True,
-        timeout: float = 5.0,  # noqa: ASYNC109  # part of the error
+        timeout: float = 5.0,
     ) -> Goal:
         """Send a goal to an action of ROS 2, or of ROS 1 (actionlib).
 
@@ -358,7 +358,7 @@ class Ros:
     async def advertise_action(
         self,
         action: str,
-        type: str,  # noqa: A002  # ROS's word
+        type: str,
         handler: GoalHandler,
     ) -> ActionServer | ActionlibServer:
         """Serve an action of ROS 2, or of ROS 1 (actionlib) if the server is known to be one (`detect_ros_version`).
@@ -392,7 +392,7 @@ class Ros:
         """ROS version of the server: configured, detected, or seen in header stamps; None if unknown."""
         return self._session.core.ros_version
 
-    async def detect_ros_version(self, timeout: float = DETECT_TIMEOUT) -> RosVersion | None:  # noqa: ASYNC109  # all of it
+    async def detect_ros_version(self, timeout: float = DETECT_TIMEOUT) -> RosVersion | None:
         """Detect the ROS version of the server, if possible.
 
         The sources are, in this order: the option of `connect`, the stamps of received messages, and rosapi
@@ -412,53 +412,53 @@ class Ros:
         self._session.core.wire.ros_version = self.ros_version
         return self.ros_version
 
-    async def topic_type(self, topic: str, timeout: float = 1.0) -> str | None:  # noqa: ASYNC109  # as above
+    async def topic_type(self, topic: str, timeout: float = 1.0) -> str | None:
         """Return the type of a topic at the server: empty if it does not know the topic, None without rosapi."""
         return await ask_text(self._session, "topic_type", {"topic": topic}, "type", timeout)
 
-    async def topics(self, timeout: float = 1.0) -> list[str] | None:  # noqa: ASYNC109  # as above
+    async def topics(self, timeout: float = 1.0) -> list[str] | None:
         """Return the names of all topics at the server; None without rosapi."""
         return await ask_names(self._session, "topics", {}, "topics", timeout)
 
-    async def publishers(self, topic: str, timeout: float = 1.0) -> list[str] | None:  # noqa: ASYNC109  # as above
+    async def publishers(self, topic: str, timeout: float = 1.0) -> list[str] | None:
         """Return the names of the nodes that publish a topic; None without rosapi."""
         return await ask_names(self._session, "publishers", {"topic": topic}, "publishers", timeout)
 
-    async def subscribers(self, topic: str, timeout: float = 1.0) -> list[str] | None:  # noqa: ASYNC109  # as above
+    async def subscribers(self, topic: str, timeout: float = 1.0) -> list[str] | None:
         """Return the names of the nodes that subscribe to a topic; None without rosapi."""
         return await ask_names(self._session, "subscribers", {"topic": topic}, "subscribers", timeout)
 
-    async def topics_for_type(self, type: str, timeout: float = 1.0) -> list[str] | None:  # noqa: A002, ASYNC109  # as above
+    async def topics_for_type(self, type: str, timeout: float = 1.0) -> list[str] | None:
         """Return the names of the topics of a type; None without rosapi."""
         await self.detect_ros_version()  # rosapi compares names of types as they are spelt
         args = {"type": self._session.core.wire.type_name(type)}
         return await ask_names(self._session, "topics_for_type", args, "topics", timeout)
 
-    async def message_details(self, type: str, timeout: float = 1.0) -> Definitions:  # noqa: A002, ASYNC109  # as above
+    async def message_details(self, type: str, timeout: float = 1.0) -> Definitions:
         """Return the fields of a message type and of its parts, by type in the form of ROS 1; empty if unknown."""
         return await ask_definitions(self._session, type, timeout)
 
-    async def nodes(self, timeout: float = 1.0) -> list[str] | None:  # noqa: ASYNC109  # as above
+    async def nodes(self, timeout: float = 1.0) -> list[str] | None:
         """Return the names of all nodes; None without rosapi."""
         return await ask_names(self._session, "nodes", {}, "nodes", timeout)
 
-    async def node_details(self, node: str, timeout: float = 1.0) -> NodeDetails | None:  # noqa: ASYNC109  # as above
+    async def node_details(self, node: str, timeout: float = 1.0) -> NodeDetails | None:
         """Return the topics and services of a node, none if it is unknown; None without rosapi."""
         return await ask_node(self._session, node, timeout)
 
-    async def services(self, timeout: float = 1.0) -> list[str] | None:  # noqa: ASYNC109  # as above
+    async def services(self, timeout: float = 1.0) -> list[str] | None:
         """Return the names of all services; None without rosapi."""
         return await ask_names(self._session, "services", {}, "services", timeout)
 
-    async def service_type(self, service: str, timeout: float = 1.0) -> str | None:  # noqa: ASYNC109  # as above
+    async def service_type(self, service: str, timeout: float = 1.0) -> str | None:
         """Return the type of a service: empty if the server does not know it, None without rosapi."""
         return await ask_text(self._session, "service_type", {"service": service}, "type", timeout)
 
-    async def service_node(self, service: str, timeout: float = 1.0) -> str | None:  # noqa: ASYNC109  # as above
+    async def service_node(self, service: str, timeout: float = 1.0) -> str | None:
         """Return the name of the node that serves a service, empty if none does; None without rosapi."""
         return await ask_text(self._session, "service_node", {"service": service}, "node", timeout)
 
-    async def service_providers(self, type: str, timeout: float = 1.0) -> list[str] | None:  # noqa: A002, ASYNC109  # as above
+    async def service_providers(self, type: str, timeout: float = 1.0) -> list[str] | None:
         """Return the names of the nodes that serve services of a type; None without rosapi."""
         await self.detect_ros_version()  # as for topics
         args = {"service": self._session.core.wire.type_name(type, "srv")}

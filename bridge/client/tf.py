@@ -59,7 +59,7 @@ class Transforms:
         target: str,
         source: str,
         stamp_ns: int | None = None,
-        timeout: float = 1.0,  # noqa: ASYNC109  # part of the error
+        timeout: float = 1.0,
     ) -> Transform:
         """Return the transform from frame `source` to frame `target`, as soon as it is known.
 

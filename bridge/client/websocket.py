@@ -50,7 +50,7 @@ _SIZE: Final = re.compile("[1-9][0-9]{2,17}")
 class _NoDebug(logging.LoggerAdapter[logging.Logger]):
     """Logger for the library without debug lines, which would contain all headers, including tokens."""
 
-    def isEnabledFor(self, level: int) -> bool:  # noqa: N802  # the standard library's name
+    def isEnabledFor(self, level: int) -> bool:
         """Return whether to log at a level."""
         return level > logging.DEBUG and super().isEnabledFor(level)
 
@@ -255,7 +255,7 @@ async def open_websocket(
     shown_uri: str,
     *,
     route: Route,
-    timeout: float,  # noqa: ASYNC109  # the limit is part of the errors' sentences
+    timeout: float,
     limits: Limits,
     on_messages: Callable[[list[bytes]], None],
     on_lost: Callable[[WebSocket, str], None],

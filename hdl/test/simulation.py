@@ -134,7 +134,7 @@ def run_bench(
     if not results.is_file():
         message = f"the simulation of {top} ended without a verdict: {said.strip()[-600:]}"
         raise HardwareToolError(message)
-    found = ET.parse(results).getroot()  # noqa: S314 - cocotb's own file
+    found = ET.parse(results).getroot()  # noqa: S314 - our own cocotb wrote it
     failures = [
         (failure.get("error_msg") or failure.get("message") or failure.text or "").strip()
         for test in found.iter("testcase")

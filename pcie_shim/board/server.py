@@ -512,7 +512,7 @@ class _Server:
             # the last word of the file may be padded with zeros
             loader.content += payload[: loader.begin.size - len(loader.content)]
         if flags & framing.END:
-            self._load(loader)
+            self._load(loader, loader.begin)
         if not flags & framing.POSTED:
             loader.send(framing.encode(framing.PROGRAM, framing.REPLY, sequence, address, 0))
 
@@ -522,9 +522,8 @@ class _Server:
                 ErrorCode.HELD, "a host holds it; stop that host, or use it to program the board"
             )
 
-    def _load(self, loader: _Loader) -> None:
-        assert loader.begin is not None  # noqa: S101 - BEGIN comes first
-        begin, content = loader.begin, bytes(loader.content)
+    def _load(self, loader: _Loader, begin: ProgramBegin) -> None:
+        content = bytes(loader.content)
         loader.begin = None
         loader.content.clear()
         self._check_not_held(begin)

@@ -175,6 +175,13 @@ class DrivenBoard:
                 f"needs {inputs} and {results}: build it for this interface, with more partitions or fewer replicas"
             )
 
+    @property
+    def open_link(self) -> Link:
+        """The link of an open board; a LinkClosedError without one."""
+        if self.link is None:
+            raise LinkClosedError(f"The link to the board at {self.endpoint} is closed: {self.broken}")
+        return self.link
+
     def close(self, reason: str) -> None:
         """Close the link; the board stops computing."""
         if self.link is not None:
@@ -187,7 +194,6 @@ class DrivenBoard:
 
     def start(self, words: BoardWords, end: int) -> None:
         """Post a new frame: the sensors, the settings that changed, and the doorbell (figure 3.3)."""
-        assert self.link is not None  # noqa: S101 - MiniCluster.run has checked
         self.waiting = True  # from here on, abandoning the frame must interrupt the board
         settings, sensors, selects, prior = words
         writes: list[RegisterWrite] = [(self.inputs_at, sensors)] if sensors else []
@@ -212,17 +218,16 @@ class DrivenBoard:
 
     def resume(self, end: int, halted: bytes = b"") -> None:
         """Post the next slice of the frame; `halted` are the words of HALT, empty if nothing is halted."""
-        assert self.link is not None  # noqa: S101 - MiniCluster.collect has checked
         self._ring([(rm.HALT, halted)] if halted else [], rm.RUN_UNTIL, b"", _RESUME, end, 0)
 
     def _ring(
         self, writes: list[RegisterWrite], address: int, before: bytes, layout: struct.Struct, *words: int
     ) -> None:
-        assert self.link is not None  # noqa: S101 - MiniCluster.run has checked
+        link = self.open_link
         self.number = next_doorbell(self.number)
         self.waiting = True
         self.done = None
-        self.link.post([*writes, (address, before + layout.pack(*words, self.number))])
+        link.post([*writes, (address, before + layout.pack(*words, self.number))])
 
     def receive(self) -> bool:
         """Receive once, after a poll; return whether the board is done.
@@ -230,12 +235,12 @@ class DrivenBoard:
         Raises:
             LinkError: The link broke, or the board's answer is wrong, early or repeated.
         """
-        assert self.link is not None  # noqa: S101 - a closed link is not polled
-        done = self.link.receive_done()
+        link = self.open_link
+        done = link.receive_done()
         is_done = done is not None
         while done is not None:
             self._take(done)
-            done = self.link.take_done()
+            done = link.take_done()
         return is_done
 
     def _take(self, done: Done) -> None:
@@ -268,7 +273,8 @@ class DrivenBoard:
 
     def result(self) -> BoardResult:
         """Return the result of the frame; the counts are copied from the buffer of the link."""
-        assert self.done is not None  # noqa: S101 - every board is done
+        if self.done is None:
+            raise SequenceError(f"The board at {self.endpoint} has not answered doorbell {self.number}")
         if self.replicas > 1:
             reasons = tuple(StopReason(reason) for reason in self.outcomes["reason"].tolist())
             joint = joint_reason(reasons, range(self.replicas))

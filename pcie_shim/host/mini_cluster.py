@@ -235,9 +235,8 @@ class MiniCluster:
             if not events:
                 if remaining <= 0:
                     late = next(board for board in progress.running if board.waiting)
-                    assert late.link is not None  # noqa: S101 - it is waited for
                     self._fail(
-                        late, late.link.timeout_error(progress.limit, f"finish {progress.cycles} cycles")
+                        late, late.open_link.timeout_error(progress.limit, f"finish {progress.cycles} cycles")
                     )
                 return False
             for descriptor, _ in events:
@@ -336,9 +335,9 @@ class MiniCluster:
         except PcieShimError as error:
             board.broken = str(error)
             raise board_error(board, error) from error
-        assert board.link is not None  # noqa: S101 - open() has made it
-        self._by_descriptor[board.link.fileno()] = board
-        self._poll.register(board.link.fileno(), select.POLLIN)
+        descriptor = board.open_link.fileno()
+        self._by_descriptor[descriptor] = board
+        self._poll.register(descriptor, select.POLLIN)
 
     def _close(self, board: DrivenBoard, reason: str) -> None:
         if board in self._interrupted:

@@ -273,7 +273,7 @@ class Stack:
         """Return a process's resident memory in KiB and its open descriptors; None if it has ended."""
         try:
             pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
-            return pages * os.sysconf("SC_PAGE_SIZE") // 1024, len(os.listdir(f"/proc/{pid}/fd"))  # noqa: PTH208
+            return pages * os.sysconf("SC_PAGE_SIZE") // 1024, len(list(Path(f"/proc/{pid}/fd").iterdir()))
         except (OSError, IndexError):
             return None
 

@@ -64,8 +64,9 @@ class Client:
             await asyncio.sleep(_AGAIN)
 
     async def _converse(self) -> None:
-        options = {"compression": None, "ping_interval": None, "open_timeout": 5, "max_size": 1 << 24}
-        async with connect(self._uri, **options) as connection:  # type: ignore[arg-type]
+        async with connect(
+            self._uri, compression=None, ping_interval=None, open_timeout=5, max_size=1 << 24
+        ) as connection:
             for operation in (
                 {"op": "advertise", "topic": TOPIC, "type": TYPE},
                 {"op": "subscribe", "topic": REPORTS, "queue_length": QUEUE},

@@ -352,7 +352,7 @@ class Play:
         assert len(core.services) <= MAX_REQUESTS
         assert len(core.calls) <= MAX_CALLS
         assert len(core.goals) <= MAX_GOALS
-        assert core._fragments.waiting_bytes <= 4 * (MAX_SIZE + 128)  # noqa: SLF001  # no one else can see it
+        assert core._fragments.waiting_bytes <= 4 * (MAX_SIZE + 128)  # noqa: SLF001 - the size has no public name
 
     def receive_raw(self) -> None:
         """Receive any data from the server."""

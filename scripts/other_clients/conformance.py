@@ -98,7 +98,7 @@ def last_line(text: str) -> str:
 
 def cases_of(report: Path) -> Iterator[tuple[str, str, str]]:
     """Return the outcome of each test from pytest's XML."""
-    for case in ET.parse(report).getroot().iter("testcase"):  # noqa: S314 - pytest wrote it, here
+    for case in ET.parse(report).getroot().iter("testcase"):  # noqa: S314 - our own pytest wrote it
         name = f"{case.get('classname', '').removeprefix('tests.').replace('.', '/')}::{case.get('name')}"
         outcome, why = "passed", ""
         for child in case:

@@ -284,7 +284,7 @@ class Stack:
     def client_command(self, network: str, *options: str) -> list[str]:
         """Return the command that starts a client's container; its URI and flags follow."""
         volumes = ["--volume", f"{self.project / CLIENT.relative_to(ROOT)}:/client.py:ro"]
-        safe = ["--read-only", "--tmpfs", "/tmp", "--cap-drop", "ALL", "--init"]  # noqa: S108 - the container's own
+        safe = ["--read-only", "--tmpfs", "/tmp", "--cap-drop", "ALL", "--init"]  # noqa: S108 - the /tmp of the container
         return [
             "docker",
             "run",

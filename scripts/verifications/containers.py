@@ -16,6 +16,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Final
@@ -306,7 +307,7 @@ def check_faults(stack: Stack, tally: Tally) -> None:
         began = time.time()
         run_check(stack, tally, "results flow to a client container", lambda: client.flowing(began, 20))
         for name, check in checks:
-            run_check(stack, tally, name, lambda check=check: check(stack, client))  # type: ignore[misc]  # a default binds the loop's check
+            run_check(stack, tally, name, partial(check, stack, client))
         run_check(
             stack,
             tally,
@@ -327,7 +328,7 @@ def check_other_deployments(stack: Stack, tally: Tally, folder: Path) -> None:
         return
     try:
         for name, check in checks:
-            run_check(stack, tally, name, lambda check=check: check(stack, folder))  # type: ignore[misc]  # a default binds the loop's check
+            run_check(stack, tally, name, partial(check, stack, folder))
     finally:
         stack.down()
 
@@ -403,7 +404,7 @@ warm_up()
 
 def check_processor(stack: Stack) -> None:
     """Check that, on a processor of another name, kernels are loaded from the image instead of compiled."""
-    settings = ["--read-only", "--tmpfs", "/tmp", "--env", "NUMBA_DEBUG_CACHE=1"]  # noqa: S108 - the container's own
+    settings = ["--read-only", "--tmpfs", "/tmp", "--env", "NUMBA_DEBUG_CACHE=1"]  # noqa: S108 - the /tmp of the container
     program = ["python", "-c", FAKE_PROCESSOR]
     with_image = stack.docker("run", "--rm", *settings, "rosbayes", *program)
     loaded, saved = (len(re.findall(rf"\] data {word} ", with_image)) for word in ("loaded from", "saved to"))

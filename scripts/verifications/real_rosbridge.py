@@ -197,7 +197,7 @@ def become(command: list[str], environment: dict[str, str] | None = None) -> Non
         RealServerError: The command does not exist.
     """
     try:
-        os.execvpe(command[0], command, environment or dict(os.environ))  # noqa: S606 - no shell is wanted
+        os.execvpe(command[0], command, environment or dict(os.environ))  # noqa: S606 - the command needs no shell
     except OSError as error:
         raise RealServerError(f"{command[0]} cannot be started: {error.strerror or error}") from error
 

@@ -72,7 +72,7 @@ class DeployedBoards:
         self._damaged: set[int] = set()
         self.canaries: Canaries | None = None
         self.disagreements = 0
-        self._is_canary = False
+        self._posted_canary: Canaries | None = None
         self._second: FrameInput | None = None
         self._first: FrameOutput | None = None
 
@@ -226,7 +226,7 @@ class DeployedBoards:
     def post(self, frame: Frame) -> None:
         """Start a frame, whose result `collect` returns; after a BoardError call `find_lost_boards`."""
         given = self._input(frame)
-        self._is_canary, self._first, self._second = False, None, None
+        self._posted_canary, self._first, self._second = None, None, None
         self._whole_cluster().post(given)
         if self._rule.kind is Integrity.TWICE:
             banks = self.generations.deployment.machine.rng_banks
@@ -234,9 +234,10 @@ class DeployedBoards:
 
     def post_canary(self) -> None:
         """Start the next canary instead of a frame."""
-        assert self.canaries is not None  # noqa: S101 - the caller has asked for it
+        if self.canaries is None:
+            raise ValueError("there are no canaries: the boards are not open, or integrity is not canary")
         self._whole_cluster().post(self.canaries.next())
-        self._is_canary, self._first, self._second = True, None, None
+        self._posted_canary, self._first, self._second = self.canaries, None, None
 
     def collect(self, seconds: float = 0) -> FrameOutput | None:
         """Return the posted frame's result, or None while boards run; after a BoardError, call `find_lost_boards`.
@@ -248,8 +249,8 @@ class DeployedBoards:
         output = self._whole_cluster().collect(seconds)
         if output is None:
             return None
-        if self._is_canary:
-            self._judge(output)
+        if self._posted_canary is not None:
+            self._judge(self._posted_canary, output)
             return output
         if self._second is not None:
             self._whole_cluster().post(self._second)
@@ -266,10 +267,9 @@ class DeployedBoards:
             self.canaries.count_frame()
         return output
 
-    def _judge(self, output: FrameOutput) -> None:
+    def _judge(self, canaries: Canaries, output: FrameOutput) -> None:
         """Compare a canary's counts; a damaged board is closed, and programmed again when it is recovered."""
-        canaries, cluster = self.canaries, self._whole_cluster()
-        assert canaries is not None  # noqa: S101 - a canary has been posted
+        cluster = self._whole_cluster()
         try:
             canaries.judge(output)
         except DamagedBoardError as error:

@@ -249,10 +249,10 @@ def expand_flags(command: Callable[..., None]) -> Callable[..., None]:
     groups: dict[str, type[Any]] = {}
     for parameter in inspect.signature(command, eval_str=True).parameters.values():
         kind = parameter.annotation
-        if not is_dataclass(kind):
+        if not (isinstance(kind, type) and is_dataclass(kind)):
             parameters.append(parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY))
             continue
-        groups[parameter.name] = kind  # type: ignore[assignment]  # the class, not an instance of it
+        groups[parameter.name] = kind
         hints = get_type_hints(kind, include_extras=True)
         parameters += [
             inspect.Parameter(

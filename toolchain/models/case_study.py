@@ -85,12 +85,12 @@ def _model_function(path: Path) -> Callable[..., object]:
         _guarded(path, "it", lambda: loader.exec_module(module))
     finally:
         del sys.modules[spec.name]
-    function = getattr(module, "model", None)
+    function: object = getattr(module, "model", None)
     if not callable(function):
         raise ModelError(
             f"{path} does not define model(); expected a function that returns a toolchain.models.Model"
         )
-    return function  # type: ignore[no-any-return]  # the content of a user's module has no type
+    return function
 
 
 def _guarded(path: Path, what: str, call: Callable[[], object]) -> object:

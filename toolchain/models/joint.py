@@ -209,17 +209,16 @@ class Question:
             ),
             key=itemgetter(0),
         )
-        found: tuple[list[str], str] | None = None
+        path: list[str] = []
+        drawn = ""
         for length, one, other in least:
-            if found is not None and len(found[0]) <= length:
+            if path and len(path) <= length:
                 break
             factors, terms = self._factors(active, [one, other])
             links = Links(terms, factors, cut)
-            path = links.path(one, other)
-            if path and (found is None or len(path) < len(found[0])):
-                found = path, links.drawn(path)
-        assert found is not None  # noqa: S101 - the caller has found two that are joined
-        path, drawn = found
+            between = links.path(one, other)
+            if between and (not path or len(between) < len(path)):
+                path, drawn = between, links.drawn(between)
         ends = f"{path[0]} or {path[-1]}"
         way_out = f"search {path[1]} too, or leave {ends} out" if len(path) > 2 else f"leave {ends} out"
         names = ", ".join(each.name for each in self.searched)

@@ -209,8 +209,7 @@ class Model:
     @property
     def prior_distribution(self) -> NDArray[np.float64]:
         """P(S), float64[lines]."""
-        assert self.prior is not None  # noqa: S101 - __post_init__ sets it
-        return self.prior
+        return self._default_prior() if self.prior is None else self.prior
 
 
 def dimension(

@@ -85,7 +85,7 @@ class Goal:
         """Ask the server to cancel the goal, if it is active; `result` returns whether it did."""
         raise NotImplementedError
 
-    async def result(self, timeout: float) -> GoalResult:  # noqa: ASYNC109  # part of the error
+    async def result(self, timeout: float) -> GoalResult:
         """Wait for the end of the goal; return its status even if canceled or aborted. May be repeated.
 
         Raises:

@@ -183,5 +183,5 @@ def test_unusable_certificates_are_an_error(certificate: tuple[Path, Path], tmp_
 
 def test_loopback_addresses_are_recognised() -> None:
     assert all(map(is_loopback, ["127.0.0.1", "127.8.9.10", "::1", "localhost"]))
-    elsewhere = ["0.0.0.0", "::", "192.168.1.10", "robot.example", "localhost.example", ""]  # noqa: S104  # that this is not loopback is what is tested
+    elsewhere = ["0.0.0.0", "::", "192.168.1.10", "robot.example", "localhost.example", ""]  # noqa: S104 - the test needs an address that is not loopback
     assert not any(map(is_loopback, elsewhere))

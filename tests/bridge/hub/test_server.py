@@ -71,7 +71,7 @@ async def test_the_end_of_the_hub_closes_its_clients_with_1001() -> None:
         await ears.sync()
         await hub.aclose()
         assert await ears.closed() == 1001
-        with pytest.raises(OSError):  # noqa: PT011 - refused, by whichever loop's class
+        with pytest.raises(OSError):  # noqa: PT011 - each event loop has its own class for a refused connection
             await connect(f"ws://127.0.0.1:{port}")
 
 
@@ -172,7 +172,7 @@ async def test_a_delayed_hub_closes_no_client() -> None:
             swept.append(now)
 
     hub = server._Hub(HubLimits(), AccessPolicy(), 1, loopback=True)
-    hub.connections.add(Connection())  # type: ignore[arg-type]  # a double with the one method that is called
+    hub.connections.add(Connection())  # a double with the one method that is called
     hub._swept -= 10
     hub.sweep()
     assert not swept

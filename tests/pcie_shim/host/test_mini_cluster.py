@@ -21,6 +21,7 @@ from machines.parameters import PriorMode
 from pcie_shim import register_map as rm
 from pcie_shim.board.emulated_board import EmulatedBoard
 from pcie_shim.board.misbehaviour import Misbehaviour, MisbehaviourKind, UnknownMisbehaviourError
+from pcie_shim.endpoint import Endpoint
 from pcie_shim.errors import (
     BoardGoneError,
     BoardHeldError,
@@ -33,7 +34,9 @@ from pcie_shim.errors import (
     EndpointError,
     FrameInputError,
     ImageMismatchError,
+    LinkClosedError,
     PcieShimError,
+    SequenceError,
 )
 from pcie_shim.host.driven_board import DrivenBoard
 from pcie_shim.host.frame import FrameInput, FrameOutput
@@ -55,6 +58,14 @@ from tests.pcie_shim.boards import (
 StartBoard = Callable[..., BoardProcess]
 LINES = (5, 4, 4, 4)
 PARTS = images(10, LINES, zeros=0.3)
+
+
+def test_a_board_that_is_not_open_has_no_link_and_no_result() -> None:
+    board = DrivenBoard(0, Endpoint(path="/nowhere"), PARTS[0])
+    with pytest.raises(LinkClosedError):
+        board.receive()
+    with pytest.raises(SequenceError):
+        board.result()
 
 
 def outcome(output: FrameOutput) -> list[tuple[list[int], int, StopReason]]:

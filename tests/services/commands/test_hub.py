@@ -15,7 +15,7 @@ from services.supervision.child import own_command
 from tests.command_runner import invoke
 
 PATIENCE = 60
-EVERYWHERE = "0.0.0.0"  # noqa: S104  # the hub is to refuse it, or to want tokens
+EVERYWHERE = "0.0.0.0"  # noqa: S104 - the hub must refuse it, or demand tokens
 TOKEN = "correct-horse-battery-staple"
 
 

@@ -115,6 +115,12 @@ def test_a_signal_ends_a_service_that_reads_or_programs(folder, loaded, monkeypa
         boards.switch(Switch(0))
 
 
+def test_no_canary_is_posted_without_canaries(loaded):
+    boards = DeployedBoards(Settings(), loaded, [Endpoint(path="/nowhere")] * len(loaded.boards))
+    with pytest.raises(ValueError, match="integrity"):
+        boards.post_canary()
+
+
 def test_a_service_switches_to_a_prepared_deployment(folder, loaded):
     edit(folder, target_count=99)
     held = Generations(loaded, lambda deployment: deployment.machine.target_count)

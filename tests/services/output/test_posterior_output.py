@@ -6,6 +6,7 @@ import errno
 import json
 import os
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -154,7 +155,8 @@ class TestPicture:
     def test_nobody_is_shown_colours_who_wants_none(self, monkeypatch):
         options = {"force_terminal": True, "color_system": "truecolor"}
         assert in_colour(Console(**options))
-        assert not in_colour(Console(file=open(os.devnull, "w")))  # noqa: SIM115, PTH123 - a device, which needs no closing
+        with Path(os.devnull).open("w") as null:
+            assert not in_colour(Console(file=null))
         monkeypatch.setenv("NO_COLOR", "1")
         assert not in_colour(Console(**options))
 

@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 from contextlib import asynccontextmanager
+from types import MappingProxyType
 from unittest.mock import Mock
 
 import numpy as np
@@ -51,7 +52,7 @@ class FakeTopics:
     """Topics of a server that takes a result when it is allowed to, one after the other."""
 
     must_wait = True
-    rosbridges = {}  # noqa: RUF012  # nobody changes it
+    rosbridges = MappingProxyType({})
     advertised = ()
     reports = None
 

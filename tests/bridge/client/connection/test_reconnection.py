@@ -182,7 +182,7 @@ async def test_a_sleep_of_this_process_is_not_the_servers_silence(fake, ros):
     while ros._session._connected()._pinged_at is None:
         await asyncio.sleep(0)
     fake.thaw()
-    time.sleep(2.5)  # noqa: ASYNC251  # the whole process stands still while the answer is on its way
+    time.sleep(2.5)  # noqa: ASYNC251 - the whole process must stop while the answer is in transit
     await asyncio.sleep(0.3)
     assert (ros.state, ros.reconnections, fake.connections) == (State.CONNECTED, 0, 1)
 

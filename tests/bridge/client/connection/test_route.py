@@ -93,7 +93,7 @@ async def refused(uri: str, error: type[BridgeError], **options: Any) -> str:
 
 
 async def test_a_ca_of_ones_own_vouches_for_the_server(certificates):
-    async with access(server_context(certificates), host="0.0.0.0") as server:  # noqa: S104  # two loopback addresses
+    async with access(server_context(certificates), host="0.0.0.0") as server:  # noqa: S104 - the test needs two loopback addresses
         for host in ("localhost", "127.0.0.1"):
             async with connect(f"wss://{host}:{server.port}", ca_file=certificates / "ca.pem") as ros:
                 assert ros.state is State.CONNECTED

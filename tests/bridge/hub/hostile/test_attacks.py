@@ -337,7 +337,7 @@ async def test_definitions_are_loaded_beside_the_event_loop(monkeypatch: pytest.
         await witness.send(op="publish", topic="/t", msg={"data": [1, 2]})
         for each in waiting:
             payload = await each.websocket.recv(decode=False)
-            assert cbor_codec.decode(payload)["msg"]["data"] == b"\x01\x02"  # type: ignore[arg-type]
+            assert cbor_codec.decode(payload)["msg"]["data"] == b"\x01\x02"
 
 
 # --- connections
