@@ -7,7 +7,7 @@ import typer
 
 from services.commands import flags as options
 from services.errors import SettingsError
-from services.output.frame_story import show_frame
+from services.output.frame_lines import show_frame
 from services.output.status_screen import show
 from services.settings import load_settings
 from services.sockets.stack import Found, find_run

@@ -8,7 +8,7 @@ import numpy as np
 
 from machines.bm1 import StopReason
 from services.pipeline.inference import REASON_WORDS
-from services.sockets.frame_story import BoardOutcome, FrameStory, StageSpan
+from services.sockets.frame_timeline import BoardOutcome, FrameTimeline, StageSpan
 from services.sockets.records import FrameResult, Published, Reading
 from services.sockets.status import BUCKETS_S, StageLatency
 
@@ -66,12 +66,12 @@ class FrameTrace:
             spans["rosbridge_out"] = (self.received_tick + self.published.total_ns - out_ns, out_ns)
         return spans
 
-    def story(self) -> FrameStory:
+    def timeline(self) -> FrameTimeline:
         """Return the frame for the user."""
         spans, published = self.spans(), self.published
         total_ns = published.total_ns if published is not None else 0
         hops_ns = total_ns - sum(duration for _, duration in spans.values())
-        return FrameStory(
+        return FrameTimeline(
             number=self.number,
             outcome=self.outcome,
             why=self.why,
@@ -155,11 +155,11 @@ class FrameHistory:
             if trace.outcome == AT_THE_PUBLISHER:
                 trace.outcome = reason
 
-    def story(self, number: int) -> FrameStory | str:
+    def timeline(self, number: int) -> FrameTimeline | str:
         """Return a frame, or a sentence that says why it is not known."""
         trace = self._trace(number)
         if trace is not None:
-            return trace.story()
+            return trace.timeline()
         if not self._traces:
             return f"frame {number} is not known: this run has not sent a frame to the boards yet"
         first, last = self._traces[0].number, self._traces[-1].number

@@ -72,7 +72,7 @@ class Master:
                 self.status,
                 metrics=settings.metrics,
                 stages=history.latencies,
-                frame=history.story,
+                frame=history.timeline,
                 **more,
             )
             await sockets.enter_async_context(report)

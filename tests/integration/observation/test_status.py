@@ -82,13 +82,13 @@ async def is_measured(stage):
     stages = {each["stage"]: each for each in by_name(stack)["master"]["stages"]}
     assert 0 < stages["compute"]["p50_ms"] < stages["frame"]["p50_ms"] <= stages["frame"]["p99_ms"]
     code, printed = await ask(stage, "--frame", "2", "--json")
-    story = json.loads(printed)
-    assert (code, story["number"], story["outcome"]) == (0, 2, "published")
-    began = [each["began_ms"] for each in story["stages"]]
+    timeline = json.loads(printed)
+    assert (code, timeline["number"], timeline["outcome"]) == (0, 2, "published")
+    began = [each["began_ms"] for each in timeline["stages"]]
     assert (began, len(began)) == (sorted(began), 6)
-    assert sum(each["took_ms"] for each in story["stages"]) <= story["total_ms"]
-    assert [board["index"] for board in story["boards"]] == [0, 1, 2, 3]
-    assert max(board["cycles"] for board in story["boards"]) == story["cycles"] > 0
+    assert sum(each["took_ms"] for each in timeline["stages"]) <= timeline["total_ms"]
+    assert [board["index"] for board in timeline["boards"]] == [0, 1, 2, 3]
+    assert max(board["cycles"] for board in timeline["boards"]) == timeline["cycles"] > 0
     assert (await ask(stage, "--frame", "1000000"))[0] == 2
 
 

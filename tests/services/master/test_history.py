@@ -1,6 +1,6 @@
 """Memory of the last frames: their stages, boards and outcomes, and latencies over all of them.
 
-Run.read ──▶ FrameFlow ──▶ FrameHistory ──▶ story(N), latencies()
+Run.read ──▶ FrameFlow ──▶ FrameHistory ──▶ timeline(N), latencies()
 """
 
 import time
@@ -9,8 +9,8 @@ import msgspec
 import pytest
 
 from services.master.history import REMEMBERED, FrameHistory
-from services.output.frame_story import lines
-from services.sockets.frame_story import FrameStory
+from services.output.frame_lines import lines
+from services.sockets.frame_timeline import FrameTimeline
 from services.sockets.records import (
     FailureReason,
     FrameFailed,
@@ -52,9 +52,9 @@ def publish(history, number, tick=0, total_ms=20):
 def test_a_published_frame_has_its_stages_in_order():
     history = FrameHistory()
     publish(history, 1, tick=77)
-    story = history.story(1)
-    assert isinstance(story, FrameStory)
-    assert [(each.stage, each.began_ms, each.took_ms) for each in story.stages] == [
+    timeline = history.timeline(1)
+    assert isinstance(timeline, FrameTimeline)
+    assert [(each.stage, each.began_ms, each.took_ms) for each in timeline.stages] == [
         ("rosbridge_in", 0, 1),
         ("waited", 2, 1),
         ("register_writes", 4, 1),
@@ -62,24 +62,29 @@ def test_a_published_frame_has_its_stages_in_order():
         ("reads", 10, 2),
         ("rosbridge_out", 17, 3),
     ]
-    assert (story.outcome, story.total_ms, story.local_hops_ms, story.cycles) == ("published", 20, 7, 512)
-    assert [(board.index, board.cycles) for board in story.boards] == [(0, 512), (1, 500)]
-    assert (story.bank, story.stamp_ns) == (1, 5)
-    assert msgspec.json.decode(msgspec.json.encode(story), type=FrameStory) == story
-    assert len(lines(story)) == 4 + 7 + 2 + 2
-    assert lines(msgspec.structs.replace(story, stamp_ns=-(1 << 62)))  # a robot may send any stamp
+    assert (timeline.outcome, timeline.total_ms, timeline.local_hops_ms, timeline.cycles) == (
+        "published",
+        20,
+        7,
+        512,
+    )
+    assert [(board.index, board.cycles) for board in timeline.boards] == [(0, 512), (1, 500)]
+    assert (timeline.bank, timeline.stamp_ns) == (1, 5)
+    assert msgspec.json.decode(msgspec.json.encode(timeline), type=FrameTimeline) == timeline
+    assert len(lines(timeline)) == 4 + 7 + 2 + 2
+    assert lines(msgspec.structs.replace(timeline, stamp_ns=-(1 << 62)))  # a robot may send any stamp
 
 
 def test_the_memory_is_bounded_and_says_what_it_has():
     history = FrameHistory()
-    assert isinstance(history.story(1), str)
+    assert isinstance(history.timeline(1), str)
     for number in range(1, REMEMBERED + 11):
         publish(history, number)
-    assert history.story(REMEMBERED + 10).number == REMEMBERED + 10
-    assert history.story(11).number == 11
-    assert "11 to 1010" in history.story(10)
-    assert "1010" in history.story(REMEMBERED + 11)
-    assert isinstance(history.story(0), str)
+    assert history.timeline(REMEMBERED + 10).number == REMEMBERED + 10
+    assert history.timeline(11).number == 11
+    assert "11 to 1010" in history.timeline(10)
+    assert "1010" in history.timeline(REMEMBERED + 11)
+    assert isinstance(history.timeline(0), str)
 
 
 def test_latencies_are_quantiles_of_the_last_frames_and_counts_of_all():
@@ -108,18 +113,18 @@ async def test_a_lost_frame_says_why(run):
     history = run.flow.history
     run.read(4)
     failure = FrameFailed(1, 0, 5, "Board 0 is tired", FailureReason.AWAY)
-    assert history.story(1).outcome == "on the boards"
+    assert history.timeline(1).outcome == "on the boards"
     run.take(run.app, failure)
-    assert (history.story(1).outcome, history.story(1).why) == (LossReason.FAILED, "Board 0 is tired")
+    assert (history.timeline(1).outcome, history.timeline(1).why) == (LossReason.FAILED, "Board 0 is tired")
     run.take(run.app, FrameResult(2, RAW, 0, 0, 0, 0))
-    assert history.story(2).outcome == "at the publisher"
+    assert history.timeline(2).outcome == "at the publisher"
     run.take(run.publisher, Published(2, Outcome.ROSBRIDGE_AWAY, None, -1, 0.0, 0, 0))
-    assert history.story(2).outcome == Outcome.ROSBRIDGE_AWAY
-    assert history.story(2).total_ms is None
+    assert history.timeline(2).outcome == Outcome.ROSBRIDGE_AWAY
+    assert history.timeline(2).total_ms is None
     run.take(run.app, FrameResult(3, RAW, 0, 0, 0, 0))
     run.flow.lost(run.peers.publisher)
     run.flow.lost(run.peers.app)
-    assert [history.story(number).outcome for number in (3, 4)] == [
+    assert [history.timeline(number).outcome for number in (3, 4)] == [
         LossReason.WITH_PUBLISHER,
         LossReason.WITH_APP,
     ]

@@ -132,7 +132,7 @@ async def test_a_run_is_open_to_questions_until_its_end(boat, tmp_path, monkeypa
     assert (given["metrics"], given["stages"], given["frame"]) == (
         run.master._settings.metrics,
         history.latencies,
-        history.story,
+        history.timeline,
     )
     assert control.call_args_list == ([] if once else [((tmp_path, run.reloads.order),)])
     run.flow.end.set_result(None)

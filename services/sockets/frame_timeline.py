@@ -1,4 +1,4 @@
-"""One frame of a run, as a master reports it over HTTP."""
+"""The timeline of one frame: its stages and boards, as a master reports them over HTTP."""
 
 import msgspec
 
@@ -20,7 +20,7 @@ class BoardOutcome(msgspec.Struct, frozen=True):
     stopped: str
 
 
-class FrameStory(msgspec.Struct, frozen=True, kw_only=True):
+class FrameTimeline(msgspec.Struct, frozen=True, kw_only=True):
     """One frame in the order of its stages, which are those that it has reached.
 
     `outcome` is published, the reason of a loss, or where the frame is now; `why` is the sentence of a board

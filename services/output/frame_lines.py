@@ -1,4 +1,4 @@
-"""The way of one frame through the processes, for `status --frame`."""
+"""One frame as lines of text, for `status --frame`."""
 
 import sys
 from datetime import datetime
@@ -7,7 +7,7 @@ from pathlib import Path
 import msgspec
 
 from services.errors import SettingsError
-from services.sockets.frame_story import FrameStory
+from services.sockets.frame_timeline import FrameTimeline
 from services.sockets.http_client import get
 from services.sockets.reporting import http_socket
 from terminal.errors import ExitCode
@@ -27,7 +27,7 @@ async def show_frame(directory: Path, number: int, *, json: bool) -> int:
         status, body = await get(path, f"/frames/{number}", timeout=_ANSWER_TIME)
         if status != 200:
             raise SettingsError(one_line(body.decode("utf-8", "replace")))
-        story = msgspec.json.decode(body, type=FrameStory)
+        timeline = msgspec.json.decode(body, type=FrameTimeline)
     except (OSError, ValueError, msgspec.MsgspecError) as error:
         reason = getattr(error, "strerror", None) or error or type(error).__name__
         raise SettingsError(
@@ -37,29 +37,30 @@ async def show_frame(directory: Path, number: int, *, json: bool) -> int:
         sys.stdout.buffer.write(body + b"\n")
         sys.stdout.buffer.flush()
     else:
-        print("\n".join(one_line(line) for line in lines(story)))
+        print("\n".join(one_line(line) for line in lines(timeline)))
     return ExitCode.DONE
 
 
-def lines(story: FrameStory) -> list[str]:
+def lines(timeline: FrameTimeline) -> list[str]:
     """Return a frame as lines of text."""
-    after = "" if story.total_ms is None else f" after {story.total_ms:.3f} ms"
-    why = f": {story.why}" if story.why else ""
-    received, stamp = _time(story.received_ns), _time(story.stamp_ns)
+    after = "" if timeline.total_ms is None else f" after {timeline.total_ms:.3f} ms"
+    why = f": {timeline.why}" if timeline.why else ""
+    received, stamp = _time(timeline.received_ns), _time(timeline.stamp_ns)
     found = [
-        f"frame {story.number}: {story.outcome}{after}{why}",
-        f"reading received {received}, stamp {stamp}; generation {story.generation}, bank {story.bank}",
+        f"frame {timeline.number}: {timeline.outcome}{after}{why}",
+        f"reading received {received}, stamp {stamp}; generation {timeline.generation}, bank {timeline.bank}",
         "",
         f"{'stage':<17}{'began ms':>10}{'took ms':>10}  process",
     ]
     found += [
-        f"{each.stage:<17}{each.began_ms:>10.3f}{each.took_ms:>10.3f}  {each.where}" for each in story.stages
+        f"{each.stage:<17}{each.began_ms:>10.3f}{each.took_ms:>10.3f}  {each.where}"
+        for each in timeline.stages
     ]
-    if story.local_hops_ms is not None:
-        found.append(f"{'local_hops':<17}{'':>10}{story.local_hops_ms:>10.3f}  between the processes")
-    if story.boards:
+    if timeline.local_hops_ms is not None:
+        found.append(f"{'local_hops':<17}{'':>10}{timeline.local_hops_ms:>10.3f}  between the processes")
+    if timeline.boards:
         found += ["", f"{'board':<8}{'cycles':>10}  stopped by"]
-        found += [f"{each.index:<8}{each.cycles:>10}  {each.stopped}" for each in story.boards]
+        found += [f"{each.index:<8}{each.cycles:>10}  {each.stopped}" for each in timeline.boards]
     return found
 
 
