@@ -10,6 +10,7 @@ import statistics
 import subprocess
 import threading
 import time
+from collections.abc import Collection
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -29,6 +30,8 @@ MEAN_TV, LARGEST_TV = 0.06, 0.25
 """Limits of results' total variation to float64 fusion: 0.04 is the mean at a target count of 255."""
 MAX_CYCLES: Final = 1 << 17
 """Cycle limit; a frame that ends there has too few counts for a bound, because its readings are unlikely."""
+KILLED: Final = 137
+"""Exit code after SIGKILL."""
 RESULTS_AGAIN: Final = 5
 """Number of consecutive results that show a recovery."""
 
@@ -246,11 +249,13 @@ class Stack:
         extra = {"COMPOSE_ANSI": "never", "COMPOSE_PROGRESS": "plain", "BUILDKIT_PROGRESS": "plain"}
         return kept | extra | self.engine.environment | self.variables
 
-    def docker(self, *arguments: str, limit: float = 120, check: bool = True) -> str:
+    def docker(
+        self, *arguments: str, limit: float = 120, check: bool = True, codes: Collection[int] = (0,)
+    ) -> str:
         """Run docker and return its output.
 
         Raises:
-            CheckError: It fails or does not end in time.
+            CheckError: It ends with another exit code than these, if they are checked, or not in time.
         """
         what = f"docker {' '.join(arguments[:3])}"
         with (OUT / "docker.log").open("a") as log:
@@ -270,7 +275,7 @@ class Stack:
             except subprocess.TimeoutExpired:
                 raise CheckError(f"{what} did not end within {limit:g} s") from None
             log.write(done.stderr)
-        if check and done.returncode:
+        if check and done.returncode not in codes:
             output = (done.stderr.strip() or done.stdout.strip()).splitlines()[-8:]
             raise CheckError(
                 f"{what} ended with exit code {done.returncode}:\n      " + "\n      ".join(output)
@@ -439,7 +444,8 @@ class Stack:
 
     def signal(self, service: str, name: str) -> None:
         """Send a signal to the process inside; after `docker kill` the engine would not restart it."""
-        self.docker("exec", self.container(service), "sh", "-c", f"kill -{name} -1")
+        # SIGKILL ends the container, and with it the shell, which may not have returned from its call yet
+        self.docker("exec", self.container(service), "sh", "-c", f"kill -{name} -1", codes=(0, KILLED))
 
     def board_pid(self, board: str) -> int:
         """Return the PID of one board inside the container of all, as `status` shows it.

@@ -124,6 +124,9 @@ def check_absent_robot(stack: Stack) -> None:
         after = {service: stack.restarts(service) for service in states}
         expect(before == after and not any(after.values()), f"containers were restarted: {after}")
         stack.notes.append(f"the first result came {took:.1f} s after the robot")
+    except Exception:
+        stack.save_logs("an absent robot before down")
+        raise
     finally:
         stack.down()
 

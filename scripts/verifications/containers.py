@@ -28,6 +28,7 @@ from scripts.verifications.container_stack import (
     CORE,
     ENGINE,
     FLOW_LIMIT,
+    KILLED,
     OUT,
     SERVICES,
     VIEWER,
@@ -61,7 +62,6 @@ STOP_LIMIT: Final = 5
 STOPS: Final = 3
 """Number of attempts, as for STARTS."""
 TERMINATED: Final = 143
-KILLED: Final = 137
 MOST_RESTARTS: Final = 8
 """Maximum number of restarts of a container until all use the deployment in the folder."""
 BUILT, UP = "the image is built", "docker compose up"
