@@ -37,6 +37,8 @@ _LONGEST_NAME: Final = 63
 _PATH: Final = re.compile(r"/[A-Za-z0-9._~/-]{0,200}")
 _HOST: Final = re.compile(r"[A-Za-z0-9.-]{1,253}")
 _LAST_PORT: Final = 65535
+_PORT: Final = re.compile(r"[0-9]+(/.*)?")
+"""What follows `robot:` in a URI without ws://, and therefore is not a name."""
 _TAKEN_TIME: Final = 3.0
 """Seconds to wait for another owner of a name."""
 
@@ -202,6 +204,11 @@ async def announced(
 
 
 def _check_name(name: str) -> None:
+    if _PORT.fullmatch(name):
+        raise DiscoveryError(
+            f"'{ROBOT}{name}' would be a robot called {name}: for a port of the host `robot` write "
+            f"ws://{ROBOT}{name}; a robot's name is more than a number"
+        )
     size = len(name.encode("utf-8", "replace"))
     if not 1 <= size <= _LONGEST_NAME or not name.isprintable() or "." in name:
         raise DiscoveryError(

@@ -11,6 +11,7 @@ from typing import Any, Final, Self
 from bridge.client.protocol.events import ServiceRequested
 from bridge.client.protocol.subscription_options import Delivery
 from bridge.client.session import Message, Session, State
+from bridge.codecs.message_check import MessageCheck
 from bridge.errors import (
     BridgeError,
     ConcurrentReadError,
@@ -381,6 +382,7 @@ class Service(Handle):
 
     Attributes:
         name: Name of the service.
+        check: The check of its answers, if their type is known.
     """
 
     def __init__(
@@ -388,6 +390,7 @@ class Service(Handle):
     ) -> None:
         super().__init__(session)
         self.name = name
+        self.check: MessageCheck | None = None
         self._handler = handler
         self._limit = handler_timeout
         session.core.services.advertise(name, type_name)
@@ -411,6 +414,8 @@ class Service(Handle):
             values = f"{self.name} failed: {type(error).__name__}"
         answer = self._session.core.services.answer
         try:
+            if self.check is not None and not isinstance(values, str):
+                self.check(values)
             answer(request.ticket, values, ok=ok)
         except BridgeError as error:
             _log.error("the answer of service %s cannot be sent: %s", self.name, error)

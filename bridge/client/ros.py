@@ -32,12 +32,13 @@ from bridge.client.protocol import ClientCore, Compression, Delivery, RosVersion
 from bridge.client.protocol.events import StatusReceived
 from bridge.client.route import Path, make_route, shown
 from bridge.client.session import Message, Session, State, StateCallback
+from bridge.client.type_checks import TypeChecks
 from bridge.client.websocket import Limits, check_uri
 from bridge.codecs.cbor_codec import Arrays
 from bridge.codecs.json_codec import MAX_SIZE
 from bridge.codecs.message_check import Definitions
 from bridge.errors import OptionError
-from bridge.names import absolute, ros_version_of_type, split_type
+from bridge.names import absolute, ros_version_of_type
 from bridge.qos import Qos
 
 if TYPE_CHECKING:
@@ -71,7 +72,7 @@ class Ros:
 
     def __init__(self, session: Session, *, check_types: bool = True) -> None:
         self._session = session
-        self._check_types = check_types
+        self._types = TypeChecks(session) if check_types else None
         self.params = Params(session)
         self._publishes = False
         self._senders: dict[tuple[str, str], ActionlibSender] = {}
@@ -184,8 +185,8 @@ class Ros:
         """
         self._publishes = True
         publication = Publication(self._session, topic, type, latch=latch, queue_size=queue_size, qos=qos)
-        if self._check_types:
-            await self._session.learn_type(type)
+        if self._types is not None:
+            await self._types.learn_message(type)
         return publication
 
     def subscribe(
@@ -258,6 +259,9 @@ class Ros:
     ) -> Any:
         """Call a service.
 
+        If the service's type is known to rosapi, the request is checked before it is sent. The first call of a
+        service asks for the type, which may take up to two seconds more.
+
         Args:
             service: Name of the service.
             args: Fields of the request.
@@ -271,8 +275,11 @@ class Ros:
             NoAnswerError: The service did not answer in time.
             SlowPeerError: The server did not accept the call in time.
             DisconnectedError: There is no connection, or it was lost meanwhile.
+            MessageTypeError: The request has a field that its type does not have, or an array of another shape.
             EncodeError: The arguments cannot be sent as JSON.
         """
+        if self._types is not None:
+            await self._types.check_request(service, args or {}, timeout)
         return await self._session.call(service, args or {}, timeout)
 
     async def advertise_service(
@@ -298,7 +305,11 @@ class Ros:
             TypeConflictError: This client already serves this service.
             DisconnectedError: The client was closed.
         """
-        return Service(self._session, service, type, handler, handler_timeout)
+        served = Service(self._session, service, type, handler, handler_timeout)
+        if self._types is not None:
+            name = self._session.core.wire.type_name(type, "srv")
+            served.check = await self._types.part("service_response", name)
+        return served
 
     # Actions
 
@@ -313,13 +324,12 @@ class Ros:
     ) -> Goal:
         """Send a goal to an action of ROS 2, or of ROS 1 (actionlib).
 
-        A known ROS version decides. If it is unknown, `pkg/action/Name` is an action of ROS 2. For another type,
-        the version is detected (`detect_ros_version`); if it stays unknown, `pkg/NameAction` and the types of
-        packages whose name begins with actionlib are actions of ROS 1.
+        The ROS version of the server decides (`detect_ros_version`). If it stays unknown, `pkg/NameAction` and the
+        types of packages whose name begins with actionlib are actions of ROS 1, and others of ROS 2.
 
         Args:
             action: Name of the action.
-            type: Its type: `example_interfaces/action/Fibonacci`, or without the middle; in ROS 1
+            type: Its type: `example_interfaces/action/Fibonacci`, or without the middle; in ROS 1 also
                 `actionlib_tutorials/FibonacciAction`, or without the ending.
             goal: Fields of the goal.
             feedback: Whether to receive feedback.
@@ -333,15 +343,17 @@ class Ros:
             NameFormError: The name or the type is malformed.
             SlowPeerError: The server did not accept it in time, or too many goals are active.
             DisconnectedError: There is no connection.
-            EncodeError: The goal cannot be sent as JSON, or in ROS 1 does not fit its type.
+            MessageTypeError: The goal has a field that its type does not have, or an array of another shape.
+            EncodeError: The goal cannot be sent as JSON.
         """
         if self._session.must_wait():
             await self._session.wait_turn(f"a goal of {action}", timeout)
-        if self.ros_version is not None or split_type(type)[1] != "action":
-            deadline = time.monotonic() + timeout
-            if await self._uses_actionlib(type, min(timeout, DETECT_TIMEOUT)):
-                sender = await self._sender(action, type)
-                return await sender.send(goal or {}, max(0.0, deadline - time.monotonic()), feedback=feedback)
+        deadline = time.monotonic() + timeout
+        if await self._uses_actionlib(type, min(timeout, DETECT_TIMEOUT)):
+            sender = await self._sender(action, type)
+            return await sender.send(goal or {}, max(0.0, deadline - time.monotonic()), feedback=feedback)
+        if self._types is not None:
+            await self._types.check_goal(action, type, goal or {}, timeout)
         return OperationGoal(self._session, action, type, goal or {}, feedback=feedback)
 
     async def _uses_actionlib(self, type_name: str, limit: float) -> bool:
@@ -521,7 +533,7 @@ def connect(
             limit.
         ping_interval: Seconds of silence after which the server is pinged.
         ping_timeout: Seconds to wait for data after a ping before the connection counts as lost.
-        check_types: Whether messages with a misspelt field or an array of another shape are refused before they
+        check_types: Whether messages, requests and goals with a misspelt field or an array of another shape are refused before they
             are sent, if their type is known.
         on_state: Callback for each new state and its reason.
 

@@ -30,11 +30,6 @@ from bridge.client.protocol.events import (
 from bridge.client.route import Route
 from bridge.client.websocket import CLOSE_TIMEOUT, Limits, Loss, WebSocket, open_websocket
 from bridge.codecs.envelope import topic_in
-from bridge.codecs.message_check import (
-    Definitions,
-    bundled_definitions,
-    definitions_from_rosapi,
-)
 from bridge.errors import (
     BridgeError,
     DecodeError,
@@ -210,7 +205,6 @@ class Session:
         self._looking: asyncio.Task[None] | None = None
         self._probe_timer: asyncio.TimerHandle | None = None
         self._largest_sent = 0
-        self._types_unanswered = False
         self._burst = 0
         self._turn = asyncio.Lock()  # fair: first in, first out
         self._waiting = 0
@@ -530,25 +524,6 @@ class Session:
         except BridgeError:
             return {}
         return answer if isinstance(answer, dict) else {}
-
-    async def learn_type(self, type_name: str) -> None:
-        """Ask for the definition of a type, unless it is known, to check messages before they are sent."""
-        if self.core.publications.is_known(type_name) or self._types_unanswered or not self.is_open:
-            return
-        definitions: Definitions = {}
-        try:
-            args = {"type": self.core.wire.type_name(type_name)}
-            definitions = definitions_from_rosapi(
-                await self.call("/rosapi/message_details", args, _ROSAPI_TIMEOUT)
-            )
-        except NoAnswerError:
-            self._types_unanswered = True
-        except BridgeError as error:
-            _log.debug("the definition of %s is unknown: %s", type_name, error)
-        version = self.core.ros_version
-        if not definitions and version is not None:
-            definitions = await asyncio.to_thread(bundled_definitions, type_name, version)
-        self.core.publications.define(type_name, definitions)
 
     async def call(self, service: str, args: Mapping[str, Any], limit: float) -> Any:
         """Call a service and wait for its answer (see `bridge.client.Ros.call`)."""

@@ -1,8 +1,8 @@
 """Checks of outbound messages against the definition of their type: names of fields, and shapes of arrays.
 
 A message is checked completely if its structure differs from that of the last checked one. The structure consists
-of the keys of the objects outside arrays, and of the Python types and lengths of arrays in their fields. After
-`CLOSELY` messages, only the outermost keys of each message are compared, and the whole structure of every
+of the keys of the objects outside arrays, their scalars, and the Python types and lengths of arrays in their fields.
+After `CLOSELY` messages, only the outermost keys of each message are compared, and the whole structure of every
 `SAMPLE`-th, because comparing nested objects would take a tenth of the time of publishing them. Values of scalars are
 left to the server.
 """
@@ -10,11 +10,14 @@ left to the server.
 import difflib
 from collections.abc import Mapping
 from itertools import cycle
+from types import NoneType
 from typing import Any, Final, NamedTuple
 
 from bridge.errors import MessageTypeError, NameFormError
 from bridge.names import ros1_type, ros2_type
 
+_SCALARS: Final = frozenset({bool, int, float, str, NoneType})
+"""Types of scalars that are recognised at once; another value, for example NumPy's, is looked at."""
 SCALAR: Final = -1
 """Length of a field that is not an array; 0 is an array of any length."""
 CLOSELY: Final = 64
@@ -61,13 +64,13 @@ def definitions_from_rosapi(answer: Any) -> Definitions:
                 "fieldtypes": [*types],
                 "fieldarraylen": [*lengths],
             } if len(names) == len(types) == len(lengths) <= _MAX_FIELDS:
-                if (
-                    all(isinstance(text, str) for text in (*names, *types))
-                    and all(type(length) is int for length in lengths)
-                    and not any(text.startswith("_") for text in names)  # slots of Python, not fields
+                if all(isinstance(text, str) for text in (*names, *types)) and all(
+                    type(length) is int for length in lengths
                 ):
+                    # ROS 2's rosapi gives the slots of Python's classes: `_x` of the field `x`
+                    # (rosapi/objectutils.py, `_handle_array_information`)
                     found[_key(name)] = {
-                        field: FieldType(_key(element), length)
+                        field.removeprefix("_"): FieldType(_key(element), length)
                         for field, element, length in zip(names, types, lengths, strict=True)
                     }
     return found
@@ -110,14 +113,15 @@ def _key(type_name: str) -> str:
 
 
 class _Shape(NamedTuple):
-    """Structure of a checked message: its keys, its objects, and types and lengths of its arrays."""
+    """Structure of a checked message: its keys, scalars and objects, and types and lengths of its arrays."""
 
     keys: tuple[str, ...]
+    scalars: tuple[str, ...]
     objects: tuple[tuple[str, "_Shape"], ...]
     arrays: tuple[tuple[str, type, int], ...]  # the length is checked if it is not 0
 
 
-_NO_SHAPE: Final = _Shape(("",), (), ())
+_NO_SHAPE: Final = _Shape(("",), (), (), ())
 
 
 class MessageCheck:
@@ -153,22 +157,25 @@ class MessageCheck:
             raise MessageTypeError(f"{place[:-1] or 'it'} is {_shown(msg)}, expected an object ({type_name})")
         fields = _TIME_FIELDS if type_name in _TIMES else self._definitions.get(type_name)
         if fields is None:
-            return _Shape(tuple(msg), (), ())
-        objects, arrays = [], []
+            return _Shape(tuple(msg), (), (), ())
+        scalars, objects, arrays = [], [], []
         for name, value in msg.items():
             field = fields.get(name)
             if field is None:
                 raise _unknown_field(type_name, fields, name, place)
             if value is None:
+                scalars.append(name)
                 continue
             if field.length != SCALAR:
                 self._check_array(type_name, field, value, f"{place}{name}")
                 arrays.append((name, type(value), 0 if isinstance(value, str) else field.length))
             elif self._is_object(field.element):
                 objects.append((name, self._shape(field.element, value, f"{place}{name}.")))
-            elif field.element in _PRIMITIVES and _is_nested(value):
-                raise _misshapen(type_name, f"{place}{name}", field, value)
-        return _Shape(tuple(msg), tuple(objects), tuple(arrays))
+            elif field.element in _PRIMITIVES:
+                if _is_nested(value):
+                    raise _misshapen(type_name, f"{place}{name}", field, value)
+                scalars.append(name)
+        return _Shape(tuple(msg), tuple(scalars), tuple(objects), tuple(arrays))
 
     def _is_object(self, element: str) -> bool:
         return element in _TIMES or element in self._definitions
@@ -192,10 +199,22 @@ class MessageCheck:
                 self._shape(field.element, item, f"{place}[{index}].")
 
 
+def check_from_rosapi(answer: Any) -> MessageCheck | None:
+    """Return the check of the first type of rosapi's answer, to which the others belong; None if it cannot be read."""
+    definitions = definitions_from_rosapi(answer)
+    match answer:
+        case {"typedefs": [{"type": str(name)}, *_]} if (key := _key(name)) in definitions:
+            return MessageCheck(key, definitions)
+    return None
+
+
 def _has_shape(msg: Mapping[str, Any], shape: _Shape) -> bool:
-    keys, objects, arrays = shape
+    keys, scalars, objects, arrays = shape
     if tuple(msg) != keys:
         return False
+    for name in scalars:
+        if type(msg[name]) not in _SCALARS:
+            return False
     for name, kind, length in arrays:
         value = msg[name]
         if type(value) is not kind or (length and len(msg[name]) != length):

@@ -56,6 +56,13 @@ async def test_what_cannot_be_a_name_is_refused(name: str) -> None:
             pass
 
 
+@pytest.mark.parametrize("uri", ["robot:9090", "robot:9090/bridge"])
+async def test_a_port_is_no_name_of_a_robot_and_the_sentence_names_the_uri(uri: str) -> None:
+    with pytest.raises(DiscoveryError, match=f"ws://{uri}") as caught:
+        await discovery.announced_uri(uri)
+    assert caught.value.exit_code == 2
+
+
 async def test_without_zeroconf_one_sentence_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     for module in ("zeroconf", "zeroconf.asyncio"):
         monkeypatch.setitem(sys.modules, module, None)

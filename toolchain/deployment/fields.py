@@ -22,6 +22,8 @@ ROBOT: Final = "robot:"
 
 def websocket_uri(uri: str) -> str:
     """Return a WebSocket URI or `robot:NAME`, or raise a ValueError."""
+    if re.fullmatch(rf"{ROBOT}[0-9]+(/.*)?", uri):
+        raise ValueError(f"{uri!r} would be a robot whose name is a number; did you mean 'ws://{uri}'?")
     if uri.startswith(ROBOT) and uri.removeprefix(ROBOT).strip() and uri.isprintable():
         return uri
     try:

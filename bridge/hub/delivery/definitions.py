@@ -218,7 +218,11 @@ class Definitions:
     def _shown(self, name: str) -> str:
         if self.ros_version == 1:
             return _TIMES.get(name) or ros1_type(name)
-        return name.replace("/msg/", "/srv/") if name.endswith(("_Request", "_Response")) else name
+        part = name.rpartition("_")[2]  # names of messages have no underscore
+        kind = next(
+            (kind for kind, parts in PARTS.items() if part in parts and "_" in name.rpartition("/")[2]), "msg"
+        )
+        return name.replace("/msg/", f"/{kind}/")
 
     def _field(self, type_name: str, field: str) -> str:
         return _ROS1_TIME[field] if self.ros_version == 1 and type_name in _TIMES else field

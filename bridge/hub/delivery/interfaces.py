@@ -63,6 +63,9 @@ _SERVICES: Final = {
     "tf2_msgs/FrameGraph": "---\nstring frame_yaml",
 }
 _ROSAPI: Final = {
+    "ActionFeedbackDetails": "string type\n---\nTypeDef[] typedefs",
+    "ActionGoalDetails": "string type\n---\nTypeDef[] typedefs",
+    "ActionResultDetails": "string type\n---\nTypeDef[] typedefs",
     "ActionType": "string action\n---\nstring type",
     "DeleteParam": "string name\n---",
     "GetActionServers": "---\nstring[] action_servers",

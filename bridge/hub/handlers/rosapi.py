@@ -10,6 +10,7 @@ Parameters are a flat dictionary of the hub from names to JSON. A failure with a
 """
 
 from collections.abc import Callable, Iterable
+from functools import partial
 from typing import Any, Final
 
 import orjson
@@ -60,6 +61,17 @@ class Rosapi:
         self._parameter_bytes = 0
         # short name -> type, arguments (all strings) in order, function
         self._services: dict[str, tuple[str, tuple[str, ...], Answer]] = {
+            "action_feedback_details": (
+                "ActionFeedbackDetails",
+                ("type",),
+                partial(self._part_details, "Feedback"),
+            ),
+            "action_goal_details": ("ActionGoalDetails", ("type",), partial(self._part_details, "Goal")),
+            "action_result_details": (
+                "ActionResultDetails",
+                ("type",),
+                partial(self._part_details, "Result"),
+            ),
             "action_servers": ("GetActionServers", (), self._action_servers),
             "action_type": ("ActionType", ("action",), self._action_type),
             "delete_param": ("DeleteParam", ("name",), self._delete_param),
@@ -75,8 +87,16 @@ class Rosapi:
             "search_param": ("SearchParam", ("name",), self._search_param),
             "publishers": ("Publishers", ("topic",), self._publishers),
             "service_host": ("ServiceHost", ("service",), self._service_host),
-            "service_request_details": ("ServiceRequestDetails", ("type",), self._service_request_details),
-            "service_response_details": ("ServiceResponseDetails", ("type",), self._service_response_details),
+            "service_request_details": (
+                "ServiceRequestDetails",
+                ("type",),
+                partial(self._part_details, "Request"),
+            ),
+            "service_response_details": (
+                "ServiceResponseDetails",
+                ("type",),
+                partial(self._part_details, "Response"),
+            ),
             "service_node": ("ServiceNode", ("service",), self._service_node),
             "service_providers": ("ServiceProviders", ("service",), self._service_providers),
             "service_type": ("ServiceType", ("service",), self._service_type),
@@ -170,11 +190,8 @@ class Rosapi:
     def _message_details(self, type_name: str) -> Values:
         return {"typedefs": self._definitions.details(type_name)}
 
-    def _service_request_details(self, type_name: str) -> Values:
-        return self._message_details(part_name(type_name, "Request", self.ros_version))
-
-    def _service_response_details(self, type_name: str) -> Values:
-        return self._message_details(part_name(type_name, "Response", self.ros_version))
+    def _part_details(self, part: str, type_name: str) -> Values:
+        return self._message_details(part_name(type_name, part, self.ros_version))
 
     def _subscribers(self, name: str) -> Values:
         topic = self._graph.topics.get(absolute(name))

@@ -27,7 +27,10 @@ async def test_calls_and_refusals(fake, ros):
     for args, error in (({"a": math.nan}, EncodeError), ({"a": object()}, EncodeError)):
         with pytest.raises(error):
             await ros.call("/add", args)
-    assert len(fake.received) == 51
+    calls = fake.ops("call_service")
+    assert len(calls) == len(fake.received) == 52
+    # without rosapi, the first call asks for the type in vain, and the others do not ask
+    assert [call["service"] for call in calls].count("/rosapi/service_type") == 1
 
 
 async def test_a_request_for_a_service_of_nobody_is_refused_at_once(fake, ros):
@@ -51,7 +54,7 @@ async def test_no_answer_in_time(fake, ros):
 async def test_the_end_of_the_connection_fails_what_waits(fake, ros, end):
     fake.serve("/mute", lambda _args: None)
     call = asyncio.create_task(ros.call("/mute", timeout=30))
-    await fake.wait_for_op("call_service")
+    await fake.wait_for_op("call_service", service="/mute")
     await (fake.cut() if end == "lost" else ros.close())
     with pytest.raises(DisconnectedError, match="/mute"):
         await asyncio.wait_for(call, 120)

@@ -6,7 +6,12 @@ import numpy as np
 import pytest
 
 from bridge.codecs import message_check
-from bridge.codecs.message_check import MessageCheck, bundled_definitions, definitions_from_rosapi
+from bridge.codecs.message_check import (
+    MessageCheck,
+    bundled_definitions,
+    check_from_rosapi,
+    definitions_from_rosapi,
+)
 from bridge.errors import MessageTypeError
 from bridge.hub.delivery.definitions import Definitions
 
@@ -95,9 +100,17 @@ def test_a_misspelt_field_after_right_messages_is_refused(check):
         {"covariance": [0.0] * 35},
         {"covariance": np.zeros((36, 1))},
         {"pose": {"position": {"u": 1}}},
+        {"pose": {"position": {"x": [1]}}},
     ):
         with pytest.raises(MessageTypeError):
             checked({"pose": {"covariance": [0.0] * 36, "pose": {"position": {"x": 1}}} | wrong})
+
+
+def test_an_object_after_none_is_checked(check):
+    checked = check(ODOMETRY)
+    checked({"pose": None})
+    with pytest.raises(MessageTypeError):
+        checked({"pose": {"u": 1}})
 
 
 def test_a_message_of_the_same_structure_is_not_checked_again(check, monkeypatch):
@@ -123,11 +136,25 @@ def test_a_type_that_is_not_a_standard_one_is_not_bundled():
         {"typedefs": [{"type": "a/B", "fieldnames": ["x"], "fieldtypes": [], "fieldarraylen": []}]},
         {"typedefs": [{"type": "a/B", "fieldnames": ["x"], "fieldtypes": [1], "fieldarraylen": [0]}]},
         {"typedefs": [{"type": "a/B", "fieldnames": ["x"], "fieldtypes": ["f"], "fieldarraylen": ["0"]}]},
-        {"typedefs": [{"type": "a/B", "fieldnames": ["_x"], "fieldtypes": ["f"], "fieldarraylen": [0]}]},
     ],
 )
 def test_an_answer_that_is_not_a_definition(answer):
     assert definitions_from_rosapi(answer) == {}
+
+
+def test_names_of_fields_from_ros2s_rosapi_have_an_underscore():
+    typedef = {"type": "a/B", "fieldnames": ["_x"], "fieldtypes": ["int32"], "fieldarraylen": [-1]}
+    assert list(definitions_from_rosapi({"typedefs": [typedef]})["a/B"]) == ["x"]
+
+
+def test_the_check_is_that_of_the_first_type_or_of_none():
+    empty = {"fieldnames": [], "fieldtypes": [], "fieldarraylen": []}
+    checked = check_from_rosapi({"typedefs": [{"type": "a/B_Request", **empty}, {"type": "a/C", **empty}]})
+    with pytest.raises(MessageTypeError, match="a/B_Request"):
+        checked({"x": 1})
+    assert check_from_rosapi({"typedefs": [{"type": "a/B"}, {"type": "a/C", **empty}]}) is None
+    assert check_from_rosapi({"typedefs": []}) is None
+    assert check_from_rosapi(None) is None
 
 
 def test_parts_of_unknown_type_are_not_checked():

@@ -186,6 +186,7 @@ def test_another_format_is_reported_before_anything_else(folder, new):
         ("ws://a:9090", "http://a:9090", 10, ("source", 0, "uri")),
         ("ws://a:9090", "ws://a:90900", 10, ("source", 0, "uri")),
         ("ws://a:9090", "robot: ", 10, ("source", 0, "uri")),
+        ("ws://a:9090", "robot:9090", 10, ("source", 0, "uri")),
         ("ws://a:9090", "ws://[::1", 10, ("source", 0, "uri")),
         ("max_cycles = 131072", f"max_cycles = {2**63}", 65, ("machine", "max_cycles")),
         ("boat_msgs/Sensors", "Sensors", 12, ("source", 0, "type")),

@@ -1,12 +1,13 @@
 """A message that does not fit its type is refused before it is sent, if the type is known."""
 
+import asyncio
 import time
 
 import pytest
 
-from bridge.client import connect
+from bridge.client import State, connect
 from bridge.codecs.message_check import CLOSELY, SAMPLE
-from bridge.errors import MessageTypeError
+from bridge.errors import MessageTypeError, ServiceError
 from tests.bridge.hub.sockets import running_hub
 
 TWIST = "geometry_msgs/Twist"
@@ -96,3 +97,75 @@ async def test_a_publisher_of_many_right_messages_is_watched_less_closely(fake, 
         except MessageTypeError:
             refused += 1
     assert refused >= 1
+
+
+@pytest.mark.parametrize("version", [1, 2])
+async def test_a_request_and_an_answer_are_checked_like_messages(version):
+    async with (
+        running_hub(ros_version=version) as port,
+        connect(f"ws://127.0.0.1:{port}") as server,
+        connect(f"ws://127.0.0.1:{port}") as ros,
+        connect(f"ws://127.0.0.1:{port}", check_types=False) as unchecked,
+    ):
+        asked = []
+
+        async def switch(args):
+            asked.append(args)
+            return {"success": True} if args["data"] else {"sucess": False}
+
+        await server.advertise_service("/switch", "std_srvs/SetBool", switch)
+        assert (await ros.call("/switch", {"data": True}))["success"] is True
+        for wrong in ({"dta": True}, {"data": [True]}):
+            with pytest.raises(MessageTypeError, match="/switch"):
+                await ros.call("/switch", wrong)
+        assert asked == [{"data": True}]
+        with pytest.raises(ServiceError, match="sucess"):
+            await ros.call("/switch", {"data": False})
+        await unchecked.call("/switch", {"data": True, "dta": True})
+        assert asked[-1]["dta"] is True
+
+
+@pytest.mark.parametrize(
+    ("version", "type_name"),
+    [
+        (1, "actionlib_tutorials/FibonacciAction"),
+        (1, "example_interfaces/action/Fibonacci"),
+        (2, "example_interfaces/action/Fibonacci"),
+        (2, "example_interfaces/Fibonacci"),
+    ],
+)
+async def test_a_goal_is_checked_and_the_version_of_the_server_decides(version, type_name):
+    async with (
+        running_hub(ros_version=version) as port,
+        connect(f"ws://127.0.0.1:{port}") as server,
+        connect(f"ws://127.0.0.1:{port}") as ros,
+    ):
+
+        async def count(goal):
+            return {"sequence": list(range(goal.values["order"]))}
+
+        async with await server.advertise_action("/count", type_name, count):
+            await server.call("/rosapi/get_time")
+            for wrong in ({"odrer": 3}, {"order": [3]}):
+                with pytest.raises(MessageTypeError):
+                    await ros.send_goal("/count", type_name, wrong)
+            async with await ros.send_goal("/count", type_name, {"order": 3}, timeout=60) as goal:
+                assert (await goal.result(60)).values["sequence"] == [0, 1, 2]
+
+
+async def test_the_type_of_a_service_is_asked_once_for_each_connection(fake, ros):
+    fake.serve("/add", lambda args: args)
+    fake.serve("/rosapi/service_type", lambda _args: {"type": "p/Add"})
+    typedef = {"type": "p/AddRequest", "fieldnames": ["a"], "fieldtypes": ["int64"], "fieldarraylen": [-1]}
+    fake.serve("/rosapi/service_request_details", lambda _args: {"typedefs": [typedef]})
+    for connection, (right, wrong) in enumerate((("a", "b"), ("b", "a"))):
+        typedef["fieldnames"] = [right]
+        requests = [{right: n} for n in range(3)]
+        assert await asyncio.gather(*(ros.call("/add", request) for request in requests)) == requests
+        with pytest.raises(MessageTypeError):
+            await ros.call("add", {wrong: 1})
+        for question in ("service_type", "service_request_details"):
+            assert len(fake.ops("call_service", service=f"/rosapi/{question}")) == connection + 1
+        await fake.cut()
+        await fake.wait_for_connections(connection + 2)
+        await ros.wait_for_state(State.CONNECTED, 60)

@@ -130,6 +130,22 @@ def test_details_of_services(ros_version: Any, type_name: str, request_type: str
     assert empty["fieldnames"] == []
 
 
+@pytest.mark.parametrize(
+    ("ros_version", "type_name", "goal_type"),
+    [
+        (1, "actionlib_tutorials/Fibonacci", "actionlib_tutorials/FibonacciGoal"),
+        (2, "example_interfaces/action/Fibonacci", "example_interfaces/action/Fibonacci_Goal"),
+    ],
+)
+def test_details_of_actions(ros_version: Any, type_name: str, goal_type: str) -> None:
+    peer = Harness(ros_version=ros_version).connect()
+    (goal,) = peer.rosapi("action_goal_details", type=type_name)["typedefs"]
+    assert (goal["type"], goal["fieldnames"]) == (goal_type, ["order"])
+    for part in ("result", "feedback"):
+        (found,) = peer.rosapi(f"action_{part}_details", type=type_name)["typedefs"]
+        assert (found["fieldnames"], found["fieldarraylen"]) == (["sequence"], [0])
+
+
 @pytest.mark.parametrize("ros_version", [1, 2])
 def test_services_of_rosapi_are_defined(ros_version: Any) -> None:
     peer = Harness(ros_version=ros_version).connect()
