@@ -16,7 +16,7 @@ RECENT_S: Final = 10.0
 
 
 class Readiness:
-    """Whether a process has worked within the last `RECENT_S` seconds."""
+    """Readiness of a process: true if it has worked within the last `RECENT_S` seconds."""
 
     def __init__(self, work: str) -> None:
         """Start with no work done; `work` names it in the past tense, such as "a reading was published"."""

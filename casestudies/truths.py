@@ -98,7 +98,7 @@ class Truths:
 
     @property
     def waits(self) -> bool:
-        """Whether a frame waits for its truth."""
+        """True while a frame waits for its truth."""
         return bool(self._untrue)
 
     def add_frame(self, heard: FrameOutcome) -> list[Instance]:

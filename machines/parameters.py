@@ -170,7 +170,7 @@ class BM1Parameters:
 
     @property
     def has_tables(self) -> bool:
-        """Whether sensor columns have tables; in `threshold` mode their inputs are codes."""
+        """True if sensor columns have tables; in `threshold` mode their inputs are codes."""
         return self.sensor_mode is not SensorMode.THRESHOLD
 
     @property

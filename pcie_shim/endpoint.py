@@ -50,7 +50,7 @@ class Endpoint:
 
     @property
     def is_loopback(self) -> bool:
-        """Whether only programs of this machine reach it."""
+        """True if only programs of this machine can reach it."""
         if not self.host or self.host == "localhost":
             return True
         try:

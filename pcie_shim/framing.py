@@ -97,7 +97,7 @@ class FrameDecoder:
 
     @property
     def inside_frame(self) -> bool:
-        """Whether the buffer contains an incomplete frame."""
+        """True while the buffer contains an incomplete frame."""
         return self._end > self._start
 
     def room(self) -> memoryview:

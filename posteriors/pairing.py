@@ -37,7 +37,7 @@ class Pairing:
 
     @property
     def waits(self) -> bool:
-        """Whether a posterior is waiting for its report."""
+        """True while a posterior is waiting for its report."""
         return bool(self._posteriors)
 
     def add_report(self, report: FrameReport) -> list[FrameOutcome]:

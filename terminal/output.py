@@ -20,7 +20,7 @@ _CLEAR_LINE: Final = "\r\x1b[K"
 
 
 class _Progress:
-    """Whether the last line of the terminal shows the progress, which the next line replaces."""
+    """State of the terminal: `shown` is true while its last line is a progress, which the next line replaces."""
 
     shown = False
 

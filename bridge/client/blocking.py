@@ -270,7 +270,7 @@ class BlockingGoalRequest(_Blocking[GoalRequest]):
 
     @property
     def canceling(self) -> bool:
-        """Whether the sender wants the goal cancelled, or nobody waits for its result any more."""
+        """True if the sender has cancelled the goal, or nobody waits for its result any more."""
         return self._async.canceling
 
     def wait_canceling(self, timeout: float) -> bool:
@@ -316,7 +316,7 @@ class BlockingGoal(_Blocking[Goal]):
 
     @property
     def done(self) -> bool:
-        """Whether the goal has ended."""
+        """True if the goal has ended."""
         return self._async.done
 
     def __iter__(self) -> Self:

@@ -351,7 +351,7 @@ class Publication(Handle):
 
     @property
     def must_wait(self) -> bool:
-        """Whether a message would have to wait for a slow server or for a connection."""
+        """True while a message would have to wait for a slow server or for a connection."""
         return not self._session.is_open or self._session.must_wait()
 
     async def ready(self, timeout: float = 5.0) -> None:

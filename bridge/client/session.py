@@ -413,7 +413,7 @@ class Session:
 
     @property
     def is_open(self) -> bool:
-        """Whether there is a connection that accepts messages."""
+        """True while there is a connection that accepts messages."""
         return self._websocket is not None and self._websocket.is_open
 
     def check_thread(self) -> None:

@@ -51,7 +51,7 @@ class Client:
     fragments: Reassembler | None = None
     """The client's incomplete messages, once it has sent a fragment."""
     wants_status: bool = False
-    """Whether the client requested status messages about refusals."""
+    """True if the client requested status messages about refusals."""
     status_lane: Lane | None = None
     """The queue of the client's status messages, once there was one."""
     last_published: "Advertisement | None" = None
@@ -61,7 +61,7 @@ class Client:
     close_reason: str = ""
     """Reason why the client must be disconnected, or empty."""
     is_ready: bool = False
-    """Whether the client is in the dispatcher's list of those with output."""
+    """True while the client is in the dispatcher's list of those with output."""
 
     @property
     def node(self) -> str:
@@ -109,7 +109,7 @@ class Subscription:
     lane: Lane = field(default_factory=Lane)
     compression: Compression = Compression.NONE
     typed: bool = False
-    """Whether the client named a type, which fixes the topic's."""
+    """True if the client named a type, which becomes the type of the topic."""
     options: dict[OperationId, SubscribeOptions] = field(default_factory=dict)
     """Options by operation; the least of each applies, as on the reference server."""
 
@@ -125,7 +125,7 @@ class Topic:
     advertisements: dict[Client, Advertisement] = field(default_factory=dict)
     subscriptions: dict[Client, Subscription] = field(default_factory=dict)
     latching: bool = False
-    """Whether one of its publishers latches."""
+    """True while one of its publishers latches."""
     latched: bytes | None = None
     """The last message as JSON, while a publisher latches."""
 

@@ -23,7 +23,7 @@ from websockets.server import ServerProtocol
 from bridge.transport import frames
 
 QUICK_FRAMES = os.environ.get("ROSBAYES_QUICK_FRAMES", "1") != "0"
-"""Whether new connections read and write whole messages without the library; 0 disables this."""
+"""True if new connections read and write whole messages without the library; 0 disables this."""
 
 MESSAGE_BYTES_HEADER: Final = "Rosbridge-Message-Bytes"
 """Header of the hub's handshake: maximum size in bytes of the messages that it accepts."""
@@ -109,7 +109,7 @@ class WebSocketTransport(asyncio.Protocol):
 
     @property
     def is_connected(self) -> bool:
-        """Whether there is, or was, a socket."""
+        """True if there is, or was, a socket."""
         return self._transport is not None
 
     @property
@@ -119,7 +119,7 @@ class WebSocketTransport(asyncio.Protocol):
 
     @property
     def is_closing(self) -> bool:
-        """Whether there is no socket, or it is about to close."""
+        """True if there is no socket, or it is about to close."""
         return self._transport is None or self._transport.is_closing()
 
     # Sending
@@ -149,7 +149,7 @@ class WebSocketTransport(asyncio.Protocol):
 
     @property
     def never_reads(self) -> bool:
-        """Whether the connection was ended because the peer read none of very many answers."""
+        """True if the connection was ended because the peer read none of very many answers."""
         return self._unread > _MAX_UNREAD * self._max_size
 
     def ping(self) -> None:

@@ -116,7 +116,7 @@ class Viewer:
 
     @property
     def done(self) -> bool:
-        """Whether all requested results have arrived."""
+        """True if all requested results have arrived."""
         return self.count is not None and self.results >= self.count
 
     def add(self, instance: "Instance") -> Line:

@@ -247,7 +247,7 @@ class Session:
 
     @property
     def is_plain(self) -> bool:
-        """Whether inputs are in SENSORS."""
+        """True if the inputs are in SENSORS."""
         return self.parameters.replicas == 1 and self.parameters.sensor_mode is SensorMode.COLUMN
 
     def chance(self, probability: float) -> bool:

@@ -62,7 +62,7 @@ class Outcome:
 
     @property
     def passed(self) -> bool:
-        """Whether every test of the bench passed."""
+        """True if every test of the bench passed."""
         return not self.failures
 
 

@@ -92,7 +92,7 @@ class EmulatedBoard:
 
     @property
     def interrupt_enabled(self) -> bool:
-        """Whether the host has enabled interrupts."""
+        """True if the host has enabled interrupts."""
         return bool(self._memory[rm.CONTROL] & rm.CONTROL_INTERRUPT_ENABLE_MASK)
 
     def _power_up(self) -> None:
@@ -456,7 +456,7 @@ class EmulatedBoard:
 
     @property
     def is_sliced(self) -> bool:
-        """Whether the machine stopped at the end of a slice, so that its counts are not final."""
+        """True if the machine stopped at the end of a slice, so that its counts are not final."""
         return self._kernel is not None and self._kernel.reason is StopReason.SLICE
 
     def with_flipped_counter(self, words: bytes) -> bytes:

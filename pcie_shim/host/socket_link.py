@@ -147,7 +147,7 @@ class SocketLink(Link):
 
     @property
     def is_open(self) -> bool:
-        """Whether the link can be used."""
+        """True while the link can be used."""
         return not self._closed
 
     def fileno(self) -> int:

@@ -54,7 +54,7 @@ BOARD_ENDS = 3
 """Frames of a round that may fail on boards: the fourth within a minute ends a master by design."""
 ENDS = {"master": 1, "hub": 2, "boards": BOARD_ENDS}
 MOST_ENDS = 2
-"""How often a round may end a process of another role, or its connection to the master."""
+"""Number of times per round that a process of another role, or its connection to the master, may be ended."""
 MISBEHAVIOURS = (
     *("drop", "stall", "short-read", "endless", "wrong-sequence"),
     *("wrong-crc", "all-ones", "never-done", "done-twice", "done-early", "stale-result"),

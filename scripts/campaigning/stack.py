@@ -45,12 +45,12 @@ class Topology(StrEnum):
 
     @property
     def fused(self) -> bool:
-        """Whether the services are inside the master."""
+        """True if the services are inside the master."""
         return self in {Topology.FUSED, Topology.FUSED_APART}
 
     @property
     def apart(self) -> bool:
-        """Whether the campaign starts the boards, instead of the master."""
+        """True if the campaign starts the boards, instead of the master."""
         return self in {Topology.APART, Topology.FUSED_APART}
 
 

@@ -74,7 +74,7 @@ class Register:
 
     @property
     def written(self) -> bool:
-        """Whether software writes the field."""
+        """True if software writes the field."""
         return bool(self.stored | self.pulsed)
 
 

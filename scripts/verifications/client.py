@@ -58,7 +58,7 @@ class Stand:
 
     @property
     def real(self) -> bool:
-        """Whether this is a real ROS 2 server."""
+        """True for a real ROS 2 server."""
         return self.kind is KINDS["real"]
 
     def topic(self) -> str:

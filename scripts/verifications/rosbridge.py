@@ -255,7 +255,7 @@ class Stand:
 
     @property
     def serves(self) -> bool:
-        """Whether the server is running."""
+        """True while the server is running."""
         return self._server is not None
 
     @property

@@ -39,7 +39,7 @@ class Canaries:
 
     @property
     def is_owed(self) -> bool:
-        """Whether a canary must run before the next frame."""
+        """True if a canary must run before the next frame."""
         return self._debt >= self._frames
 
     def count_frame(self) -> None:

@@ -281,7 +281,7 @@ class DeployedBoards:
 
     @property
     def is_canary_owed(self) -> bool:
-        """Whether a canary must run before the next frame."""
+        """True if a canary must run before the next frame."""
         return self.canaries is not None and not self.gone and self.canaries.is_owed
 
     @property
@@ -296,7 +296,7 @@ class DeployedBoards:
 
     @property
     def is_late(self) -> bool:
-        """Whether a board of the posted frame exceeded its deadline; `collect` raises an error that names it."""
+        """True if a board of the posted frame exceeded its deadline; `collect` raises an error that names it."""
         return self._cluster is not None and not self._cluster.seconds_left
 
     def _whole_cluster(self) -> MiniCluster:

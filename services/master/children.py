@@ -15,7 +15,7 @@ _ANSWER_TIME = 2.0
 
 
 class ChildrenWatch:
-    """Whether the processes that a master started make progress, according to their own `/healthz`.
+    """The progress of the processes that a master started, according to their `/healthz`.
 
     A child that is being restarted does not count: the master knows of it. One that is stopped or stuck
     while nothing is expected of it would otherwise go unnoticed.

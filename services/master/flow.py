@@ -112,7 +112,7 @@ class FrameFlow:
         self.first_reading_at: float | None = None
         """Monotonic time of the first complete reading."""
         self.has_data = False
-        """Whether a message has arrived, usable or not."""
+        """True if a message has arrived, usable or not."""
         self.end: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         """Completed at the end of the run, with its error if any."""
 

@@ -46,7 +46,7 @@ class FusedLink(Link):
 
     @property
     def has_master(self) -> bool:
-        """Whether the link is open."""
+        """True while the link is open."""
         return self._to_master is not None
 
     def send(self, record: Record) -> bool:

@@ -77,7 +77,7 @@ class Peer:
         self.greeted = False
         self.ready = False
         self.away = False
-        """Whether it has lost its rosbridge servers."""
+        """True while it has no connection to its rosbridge servers."""
         self.closed = asyncio.Event()
         self.reason: Exception | None = None
         self.since = 0.0

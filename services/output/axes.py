@@ -25,7 +25,7 @@ class Axis:
 
     @property
     def has_states(self) -> bool:
-        """Whether cells have names instead of values."""
+        """True if cells have names instead of values."""
         return self.dimension is not None and bool(self.dimension.states)
 
     def value(self, index: float) -> float | str:

@@ -1,4 +1,4 @@
-"""Whether the rosbridge servers pass results on: rosapi tells which type a topic has after it was advertised."""
+"""Check that rosbridge servers forward results: rosapi reports the type of a topic after it was advertised."""
 
 import asyncio
 from collections.abc import Iterable

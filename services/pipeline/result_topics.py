@@ -117,12 +117,12 @@ class ResultTopics:
 
     @property
     def is_connected(self) -> bool:
-        """Whether any server is connected."""
+        """True while at least one server is connected."""
         return bool(self._connected())
 
     @property
     def must_wait(self) -> bool:
-        """Whether no server is connected, or earlier messages still wait for one."""
+        """True while no server is connected, or earlier messages still wait for one."""
         connected = self._connected()
         return not connected or any(publication.must_wait for publication in connected)
 

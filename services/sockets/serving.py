@@ -26,7 +26,7 @@ class Link(Protocol):
 
     @property
     def has_master(self) -> bool:
-        """Whether a master is connected and has greeted."""
+        """True while a master is connected and has greeted."""
 
     @property
     def backlog(self) -> int:
@@ -155,7 +155,7 @@ class MasterLink(Link):
 
     @property
     def has_master(self) -> bool:
-        """Whether a master is connected and has greeted."""
+        """True while a master is connected and has greeted."""
         return self._master is not None and self._greeted
 
     @property

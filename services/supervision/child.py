@@ -104,7 +104,7 @@ class Child:
 
     @property
     def is_running(self) -> bool:
-        """Whether the process was started and has not ended."""
+        """True while the process runs."""
         return self._process is not None and self._process.returncode is None
 
     def set_flag(self, flag: str, value: str | None = None) -> None:

@@ -1,4 +1,4 @@
-"""Where no container engine can run, that is said in a sentence; and counts as a failure where it must not."""
+"""A host that cannot run a container engine gets a sentence, which is a failure where an engine is required."""
 
 import os
 import shutil

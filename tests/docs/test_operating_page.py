@@ -40,7 +40,7 @@ TEXTS = {
 
 
 def is_printed(alarm):
-    """Whether every piece of an alarm between its `…` (one sentence may quote another) stands in the sources."""
+    """Return whether every part of an alarm between its `…` (one sentence may quote another) is in the sources."""
     pieces = [piece for piece in re.split("…|: ", alarm) if len(re.sub(r"\W", "", piece)) > 2]
     return bool(pieces) and all(any(piece.strip() in text for text in TEXTS) for piece in pieces)
 

@@ -21,7 +21,7 @@ def test_a_runtime_directory_that_is_none_is_passed_over(tmp_path, monkeypatch, 
 
 @pytest.fixture
 def place(tmp_path, monkeypatch):
-    """Where runs have their directories, in this test."""
+    """The directory of all run directories in this test."""
     monkeypatch.setenv("XDG_RUNTIME_DIR", "")
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     return tmp_path

@@ -57,7 +57,7 @@ class BuildOptions:
     prob_bits: int = 8
     """Bits of a code (W)."""
     prior_mode: PriorMode = PriorMode.TABLE
-    """Whether the prior is a table in the images or written by the host."""
+    """Source of the prior: a table in the images, or the host."""
     prior_path: str | None = None
     """The path of a written prior in the message, with one number per line; None if it comes from elsewhere.
     """
@@ -68,7 +68,7 @@ class BuildOptions:
     max_cycles: int = 2**17
     """Maximum number of cycles."""
     stop: Stop = Stop.SLICES
-    """Whether boards stop together after slices, or each at its own overflow."""
+    """Stop rule: all boards together after a slice, or each at its own overflow."""
     rng: RngKind = RngKind.LFSR32
     """Kind of the random number generators."""
     rng_table: NDArray[np.uint32] | None = None
@@ -84,7 +84,7 @@ class BuildOptions:
     rng_banks: int = 16
     """Number of seed sets."""
     rng_reset: RngReset = RngReset.BANK
-    """Whether a frame restarts the generators."""
+    """Reset rule of the generators: whether each frame restarts them."""
     queue: Queue = Queue.LATEST
     """The readings that wait if they arrive faster than frames are computed."""
     tolerance_s: float = 0.05

@@ -57,7 +57,7 @@ class DeploymentEdits:
     max_cycles: int | None = None
     """Maximum number of cycles."""
     stop: Stop | None = None
-    """Whether boards stop together."""
+    """Stop rule of the boards."""
     queue: Queue | None = None
     """The readings that wait if they arrive too fast."""
     tolerance_s: float | None = None

@@ -44,7 +44,7 @@ class Difference:
 
     @property
     def is_connection(self) -> bool:
-        """Whether it is about servers, topics and boards' addresses, not about the machine."""
+        """True if it concerns servers, topics or addresses of boards, and not the machine."""
         return self.field.startswith(("[[source]]", "[[output]]")) or self.field.endswith(" endpoint")
 
     def __str__(self) -> str:

@@ -194,7 +194,7 @@ class MachineSection(Section):
 
     @property
     def is_plain(self) -> bool:
-        """Whether there is one machine with one reading per column, and so one posterior per result."""
+        """True for one machine with one reading per column, and so one posterior per result."""
         return self.replicas == 1 and self.sensor_mode is SensorMode.COLUMN
 
     @property

@@ -36,7 +36,7 @@ class Scanner:
         self._signs = re.compile(f"[{signs}]")
         self._token = re.compile(rf'\s*(?:"([^"\n]*)"|([{signs}])|([^\s{signs}"]+)|(\Z)|(.))')
         self.quoted = False
-        """Whether the last word was quoted."""
+        """True if the last word was quoted."""
 
     def error(self, sentence: str) -> NetworkFileError:
         """Return an error at the line of the last token."""

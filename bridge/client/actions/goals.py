@@ -78,7 +78,7 @@ class Goal:
 
     @property
     def done(self) -> bool:
-        """Whether the goal has ended."""
+        """True if the goal has ended."""
         return self._ended.done()
 
     async def cancel(self) -> None:

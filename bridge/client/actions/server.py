@@ -38,11 +38,11 @@ class GoalRequest:
 
     @property
     def canceling(self) -> bool:
-        """Whether the sender wants the goal cancelled."""
+        """True if the sender has cancelled the goal."""
         return self._canceling.is_set()
 
     async def wait_canceling(self) -> None:
-        """Wait until the sender wants the goal cancelled."""
+        """Wait until the sender has cancelled the goal."""
         await self._canceling.wait()
 
     def ask_to_cancel(self) -> None:

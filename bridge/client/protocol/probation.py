@@ -32,7 +32,7 @@ class Probation:
 
     @property
     def is_settled(self) -> bool:
-        """Whether the last returned suspect has had a message."""
+        """True if a message of the last returned suspect has arrived."""
         return self._current in self._heard
 
     def holds(self, topic: str) -> bool:

@@ -51,7 +51,7 @@ class _Subscribed:
     has_messages: bool = False
     renewals: int = 0
     as_json: bool = False
-    """Whether JSON is asked for instead of CBOR."""
+    """True if the subscription requests JSON instead of CBOR."""
     envelopes_tried: int = 0
     discarded: int = 0
 

@@ -78,7 +78,7 @@ class Definitions:
         self.load_in_background: Callable[[], None] | None = None
         """Starts a thread for `load`; without it, loading blocks the operation that needs definitions."""
         self.pending = False
-        """Whether an operation waits for `load`."""
+        """True while an operation waits for `load`."""
         self._store: Typestore | None = None
         self._missing = False
         self._typed: dict[str, _Convert] = {}

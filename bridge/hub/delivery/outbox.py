@@ -98,7 +98,7 @@ class Outbox:
         self.undroppable = 0
         """Bytes of answers and requests in the queue."""
         self.overflowed = False
-        """Whether output that cannot be dropped exceeded the bound: the client does not read its answers.
+        """True if output that cannot be dropped exceeds the bound: the client does not read its answers.
         """
         self.deadline = inf
         """When `release` may have something to do (monotonic seconds), infinity for never."""

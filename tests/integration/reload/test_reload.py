@@ -71,7 +71,7 @@ class Witness(Robot):
         return stamp_ns
 
     def generations(self):
-        """How many results there were of each generation; each must be that one's, to the bit."""
+        """Return the number of results of each generation, after comparing each with that generation bit for bit."""
         found = Counter()
         numbers = []
         published = [frame for frame in self.frames if frame["status"][0]["level"] == 0]

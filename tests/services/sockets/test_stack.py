@@ -142,7 +142,7 @@ async def test_what_a_process_says_can_not_write_over_the_terminal(tmp_path):
 
 @pytest.fixture
 def places(tmp_path, monkeypatch):
-    """Where runs are looked for: nothing but this test's."""
+    """The directory that is searched for runs; it contains only those of this test."""
     monkeypatch.setattr(status.tempfile, "gettempdir", lambda: str(tmp_path))
     monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
     monkeypatch.delenv("BM_RUN_DIRECTORY", raising=False)

@@ -67,7 +67,7 @@ class Estimate:
 
     @property
     def fits(self) -> bool:
-        """Whether the machine can be placed and routed."""
+        """True if the machine can be placed and routed."""
         return self.why_not == ""
 
     @property

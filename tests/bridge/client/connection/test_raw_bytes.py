@@ -69,7 +69,7 @@ async def says(data: bytes, at_once: bytes = b"") -> AsyncIterator[tuple[int, as
 
 
 async def hears(data: bytes, **options: Any) -> tuple[str, int]:
-    """What the client says of a server that says this: the last error, and how much was of no use."""
+    """Return the client's last error and its number of unusable messages after a server has sent these bytes."""
     problems: list[dict[str, Any]] = []
     asyncio.get_running_loop().set_exception_handler(lambda _loop, context: problems.append(context))
     async with says(data) as (port, go), connect(f"ws://127.0.0.1:{port}", **options) as ros:
