@@ -38,7 +38,7 @@ class MisbehaviourKind(StrEnum):
     DONE_TWICE = "done-twice"
     """An interrupt is sent twice, as two interrupts with the same doorbell number."""
     DONE_EARLY = "done-early"
-    """An interrupt is sent while the machine is still running."""
+    """An interrupt is sent before the machine has run."""
     STALE_RESULT = "stale-result"
     """An interrupt has the doorbell number and the results of the one before."""
     FLIP_TABLE = "flip-table"

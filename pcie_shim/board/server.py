@@ -369,6 +369,8 @@ class _Server:
             if self._misbehaviour is not None and not board.running:
                 rings = address <= register_map.RESUME and address + 4 * count > register_map.START
                 board.stuck = rings and self._misbehaves(MisbehaviourKind.NEVER_DONE, ahead=1)
+                if rings and self._misbehaves(MisbehaviourKind.DONE_EARLY, ahead=1):
+                    self._interrupt(host)
                 if rings and self._misbehaves(MisbehaviourKind.FLIP_TABLE, ahead=1):
                     board.flip_used_bit()
             board.write(address, payload)
@@ -377,8 +379,6 @@ class _Server:
                 self._send(host, framing.WRITE, framing.REPLY, sequence, address, b"")
             if board.done != done or board.running:
                 self._starts += 1
-                if self._misbehaves(MisbehaviourKind.DONE_EARLY):
-                    self._interrupt(host)
                 self._interrupt_if_done()
         else:
             raise FramingError(f"the register port does not support operation {operation}")

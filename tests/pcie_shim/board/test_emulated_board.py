@@ -1,6 +1,7 @@
 """The emulated board without sockets: its registers, the accesses that it refuses, and its machine."""
 
 import struct
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from machines.kernel import BM1Kernel, make_kernel
 from machines.parameters import CYCLES_MAX, PriorMode, RngKind, RngReset
 from pcie_shim import register_map as rm
 from pcie_shim.board import emulated_board
-from pcie_shim.board.emulated_board import EmulatedBoard, RefusedError
+from pcie_shim.board.emulated_board import CHUNK_S, EmulatedBoard, RefusedError
 from pcie_shim.programming_file import image_bytes
 from pcie_shim.register_layout import next_doorbell
 from pcie_shim.register_map import BoardState, ErrorCode
@@ -57,7 +58,10 @@ def start(board: EmulatedBoard, *addresses: int, number: int = 0, **settings_) -
 
 
 def refused(code: ErrorCode):
-    return pytest.raises(RefusedError, check=lambda error: error.code is code)
+    """An error of this code; its sentence has no full stop, because the host continues it."""
+    return pytest.raises(
+        RefusedError, check=lambda error: error.code is code and not str(error).endswith(".")
+    )
 
 
 def test_what_only_replicas_have_is_not_there_without_them(board: EmulatedBoard) -> None:
@@ -304,6 +308,19 @@ def test_a_long_run_is_cut_into_chunks_that_can_be_reset() -> None:
     with refused(ErrorCode.DOORBELL):
         board.write(rm.START, words(1, 1))
     assert board.running
+
+
+def test_a_chunk_takes_its_time_whatever_the_speed(monkeypatch: pytest.MonkeyPatch) -> None:
+    board = programmed(never_stopping())
+    start(board, 1, target=2**32 - 1, max_cycles=CYCLES_MAX)
+    for nanoseconds in (1_000, 20_000, 1_000):  # per cycle, of a clock that stands still between chunks
+        clock = SimpleNamespace(perf_counter_ns=lambda each=nanoseconds: board._kernel.cycles * each)
+        monkeypatch.setattr(emulated_board, "time", clock)
+        for _ in range(20):
+            before = read64(board, rm.CYCLES)
+            board.step()
+        seconds = (read64(board, rm.CYCLES) - before) * nanoseconds * 1e-9
+        assert 0.4 * CHUNK_S < seconds < 1.6 * CHUNK_S
 
 
 def test_a_reset_restarts_the_rngs_and_keeps_done() -> None:
