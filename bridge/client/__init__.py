@@ -1,17 +1,11 @@
 """The asyncio rosbridge client."""
 
-from bridge.client.ros import (
-    Goal,
-    GoalRequest,
-    Message,
-    Publication,
-    Qos,
-    Ros,
-    Service,
-    State,
-    Subscription,
-    connect,
-)
+from bridge.client.actions.goals import Goal
+from bridge.client.actions.server import GoalRequest
+from bridge.client.handles import Publication, Service, Subscription
+from bridge.client.ros import Ros, connect
+from bridge.client.session import Message, State
+from bridge.qos import Qos
 
 __all__ = [
     "Goal",

@@ -44,19 +44,6 @@ from bridge.qos import Qos
 if TYPE_CHECKING:
     from bridge.client.tf import Transforms
 
-__all__ = [
-    "Goal",
-    "GoalRequest",
-    "Message",
-    "Publication",
-    "Qos",
-    "Ros",
-    "Service",
-    "State",
-    "Subscription",
-    "connect",
-]
-
 DETECT_TIMEOUT: Final = 2.0
 """Timeout in seconds for detecting the ROS version of the server."""
 FAREWELL_TIMEOUT: Final = 0.3

@@ -190,16 +190,21 @@ async def outcome_of(link):
     return found[-1].outcome, found[-1].missed
 
 
+def refuse_results(fake, other):
+    """Let the server know the topic with another type, or, with an empty one, not allow it."""
+    if other:
+        fake.know("/BMresults", other)
+    else:
+        fake.refused_topics.add("/BMresults")
+
+
 @pytest.mark.parametrize("other", ["std_msgs/msg/String", ""])
 async def test_results_that_nobody_can_receive_are_lost(boat, link, monkeypatch, other):
     """The topic has another type, or the server's `topics_glob` refuses it."""
     monkeypatch.setattr("services.pipeline.publisher.SETTLED_TIME", 0.01)
     monkeypatch.setattr("services.pipeline.publisher.CHECK_INTERVAL", 0.01)
     async with FakeRosbridge(rosapi=True) as fake:
-        if other:
-            fake.know("/BMresults", other)
-        else:
-            fake.refused_topics.add("/BMresults")
+        refuse_results(fake, other)
         _, running = await running_publisher(boat, link, fake.uri)
         while not any(isinstance(each, Notice) for each in link.sent):
             await asyncio.sleep(0.01)
@@ -228,10 +233,7 @@ async def test_reports_that_nobody_can_receive_cost_no_results(boat, link):
 @pytest.mark.parametrize("other", ["std_msgs/msg/String", ""])
 async def test_one_result_that_nobody_can_receive_is_an_error(boat, link, other):
     async with FakeRosbridge(rosapi=True) as fake:
-        if other:
-            fake.know("/BMresults", other)
-        else:
-            fake.refused_topics.add("/BMresults")
+        refuse_results(fake, other)
         _, running = await running_publisher(boat, link, fake.uri)
         link.take(Begin(once=True))
         link.take(result(boat, 1))
