@@ -18,7 +18,7 @@ from bridge.client.actions.actionlib import base_type, is_actionlib_type
 from bridge.client.actions.actionlib_goals import ActionlibSender
 from bridge.client.actions.actionlib_server import ActionlibServer
 from bridge.client.actions.goals import Goal, OperationGoal
-from bridge.client.actions.server import ActionServer, GoalHandler, GoalRequest
+from bridge.client.actions.server import ActionServer, GoalHandler
 from bridge.client.graph import NodeDetails, Params, ask_definitions, ask_names, ask_node, ask_text
 from bridge.client.handles import (
     PUBLISH_QUEUE_SIZE,
@@ -31,7 +31,7 @@ from bridge.client.handles import (
 from bridge.client.protocol import ClientCore, Compression, Delivery, RosVersion
 from bridge.client.protocol.events import StatusReceived
 from bridge.client.route import Path, make_route, shown
-from bridge.client.session import Message, Session, State, StateCallback
+from bridge.client.session import Session, State, StateCallback
 from bridge.client.type_checks import TypeChecks
 from bridge.client.websocket import Limits, check_uri
 from bridge.codecs.cbor_codec import Arrays
