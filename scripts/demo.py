@@ -53,7 +53,7 @@ async def demo(arguments: argparse.Namespace) -> int:
         options = ("--set", "array=true") if array else ()
         building = asyncio.create_task(build("boat", deployment, uri, BOAT_TOPIC, type_, *options))
         await asyncio.gather(building, viewer.line("listening"))
-        screen.waits_for = "waiting for results; the boards' first start on a computer compiles their kernels"
+        screen.waits_for = "waiting for results; a first start compiles kernels"
         await master.start("master", "--loop", *count, "-d", str(deployment), "--uri", uri)
         await normaliser.start("boat-normaliser", "--uri", uri, *array)
         seed = ["--seed", str(arguments.seed)] if arguments.seed is not None else []

@@ -22,7 +22,7 @@ from toolchain.errors import ToolchainError
 
 ROOT = Path(__file__).resolve().parent.parent
 SILENCE = 1.5
-"""Seconds without a line, after which a `Screen` prints one."""
+"""Seconds of silence, after which a `Screen` shows that the work goes on."""
 BOAT_TOPIC, BOAT_TYPE = "/boat/sensors", "boat_msgs/Sensors"
 
 
@@ -128,25 +128,54 @@ class Process:
 
 
 class Screen:
-    """The lines of a script and, during silence, lines that name the work it waits for."""
+    """The lines of a script and, during silence, the work that it waits for.
+
+    On a terminal that is one line with the time so far, which the next line replaces. Elsewhere it is a line for each
+    work, followed by dots.
+    """
 
     def __init__(self) -> None:
         self.waits_for = "starting"
         """The current work, such as "building"."""
         self._began = time.monotonic()
         self._newest = self._began
+        self._named = ""
+        self._is_open = False  # whether a line without its end is on the screen
 
     def show(self, text: str) -> None:
         """Print a line."""
+        self._end_line()
+        self._print(text + "\n")
+
+    def _print(self, text: str) -> None:
         self._newest = time.monotonic()
-        print(text, flush=True)
+        print(text, end="", flush=True)
+
+    def _end_line(self) -> None:
+        if self._is_open:
+            self._is_open = False
+            self._print("\r\033[K" if sys.stdout.isatty() else "\n")
 
     async def say_what_it_waits_for(self) -> None:
-        """Print a line after each `SILENCE` seconds without one, until cancelled."""
-        while True:
-            await asyncio.sleep(max(self._newest + SILENCE - time.monotonic(), 0))
-            if time.monotonic() - self._newest >= SILENCE:
-                self.show(f"... {self.waits_for} ({time.monotonic() - self._began:.0f} s)")
+        """Show the work after each `SILENCE` seconds without a line, until cancelled."""
+        try:
+            while True:
+                await asyncio.sleep(max(self._newest + SILENCE - time.monotonic(), 0))
+                if time.monotonic() - self._newest >= SILENCE:
+                    self._say()
+        finally:
+            self._end_line()
+
+    def _say(self) -> None:
+        if sys.stdout.isatty():
+            self._print(f"\r\033[K... {self.waits_for} ({time.monotonic() - self._began:.0f} s)")
+        elif self._named == self.waits_for:
+            self._print(".")
+        else:
+            self._end_line()
+            self._named = self.waits_for
+            self._print(f"... {self.waits_for} ...")
+        self._is_open = True
 
 
 async def build(case_study: str, deployment: Path, uri: str, topic: str, type_: str, *options: str) -> None:

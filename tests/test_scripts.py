@@ -32,20 +32,30 @@ def test_mutants_of_a_module_that_does_not_exist_are_a_mistake():
     assert "services/pipeline/publisher.py" in done.stderr
 
 
-async def test_a_screen_says_what_it_waits_for_when_nothing_else_comes(capsys, monkeypatch):
+@pytest.mark.parametrize("terminal", [False, True])
+async def test_a_screen_says_what_it_waits_for_when_nothing_else_comes(terminal, capsys, monkeypatch):
     monkeypatch.setattr(processes, "SILENCE", 0.2)
+    monkeypatch.setattr("sys.stdout.isatty", lambda: terminal)
     screen = processes.Screen()
-    screen.waits_for = "building"
     saying = asyncio.create_task(screen.say_what_it_waits_for())
-    for _ in range(4):
-        screen.show("frame")
-        await asyncio.sleep(0.1)
-    assert capsys.readouterr().out == "frame\n" * 4
-    await asyncio.sleep(0.5)
+    said = ""
+    for work in ("building", "drawing"):
+        screen.waits_for = work
+        for _ in range(4):
+            screen.show("frame")
+            await asyncio.sleep(0.1)
+        assert capsys.readouterr().out == "frame\n" * 4
+        await asyncio.sleep(1.0)
+        screen.show("done")
+        said = capsys.readouterr().out
+        assert work in said
+        if terminal:
+            assert said.count(work) >= 2
+            assert said.count("\n") == 1
+        else:
+            assert said.splitlines()[0].endswith("....")
+            assert (said.count(work), said.splitlines()[1:]) == (1, ["done"])
     saying.cancel()
-    lines = capsys.readouterr().out.splitlines()
-    assert 1 <= len(lines) <= 3
-    assert all("building" in line for line in lines)
 
 
 def test_setting_up_an_environment_shows_that_it_goes_on(tmp_path):
