@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import re
 import sys
 import tomllib
@@ -20,6 +19,8 @@ from cyclonedx.model.license import LicenseExpression
 from cyclonedx.output.json import JsonV1Dot6
 from license_expression import get_spdx_licensing
 from packageurl import PackageURL
+
+from scripts.flags import ScriptParser
 
 ROOT: Final = Path(__file__).resolve().parent.parent
 LICENCES: Final = ROOT / "scripts" / "licences.toml"
@@ -137,7 +138,7 @@ def bill(lock: Path, dev_lock: Path) -> Bom:
 
 def main() -> int:
     """Write the bill."""
-    parser = argparse.ArgumentParser(prog="scripts/bill-of-materials", description=__doc__)
+    parser = ScriptParser(prog="scripts/bill-of-materials", description=__doc__)
     parser.add_argument("--json", type=Path, metavar="FILE", default=ROOT / "out" / "rosbayes.cdx.json")
     file: Path = parser.parse_args().json
     try:

@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 
 from bridge.discovery import announced_uri
+from scripts.flags import ScriptParser
 from scripts.processes import BOAT_TOPIC, BOAT_TYPE, ROOT, Process, Screen, build, run_script
 
 LIMIT = 180.0
@@ -70,21 +71,25 @@ async def demo(arguments: argparse.Namespace) -> int:
 
 def main() -> int:
     """Parse the flags and run the demo."""
-    parser = argparse.ArgumentParser(
+    parser = ScriptParser(
         prog="scripts/demo", description="Run the boat case study from end to end, without a robot."
     )
     parser.add_argument(
-        "--uri", help="a rosbridge server, instead of the embedded hub (ws://HOST:PORT or robot:NAME)"
+        "--uri", metavar="ws://HOST:PORT|robot:NAME", shown="the embedded hub", help="a rosbridge server"
     )
-    parser.add_argument("--count", type=int, default=25, help="number of frames (25)")
+    parser.add_argument("--count", type=int, default=25, help="number of frames")
     parser.add_argument(
         "--stay",
         action="store_true",
         help=f"run until Ctrl-C, with the hub on port {PORT}, so that `listen` and others can connect",
     )
-    parser.add_argument("--rate", type=float, default=10.0, help="readings per second (10)")
-    parser.add_argument("--seed", type=int, help="seed of the route and of the noise (a new one each time)")
-    parser.add_argument("--out", type=Path, default=ROOT / "out", help="folder for pictures and logs (out)")
+    parser.add_argument("--rate", type=float, default=10.0, help="readings per second")
+    parser.add_argument(
+        "--seed", type=int, shown="a new one each time", help="seed of the route and of the noise"
+    )
+    parser.add_argument(
+        "--out", metavar="DIR", type=Path, default=ROOT / "out", help="folder for pictures and logs"
+    )
     arguments = parser.parse_args()
     if arguments.count < 1:
         parser.error("--count must be 1 or more")

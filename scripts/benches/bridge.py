@@ -25,6 +25,7 @@ from typing import Any, NamedTuple, TypeVar, cast
 from rich.console import Console
 from rich.table import Table
 
+from scripts.flags import ScriptParser
 from scripts.other_clients.installation import install_roslib, install_roslibpy
 from scripts.processes import ROOT, Process, run_script
 from services.errors import StackError
@@ -572,7 +573,7 @@ def draw(by_values: dict[str, dict[str, float]], path: Path) -> bool:
 
 def main() -> int:
     """Parse the flags and measure."""
-    parser = argparse.ArgumentParser(
+    parser = ScriptParser(
         prog="scripts/bench bridge",
         description="Compare rosbridge clients on the hub, and the hub with a model of the reference server.",
     )

@@ -25,6 +25,7 @@ from rich.table import Table
 
 from bridge.client import Publication, Ros, Subscription, connect
 from bridge.stamps import header, header_stamp_ns
+from scripts.flags import ScriptParser
 from scripts.processes import BOAT_TOPIC, BOAT_TYPE, Process, build, run_script
 
 STAGES = (
@@ -326,18 +327,20 @@ def show(figures: dict[str, Any]) -> None:
 
 def main() -> int:
     """Parse the flags and measure."""
-    parser = argparse.ArgumentParser(
+    parser = ScriptParser(
         prog="scripts/bench cycle",
         description="Compare the time from a reading to its result with that of an echo.",
     )
-    parser.add_argument("--frames", type=int, default=1000, help="number of readings (1000)")
+    parser.add_argument("--frames", type=int, default=1000, help="number of readings")
     parser.add_argument(
         "--turn",
         type=int,
         default=50,
-        help="readings of one turn, after which another alternative is measured (50)",
+        help="readings of one turn, after which another alternative is measured",
     )
-    parser.add_argument("--seed", type=int, help="seed of the positions of the boat (a new one each time)")
+    parser.add_argument(
+        "--seed", type=int, shown="a new one each time", help="seed of the positions of the boat"
+    )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all figures")
     arguments = parser.parse_args()
     if min(arguments.frames, arguments.turn) < 1:

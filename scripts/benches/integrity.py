@@ -19,6 +19,7 @@ from rich.table import Table
 
 from bridge.client import connect
 from scripts.benches.cycle import one_by_one, per_second, quantile, readings
+from scripts.flags import ScriptParser
 from scripts.processes import BOAT_TOPIC, BOAT_TYPE, Process, build, run_script
 
 RULES: dict[str, tuple[str, ...]] = {
@@ -89,11 +90,11 @@ async def bench(arguments: argparse.Namespace) -> int:
 
 def main() -> int:
     """Parse the flags and measure."""
-    parser = argparse.ArgumentParser(
+    parser = ScriptParser(
         prog="scripts/bench integrity", description="Measure the cost of each value of integrity."
     )
-    parser.add_argument("--frames", type=int, default=2000, help="readings of one turn (2000)")
-    parser.add_argument("--turns", type=int, default=3, help="number of turns of each value (3)")
+    parser.add_argument("--frames", type=int, default=2000, help="readings of one turn")
+    parser.add_argument("--turns", type=int, default=3, help="number of turns of each value")
     parser.add_argument("--fused", action="store_true", help="measure master --fused")
     parser.add_argument(
         "--seed", type=int, default=random.randrange(2**32), help="seed of the positions of the boat"

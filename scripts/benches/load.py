@@ -26,6 +26,7 @@ from rich.console import Console
 from rich.table import Table
 
 from scripts.benches.bridge import TYPE, Bare, bare, frame, settled
+from scripts.flags import ScriptParser
 from scripts.processes import Process, run_script
 
 TOPICS = 200
@@ -334,12 +335,12 @@ def show(found: dict[str, Any]) -> None:
 
 def main() -> int:
     """Parse the flags and measure."""
-    parser = argparse.ArgumentParser(
+    parser = ScriptParser(
         prog="scripts/bench load",
         description="Measure the hub with many clients, with slow readers, and under attack.",
     )
-    parser.add_argument("--clients", type=int, default=500, help="number of clients (500)")
-    parser.add_argument("--seconds", type=float, default=10.0, help="duration of each phase in seconds (10)")
+    parser.add_argument("--clients", type=int, default=500, help="number of clients")
+    parser.add_argument("--seconds", type=float, default=10.0, help="duration of each phase in seconds")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all figures")
     arguments = parser.parse_args()
     return run_script(lambda: bench(arguments), 600)

@@ -21,6 +21,7 @@ from rich.table import Table
 
 from bridge.client import Publication, Subscription, connect
 from scripts.benches.cycle import WINDOW, message, processes_of, quantile, readings
+from scripts.flags import ScriptParser
 from scripts.processes import BOAT_TOPIC, BOAT_TYPE, ROOT, Process, build, run_script
 
 WARM_UP = 200
@@ -167,19 +168,21 @@ def draw(minutes: list[Minute], path: Path) -> None:
 
 def main() -> int:
     """Parse the flags and measure."""
-    parser = argparse.ArgumentParser(
+    parser = ScriptParser(
         prog="scripts/bench loop",
         description="Run master --loop at full rate, and print the figures of each minute.",
     )
-    parser.add_argument("--minutes", type=int, default=30, help="minutes to measure (30)")
+    parser.add_argument("--minutes", type=int, default=30, help="minutes to measure")
     parser.add_argument("--fused", action="store_true", help="measure master --fused")
-    parser.add_argument("--seed", type=int, help="seed of the positions of the boat (a new one each time)")
+    parser.add_argument(
+        "--seed", type=int, shown="a new one each time", help="seed of the positions of the boat"
+    )
     parser.add_argument(
         "--picture",
         type=Path,
         metavar="FILE",
         default=ROOT / "out" / "loop.png",
-        help="picture of the figures (out/loop.png)",
+        help="picture of the figures",
     )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all figures")
     arguments = parser.parse_args()

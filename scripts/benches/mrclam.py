@@ -24,6 +24,7 @@ from casestudies.mrclam.landmarks import Landmark, read_landmarks
 from casestudies.mrclam.model import model
 from casestudies.mrclam.player import median_distance, play
 from casestudies.mrclam.recording import RecordedFrame, area_grid, read_recording
+from scripts.flags import ScriptParser
 from scripts.processes import ROOT, Process, build, run_script
 from toolchain.deployment.address import to_address
 from toolchain.models import Model, exact_posterior
@@ -225,7 +226,7 @@ def _report_fit(by_hand: Figures, fitted: Figures) -> int:
 
 def main() -> int:
     """Parse the flags and play."""
-    parser = argparse.ArgumentParser(
+    parser = ScriptParser(
         prog="scripts/bench mrclam",
         description="Replay the data of recorded robots through the whole stack, and compare with float64.",
     )
@@ -239,7 +240,7 @@ def main() -> int:
         help="on robot 5, compare tables set by hand with tables learnt on robot 3; if FILE does not exist, they are "
         "learnt now and written to it",
     )
-    parser.add_argument("--cells", type=int, default=32, help="number of cells along x, and along y (32)")
+    parser.add_argument("--cells", type=int, default=32, help="number of cells along x, and along y")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all figures")
     arguments = parser.parse_args()
     if not 1 <= arguments.cells <= 128:  # four boards hold 4096 lines each

@@ -27,6 +27,7 @@ from scripts.campaigning.round import POOL, Round
 from scripts.campaigning.shrinking import shrink
 from scripts.campaigning.stack import Topology
 from scripts.campaigning.wire import TOPIC, TYPE
+from scripts.flags import ScriptParser
 from scripts.processes import ROOT, Process, run_script
 
 FRAMES = 100_000
@@ -238,12 +239,12 @@ class Campaign:
 
 def main() -> int:
     """Run the command."""
-    parser = argparse.ArgumentParser(
+    parser = ScriptParser(
         prog="scripts/campaign",
         description="Run the stack, inject faults, and judge every result (docs/how-to/verify.md).",
     )
-    parser.add_argument("--frames", type=int, default=FRAMES, help=f"number of results to judge ({FRAMES})")
-    parser.add_argument("--seed", type=int, default=1, help="seed of the first round (1)")
+    parser.add_argument("--frames", type=int, default=FRAMES, help="number of results to judge")
+    parser.add_argument("--seed", type=int, default=1, help="seed of the first round")
     parser.add_argument(
         "--only",
         action="append",
@@ -256,8 +257,8 @@ def main() -> int:
         choices=[each.name for each in Topology],
         help="run only this topology; repeatable",
     )
-    parser.add_argument("--steps", type=int, default=STEPS, help=f"steps of a round ({STEPS})")
-    parser.add_argument("--calm", type=int, default=200, help="results between two steps (200)")
+    parser.add_argument("--steps", type=int, default=STEPS, help="steps of a round")
+    parser.add_argument("--calm", type=int, default=200, help="results between two steps")
     parser.add_argument(
         "--short", action="store_true", help="run the same schedule each time, for at most three minutes"
     )
@@ -266,7 +267,7 @@ def main() -> int:
         "--shrink",
         type=float,
         default=SHRINKING,
-        help=f"seconds in which to shorten a failed schedule ({SHRINKING:g})",
+        help="seconds in which to shorten a failed schedule",
     )
     parser.add_argument("--json", type=Path, help="write the figures to this file")
     options = parser.parse_args()

@@ -6,7 +6,6 @@ sees the project's packages.
 
 from __future__ import annotations
 
-import argparse
 import hashlib
 import os
 import shutil
@@ -18,6 +17,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+from scripts.flags import ScriptParser
 from scripts.fuzzing.targets import SEEDS, TARGETS
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -188,15 +188,13 @@ def fuzz(targets: list[str], seconds: float) -> int:
 
 def main() -> int:
     """Run the command."""
-    parser = argparse.ArgumentParser(
+    parser = ScriptParser(
         prog="scripts/fuzz", description="Fuzz the codecs and the protocol cores of client and hub."
     )
     parser.add_argument(
-        "targets", nargs="*", metavar="TARGET", help=f"one of {', '.join(TARGETS)} (default: all)"
+        "targets", nargs="*", metavar="TARGET", help=f"one of {', '.join(TARGETS)} [default: all]"
     )
-    parser.add_argument(
-        "--seconds", type=float, default=SECONDS, help=f"total duration in seconds ({SECONDS:g})"
-    )
+    parser.add_argument("--seconds", type=float, default=SECONDS, help="total duration in seconds")
     options = parser.parse_args()
     unknown = [target for target in options.targets if target not in TARGETS]
     if unknown:

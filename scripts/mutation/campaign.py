@@ -28,6 +28,7 @@ from typing import Any, Final, Literal
 import coverage
 import psutil
 
+from scripts.flags import ScriptParser
 from scripts.mutation import contexts, warm
 from scripts.mutation.mutants import Mutant, mutants
 
@@ -476,7 +477,7 @@ def _digest(mutant: Mutant) -> str:
 
 def main() -> int:
     """Parse the flags, try the mutants and report."""
-    parser = argparse.ArgumentParser(
+    parser = ScriptParser(
         prog="scripts/mutants",
         description="Try one-line mistakes, each of which the tests must find.",
     )
@@ -487,16 +488,17 @@ def main() -> int:
         metavar="WORD",
         help="only modules whose path contains WORD; repeatable",
     )
-    parser.add_argument("--sample", type=int, default=SAMPLE, help=f"mutants per module ({SAMPLE})")
-    parser.add_argument("--seed", type=int, default=1, help="seed of the sample (1)")
+    parser.add_argument("--sample", type=int, default=SAMPLE, help="mutants per module")
+    parser.add_argument("--seed", type=int, default=1, help="seed of the sample")
     parser.add_argument(
-        "--minutes", type=float, default=240.0, help="time limit in minutes (240); the next run continues"
+        "--minutes", type=float, default=240.0, help="time limit in minutes; the next run continues"
     )
     parser.add_argument(
         "--workers",
         type=int,
         default=os.cpu_count() or 1,
-        help="number of mutants tried at the same time (one per CPU)",
+        shown="one per CPU",
+        help="number of mutants tried at the same time",
     )
     parser.add_argument("--quick", action="store_true", help="without the tests of processes")
     parser.add_argument("--again", action="store_true", help="try survivors of earlier runs again")

@@ -20,6 +20,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from scripts.flags import ScriptParser
 from scripts.other_clients.fibonacci_server import fibonacci_server
 from scripts.other_clients.installation import install_roslib, install_roslibpy
 from scripts.processes import Process, run_script
@@ -209,11 +210,11 @@ def show(outcomes: list[Outcome]) -> None:
 
 def main() -> int:
     """Parse the flags and run the tests."""
-    parser = argparse.ArgumentParser(
+    parser = ScriptParser(
         prog="scripts/conformance", description="The hub under the tests of other projects."
     )
-    parser.add_argument("--only", choices=("roslibpy", "roslib"), help="one client (both)")
-    parser.add_argument("--ros-version", choices=("1", "2"), help="the hub as one ROS version (both)")
+    parser.add_argument("--only", choices=("roslibpy", "roslib"), shown="both", help="one client")
+    parser.add_argument("--ros-version", choices=("1", "2"), shown="both", help="the hub as one ROS version")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all outcomes")
     arguments = parser.parse_args()
     return run_script(lambda: check(arguments), 1800)

@@ -7,7 +7,6 @@ but not the explanations.
 
 from __future__ import annotations
 
-import argparse
 import hashlib
 import sys
 import textwrap
@@ -15,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from scripts.flags import ScriptParser
 from scripts.register_maps import hardware
 
 if TYPE_CHECKING:
@@ -304,7 +304,7 @@ def generated_files(register_map: RegisterMap) -> dict[Path, str]:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Write all files, or with `--check` compare them with the SystemRDL file's output."""
-    parser = argparse.ArgumentParser(
+    parser = ScriptParser(
         prog="scripts/registers",
         description="Makes the constants module, the documentation, the VHDL and the C header from hdl/bm_registers.rdl.",
         epilog="example: scripts/registers --check",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import sys
 import time
@@ -10,6 +9,7 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from scripts.flags import ScriptParser
 from scripts.processes import Process, run_script
 from scripts.verifications import real_rosbridge
 
@@ -104,8 +104,8 @@ def on_servers(
             code.
         limit: Time limit in seconds.
     """
-    parser = argparse.ArgumentParser(prog=f"scripts/verify {name}", description=description.splitlines()[0])
-    parser.add_argument("--server", choices=["real", "hub", "both"], default="both", help="(both)")
+    parser = ScriptParser(prog=f"scripts/verify {name}", description=description.splitlines()[0])
+    parser.add_argument("--server", choices=["real", "hub", "both"], default="both", help="the servers")
     server = parser.parse_args().server
     kinds = ["real", "hub"] if server == "both" else [server]
     if "real" in kinds and not real_rosbridge.network_is_alone():

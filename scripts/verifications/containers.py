@@ -6,7 +6,6 @@ this folder.
 
 from __future__ import annotations
 
-import argparse
 import hashlib
 import os
 import re
@@ -21,6 +20,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Final
 
+from scripts.flags import ScriptParser
 from scripts.processes import ROOT
 from scripts.verifications.checks import CheckError, Tally, expect
 from scripts.verifications.container_stack import (
@@ -560,7 +560,7 @@ def verify(only: str) -> int:
 
 def main() -> int:
     """Check that this machine can run it, then run it with a time limit."""
-    parser = argparse.ArgumentParser(prog="scripts/verify containers", description=__doc__)
+    parser = ScriptParser(prog="scripts/verify containers", description=__doc__)
     parser.add_argument(
         "--only", default="", help="only the checks with this in their names, and what they need"
     )

@@ -7,7 +7,6 @@ VHDL            --> Verilog (GHDL) --> yosys        --> properties for every inp
 
 from __future__ import annotations
 
-import argparse
 import os
 import sys
 import time
@@ -18,6 +17,7 @@ from typing import TypeVar
 from hdl.test.mutants import MUTANTS, Mutant, caught_by
 from hdl.test.simulation import HardwareToolError
 from hdl.test.verification import Check, formal, sessions, units
+from scripts.flags import ScriptParser
 from scripts.verifications.debian import MissingToolError, install
 
 _Item = TypeVar("_Item")
@@ -28,13 +28,11 @@ SESSIONS = 60
 
 def main() -> int:
     """Run the matrix or the mutants; exit 1 if a check fails or a mutant is not found."""
-    parser = argparse.ArgumentParser(prog="scripts/verify hdl", description=__doc__.splitlines()[0])
+    parser = ScriptParser(prog="scripts/verify hdl", description=__doc__.splitlines()[0])
     parser.add_argument(
         "--mutants", action="store_true", help="check that mistakes in the VHDL are found, one by one"
     )
-    parser.add_argument(
-        "--sessions", type=int, default=SESSIONS, metavar="N", help=f"random machines ({SESSIONS})"
-    )
+    parser.add_argument("--sessions", type=int, default=SESSIONS, metavar="N", help="random machines")
     parser.add_argument("--only", default="", metavar="TEXT", help="what has this in its name")
     arguments = parser.parse_args()
     try:

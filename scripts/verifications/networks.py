@@ -6,7 +6,6 @@ pgmpy's wheel (pinned, hashed) --> *.bif --> pyagrum --> tables, the same networ
 
 from __future__ import annotations
 
-import argparse
 import gzip
 import hashlib
 import json
@@ -28,6 +27,7 @@ import numpy as np
 from machines.bm1 import BM1Machine
 from machines.parameters import BM1Parameters, RngKind
 from machines.posterior import posterior
+from scripts.flags import ScriptParser
 from toolchain.building.quantise import quantise
 from toolchain.errors import ModelError
 from toolchain.models.distribution import Distribution
@@ -310,9 +310,7 @@ def verify(only: list[str]) -> Checks:
 
 def main() -> int:
     """Parse the flags and verify."""
-    parser = argparse.ArgumentParser(
-        prog="scripts/verify networks", description="Our readers beside pyagrum's."
-    )
+    parser = ScriptParser(prog="scripts/verify networks", description="Our readers beside pyagrum's.")
     parser.add_argument("--network", action="append", metavar="NAME", help="only this one; repeat for more")
     arguments = parser.parse_args()
     try:

@@ -5,7 +5,6 @@ small machines --> VHDL --> Verilog (GHDL) --> yosys --> as many look-up tables,
 
 from __future__ import annotations
 
-import argparse
 import statistics
 import sys
 import tempfile
@@ -21,6 +20,7 @@ from hdl.test.netlist import Netlist, synthesised
 from hdl.test.project import image_of_parameters
 from hdl.test.simulation import HardwareToolError
 from machines.parameters import BM1Parameters, PriorMode, RngKind, RngReset, SensorMode
+from scripts.flags import ScriptParser
 from scripts.verifications.debian import MissingToolError, install
 from toolchain.analysis.resources.logic import COSTS, WORST_ERROR, Of, logic_of
 
@@ -84,7 +84,7 @@ CALIBRATION: Final = (
 
 def main() -> int:
     """Synthesise the machines one after the other; exit 1 if an error exceeds the stated one."""
-    parser = argparse.ArgumentParser(prog="scripts/verify resources", description=__doc__.splitlines()[0])
+    parser = ScriptParser(prog="scripts/verify resources", description=__doc__.splitlines()[0])
     parser.add_argument("--calibrate", action="store_true", help="fit the costs again to other machines")
     parser.add_argument(
         "--only", default="", metavar="TEXT", help="machines whose parameters have this in it"

@@ -147,7 +147,7 @@ class BuildFlags(ModelFlags):
             rich_help_panel=TABLES,
         ),
     ] = None
-    prob_bits: Annotated[int, typer.Option(help="Bits of a code, 1 to 16.", rich_help_panel=TABLES)] = 8
+    prob_bits: Annotated[int, typer.Option(help="Bits of a code.", min=1, max=16, rich_help_panel=TABLES)] = 8
     bits: Bits = None
     prior_mode: Annotated[
         PriorMode,
@@ -156,7 +156,7 @@ class BuildFlags(ModelFlags):
         ),
     ] = PriorMode.TABLE
     counter_bits: Annotated[
-        int, typer.Option(help="Bits of a line's counter, 1 to 32.", rich_help_panel=STOPPING)
+        int, typer.Option(help="Bits of a line's counter.", min=1, max=32, rich_help_panel=STOPPING)
     ] = 8
     target_count: TargetCount = None
     max_cycles: MaxCycles = 2**17
@@ -212,7 +212,9 @@ class BuildFlags(ModelFlags):
     replicas: Annotated[
         int,
         typer.Option(
-            help="Number of machines on each board, which share the generators, 1 to 256.",
+            help="Number of machines on each board, which share the generators.",
+            min=1,
+            max=256,
             rich_help_panel=BOARDS,
         ),
     ] = 1
